@@ -34,8 +34,8 @@ import httpx
 import websockets
 
 from rampart.actors.run.run_info import find_runs
+from rampart.actors.runtime.process_usage import read_count
 from rampart.actors.supervision.process_title import find_processes
-from rampart.actors.supervision.process_usage import read_count
 
 ROOT = Path(__file__).resolve().parents[1]
 PORT, PAGE_PORT = 8660, 8760
@@ -132,7 +132,7 @@ async def stick(until_s: float, waits: list[float], failed: list[str]) -> None:
         try:
             async with websockets.connect(f"ws://{AT}/ws", additional_headers=BEARER) as page:
                 while (sent := time.monotonic()) < until_s:
-                    await page.send('{"type":"stick","held":false}')
+                    await page.send('{"type":"stick","panel":"Drive","held":false}')
                     while json.loads(await page.recv())["type"] != "stick":
                         pass
                     waits.append(1000 * (time.monotonic() - sent))

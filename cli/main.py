@@ -31,10 +31,9 @@ from importlib.metadata import entry_points
 
 from rampart.cli import new
 from rampart.cli.analyse import (
-    check_verb,
+    check_verbs,
     cut_set_verbs,
     decide_verbs,
-    explain_verb,
     tree_verbs,
     verify_verb,
 )
@@ -47,7 +46,7 @@ from rampart.files import streams, working_folder
 
 _OF_A_RUN = (node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
              record_verbs)
-_OF_A_SYSTEM = (check_verb, explain_verb, cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
+_OF_A_SYSTEM = (check_verbs, cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
 # Each adds its verbs, in this order in the help.
 
 

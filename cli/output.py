@@ -6,6 +6,7 @@ import contextlib
 import difflib
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -113,6 +114,24 @@ def progress() -> Iterator[Callable[[str], None]]:
         yield show
     finally:
         show("")
+
+
+def rendered(template: Path, *, escaped: bool = False, **values: Any) -> str:
+    """Return a template of Jinja filled in, numbers in their shortest form.
+
+    Args:
+        template: its file.
+        escaped: what is filled in is escaped, as XML needs it.
+        values: by name.
+    """
+    import jinja2  # noqa: PLC0415 few verbs need it
+
+    pages = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(template.parent),
+        autoescape=escaped,  # noqa: S701 Markdown needs no escapes
+        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        finalize=lambda value: f"{value:g}" if isinstance(value, float) else value)
+    return pages.get_template(template.name).render(values)
 
 
 def print_json(data: Any, *, indent: bool = True, names: bool = False) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Iterator
 
 from rampart import systems
 from rampart.actors.layout.layout import Layout, application_class, load_application
@@ -99,21 +98,14 @@ def check(file: str | None) -> Layout:
     layout = Layout(plan, spec)
     application = load_application(plan, spec)
     application.check(spec, virtual=False)
-    with _of(plan):
+    try:
         system_topics(spec)
         trial_class(spec)
         faults_of(spec)
         lines_of(spec)
-    return layout
-
-
-@contextlib.contextmanager
-def _of(plan: RunPlan) -> Iterator[None]:
-    """Name the file in what is wrong with the classes of its application."""
-    try:
-        yield
     except (ValueError, UsageError) as error:
         raise UsageError(f"{plan.system_file}: {error}") from None
+    return layout
 
 
 # Users are told what the actors or the application of a system lack.

@@ -20,6 +20,8 @@ import select
 import sys
 from typing import Any
 
+from rampart.files.plain_text import one_line
+
 PATIENCE_S = 0.5
 """Real seconds that stderr may take nothing, before lines are lost."""
 
@@ -76,6 +78,11 @@ def secure() -> None:
             errors="backslashreplace", line_buffering=name == "stderr" or raw.isatty())
         setattr(sys, name, made)
         setattr(sys, f"__{name}__", made)
+
+
+def complain(text: str) -> None:
+    """Print a text as one line on stderr."""
+    print(f"rampart: {one_line(text)}", file=sys.stderr, flush=True)
 
 
 def lost() -> OSError | None:

@@ -3,3 +3,10 @@
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+CELL = ROOT / "tests" / "systems" / "cell.toml"
+"""A system that is rich in everything but a robot: gates, an order of two, a shared process."""
+
+
+def system_file(name: str) -> Path:
+    """Return the file of a system that ships, or of the cell."""
+    return CELL if name == "cell" else ROOT / "systems" / f"{name}.toml"

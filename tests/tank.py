@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Annotated
+
+import msgspec
 
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
@@ -39,6 +42,14 @@ class Valve(Message):
     opening: float = 1.0
 
 
+class Hand(Message):
+    """Where the operator's stick is."""
+
+    forward: Annotated[float, msgspec.Meta(ge=-0.5, le=2.0)]
+    left: float = 0.0
+    held: bool = False
+
+
 LEVEL = Topic("tank/level", Level, Qos.SENSOR, 10.0, "", "How full the tank is.")
 SECOND = Topic("tank/second", Level, Qos.SENSOR, 10.0, "", "The same by another gauge.")
 THIRD = Topic("tank/third", Level, Qos.SENSOR, 10.0, "", "The same by a third gauge.")
@@ -46,4 +57,5 @@ PUMP = Topic("tank/pump", Pump, Qos.STATE, 5.0, "", "What the pump does.")
 ORDER = Topic("tank/order", Valve, Qos.COMMAND, 0.0, "", "Orders to the valve.")
 VALVE = Topic("tank/valve", Valve, Qos.STATE, 5.0, "", "The state of the valve.")
 GAUGE = Topic("tank/gauge/{name}", Level, Qos.SENSOR, 10.0, "", "The level by one of many gauges.")
-TOPICS = (LEVEL, SECOND, THIRD, PUMP, ORDER, VALVE, GAUGE)
+HAND = Topic("tank/hand", Hand, Qos.SENSOR, 20.0, "", "The operator's stick.")
+TOPICS = (LEVEL, SECOND, THIRD, PUMP, ORDER, VALVE, GAUGE, HAND)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Any
 
@@ -103,3 +103,63 @@ def _follow(info: inspect.Type, step: str | int, path: str) -> inspect.Type:
         hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(known) or 'none'}"
         raise ValueError(f"{path}: {info.cls.__name__} has no field {step!r}; {hint}")
     return known[step]
+
+
+class Steered:
+    """Messages that say where a stick is: one or two numbers, and whether it is held.
+
+    A number is at its greatest where the stick is at 1, at its least where that is at -1: at the
+    bounds of its type, which are 1 and -1 where it has none, or at plus and minus its `scale`.
+
+    Args:
+        message: type of the messages.
+        fields: those of the numbers.
+        held: that of the truth value, "" for none.
+        scale: for each number what it is at 1; () for the bounds of its type.
+
+    Raises:
+        ValueError: no such message can be made; one line.
+    """
+
+    def __init__(self, message: type[msgspec.Struct], fields: Sequence[str], held: str = "",
+                 scale: Sequence[float] = ()) -> None:
+        known = {field.name: field for field in msgspec.structs.fields(message)}
+        steered = (*fields, held) if held else tuple(fields)
+        for name in steered:
+            if name not in known:
+                raise ValueError(f"{name}: a whole field of {message.__name__} is right: "
+                                 f"{', '.join(known)}")
+        if left := [name for name, field in known.items()
+                    if field.required and name not in steered]:
+            raise ValueError(f"nothing says what {', '.join(left)} of {message.__name__} is; a "
+                             "default in its class is right")
+        self._message = message
+        self._held = held
+        self._ends = {name: _ends(known[name].type, scale[i] if scale else None)
+                      for i, name in enumerate(fields)}
+        for name, (low, high) in self._ends.items():
+            for value in (0, low, high):
+                try:
+                    msgspec.convert(value, known[name].type)
+                except ValueError as error:
+                    when = "at rest" if value == 0 else "at full stick"
+                    raise ValueError(f"{name} = {value:g} {when}: {error}; a scale within its "
+                                     "bounds is right") from None
+
+    def __call__(self, position: Sequence[float] | None) -> msgspec.Struct:
+        """Return the message of a stick that is held at a position in [-1, 1], None: at rest."""
+        said: dict[str, Any] = {self._held: position is not None} if self._held else {}
+        for (name, (low, high)), at in zip(self._ends.items(), position or (0, 0), strict=False):
+            value = (at * high if at >= 0 else -at * low) + 0.0  # no -0
+            said[name] = round(value) if isinstance(high, int) else value
+        return self._message(**said)
+
+
+def _ends(kind: Any, scale: float | None) -> tuple[float, float]:
+    """Return what a number is at -1 and at 1, as whole numbers if it is one."""
+    info = _plain(inspect.type_info(kind))
+    as_said = int if isinstance(info, inspect.IntType) else float
+    low, high = getattr(info, "ge", None), getattr(info, "le", None)
+    if scale is not None:
+        low, high = -scale, scale
+    return as_said(-1 if low is None else low), as_said(1 if high is None else high)

@@ -80,7 +80,6 @@ class _Comparing(DetectionModule):
         said = self.parameters
         self.monitor = self.judged_by(Sustained(
             said.for_s, said.clear_s, self.known_after_s(said.stale_s + said.clear_s)))
-        self.monitor.accused = said.suspects
         self._waits_until_s = self.clock.now() + self.grace_s(said.stale_s)
         fields = self.compared()
         self._samples = [_NOTHING] * len(fields)

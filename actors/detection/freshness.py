@@ -46,19 +46,13 @@ class FreshnessMonitor(Finding):
         self.timeout_s = timeout_s
         self.hold_s = hold_s
         self._newest_s = -math.inf
-        self._first_due_s = start_s + grace_s
+        self._stale_s = start_s + grace_s
         self._fresh_since_s: float | None = None
 
     @property
     def due_s(self) -> float:
         """When time alone changes the finding."""
         return math.inf if self.active and self._fresh_since_s is None else self._stale_s
-
-    @property
-    def _stale_s(self) -> float:
-        if self._newest_s == -math.inf:
-            return self._first_due_s
-        return self._newest_s + self.timeout_s
 
     def heard(self, stamp_s: float, now_s: float) -> None:
         """Take note of a sample.
@@ -71,6 +65,7 @@ class FreshnessMonitor(Finding):
         if not is_possible(stamp_s, now_s) or not stamp_s > self._newest_s:
             return
         self._newest_s = min(stamp_s, now_s)
+        self._stale_s = self._newest_s + self.timeout_s
         if now_s >= self._stale_s:
             return
         self.known = True

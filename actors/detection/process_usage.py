@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from rampart.actors.bus import topics as bus_topics
@@ -15,31 +13,11 @@ from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.parameters import NodeNames
+from rampart.actors.runtime.process_usage import ProcessCount
 from rampart.manager.spec.tables import NonNegative, Positive
 
 PERIOD_S = 0.5
 _MB = 1e6
-_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
-_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
-
-
-class Usage(NamedTuple):
-    """Processor time since its start, s, and resident memory, bytes."""
-
-    processor_s: float
-    memory_bytes: int
-
-
-def read_usage(pid: int) -> Usage | None:
-    """Return what a process of this machine uses, None if there is none (Linux: /proc/PID)."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_bytes()
-        pages = Path(f"/proc/{pid}/statm").read_bytes().split()[1]
-        # The name in brackets may hold anything; field 14 and 15 are utime and stime.
-        fields = stat[stat.rindex(b")") + 2:].split()
-        return Usage((int(fields[11]) + int(fields[12])) / _TICKS_PER_S, int(pages) * _PAGE_BYTES)
-    except (OSError, ValueError, IndexError):
-        return None
 
 
 class _Look(NamedTuple):
@@ -48,7 +26,7 @@ class _Look(NamedTuple):
     pid: int
     incarnation: int
     at_s: float
-    usage: Usage
+    usage: ProcessCount
 
 
 class ProcessUsage(DetectionModule):
@@ -86,7 +64,6 @@ class ProcessUsage(DetectionModule):
         super().__init__(context)
         said = self.parameters
         self._now = now
-        self._usage: Callable[[int], Usage | None] = context.usage or read_usage
         self._looks: dict[str, _Look] = {}
         self._running: dict[str, tuple[int, int]] = {}
         self.monitor = self.judged_by(Sustained(
@@ -115,7 +92,7 @@ class ProcessUsage(DetectionModule):
         self.follow()
 
     def _problem(self, node: str, pid: int, incarnation: int) -> str:
-        usage, now_s = self._usage(pid), self._now()
+        usage, now_s = self.context.usage(pid), self._now()
         before = self._looks.pop(node, None)
         if usage is None:
             return ""
@@ -126,7 +103,7 @@ class ProcessUsage(DetectionModule):
         if said.processor_share is None or before is None or now_s <= before.at_s or (
                 before.pid, before.incarnation) != (pid, incarnation):
             return ""
-        share = (usage.processor_s - before.usage.processor_s) / (now_s - before.at_s)
+        share = (usage.cpu_s - before.usage.cpu_s) / (now_s - before.at_s)
         if share > said.processor_share:
             return f"{share:.2f} of a core, more than {said.processor_share:g}"
         return ""

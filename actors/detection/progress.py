@@ -136,7 +136,6 @@ class Progress(DetectionModule):
         said = self.parameters
         self.monitor = self.judged_by(ProgressMonitor(
             said.value, said.steps, said.busy_at_most_s, self.known_after_s(1.0)))
-        self.monitor.accused = said.suspects
         if said.busy_until:
             self.hear_field(said.busy_until, self.busy)
         self.hear_field(said.value, self.heard)

@@ -59,9 +59,8 @@ class Child:
         Raises:
             CommandError: not even its keeper can be started.
         """
-        order = {"who": who, "command": list(command), "folder": str(folder), "log": str(log),
-                 "env": dict(environment), "limits": _by_name(limits), "fds": list(inherited),
-                 "grace_s": GRACE_S}
+        order = keeper.Order(who, list(command), str(folder), dict(environment), _by_name(limits),
+                             list(inherited), str(log), GRACE_S)
         mine, other = socket.socketpair()
         with other:
             try:
@@ -74,7 +73,7 @@ class Child:
                 raise CommandError(f"its keeper cannot be started: {error.strerror}") from None
         self._control = mine
         with contextlib.suppress(OSError):  # of a keeper that has ended; that is heard below
-            mine.sendall(json.dumps(order).encode() + b"\n")
+            mine.sendall(json.dumps(order._asdict()).encode() + b"\n")
         mine.setblocking(False)
         asyncio.get_running_loop().add_reader(mine, self._hear, mine)
 

@@ -29,6 +29,8 @@ import signal
 import socket
 import sys
 import time
+from collections import namedtuple
+from collections.abc import Callable
 
 LOG_BYTES = 5_000_000
 LOG_BYTES_PER_S = 1_000_000
@@ -133,11 +135,11 @@ def descendants(of: int) -> list[int]:
     return found
 
 
-def end_all(within_s: float = END_S) -> bool:
-    """Kill everything below this process and wait for its end; False if something is left."""
+def kill_all(find: Callable[[], list[int]], within_s: float) -> bool:
+    """Kill what is found until nothing is; False if something is left after so many seconds."""
     until_s = time.monotonic() + within_s
     while True:
-        left = descendants(os.getpid())
+        left = find()
         for pid in left:
             with contextlib.suppress(OSError):
                 os.kill(pid, signal.SIGKILL)
@@ -146,13 +148,17 @@ def end_all(within_s: float = END_S) -> bool:
         time.sleep(0.001)
 
 
+Order = namedtuple("Order", "who command folder env limits fds log grace_s")
+"""What is kept, as whom, where, with which environment, limits and descriptors, and until when."""
+
+
 class Keeper:
     """Keeps one command from its start to its end."""
 
-    def __init__(self, control: socket.socket, order: dict[str, object]) -> None:
+    def __init__(self, control: socket.socket, order: Order) -> None:
         self._control = control
         self._order = order
-        self._log = Log(str(order["log"]))
+        self._log = Log(order.log)
         self._libc = ctypes.CDLL(None, use_errno=True)
         self._output = -1
         self._stop_by_s: float | None = None
@@ -166,16 +172,16 @@ class Keeper:
         signal.set_wakeup_fd(woken, warn_on_full_buffer=False)
         pid, error = self._start()
         if error:
-            self._log.note(f"{self._order['who']}: {error}")
+            self._log.note(f"{self._order.who}: {error}")
             self._tell({"error": error})
             return
-        self._log.note(f"{self._order['who']} is process {pid}")
+        self._log.note(f"{self._order.who} is process {pid}")
         self._tell({"started": pid})
         status = self._keep(pid, wake)
-        end_all()
+        kill_all(lambda: descendants(os.getpid()), END_S)
         self._read_output()
         if status is not None:
-            self._log.note(f"{self._order['who']} ended: {in_words(status)}")
+            self._log.note(f"{self._order.who} ended: {in_words(status)}")
             self._tell({"ended": status})
 
     def _keep(self, pid: int, wake: int) -> int | None:
@@ -211,7 +217,7 @@ class Keeper:
         with contextlib.suppress(OSError):
             os.killpg(pid, signal.SIGTERM)
             os.killpg(pid, signal.SIGCONT)
-        self._stop_by_s = time.monotonic() + float(str(self._order["grace_s"]))
+        self._stop_by_s = time.monotonic() + self._order.grace_s
         return True
 
     def _reap(self, wanted: int) -> int | None:
@@ -255,7 +261,7 @@ class Keeper:
                 why = getattr(error, "strerror", None) or str(error)
                 os.write(failed, f"cannot be started: {why}".encode()[:4000])
             os._exit(127)
-        for fd in (printed, failed, *self._inherited()):
+        for fd in (printed, failed, *self._order.fds):
             os.close(fd)
         with os.fdopen(failure, "rb") as end:
             return pid, end.read().decode(errors="replace")
@@ -268,29 +274,22 @@ class Keeper:
         nothing = os.open(os.devnull, os.O_RDONLY)
         for fd, place in ((nothing, 0), (printed, 1), (printed, 2)):
             os.dup2(fd, place)
-        for fd in self._inherited():
+        for fd in self._order.fds:
             os.set_inheritable(fd, True)
-        os.chdir(str(self._order["folder"]))
+        os.chdir(self._order.folder)
         signal.set_wakeup_fd(-1)
         for number in (*_SIGNALS_IGNORED, signal.SIGCHLD, signal.SIGPIPE, signal.SIGXFSZ):
             signal.signal(number, signal.SIG_DFL)
-        limits, environment, command = (self._order[what] for what in ("limits", "env", "command"))
-        if not (isinstance(limits, dict) and isinstance(environment, dict)
-                and isinstance(command, list)):
-            raise TypeError("no such order")
-        for name, most in limits.items():
+        for name, most in self._order.limits.items():
             try:
                 resource.setrlimit(getattr(resource, name), (most, most))
             except ValueError:
                 raise ValueError(f"{name} {most} is above the hard limit") from None
         try:
-            os.execve(command[0], command, environment)  # noqa: S606 what the system names
+            command = self._order.command
+            os.execve(command[0], command, self._order.env)  # noqa: S606 what the system names
         except FileNotFoundError:  # it was there a moment ago
             raise FileNotFoundError("there is no interpreter as its first line names it") from None
-
-    def _inherited(self) -> list[int]:
-        fds = self._order["fds"]
-        return list(fds) if isinstance(fds, list) else []
 
 
 def in_words(status: int) -> str:
@@ -317,7 +316,7 @@ def main() -> None:
             if not part:
                 return
             text += part
-    Keeper(control, json.loads(text)).run()
+    Keeper(control, Order(**json.loads(text))).run()
 
 
 if __name__ == "__main__":

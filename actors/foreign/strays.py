@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
-import time
 from pathlib import Path
+
+from rampart.actors.foreign.keeper import kill_all
 
 FOLDER, NODE = "RAMPART_FOLDER", "RAMPART_NODE"
 
@@ -33,14 +33,4 @@ def find_strays(folder: str, node: str = "") -> list[int]:
 
 def kill_strays(folder: str, node: str = "") -> bool:
     """Kill them and wait until they are gone; False if something is left after a second."""
-    if not folder:
-        return True
-    until_s = time.monotonic() + _WITHIN_S
-    while pids := find_strays(folder, node):
-        for pid in pids:
-            with contextlib.suppress(OSError):
-                os.kill(pid, signal.SIGKILL)
-        if time.monotonic() > until_s:
-            return False
-        time.sleep(0.002)
-    return True
+    return not folder or kill_all(lambda: find_strays(folder, node), _WITHIN_S)

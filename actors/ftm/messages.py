@@ -14,12 +14,12 @@ from typing import Annotated
 import msgspec
 
 from rampart.actors.bus.bounds import (
-    MANY,
     Count,
     Document,
     Explained,
     Incarnation,
     Lasting,
+    Many,
     Name,
     Names,
     Pid,
@@ -82,14 +82,19 @@ class RecoveryReport(Message, frozen=True):
     reason: Text
 
 
-class DecisionRecord(Message, frozen=True):
-    """A decision with its certificate: rule is the block 1 to 4 of safety-first, 0 for no fault."""
+class Decided(Message, frozen=True):
+    """What a strategy decides."""
 
     decision: Count
     strategy: Name
     active: Names
     rule: Count
     recoveries: Names
+
+
+class DecisionRecord(Decided, frozen=True):
+    """A decision with its certificate: rule is the block 1 to 4 of safety-first, 0 for no fault."""
+
     path: Texts
     rejected: Explained
     detected_s: Seconds
@@ -134,14 +139,9 @@ class StubTrigger(Message, frozen=True):
     reason: Text
 
 
-class ShadowRecord(Message, frozen=True):
+class ShadowRecord(Decided, frozen=True):
     """A decision that the strategy in shadow would have taken instead of decision `decision`."""
 
-    decision: Count
-    strategy: Name
-    active: Names
-    rule: Count
-    recoveries: Names
     taken: Names
 
 
@@ -154,9 +154,6 @@ class DetectionView(Message, frozen=True):
     nodes: Names
 
 
-_Views = Annotated[tuple[DetectionView, ...], msgspec.Meta(max_length=MANY)]
-
-
 class ManagerStatus(Message, frozen=True):
     """The manager's view, and by its regularity the proof that the manager works."""
 
@@ -166,7 +163,7 @@ class ManagerStatus(Message, frozen=True):
     latched: Names
     strategy: Name
     decision: Count
-    detections: _Views = ()
+    detections: Many[DetectionView] = ()
 
 
 class Reset(Message, frozen=True):
@@ -198,13 +195,10 @@ class NodeInfo(Message, frozen=True):
     restarts: Count
 
 
-_Rows = Annotated[tuple[NodeInfo, ...], msgspec.Meta(max_length=MANY)]
-
-
 class NodeTable(Message, frozen=True):
     """All nodes of the system."""
 
-    nodes: _Rows
+    nodes: Many[NodeInfo]
 
 
 class RespawnRequest(Message, frozen=True):
@@ -233,8 +227,8 @@ _Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]
 class FaultOrder(Message, frozen=True):
     """A fault that is no disturbance of a topic: a message on `topic`, as a JSON object.
 
-    Its type has the fields `injection`, filled in when it is ordered, and `duration_s`, of which 0
-    ends it. The node that carries it out reports on it as on an injection.
+    Its type has the fields `injection` and `duration_s`, filled in when it is ordered; a duration
+    of 0 ends it. The node that carries it out reports on it as on an injection.
     """
 
     topic: Name
@@ -247,12 +241,12 @@ _FaultOrders = Annotated[tuple[FaultOrder, ...], msgspec.Meta(max_length=64)]
 class NamedFault(Message, frozen=True):
     """A fault that can be ordered by its name: what the launcher offers to the operator's page.
 
-    `duration_s` is how long it lasts unless told otherwise, simulated seconds.
+    `duration_s` is how long it lasts unless told otherwise, simulated seconds; None for ever.
     """
 
     name: Name
     title: Text
     group: Name
-    duration_s: Lasting
+    duration_s: Lasting | None
     injections: _Injections = ()
     orders: _FaultOrders = ()

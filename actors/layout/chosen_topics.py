@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.fields import Field
+from rampart.actors.bus.fields import Field, Steered
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
-from rampart.actors.layout.wiring import Member, shows_panels
-from rampart.actors.runtime.actor import BASE_OUTPUTS
+from rampart.actors.layout.wiring import Member, panels_of, shows_panels
+from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import Named, messages_said, topics_named
 from rampart.manager.spec.panels import NUMBER, Panel
 from rampart.manager.spec.schema import SystemSpec
@@ -58,12 +58,22 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
                 there = ways[way].get(topic.key, ())
                 ways[way][topic.key] = (*(there or ()), name) if name else None
         _check_messages(member, found, file)
+        _check_sticks(member, found, file)
         chosen[member.name] = replace(member, hears=ways["heard"], publishes=ways["published"])
     return chosen, found
 
 
-def with_panels(members: Iterable[Member], spec: SystemSpec, file: str) -> list[Member]:
-    """Return the members; a page without panels gets plots of the numbers that the nodes publish.
+def with_pages(members: Iterable[Member], spec: SystemSpec, orders: Collection[str], file: str
+               ) -> list[Member]:
+    """Return the members, pages with what they show and order.
+
+    A page without panels gets plots of the numbers that the nodes publish.
+
+    Args:
+        members: all of a system.
+        spec: the system.
+        orders: keys of the topics on which the faults are ordered that a page offers.
+        file: name of the spec, for messages.
 
     Raises:
         ValueError: the spec has panels, and no node shows them.
@@ -75,8 +85,13 @@ def with_panels(members: Iterable[Member], spec: SystemSpec, file: str) -> list[
                          "rampart.actors.operator.hmi:Hmi does")
     nodes = {node.name for node in spec.nodes}
     plots = tuple(plots_of([m for m in everyone if m.name in nodes and m not in pages]))
-    return [replace(member, parameters=msgspec.structs.replace(member.parameters, panels=plots))
-            if member in pages and not getattr(member.parameters, "panels", ()) else member
+
+    def page(said: Actor.Parameters) -> Actor.Parameters:
+        more = {"panels": panels_of(said) or plots, "fault_orders": tuple(orders)}
+        return msgspec.structs.replace(
+            said, **{name: value for name, value in more.items() if hasattr(said, name)})
+
+    return [replace(member, parameters=page(member.parameters)) if member in pages else member
             for member in everyone]
 
 
@@ -125,6 +140,27 @@ def _check_messages(member: Member, chosen: Mapping[str, Topic[Any]], file: str)
         except ValueError as error:
             raise ValueError(f"{file}: {member.name}: parameters.{name}: topic {topic.key}: "
                              f"{error}") from None
+
+
+def _check_sticks(member: Member, chosen: Mapping[str, Topic[Any]], file: str) -> None:
+    for panel in panels_of(member.parameters):
+        if panel.stick:
+            try:
+                steered(panel, chosen[panel.topic])
+            except ValueError as error:
+                raise ValueError(f"{file}: {member.name}: panel {panel.title!r}: stick: topic "
+                                 f"{panel.topic}: {error}") from None
+
+
+def steered(panel: Panel, topic: Topic[Any]) -> Steered:
+    """Return what makes the messages of a panel's stick.
+
+    Raises:
+        ValueError: none can be made.
+    """
+    names = [shown.field.partition(":")[2] for shown in panel.fields()]
+    count = len(panel.stick or ())
+    return Steered(topic.type, names[:count], "".join(names[count:]), panel.scale)
 
 
 def _check_field(topic: Topic[Any], named: Named, where: str) -> None:

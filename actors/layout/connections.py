@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.topic import Members, Qos, Topic
-from rampart.actors.layout.wiring import Member, heard, published
+from rampart.actors.layout.wiring import Member, heard, panels_of, published
 from rampart.actors.runtime.actor import BASE_OUTPUTS
 from rampart.manager.spec.schema import Kind
 
@@ -76,7 +76,8 @@ def check_connections(members: Collection[Member], said: Published, known: Itera
 
     Raises:
         ValueError: a topic makes no sense, is declared in two ways, is heard and never published,
-            or has two publishers where one is meant; the message names nodes and key.
+            or has two publishers where one is meant, or of a stick; the message names nodes and
+            key.
     """
     declared = Declared(known, file)
     for member in {one.name: one for those in said.values() for one, _ in those}.values():
@@ -88,6 +89,8 @@ def check_connections(members: Collection[Member], said: Published, known: Itera
         for key, names in heard(member).items():
             if key not in optional and key not in silent:
                 check_heard(f"{file}: {member.where}:", declared.find(key), names, said)
+    for member in members:
+        _check_sticks(member, said, declared, file)
     for key, publishers in said.items():
         topic = declared.find(key)
         if topic.several or topic.qos is Qos.COMMAND or topic in BASE_OUTPUTS:
@@ -125,6 +128,23 @@ def check_heard(who: str, topic: Topic[Any], names: Members, said: Published) ->
     hint = f"did you mean {near[0]!r}? " if near else ""
     raise ValueError(f"{who} hears {key!r}, which nothing publishes; {hint}What a node can do "
                      "without is named in optional_inputs of its class")
+
+
+def _check_sticks(page: Member, said: Published, declared: Declared, file: str) -> None:
+    """Check that nobody else publishes what an operator says with a stick.
+
+    Also of a command: the robot is told to stand still once, when he lets go.
+    """
+    for panel in panels_of(page.parameters):
+        for key, publishers in said.items() if panel.stick else ():
+            topic = declared.find(key)
+            name = topic.member(panel.topic)
+            for other, names in publishers if name is not None and not topic.several else ():
+                if other.name != page.name and (names is None or name in names):
+                    raise ValueError(
+                        f"{file}: {page.name}: panel {panel.title!r}: stick: {other.where} "
+                        f"publishes {panel.topic!r} as well, and may move what an operator let go "
+                        "of; a topic of the stick's own is right (or several = True in the Topic)")
 
 
 def _spelt(said: Published) -> list[str]:

@@ -13,7 +13,7 @@ from rampart.actors.bus.zenoh_bus import endpoint
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.layout.chosen_topics import choose_topics, with_panels
+from rampart.actors.layout.chosen_topics import choose_topics, with_pages
 from rampart.actors.layout.connections import check_connections, check_heard, publishers_of
 from rampart.actors.layout.wiring import (
     Member,
@@ -93,8 +93,9 @@ class Layout:
         own += [load_member(n, spec, file, world if n.kind is Kind.WORLD else {})
                 for n in spec.actors()]
         known = (*kind.topics, *stand_in_topics(spec))
+        ordered = dict.fromkeys(o.topic for fault in plan.faults for o in fault.orders)
         self.members, self.topics = choose_topics(
-            with_panels(own, spec, file), (*known, *judged), file)
+            with_pages(own, spec, ordered, file), (*known, *judged), file)
         self._check(judge, (*ftm_topics.ALL, *known), file)
         self._partners = partners(self.members.values())
 

@@ -80,14 +80,10 @@ def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
 
 
 def _actors(spec: SystemSpec) -> Iterator[str]:
-    """Yield the paths of all actor classes of a system."""
-    for part in (spec.nodes, spec.detections, spec.recoveries):
-        for one in part:
-            if one.actor:
-                yield one.actor
-    for node in spec.nodes:
-        if node.stand_in:
-            yield node.stand_in
+    """Return the paths of all actor classes of a system."""
+    tables = (spec.nodes, spec.detections, spec.recoveries)
+    return filter(None, [*(row.actor for table in tables for row in table),
+                         *(node.stand_in for node in spec.nodes)])
 
 
 def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[Any], ...]:

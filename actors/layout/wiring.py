@@ -24,7 +24,7 @@ from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
-from rampart.manager.spec.panels import problem_of
+from rampart.manager.spec.panels import Panel, problem_of
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
@@ -159,6 +159,11 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
 def shows_panels(actor: type[Actor]) -> bool:
     """Whether an actor is a page, which shows panels."""
     return any(field.name == "panels" for field in msgspec.structs.fields(actor.Parameters))
+
+
+def panels_of(parameters: Actor.Parameters) -> tuple[Panel, ...]:
+    """Return the panels of an actor that is a page."""
+    return getattr(parameters, "panels", ())
 
 
 def load_class(path: str, kind: Kind | None = None, field: str = "actor") -> type[Actor]:

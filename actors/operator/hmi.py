@@ -31,7 +31,7 @@ from rampart.actors.operator.state import STALE_S, HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.runtime.parameters import Panels
+from rampart.actors.runtime.parameters import Panels, TopicsPublished
 from rampart.actors.web.access import AccessError
 from rampart.manager.spec.panels import MAX_PANELS, Panel
 from rampart.manager.spec.specification import SystemSpec, check_document
@@ -53,9 +53,15 @@ class Hmi(Actor):
     """
 
     class Parameters(Actor.Parameters, frozen=True):
-        """panels: of its class and of the specification, which the loader puts together."""
+        """What the loader puts together.
+
+        Attributes:
+            panels: of its class and of the specification.
+            fault_orders: topics on which the page orders faults of the robot.
+        """
 
         panels: Panels = ()
+        fault_orders: TopicsPublished = ()
 
     parameters: Parameters
     panels: ClassVar[tuple[Panel, ...]] = ()
@@ -78,6 +84,7 @@ class Hmi(Actor):
         super().__init__(context)
         run, plan = context.run, context.run.plan
         self._port: int = plan.hmi_port
+        self._panels = self.parameters.panels
         self._state = self._make_state()
         self._operating = self._make_operating()
         self._camera = self._make_camera()
@@ -86,7 +93,6 @@ class Hmi(Actor):
         self._observer = ProcessObserver(plan.base_port, plan.launcher_pid)
         self._version = -1
         self._unheard: list[str] = []
-        self._panels = self.parameters.panels or self.panels
         if self._port:
             self._hear_panels()
         self._show_system(run.system, run.adapted.version if run.adapted else 0)
@@ -97,7 +103,7 @@ class Hmi(Actor):
         return HmiState()
 
     def _make_operating(self) -> Operating:
-        return Operating(self, self._state)
+        return Operating(self, self._state, self._panels)
 
     def _make_camera(self) -> CameraEye | None:
         return None
@@ -133,7 +139,7 @@ class Hmi(Actor):
         """Hear what the panels show, each field once."""
         kept_s: dict[str, float] = {}
         for panel in self._panels:
-            for shown in panel.fields():
+            for shown in (field for field in panel.fields() if not field.is_said):
                 kept_s[shown.field] = max(panel.kept_s, kept_s.get(shown.field, 0.0))
         for field, past_s in kept_s.items():
             try:

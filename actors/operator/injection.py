@@ -80,7 +80,7 @@ class Injections:
         prefix: of the ids; another one for each incarnation of the HMI.
         catalogue: faults that have a name.
         places: keys of topics that can be disturbed.
-        robots: topics of the robot, on one of which a fault of the catalogue may be ordered.
+        robots: topics on which a fault of the catalogue may be ordered.
         overhead_s: granted for what takes real time, in simulated seconds.
     """
 
@@ -153,7 +153,8 @@ class Injections:
     def _find(self, fault: str, injection: str) -> tuple[list[Order], float]:
         if named := self._catalogue.get(fault):
             return [o.with_(injection=f"{injection}.{i}")
-                    for i, o in enumerate(self._orders(named), start=1)], named.duration_s
+                    for i, o in enumerate(self._orders(named), start=1)], (
+                        math.inf if named.duration_s is None else named.duration_s)
         mode, colon, key = fault.partition(":")
         if not colon:
             raise RefusedError(f"no fault {fault[:60]!r}; choose one of the list, or MODE:TOPIC")

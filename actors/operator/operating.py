@@ -1,7 +1,7 @@
-"""What an operator does from every page: chooses a strategy, sends signals, breaks things.
+"""What an operator does from every page: drives, chooses a strategy, sends signals, breaks things.
 
-Thin: `adaptation` and `injection` keep what waits for an answer; here are the topics, and what
-pages are shown of it.
+Thin: `adaptation` and `injection` keep what waits for an answer, and `stick` who drives; here are
+the topics, and what pages are shown of it.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rampart.actors.bus import messages as bm
@@ -18,7 +19,9 @@ from rampart.actors.operator import requests
 from rampart.actors.operator.adaptation import StrategyChoice
 from rampart.actors.operator.injection import Injections, places_of
 from rampart.actors.operator.requests import RefusedError, Request
+from rampart.actors.operator.stick import Stick
 from rampart.actors.supervision.kill_node import SIGNALS, SignalError, signal_node
+from rampart.manager.spec.panels import Panel
 from rampart.manager.strategies.registry import STRATEGIES
 
 if TYPE_CHECKING:
@@ -34,14 +37,15 @@ OWN_DEATH_S = 0.2
 
 
 class Operating:
-    """The operator's hands; those of a robot that can be driven are derived from it.
+    """The operator's hands; a robot that knows more of what they do derives its own from it.
 
     Args:
         actor: the page's node.
+        panels: of the page; among them are its sticks.
         state: what its pages are shown; the section "operating" is this one's.
     """
 
-    def __init__(self, actor: Actor, state: HmiState) -> None:
+    def __init__(self, actor: Actor, state: HmiState, panels: Sequence[Panel]) -> None:
         run = actor.context.run
         prefix = f"{run.plan.run_id}/{actor.name}.{actor.context.incarnation}"
         self._actor = actor
@@ -49,17 +53,24 @@ class Operating:
         overhead_s = OVERHEAD_S * actor.clock.rate
         self._choice = StrategyChoice(f"{prefix}.s", "operator", tuple(STRATEGIES), overhead_s)
         self._injections = Injections(f"{prefix}.f", run.plan.faults, places_of(run.system),
-                                      run.application.topics, overhead_s)
+                                      (*run.application.topics, *actor.context.topics.values()),
+                                      overhead_s)
         self._has_processes = run.plan.launcher_pid > 0  # a replay has none
         self._strategy = ""
+        self._sticks = {panel.title: Stick(actor, panel, partial(self._stick_changed, panel.title))
+                        for panel in panels if panel.stick}
         state.picture.section("operating")
         self.show()
 
     def start(self) -> None:
         """Begin; the page is about to be served."""
+        for stick in self._sticks.values():
+            stick.start()
 
     def stop(self) -> None:
         """End; the node stops."""
+        for stick in self._sticks.values():
+            stick.stop()
 
     # -- requests -------------------------------------------------------------------------------
 
@@ -76,6 +87,8 @@ class Operating:
         """
         try:
             match request:
+                case requests.StickRequest():
+                    return self._stick(request.panel).move(page, request)
                 case requests.StrategyRequest():
                     self._actor.publish(ftm_topics.ADAPT, self._choice.ask(
                         request.name, self._strategy, self._now()))
@@ -96,6 +109,19 @@ class Operating:
 
     def left(self, page: int) -> None:
         """Take note that a page was closed."""
+        for stick in self._sticks.values():
+            stick.left(page)
+
+    def _stick(self, panel: str) -> Stick:
+        if panel not in self._sticks:
+            raise RefusedError(f"no stick {panel[:40]!r}; there are: "
+                               f"{', '.join(self._sticks) or 'none'}")
+        return self._sticks[panel]
+
+    def _stick_changed(self, panel: str, why: str) -> None:
+        if why:
+            self._state.log(self._now(), "note", f"{panel}: stick released: {why}")
+        self.show()
 
     def _send_signal(self, request: requests.SignalRequest, page: int) -> str:
         if not self._has_processes:
@@ -167,9 +193,19 @@ class Operating:
             self._state.announce(told, self._now())
             self.show()
 
+    def effect(self, panel: str, now_s: float) -> tuple[bool, str]:  # noqa: ARG002
+        """Return whether a panel's stick has any effect now, and in words why not, or what."""
+        return True, ""
+
+    def _view_stick(self, panel: str, stick: Stick, now_s: float) -> dict[str, Any]:
+        works, text = self.effect(panel, now_s)
+        return {"holder": stick.desk.holder, "works": works, "text": text, "note": stick.note}
+
     def view(self, now_s: float) -> dict[str, Any]:
-        """Return the section: the strategy and the faults."""
-        return {"strategy": self._strategy, "strategy_asked": self._choice.pending is not None,
+        """Return the section: who drives, the strategy and the faults."""
+        return {"sticks": {panel: self._view_stick(panel, stick, now_s)
+                           for panel, stick in self._sticks.items()},
+                "strategy": self._strategy, "strategy_asked": self._choice.pending is not None,
                 "faults": self._injections.view(now_s)}
 
     def show(self) -> None:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rampart.actors.ftm.messages import NodeTable
+from rampart.actors.runtime.process_usage import ProcessUsage, UsageMeter
 from rampart.actors.supervision.process_title import RunProcess, find_processes, process_state
-from rampart.actors.supervision.process_usage import ProcessUsage, UsageMeter
 
 SEARCH_EVERY = 5
 """Looks between two searches of /proc for the guards: a search reads a file of every process."""

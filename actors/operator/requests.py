@@ -60,8 +60,21 @@ class EndFaultRequest(Request, frozen=True, tag="end-fault"):
     injection: Name
 
 
+class StickRequest(Request, frozen=True, tag="stick"):
+    """Where the stick of a panel is, and whether the operator holds it.
+
+    `ticket` is the newest that the page was given (`stick`). Forward and left are in [-1, 1].
+    """
+
+    panel: Name
+    held: bool
+    ticket: int = 0
+    forward: float = 0.0
+    left: float = 0.0
+
+
 REQUESTS: tuple[type[Request], ...] = (
-    ResetRequest, StrategyRequest, SignalRequest, InjectRequest, EndFaultRequest)
+    ResetRequest, StrategyRequest, SignalRequest, InjectRequest, EndFaultRequest, StickRequest)
 """What every page may ask for."""
 
 

@@ -17,7 +17,7 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.bounds import SHOWN, Bounds, clip
 from rampart.actors.operator.picture import Picture
-from rampart.manager.strategies.decision_words import decision_in_words
+from rampart.manager.strategies.registry import decision_in_words
 
 STALE_S = 1.5
 """A state that was not heard for so long is shown as stale (simulated seconds)."""

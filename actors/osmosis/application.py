@@ -52,7 +52,7 @@ class Osmosis(Application):
     views = "rampart.actors.osmosis.recording.views:OsmosisViews"
     lines = "rampart.cli.osmosis.lines:OsmosisLines"
     faults = "rampart.sim.osmosis.trial.faults:OsmosisFaults"
-    observer = "rampart.sim.osmosis.trial.observer:OsmosisObserver"
+    observer = "rampart.sim.osmosis.trial.injector:OsmosisObserver"
     trial = "rampart.sim.osmosis.trial.mission_trial:MissionTrial"
     examples = (
         ("--mission A --obstacles 2", "two obstacles on the way"),
@@ -66,8 +66,7 @@ class Osmosis(Application):
         from rampart.actors.osmosis.airport import formats  # noqa: PLC0415 heavy for a tool
 
         super().__init__(options)
-        self.airport: Airport = formats.load_airport(options.airport)
-        self.world: WorldTruth = formats.load_world(options.airport)
+        self.airport, self.world = formats.load_with_truth(options.airport)
         self.mission: Mission = formats.load_mission(options.mission, self.airport)
         if options.obstacles > len(self.airport.obstacles):
             raise ValueError(f"obstacles = {options.obstacles}: {self.airport.name} has places for "

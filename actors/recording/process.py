@@ -21,7 +21,6 @@ import setproctitle
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.recorder import RUN_ENDED, Recorder
 from rampart.files import streams, working_folder
-from rampart.files.plain_text import one_line
 
 _READY = "ready"
 _PR_SET_PDEATHSIG = 1
@@ -118,10 +117,10 @@ def record(order: Order) -> int:
     try:
         recorder.run(stop)
     except (BagError, ValueError, OSError) as error:
-        _say(str(error))
+        streams.complain(str(error))
         return 1
     if recorder.writer is not None:
-        _say(told(recorder))
+        streams.complain(told(recorder))
     return 0
 
 
@@ -142,10 +141,6 @@ def _answer(text: str) -> None:
     """Tell the launcher, if it is still there; past the buffer, which would be tried once more."""
     with contextlib.suppress(OSError):
         os.write(sys.stdout.fileno(), f"{text}\n".encode())
-
-
-def _say(text: str) -> None:
-    print(f"rampart: {one_line(text)}", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from rampart.actors.recording import foxglove as fg
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.decision_words import decision_in_words
+from rampart.manager.strategies.registry import decision_in_words
 
 View = tuple[str, fg.Record]
 """Channel and what is to be seen on it."""

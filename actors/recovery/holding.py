@@ -88,3 +88,25 @@ class HeldOrder:
                 module.fail(f"no longer in force: {reason}")
             else:
                 self._give(True, self.why)
+
+
+class HeldRecovery(RecoveryModule):
+    """A recovery that is nothing but such an order; a subclass sets it."""
+
+    order: HeldOrder
+
+    def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
+        """Give the order."""
+        self.order.act(command, renewed=renewed)
+
+    def let_go(self) -> None:
+        """End it."""
+        self.order.let_go()
+
+    def stay_idle(self) -> None:
+        """End what an earlier incarnation of this module may have left."""
+        self.order.stay_idle()
+
+    def repeat(self) -> None:
+        """Repeat the order, or its end for a while."""
+        self.order.repeat()

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import msgspec
 
 from rampart.actors.ftm.messages import RecoveryCommand
-from rampart.actors.recovery.holding import HeldOrder
+from rampart.actors.recovery.holding import HeldOrder, HeldRecovery
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import (
@@ -53,7 +53,7 @@ class _Telling(RecoveryModule):
         self.publish(self._topic, message, name=self._topic.member(self.parameters.topic) or None)
 
 
-class Hold(_Telling):
+class Hold(HeldRecovery, _Telling):
     """Says a message again and again while it is in force, and perhaps another when it ends.
 
     States: acting until the message is confirmed, then degraded; at once without `confirm`.
@@ -87,32 +87,24 @@ class Hold(_Telling):
         super().__init__(context)
         said = self.parameters
         self._back = None if said.back is None else self._made(said.back)
-        self._order = HeldOrder(self, self._give, inherits=context.incarnation > 1)
+        self.order = HeldOrder(self, self._give, inherits=context.incarnation > 1)
         self._repeats = 0
         if said.confirm:
             self.hear_field(said.confirm, self._confirmed)
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Say it, and go on saying it."""
-        self._order.act(command, renewed=renewed)
+        super().act(command, renewed=renewed)
         if not self.parameters.confirm:
             self.degrade(f"{self.parameters.topic} is told")
         if not self._repeats:
             self._repeats += 1
             self.call_later(self.parameters.repeat_s, self._again)
 
-    def let_go(self) -> None:
-        """Say that it is over."""
-        self._order.let_go()
-
-    def stay_idle(self) -> None:
-        """Say that it is over what an earlier incarnation of this module may have said."""
-        self._order.stay_idle()
-
     def repeat(self) -> None:
         """Repeat the end for a while."""
         if not self.activated:
-            self._order.repeat()
+            super().repeat()
 
     def _give(self, in_force: bool, why: str) -> None:
         del why
@@ -123,14 +115,14 @@ class Hold(_Telling):
     def _again(self) -> None:
         self._repeats -= 1
         if self.activated:
-            self._order.repeat()
+            self.order.repeat()
             self._repeats += 1
             self.call_later(self.parameters.repeat_s, self._again)
 
     def _confirmed(self, value: Any, header: Header) -> None:
         said = self.parameters
-        self._order.status(in_force=value == said.equals, reason=f"{said.confirm} is {value}",
-                           stamp_s=header.stamp)
+        self.order.status(in_force=value == said.equals, reason=f"{said.confirm} is {value}",
+                          stamp_s=header.stamp)
 
 
 class SwitchMode(Hold):

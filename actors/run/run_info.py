@@ -6,6 +6,7 @@ The kernel lists such sockets in /proc/net/unix; nothing lies on a disk that cou
 
 from __future__ import annotations
 
+import contextlib
 import re
 import socket
 from pathlib import Path
@@ -106,6 +107,15 @@ def ask(port: int) -> RunInfo | None:
             return read_info(connection.recv(65536))
         except (OSError, *UNREADABLE):
             return None
+
+
+def answer(listener: socket.socket, info: RunInfo) -> None:
+    """Tell one tool of this user, which is waiting on the socket of a launcher, of a run."""
+    with contextlib.suppress(OSError):
+        connection, _ = listener.accept()
+        with connection:
+            if is_same_user(connection):
+                connection.send(msgspec.json.encode(info))
 
 
 def read_info(data: bytes) -> RunInfo:

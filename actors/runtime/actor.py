@@ -258,11 +258,13 @@ class Actor(Declared):
             await self._tear_down()
 
     def _set_up(self) -> None:
+        declared: dict[str, tuple[Topic[Any], list[Callable[[Any, Header], None]]]] = {}
         for topic, method in self._handlers:
-            if not self.listens(topic):
-                continue
-            # A topic that its parameters name as well comes once, for all who want it.
-            handler = _all_of([getattr(self, method), *self._chosen.pop(topic.key, ())])
+            if self.listens(topic):
+                declared.setdefault(topic.key, (topic, []))[1].append(getattr(self, method))
+        # A topic comes once, for all handlers that want it, those of its parameters included.
+        for topic, handlers in declared.values():
+            handler = _all_of([*handlers, *self._chosen.pop(topic.key, ())])
             names = self.names(topic, self.name, self.parameters) if topic.is_family else None
             for key in [topic.pattern] if names is None else map(topic.at, names):
                 self._bus.subscribe(topic, key, self._receiver(topic, handler))
@@ -304,7 +306,6 @@ class Actor(Declared):
     def _receiver(self, topic: Topic[Any],
                   handler: Callable[[Any, Header], None]) -> Callable[[str, bytes], None]:
         command, members = topic.qos is Qos.COMMAND, self.context.members
-        slot = id(handler)  # two handlers of one topic wait side by side
         dispatcher = self._dispatcher
 
         def take(key: str, message: Envelope[Any]) -> None:
@@ -313,7 +314,7 @@ class Actor(Declared):
                 dispatcher.work(item)
                 return
             reserved = not members or message.source in members
-            dispatcher.put_message(None if command else f"{key} {slot}", item, reserved=reserved)
+            dispatcher.put_message(None if command else key, item, reserved=reserved)
 
         return self._guard.receiver(topic, take, self._reject)
 

@@ -15,6 +15,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.process_usage import ProcessCount, read_count
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,7 @@ class Context:
         register: returns the incarnation of a node that was issued last, None if it is not known.
         members: names of all nodes of the system; what others make it remember is bounded.
         topics: those that parameters of the system's nodes name, by key.
-        usage: returns what a process uses of the machine, in place of the kernel.
+        usage: returns what a process has used of the machine.
     """
 
     name: str
@@ -51,4 +52,4 @@ class Context:
     register: Register = lambda _node: None
     members: frozenset[str] = frozenset()
     topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
-    usage: Callable[[int], Any] | None = None
+    usage: Callable[[int], ProcessCount | None] = read_count

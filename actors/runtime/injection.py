@@ -52,17 +52,6 @@ class Outgoing:
     copies: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class News:
-    """What became of an injection: its first effect, or (with a reason) its early end."""
-
-    injection: str
-    topic: str
-    affected: int
-    finished: bool
-    reason: str
-
-
 @dataclass(slots=True)
 class _Active:
     order: Injection
@@ -95,7 +84,7 @@ class FaultGate:
 
     in_force: dict[str, _Active] = field(default_factory=dict)
     last: dict[str, tuple[Any, float]] = field(default_factory=dict)
-    _news: list[News] = field(default_factory=list)
+    _news: list[tuple[Injection, int, str]] = field(default_factory=list)
 
     def order(self, injection: Injection, now_s: float, kind: type[Any] | None = None) -> str:
         """Put an injection in force; return the reason if it cannot be, else an empty text.
@@ -133,19 +122,19 @@ class FaultGate:
                 changed = self._disturb(active, out, now_s)
             except InjectionError as error:
                 del self.in_force[active.order.injection]
-                self._tell(active, str(error))
+                self._news.append((active.order, active.affected, str(error)))
                 continue
             if changed is None or changed != out:
                 active.affected += 1
                 if active.affected == 1:
-                    self._tell(active)
+                    self._news.append((active.order, active.affected, ""))
             if changed is None:
                 return None
             out = changed
         return out
 
-    def take_news(self) -> list[News]:
-        """Return what has become of injections since the last call."""
+    def take_news(self) -> list[tuple[Injection, int, str]]:
+        """Return what had its first effect since, or ended early: with its count, and why."""
         news, self._news = self._news, []
         return news
 
@@ -168,10 +157,6 @@ class FaultGate:
             active.frozen = Outgoing(*last) if last else out
         stamp = active.frozen.stamp if order.mode == "freeze" else out.stamp
         return Outgoing(active.frozen.body, stamp, out.delay_s, out.copies)
-
-    def _tell(self, active: _Active, reason: str = "") -> None:
-        self._news.append(News(
-            active.order.injection, active.order.topic, active.affected, bool(reason), reason))
 
 
 def flaw(order: Injection, kind: type[Any] | None = None) -> str:
@@ -292,11 +277,11 @@ class InjectedFaults:
                 topic, key, out.body, out.stamp, out.copies))
         elif out is not None:
             publisher.send(topic, key, out.body, out.stamp, out.copies)
-        for news in self.gate.take_news():  # the first effect of one, or that it ended early
-            if news.finished:
-                self._forget_end(news.injection)
-                publisher.report_diagnostic("fault injection", news.reason, news.topic)
-            self._report(news.injection, news.affected, news.finished, news.reason)
+        for order, affected, reason in self.gate.take_news():
+            if reason:
+                self._forget_end(order.injection)
+                publisher.report_diagnostic("fault injection", reason, order.topic)
+            self._report(order.injection, affected, bool(reason), reason)
 
     def _send_later(self, delay_s: float, send: Callable[[], None]) -> None:
         if self._delayed >= MAX_DELAYED:

@@ -43,7 +43,7 @@ OptionalFieldName = Annotated[str, msgspec.Meta(
 FieldNames = Annotated[tuple[FieldName, ...], msgspec.Meta(min_length=1, extra={
     "names": "field", "way": "heard"})]
 Panels = Annotated[tuple[Panel, ...], msgspec.Meta(extra={"panels": True, "way": "heard"})]
-"""Panels of the operator's page; the node hears what they show."""
+"""Panels of the operator's page; the node hears what they show, and publishes what they say."""
 
 MessageOf = Annotated[dict[str, Any], msgspec.Meta(extra={"message_of": "topic"})]
 """Fields of a message on the topic that the parameter `topic` names."""
@@ -96,7 +96,7 @@ class Named(NamedTuple):
         key: of the topic.
         field: of its messages, or "".
         kinds: of which the field may be.
-        shown_by: "panel TITLE: " if a panel shows it.
+        shown_by: "panel TITLE: " if a panel shows or says it.
     """
 
     name: str
@@ -112,9 +112,10 @@ def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
     for name, marks in _marks(type(parameters)).items():
         said = getattr(parameters, name)
         if marks.get("panels"):
-            found["heard"] += [
-                Named(shown.key, *_parts(shown.field), shown.kinds, f"panel {panel.title!r}: ")
-                for panel in said for shown in panel.fields()]
+            for panel in said:
+                for shown in panel.fields():
+                    found["published" if shown.is_said else "heard"].append(Named(
+                        shown.key, *_parts(shown.field), shown.kinds, f"panel {panel.title!r}: "))
         elif "way" in marks and said:
             found[marks["way"]] += [Named(name, *_parts(text))
                                     for text in ([said] if isinstance(said, str) else said)]

@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping
 
@@ -22,6 +21,7 @@ from rampart.actors.supervision.processes import OsHandle
 from rampart.actors.supervision.spawner import NAMES
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import RestartPolicy
+from rampart.files.streams import complain
 
 PERIOD_S = 0.25
 SUPERVISOR_PATIENCE_S = 1.5
@@ -59,7 +59,7 @@ class Guard:
         self.supervisor_incarnation = 0
         self.policy = RestartPolicy()
         self.on_restart: Callable[[str], None] = lambda _name: None
-        self.report: Callable[[str], None] = _to_stderr
+        self.report: Callable[[str], None] = complain
         self._plan = plan
         self._spawners = spawners
         self._load = load
@@ -243,7 +243,3 @@ class Guard:
             self._trouble = trouble
             with contextlib.suppress(Exception):  # no reader is left: that ends no guard
                 self.report(trouble)
-
-
-def _to_stderr(text: str) -> None:
-    print(f"rampart: {text}", file=sys.stderr, flush=True)

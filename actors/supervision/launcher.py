@@ -23,7 +23,6 @@ import msgspec
 
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
@@ -176,7 +175,7 @@ class Launcher:
         if self._info is not None:
             self._info.listen(8)
             self._info.setblocking(False)
-            loop.add_reader(self._info, self._answer_one, self._info)
+            loop.add_reader(self._info, lambda info: run_info.answer(info, self.info()), self._info)
         self._keeping = asyncio.create_task(self.guard.keep())
         watch(self._keeping, "the guard of supervisor and spawners", self.failed)
 
@@ -204,13 +203,6 @@ class Launcher:
                         RecorderConnection(self.plan.base_port))
 
     # -- tools ----------------------------------------------------------------------------------
-
-    def _answer_one(self, info: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            connection, _ = info.accept()
-            with connection:
-                if is_same_user(connection):
-                    connection.send(msgspec.json.encode(self.info()))
 
     def info(self) -> run_info.RunInfo:
         """Return what tools need to know of this run."""

@@ -24,7 +24,6 @@ import asyncio
 import contextlib
 import os
 import signal
-import sys
 import threading
 import time
 import traceback
@@ -44,7 +43,7 @@ from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.process_title import end_run, kill, set_title
 from rampart.actors.supervision.unseen import tell_of_callbacks
-from rampart.files.plain_text import one_line
+from rampart.files.streams import complain
 from rampart.manager.spec.schema import Kind
 
 WORLD_NICE = -10
@@ -108,7 +107,7 @@ def node_main(layout: Layout, names: tuple[str, ...], incarnation: int, run: Run
 
     def tell(error: Exception) -> None:  # at once: what replaces this process may kill it
         told.append(error)
-        _complain(f"{who} failed: {type(error).__name__}: {error}")
+        complain(f"{who} failed: {type(error).__name__}: {error}")
         _log_traceback(layout.plan.error_log, who, error)
 
     try:
@@ -123,7 +122,7 @@ def node_main(layout: Layout, names: tuple[str, ...], incarnation: int, run: Run
         asyncio.run(_run_actors(layout, names, incarnation, run, tell))
     except BusError as error:
         if error not in told:
-            _complain(f"{'+'.join(names)}: {error}")
+            complain(f"{'+'.join(names)}: {error}")
         return EXIT_BUS
     except Exception as error:  # the last stop before the exit code: nothing may pass unseen
         if error not in told:
@@ -135,7 +134,7 @@ def node_main(layout: Layout, names: tuple[str, ...], incarnation: int, run: Run
 async def _run_actors(layout: Layout, names: tuple[str, ...], incarnation: int, run: RunContext,
                       failed: Callable[[Exception], None]) -> None:
     loop = asyncio.get_running_loop()
-    tell_of_callbacks(loop, lambda line: _complain(f"{'+'.join(names)} #{incarnation}: {line}"))
+    tell_of_callbacks(loop, lambda line: complain(f"{'+'.join(names)} #{incarnation}: {line}"))
     actors = [make_actor(layout, name, incarnation, run, loop, failed=failed) for name in names]
 
     def stop_all() -> None:
@@ -168,10 +167,6 @@ def wedge(_signal: int, _frame: Any) -> None:
         time.sleep(3600)
 
 
-def _complain(line: str) -> None:
-    print(f"rampart: {one_line(line)}", file=sys.stderr, flush=True)
-
-
 def _log_traceback(file: str, who: str, failed: Exception) -> None:
     if not file:
         return
@@ -180,4 +175,4 @@ def _log_traceback(file: str, who: str, failed: Exception) -> None:
             log.write(f"--- {who} pid {os.getpid()}\n")
             traceback.print_exception(failed, file=log)
     except OSError as error:
-        _complain(f"cannot write {file}: {error}")
+        complain(f"cannot write {file}: {error}")

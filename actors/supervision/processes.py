@@ -14,23 +14,15 @@ import select
 import signal
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.supervision.patience import AT_LEISURE, Usage, usage
-from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import RunProcess, find_processes
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
-__all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerUnavailableError"]
-
-
-class Living(NamedTuple):
-    """A process of the run that is there already."""
-
-    names: tuple[str, ...]
-    pid: int
-    incarnation: int
+__all__ = ["OsProcesses", "ProcessHandle", "Processes", "RunProcess", "SpawnerUnavailableError"]
 
 
 class ProcessHandle:
@@ -68,7 +60,7 @@ class ProcessHandle:
 class Processes(Protocol):
     """The processes of one run."""
 
-    def living(self) -> Sequence[Living]:
+    def living(self) -> Sequence[RunProcess]:
         """Return those that are there."""
 
     def fork(self, names: tuple[str, ...], incarnation: int) -> int:
@@ -151,10 +143,9 @@ class OsHandle(ProcessHandle):
 class OsProcesses(SpawnerClient):
     """Processes of this machine; the run's spawners fork them."""
 
-    def living(self) -> list[Living]:
+    def living(self) -> list[RunProcess]:
         """Return the processes of this run, found in /proc."""
-        return [Living(p.names, p.pid, p.incarnation)
-                for p in find_processes(self._port, self._launcher)]
+        return find_processes(self._port, self._launcher)
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Open a pidfd; raises ProcessLookupError if there is no such process."""

@@ -38,7 +38,7 @@ from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.patience import Patience
-from rampart.actors.supervision.processes import Living, OsProcesses, Processes, ProcessHandle
+from rampart.actors.supervision.processes import OsProcesses, Processes, ProcessHandle, RunProcess
 from rampart.actors.supervision.relay import Relay
 from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import (
@@ -348,7 +348,7 @@ class Supervisor(Relay):
         except OSError as error:  # no descriptor left to look with
             self.report_diagnostic("search", str(error), process.unit.name)
 
-    def _adopt_living(self, process: _Process, living: Sequence[Living]) -> bool:
+    def _adopt_living(self, process: _Process, living: Sequence[RunProcess]) -> bool:
         """Adopt the highest incarnation that is there and end the others; False without any."""
         found = sorted((p for p in living if p.names == process.names),
                        key=lambda p: -p.incarnation)

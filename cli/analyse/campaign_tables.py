@@ -8,9 +8,8 @@ from typing import Any
 from rampart.cli.output import print_json, print_table, say
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.campaign import statistics
-from rampart.sim.campaign.grouping import varying_options
 from rampart.sim.campaign.named import NamedCampaign
-from rampart.sim.campaign.statistics import Rate, Row, Spread, table, total
+from rampart.sim.campaign.statistics import Rate, Row, Spread, table, total, varying_options
 from rampart.sim.campaign.store import Run
 from rampart.sim.runs.report import NONE, margin_text
 from rampart.sim.runs.trial import Trial, trial_class

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
+import math
+import os
 import shlex
 import sys
 import time
@@ -11,17 +13,19 @@ from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
 
+import joblib
+import msgspec
 from tqdm import tqdm
 
 from rampart.actors.layout.layout import application_class, load_application
 from rampart.actors.run.run_plan import RunPlan
 from rampart.cli import application_options, systems
 from rampart.cli.analyse.campaign_tables import show_faults, show_runs
-from rampart.cli.analyse.hunting import hunt
 from rampart.cli.output import (
     NoEffectError,
     UsageError,
     print_json,
+    print_table,
     refusing,
     say,
     say_text,
@@ -29,13 +33,20 @@ from rampart.cli.output import (
     warn,
 )
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.registry import STRATEGIES
+from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
 from rampart.sim.campaign.execute import BackendError, JobError, execute
-from rampart.sim.campaign.job import Job, RunResult, run_virtually, virtual_run
+from rampart.sim.campaign.job import (
+    Job,
+    RunResult,
+    run_job,
+    run_virtually,
+    virtual_run,
+)
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.campaign.plan import cross, fault_groups, sample
 from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_report
+from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.faults import faults_of
@@ -43,7 +54,7 @@ from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
 from rampart.sim.runs.report import in_words
 from rampart.sim.runs.trial import trial_class
-from rampart.sim.virtual.network import NETWORKS
+from rampart.sim.virtual.network import find_network
 
 
 def campaign(options: argparse.Namespace) -> int:
@@ -55,31 +66,24 @@ def campaign(options: argparse.Namespace) -> int:
         return _replay(options)
     _check(options)
     if options.search is not None:
-        if not trial_class(spec).margins:
-            raise UsageError(f"--search: {spec.name} has no judge that measures margins")
-        with refusing(ValueError):
-            bases = with_content(_base_jobs(options, spec))
-        return hunt(options, _groups(options, spec), bases, faults_of(spec),
-                    _moments(spec, bases[0], searched=True))
+        return _hunt(options, spec)
     name, chosen = _choose(options, spec)
     with refusing(ValueError):
         jobs = with_content(chosen)
     named: NamedCampaign | None = options.named[0] if options.named else None
     directory = Path(options.out) if options.out else Path("reports") / f"campaign-{name}"
-    try:
+    with refusing(StoreError):
         store = Store(directory)
-    except StoreError as error:
-        raise UsageError(str(error)) from None
     try:
-        made = _execute(options, jobs, store)
-        keys = {job.key for job in jobs}
-        runs = _in_order(store.runs(keys), jobs)
+        with refusing(BackendError):
+            made = _execute(options, jobs, store)
+        results = {run.job.key: run.result for run in store.runs({job.key for job in jobs})}
         store.close()
-    except BackendError as error:
-        raise UsageError(str(error)) from None
     except (StoreError, JobError) as error:
         raise UsageError(f"{error}; what was finished is in {directory}, and the same command "
                          "goes on from there") from None
+    # Those of the campaign: a stored row may have been named by an earlier one.
+    runs = [Run(job, results[job.key]) for job in jobs if job.key in results]
     show_runs(spec, runs, made, named, as_json=options.json)
     try:
         page = _write_report(options, spec, directory, runs, named)
@@ -110,11 +114,10 @@ def _check(options: argparse.Namespace) -> None:
             raise UsageError(f"{name} {value}: must be {least} or more")
     if not options.patience > 0:
         raise UsageError(f"--patience {options.patience:g}: must be above 0")
-    if options.network not in NETWORKS:
-        raise unknown("network", options.network, NETWORKS)
-    for strategy in options.strategy:
-        if strategy not in STRATEGIES:
-            raise unknown("strategy", strategy, STRATEGIES)
+    with refusing(ValueError):
+        find_network(options.network)
+        for strategy in options.strategy:
+            find_strategy(strategy)
 
 
 def _base_jobs(options: argparse.Namespace, spec: SystemSpec) -> list[Job]:
@@ -126,10 +129,8 @@ def _base_jobs(options: argparse.Namespace, spec: SystemSpec) -> list[Job]:
     ftm = {"on": (True,), "off": (False,), "both": (False, True)}[options.ftm]
     chosen = application_options.alternatives(options, application_class(spec))
     for each in chosen:
-        try:
+        with refusing(ValueError):
             load_application(RunPlan(system_file=options.system, options=each), spec)
-        except ValueError as error:
-            raise UsageError(" ".join(str(error).split())) from None
     return [Job(row="", system=options.system, strategy=strategy, options=each, ftm=with_ftm,
                 network=options.network, seed=options.seed, patience_s=options.patience,
                 duration_s=options.duration)
@@ -156,10 +157,8 @@ def _moments(spec: SystemSpec, job: Job, *, searched: bool = False) -> tuple[flo
     """Return between which moments faults are drawn: within a run that has none."""
     if found := trial_class(spec).moments(spec, searched=searched):
         return found
-    try:
+    with refusing(ValueError):
         lasts_s = run_virtually(job).record.duration_s
-    except ValueError as error:
-        raise UsageError(" ".join(str(error).split())) from None
     return round(min(2.0, 0.1 * lasts_s), 2), round(0.9 * lasts_s, 2)
 
 
@@ -175,16 +174,8 @@ def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[st
     return {kind: groups[kind] for kind in wanted}
 
 
-def all_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
-    """Return the faults that there are, by kind.
-
-    Raises:
-        UsageError: the spec names actors or topics that make no sense.
-    """
-    try:
-        return fault_groups(spec)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+all_groups = refusing(ValueError)(fault_groups)
+"""The names of all faults of a system, by kind; users are told what it lacks."""
 
 
 def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str, ...]]
@@ -268,24 +259,16 @@ class ProgressLog:
         return f"{self._done} of {self._total} runs, {unsafe} unsafe with FTM{more}"
 
 
-def _in_order(runs: Iterable[Run], jobs: Sequence[Job]) -> list[Run]:
-    """Return the runs in the order of their jobs, with the rows that these name."""
-    results = {run.job.key: run.result for run in runs}
-    return [Run(job, results[job.key]) for job in jobs if job.key in results]
-
-
 def _replay(options: argparse.Namespace) -> int:
     if not options.out:
         raise UsageError("--replay RUN: --out DIR is missing: the campaign that the run is of")
     directory = Path(options.out)
     if not directory.is_dir():
         raise UsageError(f"--out {options.out}: no such directory")
-    try:
+    with refusing(StoreError):
         store = Store(directory)
         found = store.find(options.replay)
         store.close()
-    except StoreError as error:
-        raise UsageError(str(error)) from None
     if found is None:
         raise UsageError(f"--replay {options.replay}: no run, or several, of this key in "
                          f"{directory}")
@@ -328,3 +311,78 @@ def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path
         section=named.section(spec, runs) if named else None)
     worst = {run.job.key: run_virtually(run.job) for run in worth_showing(runs)}
     return write_campaign_report(directory, about, runs, worst)
+
+
+_SHRUNK_AT_MOST = 3
+
+
+# -- the optimiser's hunt for the smallest safety margin ----------------------------------------
+
+
+def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
+    """Search among the faults of a system, shrink what was found, and keep it."""
+    if not trial_class(spec).margins:
+        raise UsageError(f"--search: {spec.name} has no judge that measures margins")
+    with refusing(ValueError):
+        bases = with_content(_base_jobs(options, spec))
+    space = Space(tuple(bases), _groups(options, spec), faults_of(spec).intruder,
+                  _moments(spec, bases[0], searched=True))
+    directory = Path(options.out or "reports/campaign-search")
+    with refusing(StoreError):
+        store = Store(directory)
+    unit = trial_class(spec).margin_unit
+    workers = options.jobs or os.cpu_count() or 1
+    with joblib.Parallel(n_jobs=workers, batch_size=1) as pool, tqdm(
+            total=options.search, unit="run", file=sys.stderr,
+            disable=None) as bar:  # no bar into a file
+
+        def run(jobs: Sequence[Job]) -> Sequence[RunResult]:
+            return list(pool(joblib.delayed(run_job)(job) for job in jobs))
+
+        smallest = math.inf
+
+        def seen(job: Job, result: RunResult) -> None:
+            nonlocal smallest
+            try:
+                store.add(job, result)
+            except StoreError as error:
+                raise UsageError(f"{error}; what was finished is in {directory}") from None
+            if margin(result) < smallest:
+                smallest = margin(result)
+                bar.write(f"{smallest:8.3f} {unit}  {job.key}  {job.text()}", file=sys.stderr)
+            bar.update()
+
+        try:
+            made = search(space, options.search, run, seed=options.seed, at_once=workers, seen=seen)
+        except ImportError:
+            raise UsageError("--search: Optuna is not installed; pip install 'rampart[search]'"
+                             ) from None
+    unsafe = [job for job, result in made if not result.safe]
+    store.close()
+    shrunk = [_shrunk(job, directory) for job in unsafe[:_SHRUNK_AT_MOST]]
+    if options.json:
+        print_json({"runs": len(made), "unsafe": len(unsafe), f"smallest_margin_{unit}": smallest,
+                    "counterexamples": [{"file": str(path) if path else None, "job": job}
+                                        for job, path in shrunk]})
+    else:
+        print_table(("margin", "run", "faults"), [
+            (f"{margin(result):.3f} {unit}", job.key, job.text()) for job, result in made[:10]])
+        say_text(f"\n{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} {unit}")
+        for job, path in shrunk:
+            chosen = "".join(f"{name} {value}, " for name, value in job.options.items())
+            say(f"counterexample: {job.text()}, {chosen}seed {job.seed}: {path or 'not written'}")
+    return 1 if unsafe else 0
+
+
+def _shrunk(job: Job, directory: Path) -> tuple[Job, Path | None]:
+    """Return what is left of a job, and its file; None if that cannot be written."""
+    small = shrink(job, tried=lambda tried, found: print(
+        f"shrinking {'to' if found else 'not to'} {tried.text()}", file=sys.stderr))
+    path = directory / "counterexamples" / f"{small.key}.toml"
+    try:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(msgspec.toml.encode(small))
+    except OSError as error:
+        warn(f"{path}: {error.strerror}")
+        return small, None
+    return small, path

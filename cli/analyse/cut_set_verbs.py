@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
 
     Examples:
       rampart cut-sets                              the shipped system
-      rampart cut-sets cell
+      rampart cut-sets paper
       rampart cut-sets plant.xml --count --json     an Open-PSA file
       rampart cut-sets plant.xml --top g12 --max-order 2
       rampart cut-sets --active FTM2                what is left if DM2 is active

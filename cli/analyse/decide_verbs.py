@@ -15,8 +15,7 @@ from rampart.cli.verbs import JSON, JSON_FORMAT, add_verb, flag, option, word
 from rampart.manager.model.order import UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.decision import Decision
-from rampart.manager.strategies.decision_words import decision_in_words
-from rampart.manager.strategies.registry import UnknownStrategyError, decide
+from rampart.manager.strategies.registry import UnknownStrategyError, decide, decision_in_words
 
 
 def add(verbs: Any) -> None:

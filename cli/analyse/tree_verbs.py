@@ -11,9 +11,8 @@ from typing import Any
 import msgspec
 
 from rampart.cli import systems
-from rampart.cli.analyse.tree_dot import to_dot
 from rampart.cli.analyse.tree_svg import to_svg
-from rampart.cli.analyse.tree_text import to_text
+from rampart.cli.analyse.tree_text import to_dot, to_text
 from rampart.cli.output import UsageError, refusing, say, unknown, using
 from rampart.cli.verbs import JSON_FORMAT, add_verb, option, word
 from rampart.manager.drawing.diagram import WHATS, Diagram, Situation, clean, draw

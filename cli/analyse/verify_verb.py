@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
     Examples:
       rampart verify
       rampart verify my_system.toml --strategy safety-first
-      rampart verify cell --json
+      rampart verify paper --json
       rampart verify --strict && python launch.py     only if all holds
 
     exit code: 0 verified, whatever was found; with --strict 1 if a property of the

@@ -21,7 +21,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.cli.robot_lines import Row
 from rampart.cli.run_picture import RunPicture, manager_in_words
 from rampart.files.plain_text import printable
-from rampart.manager.strategies.decision_words import decision_in_words
+from rampart.manager.strategies.registry import decision_in_words
 
 _LABEL = 10
 _PROCESS_WIDTH = 57

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from enum import Enum
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import msgspec
@@ -18,7 +19,7 @@ from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.cli import systems
-from rampart.cli.output import UsageError, unknown
+from rampart.cli.output import UsageError, refusing, rendered, unknown
 from rampart.manager.spec.specification import SystemSpec
 
 MAILBOX = {
@@ -44,10 +45,8 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
         UsageError: the spec names an actor class that does not exist, or one of them declares a
             topic that makes no sense.
     """
-    try:
+    with refusing(ValueError):
         members = Layout(RunPlan(system_file=spec.name), spec).members.values()
-    except ValueError as error:
-        raise UsageError(str(error)) from None
     inputs = {member.name: heard(member) for member in members}
     outputs = {member.name: published(member) for member in members}
     return [TopicUse(topic, _who(topic, BASE_OUTPUTS, outputs) or ("tools",),
@@ -134,11 +133,8 @@ def check_member(key: str, nodes: Collection[str]) -> None:
         UsageError: there is no such node.
     """
     topic = find_topic(key, topics.ALL)
-    if topic is not None and topic.is_family:
-        head, tail = topic.key.split("{name}")
-        member = key[len(head):len(key) - len(tail)]
-        if member not in nodes:
-            raise unknown("node", member, nodes)
+    if topic is not None and (member := topic.member(key)) and member not in nodes:
+        raise unknown("node", member, nodes)
 
 
 def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
@@ -148,41 +144,11 @@ def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
 
 def markdown(spec: SystemSpec) -> str:
     """Return `topics.md`: the contract of every key, for people."""
-    lines = [
-        "# Topics", "",
-        "The contract of every Zenoh key. Written from the topics of the engine and of the "
-        f"application and the actors of `systems/{spec.name}.toml` by `rampart topic list "
-        "--markdown`; a test keeps it true.", "",
-        f"All keys are below `{ROOT}/`. A payload is a msgpack array `[source, incarnation, "
-        "sequence, stamp, body]`: which node, which life of it, how many-th message of that life, "
-        "the simulated time in seconds at which the content was true, and the message. Units are "
-        "SI and stand in the field names; frames follow REP-105, axes REP-103. Rates are in "
-        "simulated time; 0 means on event. Bounds stand in braces: `{0..9}` of a number, `{<=9}` "
-        "of the characters of a text, the bytes of an array or the elements of a sequence. What is "
-        f"beyond them, or longer than {MAX_PAYLOAD_BYTES} bytes, is refused by every reader. A "
-        "`float` without bounds may be anything, NaN and infinity included.", "",
-        "- **sensor**: the newest sample counts; at the reader the latest wins.",
-        "- **state**: like sensor, and repeated at its rate even without change.",
-        "- **command**: each message counts; queued at the reader, bounded, an overflow is "
-        "reported.", "",
-        "| key | message | QoS | mailbox | rate | frame | publishers | readers |",
-        "|---|---|---|---|---|---|---|---|"]
     table = uses(spec)
-    for use in table:
-        t = use.topic
-        cells = (
-            f"`{t.key}`", f"[{t.type.__name__}](#{t.type.__name__.lower()})", t.qos.value,
-            MAILBOX[t.qos], rate(t), f"`{t.frame}`" if t.frame else "",
-            ", ".join(use.publishers), ", ".join(use.readers))
-        lines.append(f"| {' | '.join(cells)} |")
-    lines += ["", "## What each key is for", ""]
-    lines += [f"- `{use.topic.key}`: {use.topic.doc}" for use in table]
-    lines += ["", "## Messages", ""]
-    for kind in _messages(use.topic for use in table):
-        lines += [f"### {kind.__name__}", "", summary(kind), ""]
-        lines += [f"- `{name}`: {type_name}" for name, type_name in fields(kind)]
-        lines.append("")
-    return "\n".join(lines).rstrip() + "\n"
+    return rendered(
+        Path(__file__).with_name("topics.md.jinja"), spec=spec, table=table, root=ROOT,
+        most_bytes=MAX_PAYLOAD_BYTES, mailbox=MAILBOX, rate=rate, summary=summary, fields=fields,
+        kinds=_messages(use.topic for use in table)).rstrip() + "\n"
 
 
 def _who(topic: Topic[Any], of_all: Collection[Topic[Any]],

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import argparse
 import math
+import uuid
 from collections.abc import Coroutine
 from typing import Any
 
 import msgspec
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.system_topics import find_topic, published_keys
 from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
+from rampart.actors.runtime.fault_watch import Order
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
@@ -27,6 +30,9 @@ from rampart.sim.faults.topic_faults import modes_of, systematic_faults
 
 _DEFAULT_DURATION_S = 5.0
 _SECONDS = "must be seconds above 0"
+_OF_MESSAGES = ("mode", "share", "on", "off", "seed", "delay", "stamp", "set", "add", "ramp",
+                "noise", "keep_ends")
+"""Options that say which messages of a topic are disturbed, and how."""
 
 
 def add(verbs: Any) -> None:
@@ -69,7 +75,8 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     r"""List the catalogue, or inject a fault.
 
     Inject a fault of the catalogue, or disturb any topic, for a while. It
-    acts in the node that publishes the topic. The verb waits for its end and
+    acts in the node that publishes the topic, one of the robot's own (a rotor, a wheel)
+    in the node that carries it out. The verb waits for its end and
     says how many messages were affected; if none was, it says so and exits 1.
     For a permanent fault it waits until the first message was affected.
     Ctrl-C ends the fault at once. Durations are simulated seconds.
@@ -103,9 +110,39 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
                          "the run that there is")
     if (options.fault or "").partition(":")[0] in PROCESS_FAULTS:
         return hit_process(options)
-    fault = choose(options)
     positive("--duration", options.duration, "must be seconds above 0, or inf")
-    return run_fault(fault, options)
+    name, orders = orders_of(options)
+    return run_fault(name, orders, options)
+
+
+def orders_of(options: argparse.Namespace) -> tuple[str, tuple[Order, ...]]:
+    """Return the name of the fault that the options describe, and what the nodes are told to do.
+
+    Raises:
+        UsageError: something in the options is wrong.
+    """
+    unique = uuid.uuid4().hex[:6]
+    if options.fault is not None and options.topic is None:
+        with refusing(ValueError):  # of which those are that a robot's faults raise
+            own = faults_of(systems.at_hand(None, options.port)).own(
+                options.fault, f"{options.fault}-{unique}", options.duration)
+        if own is not None:
+            return options.fault, _of_the_robot(own, options)
+    fault = choose(options)
+    name = fault.name.replace(" ", "-").replace("/", "-")
+    return fault.name, tuple(Order(bus_topics.INJECT, order) for order in fault.orders(
+        f"{name}-{unique}", options.duration))
+
+
+def _of_the_robot(own: object, options: argparse.Namespace) -> tuple[Order, ...]:
+    for name in _OF_MESSAGES:
+        if getattr(options, name) not in (None, []):
+            raise UsageError(f"--{name.replace('_', '-')} goes with a fault of a topic, not with "
+                             f"{options.fault}")
+    if not isinstance(own, tuple):
+        raise UsageError(f"{options.fault}: carried out by what stands beside a run; start one "
+                         f"with --fault {options.fault}@SECONDS")
+    return own
 
 
 def choose(options: argparse.Namespace) -> Fault:
@@ -207,13 +244,18 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
     keys, faults = published_keys(spec), faults_of(spec)
     if as_json:
         everything = (*faults.named.values(), *systematic_faults(keys, known))
-        print_json([{"name": f.name, "title": f.title, "group": f.group,
-                     "detected_by": f.detected_by, "duration_s": f.duration_s,
-                     "topics": [d.topic for d in f.disturbances]} for f in everything])
+        print_json([*({"name": f.name, "title": f.title, "group": f.group,
+                       "detected_by": f.detected_by, "duration_s": f.duration_s,
+                       "topics": [d.topic for d in f.disturbances]} for f in everything),
+                    *({"name": f.name, "title": f.title, "group": f.group, "detected_by": (),
+                       "duration_s": f.duration_s, "topics": [o.topic for o in f.orders]}
+                      for f in faults.offered() if f.orders)])
         return
     for kind, title in faults.kinds.items():
-        rows = [(f.name, " ".join(f.detected_by), f"{f.duration_s:g}", f.title)
-                for f in faults.named.values() if f.group == kind]
+        rows = [(f.name, " ".join(faults.named[f.name].detected_by if f.name in faults.named
+                                  else ()),
+                 "inf" if f.duration_s is None else f"{f.duration_s:g}", f.title)
+                for f in faults.offered() if f.group == kind]
         if rows:
             say(f"{title}:")
             print_table(("fault", "seen by", "s", "what happens"), rows)
@@ -223,7 +265,7 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
     say()
     others = [name for names in faults.others.values() for name in names]
     if others:
-        say("of the robot, for --fault of a run and in campaigns:")
+        say("of the robot, with details behind a colon:")
         for name in others:
             say(f"  {name}")
         say()

@@ -8,7 +8,7 @@ import contextlib
 import math
 import os
 import signal
-import uuid
+from collections.abc import Sequence
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
@@ -19,7 +19,6 @@ from rampart.actors.supervision.kill_node import SignalError, signal_node
 from rampart.cli.look.topic_catalogue import check_member
 from rampart.cli.output import NoEffectError, UsageError, positive, print_json, refusing, say
 from rampart.cli.session import Session, connect, pause
-from rampart.sim.faults.disturbance import Fault
 
 STOPPED_S = 5.0
 """Simulated seconds for which `stop:NODE` stops a process unless told otherwise."""
@@ -32,16 +31,19 @@ def _refused(watch: FaultWatch) -> str:
     return next((f"{node}: {reason}" for node, reason in watch.refused.items()), "")
 
 
-async def run_fault(fault: Fault, options: argparse.Namespace) -> int:
+async def run_fault(name: str, orders: Sequence[Order], options: argparse.Namespace) -> int:
     """Inject a fault into the run, as the options of `rampart inject` say; return the exit code.
+
+    Args:
+        name: of the fault.
+        orders: to the nodes that carry it out.
+        options: of the verb.
 
     Raises:
         NoEffectError: the fault had no effect, or it is unknown whether it had.
         UsageError: there is no run, or no such node in it.
     """
-    name = fault.name.replace(" ", "-").replace("/", "-")
-    watches = [FaultWatch((Order(bus_topics.INJECT, order),))
-               for order in fault.orders(f"{name}-{uuid.uuid4().hex[:6]}", options.duration)]
+    watches = [FaultWatch((order,)) for order in orders]
     async with connect(options.port) as session:
         for watch in watches:
             check_member(watch.orders[0].place, session.run.nodes)
@@ -61,8 +63,8 @@ async def run_fault(fault: Fault, options: argparse.Namespace) -> int:
                     order = watch.orders[0].message
                     time = ("until its process ends" if watch.is_permanent
                             else f"for {watch.waits_s:g} s")
-                    say(f"{fault.name}: {order.mode} {order.topic} in force at "
-                        f"{', '.join(watch.nodes)} {time}")
+                    what = f"{order.mode} {order.topic} " if _is_of_topic(watch) else ""
+                    say(f"{name}: {what}in force at {', '.join(watch.nodes)} {time}")
             if not options.at_once:
                 await pause(settled, session.real_s(max(w.waits_s for w in watches)) + 1.0)
                 if not settled.is_set():
@@ -71,14 +73,15 @@ async def run_fault(fault: Fault, options: argparse.Namespace) -> int:
             await _end(session, watches)
             raise
     if options.json:
-        _print_result(fault, watches, at_once=options.at_once)
+        _print_result(name, watches, at_once=options.at_once)
     if not options.at_once:
         for watch in watches:
             _judge(watch)
             if not options.json:
-                topic = watch.orders[0].place
-                say(f"{fault.name}: affects {topic}, and goes on" if watch.unfinished else
-                    f"{fault.name}: over, {watch.affected} messages on {topic} affected")
+                where = watch.orders[0].place if _is_of_topic(watch) else ", ".join(watch.nodes)
+                what = f"messages on {where} affected" if _is_of_topic(watch) else "ticks changed"
+                say(f"{name}: affects {where}, and goes on" if watch.unfinished else
+                    f"{name}: over, {watch.affected} {what}")
     return 0
 
 
@@ -130,7 +133,8 @@ async def _take_hold(session: Session, watch: FaultWatch) -> None:
     order = watch.orders[0]
     if not await session.command(order.topic, order.message, lambda: bool(watch.reports),
                                  _TAKE_HOLD_S):
-        raise NoEffectError(f"no effect: no node publishes {order.place} in this run")
+        does = "publishes" if _is_of_topic(watch) else "carries out what is ordered on"
+        raise NoEffectError(f"no effect: no node {does} {order.place} in this run")
     if _refused(watch) and watch.affected == 0:
         raise NoEffectError(f"no effect: refused by {_refused(watch)}")
 
@@ -152,17 +156,25 @@ def _judge(watch: FaultWatch) -> None:
         raise NoEffectError(f"effect unknown: {where} did not report the end of "
                             f"{order.injection}; it was probably restarted")
     if watch.affected == 0:
-        raise NoEffectError(f"no effect: {where} published nothing on {order.place} within "
-                            f"{watch.waits_s:g} s, or nothing that it changed")
+        raise NoEffectError(
+            f"no effect: {where} published nothing on {order.place} within {watch.waits_s:g} s, or "
+            "nothing that it changed" if _is_of_topic(watch) else
+            f"no effect: {where} was not changed within {watch.waits_s:g} s")
 
 
-def _print_result(fault: Fault, watches: list[FaultWatch], *, at_once: bool) -> None:
+def _is_of_topic(watch: FaultWatch) -> bool:
+    """Whether it disturbs a topic; if not, it is carried out by a node of the robot."""
+    return watch.orders[0].topic == bus_topics.INJECT
+
+
+def _print_result(name: str, watches: list[FaultWatch], *, at_once: bool) -> None:
     """Print the result as JSON; the duration of a permanent fault is null."""
     print_json({
-        "fault": fault.name,
+        "fault": name,
         "effective": None if at_once else all(w.affected > 0 for w in watches),
         "injections": [
-            {"id": order.injection, "topic": order.topic, "mode": order.mode,
+            {"id": order.injection, "topic": w.orders[0].place,
+             "mode": order.mode if _is_of_topic(w) else None,
              "nodes": list(w.nodes), "duration_s": order.duration_s,
              "affected": w.affected, "finished": not w.unfinished, "reason": _refused(w)}
             for w in watches for order in [w.orders[0].message]]})

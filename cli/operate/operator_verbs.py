@@ -33,7 +33,7 @@ def add(verbs: Any) -> None:
     add_verb(verbs, "reset", "release a latched recovery, e.g. the emergency stop", reset, PORT,
              option("recovery", metavar="NAME", help="e.g. RM1"))
     add_verb(verbs, "trigger", "make the stand-in of a detection module detect", trigger, PORT,
-             option("module", metavar="NAME", help="detection module, e.g. D_CURTAIN"),
+             option("module", metavar="NAME", help="detection module, e.g. D_LEVEL"),
              option("--for", dest="duration", type=float, default=2.0, metavar="S",
                     help="simulated seconds (default 2)"))
 
@@ -99,7 +99,7 @@ async def trigger(options: argparse.Namespace) -> int:
     simulated seconds. What real modules detect is injected: rampart inject.
 
     Examples:
-      rampart trigger D_CURTAIN
+      rampart trigger D_LEVEL
       rampart trigger D_VISION --for 5
     """
     positive("--for", options.duration, below=1e6)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import math
 import sys
 from typing import Any
@@ -18,13 +17,14 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import TELEOPERATION
 from rampart.actors.osmosis.control.teleoperation.joystick_device import AUTO, JoystickDevice
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from rampart.actors.osmosis.messages import Joystick
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
-from rampart.cli.osmosis.keyboard_stick import KeyboardStick
-from rampart.cli.output import NoEffectError, UsageError, say
-from rampart.cli.session import Latest, Session, connect
+from rampart.cli.output import NoEffectError, UsageError, refusing, say
+from rampart.cli.session import Latest, Session, connect, pause
 from rampart.cli.terminal import END, keys
+from rampart.cli.verbs import PORT, add_verb, number, option
 from rampart.files.plain_text import printable
 
 _PERIOD_S = 0.05
@@ -38,30 +38,34 @@ _ANSWER_S = 1.0
 _RELEASES = 3
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any, _formatter: Any, _common: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "joystick", parents=[common], formatter_class=formatter,
-        help="drive from the keyboard, or with a joystick",
-        description="Drive the robot by the arrow keys, or by u i o j l m , . as ROS users know.\n"
-                    "Space or k lets go, + and - change the speed, q or Ctrl-C quits.\n\n"
-                    "The dead man: hold the key. A terminal tells no letting go, so the robot\n"
-                    "drives while the key repeats and stops within 0.6 s when it does not. If the\n"
-                    "robot stops once after the first moment, make the keyboard repeat sooner\n"
-                    "(X11: xset r rate 250).\n\n"
-                    "One stick is followed at a time: who holds first, drives; others are told.",
-        epilog="examples:\n  rampart joystick\n  rampart joystick --speed 0.2\n"
-               "  rampart joystick --device            the first joystick plugged in here\n"
-               "  rampart joystick --device /dev/input/js1")
-    parser.add_argument("--speed", type=float, default=0.5, metavar="SHARE",
-                        help="share of full speed to begin with, 0.1 to 1 (default 0.5)")
-    parser.add_argument("--device", nargs="?", const=AUTO, metavar="DEVICE",
-                        help="a joystick instead of the keyboard; hold its dead-man button")
-    parser.set_defaults(run=lambda options: asyncio.run(joystick(options)))
+    add_verb(verbs, "joystick", "drive from the keyboard, or with a joystick", joystick, PORT,
+             number("--speed", "SHARE", "share of full speed to begin with, 0.1 to 1 (default 0.5)",
+                    0.5),
+             option("--device", nargs="?", const=AUTO, metavar="DEVICE",
+                    help="a joystick instead of the keyboard; hold its dead-man button"))
 
 
 async def joystick(options: argparse.Namespace) -> int:
-    """Drive until the user has had enough, or the run ends."""
+    """Drive by hand until told to stop, or until run or joystick end.
+
+    Drive the robot by the arrow keys, or by u i o j l m , . as ROS users know.
+    Space or k lets go, + and - change the speed, q or Ctrl-C quits.
+
+    The dead man: hold the key. A terminal tells no letting go, so the robot
+    drives while the key repeats and stops within 0.6 s when it does not. If the
+    robot stops once after the first moment, make the keyboard repeat sooner
+    (X11: xset r rate 250).
+
+    One stick is followed at a time: who holds first, drives; others are told.
+
+    Examples:
+      rampart joystick
+      rampart joystick --speed 0.2
+      rampart joystick --device            the first joystick plugged in here
+      rampart joystick --device /dev/input/js1
+    """
     if not 0.1 <= options.speed <= 1.0:
         raise UsageError(f"--speed {options.speed:g}: must be between 0.1 and 1")
     if options.device is None and not sys.stdin.isatty():
@@ -92,11 +96,9 @@ async def joystick(options: argparse.Namespace) -> int:
 def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:
     spec = systems.load(session.run.system_file)
     parameters = next((n.parameters for n in spec.nodes if n.actor == TELEOPERATION), {})
-    try:
+    with refusing(ValueError):
         mapping = read_parameters(Teleoperation.Parameters, parameters, session.run.system_file,
                                   "teleoperation")
-    except ValueError as error:
-        raise UsageError(str(error)) from None
     device = JoystickDevice(name, mapping, lambda: drive.moved(device.stick), drive.lost)
     missing = device.open()
     if missing:
@@ -166,8 +168,7 @@ class _Drive:
             if self._loop.time() - shown_s >= _SHOW_EVERY_S:
                 shown_s = self._loop.time()
                 self._show()
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._stop.wait(), period_s)
+            await pause(self._stop, period_s)
 
     async def let_go(self) -> None:
         """Tell that nobody holds the stick any more."""
@@ -209,3 +210,59 @@ class _Drive:
             self.answered = True
             sys.stdout.write("\r")
             say(f"{report.node}: {report.reason.replace(self._session.name, 'you')}")
+
+
+HOLD_S = 0.5
+"""Real seconds for which a key counts; with the period of sending and the way to the base it
+stands within 0.6 s."""
+
+STEP = 0.1
+_DIRECTIONS: dict[str, tuple[float, float]] = {
+    "up": (1, 0), "down": (-1, 0), "left": (0, 1), "right": (0, -1),
+    "u": (1, 1), "i": (1, 0), "o": (1, -1), "j": (0, 1), "l": (0, -1),
+    "m": (-1, -1), ",": (-1, 0), ".": (-1, 1)}
+"""Arrow keys, and the letters of ROS's teleop_twist_keyboard, which can do both at once. Backing
+up, m and . turn so that the robot's tail goes to their side."""
+
+_LET_GO = (" ", "k")
+
+
+class KeyboardStick:
+    """Keys in, position of the stick out. Pure.
+
+    A terminal tells that a key was pressed, and goes on telling while it is held; it never tells
+    that it was let go. So the dead man is the *repetition*: each key counts for `HOLD_S`, and
+    without the next one the stick is let go. Between the first press and its first repetition most
+    keyboards wait for 0.25 to 0.5 s; on one that waits longer the robot stops once before it drives
+    on.
+
+    Args:
+        speed: share of full speed to begin with, 0.1 to 1.
+    """
+
+    def __init__(self, speed: float = 0.5) -> None:
+        self.speed = min(max(speed, STEP), 1.0)
+        self._direction = (0.0, 0.0)
+        self._until_s = 0.0
+
+    def press(self, key: str, now_s: float) -> bool:
+        """Take a key at a real time; return whether it means anything."""
+        if key in _DIRECTIONS:
+            self._direction = _DIRECTIONS[key]
+            self._until_s = now_s + HOLD_S
+        elif key in _LET_GO:
+            self._until_s = now_s
+        elif key in {"+", "="}:
+            self.speed = min(1.0, round(self.speed + STEP, 1))
+        elif key == "-":
+            self.speed = max(STEP, round(self.speed - STEP, 1))
+        else:
+            return False
+        return True
+
+    def stick(self, now_s: float) -> Joystick:
+        """Return the position at a real time."""
+        if not now_s < self._until_s:
+            return Joystick(0.0, 0.0, False)
+        forward, left = self._direction
+        return Joystick(forward * self.speed, left * self.speed, True)

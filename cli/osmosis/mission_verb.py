@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import uuid
 from typing import Any
 
@@ -12,7 +11,8 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.cli.output import NoEffectError, UsageError, print_json, say
-from rampart.cli.session import Session, connect
+from rampart.cli.session import Session, connect, pause
+from rampart.cli.verbs import JSON, PORT, add_verb, option, word
 
 OPERATOR = "operator"
 """Who asks, as the mission's state will tell."""
@@ -26,47 +26,40 @@ _ANSWER_S = 5.0
 _STATUS_S = 1.0
 """Simulated seconds within which it repeats its status (nominally each half second)."""
 
-_WHAT = {m.MissionAction.PAUSE: "stop, and keep the goal",
-         m.MissionAction.RESUME: "go on with the goal it was paused at",
-         m.MissionAction.REPLAN: "drive on, by a way that is planned anew",
-         m.MissionAction.SKIP: "leave the present goal out; the mission cannot succeed any more",
-         m.MissionAction.CANCEL: "give the mission up where the robot is",
-         m.MissionAction.HOME: "give the mission up and drive to where it began"}
 
-_EPILOG = """examples:
-  rampart mission pause --reason "runway in use"
-  rampart mission resume
-  rampart mission skip --reason "goal 2 is closed"
-  rampart mission home --json
-  rampart status                                  what the mission does now
-An order that makes no sense now is refused, with the reason, e.g. to resume what is not paused.
-A robot that a recovery holds is not released by `resume`: see rampart reset.
-exit code: 0 obeyed, 1 refused or not answered, 2 bad usage or no run"""
-
-
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any, _formatter: Any, _common: Any) -> None:
     """Add the verb to the parser."""
-    orders = "\n".join(f"  {action.value:<8}{what}" for action, what in _WHAT.items())
-    parser = verbs.add_parser(
-        "mission", parents=[common], formatter_class=formatter,
-        help="pause, resume, replan, skip, cancel, or drive home",
-        description="Give the Mission Manager an order, wait for its answer, and say what became\n"
-                    f"of the mission.\n\norders:\n{orders}",
-        epilog=_EPILOG)
-    parser.add_argument("action", metavar="ORDER", choices=[a.value for a in m.MissionAction],
-                        help=", ".join(a.value for a in m.MissionAction))
-    parser.add_argument("--reason", metavar="TEXT", default="no reason given",
-                        help="why; it is kept and shown with the mission")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=lambda options: asyncio.run(mission(options)))
+    orders = [action.value for action in m.MissionAction]
+    add_verb(verbs, "mission", "pause, resume, replan, skip, cancel, or drive home", mission, PORT,
+             option("action", metavar="ORDER", choices=orders, help=", ".join(orders)),
+             word("--reason", "TEXT", "why; it is kept and shown with the mission",
+                  "no reason given"), JSON)
 
 
 async def mission(options: argparse.Namespace) -> int:
     """Give an order and say what came of it.
 
-    Raises:
-        NoEffectError: it was refused, or nobody answered.
-        UsageError: the reason is none, or there is no run.
+    Give the Mission Manager an order, wait for its answer, and say what became
+    of the mission.
+
+    orders:
+      pause   stop, and keep the goal
+      resume  go on with the goal it was paused at
+      replan  drive on, by a way that is planned anew
+      skip    leave the present goal out; the mission cannot succeed any more
+      cancel  give the mission up where the robot is
+      home    give the mission up and drive to where it began
+
+    Examples:
+      rampart mission pause --reason "runway in use"
+      rampart mission resume
+      rampart mission skip --reason "goal 2 is closed"
+      rampart mission home --json
+      rampart status                                  what the mission does now
+    An order that makes no sense now is refused, with the reason, e.g. to resume what is not paused.
+    A robot that a recovery holds is not released by `resume`: see rampart reset.
+
+    exit code: 0 obeyed, 1 refused or not answered, 2 bad usage or no run
     """
     order = m.MissionOrder(f"rampart-{uuid.uuid4().hex[:10]}", m.MissionAction(options.action),
                          checked_reason(options.reason), OPERATOR)
@@ -74,8 +67,7 @@ async def mission(options: argparse.Namespace) -> int:
         asked = _Asked(session, order)
         if await session.command(topics.MISSION_ORDER, order, lambda: asked.answer is not None,
                                  session.real_s(_ANSWER_S)):
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(asked.shown.wait(), session.real_s(_STATUS_S))
+            await pause(asked.shown, session.real_s(_STATUS_S))
     answer, status = asked.answer, asked.status
     if answer is None:
         raise NoEffectError(f"no effect: the Mission Manager did not answer within {_ANSWER_S:g} s")

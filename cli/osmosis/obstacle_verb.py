@@ -1,9 +1,17 @@
-"""`rampart obstacle`: what the world does to a run."""
+"""`rampart obstacle`: what the world does to a run.
+
+Put an obstacle into the simulated world, move it, or take it away.
+
+Examples:
+  rampart obstacle list
+  rampart obstacle add crate 5 -18.5
+  rampart obstacle add van -3.2 4 --radius 0.8
+  rampart obstacle remove crate
+"""
 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import math
 from collections.abc import Callable
 from typing import Any
@@ -15,43 +23,32 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say, unknown
 from rampart.cli.session import Latest, Session, connect
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, number, option
 
 _OBSTACLES_PERIOD_S = 1.5
 """Simulated seconds within which the world lists its obstacles (nominally each second)."""
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
-    """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "obstacle", formatter_class=formatter, help="put obstacles in the robot's way",
-        description="Put an obstacle into the simulated world, move it, or take it away.",
-        epilog="examples:\n  rampart obstacle list\n  rampart obstacle add crate 5 -18.5\n"
-               "  rampart obstacle add van -3.2 4 --radius 0.8\n  rampart obstacle remove crate")
-    subverbs = parser.add_subparsers(dest="subverb", required=True, metavar="VERB")
-    adding = subverbs.add_parser(
-        "add", parents=[common], formatter_class=formatter, help="make an obstacle appear",
-        description="Make an obstacle appear at (X, Y) of the map frame, metres, or move it there.",
-        epilog="examples:\n  rampart obstacle add crate 5 -18.5 --radius 0.4")
-    adding.add_argument("name", metavar="NAME")
-    adding.add_argument("x", type=float, metavar="X", help="east, m")
-    adding.add_argument("y", type=float, metavar="Y", help="north, m")
-    adding.add_argument("--radius", type=float, default=0.4, metavar="M", help="default 0.4 m")
-    adding.set_defaults(run=lambda options: asyncio.run(obstacle_add(options)))
-    removing = subverbs.add_parser(
-        "remove", parents=[common], formatter_class=formatter, help="take an obstacle away",
-        description="Take an obstacle away.", epilog="examples:\n  rampart obstacle remove crate")
-    removing.add_argument("name", metavar="NAME")
-    removing.set_defaults(run=lambda options: asyncio.run(obstacle_remove(options)))
-    listing = subverbs.add_parser(
-        "list", parents=[common], formatter_class=formatter, help="the obstacles there are",
-        description="List the obstacles that are there now.",
-        epilog="examples:\n  rampart obstacle list --json")
-    listing.add_argument("--json", action="store_true", help="print JSON")
-    listing.set_defaults(run=lambda options: asyncio.run(obstacle_list(options)))
+def add(verbs: Any, _formatter: Any, _common: Any) -> None:
+    """Add the verbs to the parser."""
+    family = add_family(verbs, "obstacle", "put obstacles in the robot's way", __doc__)
+    name = option("name", metavar="NAME")
+    add_verb(family, "add", "make an obstacle appear", obstacle_add, PORT, name,
+             option("x", type=float, metavar="X", help="east, m"),
+             option("y", type=float, metavar="Y", help="north, m"),
+             number("--radius", "M", "default 0.4 m", 0.4))
+    add_verb(family, "remove", "take an obstacle away", obstacle_remove, PORT, name)
+    add_verb(family, "list", "the obstacles there are", obstacle_list, PORT, JSON)
 
 
 async def obstacle_list(options: argparse.Namespace) -> int:
-    """Print the obstacles."""
+    """Print the obstacles.
+
+    List the obstacles that are there now.
+
+    Examples:
+      rampart obstacle list --json
+    """
     async with connect(options.port) as session:
         present = await _World(session).obstacles()
     head = ("name", "x_m", "y_m", "radius_m")
@@ -64,7 +61,13 @@ async def obstacle_list(options: argparse.Namespace) -> int:
 
 
 async def obstacle_add(options: argparse.Namespace) -> int:
-    """Make an obstacle appear."""
+    """Make an obstacle appear, or move it.
+
+    Make an obstacle appear at (X, Y) of the map frame, metres, or move it there.
+
+    Examples:
+      rampart obstacle add crate 5 -18.5 --radius 0.4
+    """
     for name in ("x", "y", "radius"):
         value = getattr(options, name)
         if not math.isfinite(value):
@@ -85,7 +88,13 @@ async def obstacle_add(options: argparse.Namespace) -> int:
 
 
 async def obstacle_remove(options: argparse.Namespace) -> int:
-    """Take an obstacle away."""
+    """Take an obstacle away.
+
+    Take an obstacle away.
+
+    Examples:
+      rampart obstacle remove crate
+    """
     async with connect(options.port) as session:
         world = _World(session)
         present = await world.obstacles()

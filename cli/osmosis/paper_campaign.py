@@ -12,7 +12,6 @@ from rampart.sim.campaign.job import Job
 from rampart.sim.campaign.named import NamedCampaign, Section
 from rampart.sim.campaign.statistics import Row
 from rampart.sim.campaign.store import Run
-from rampart.sim.osmosis.trial.paper_section import section
 from rampart.sim.osmosis.trial.paper_tables import (
     FULL_SYSTEM,
     PAPER_SYSTEM,
@@ -20,8 +19,11 @@ from rampart.sim.osmosis.trial.paper_tables import (
     cells,
     full_jobs,
     paper_jobs,
+    section,
     table_iii,
 )
+
+_HEAD = ("fault", "obst.", "paper", "ours", "runs", "no effect", "success", "safe", "")
 
 
 class PaperCampaign(NamedCampaign):
@@ -72,12 +74,8 @@ class PaperCampaign(NamedCampaign):
             say()
             say(f"Table {title}: mission and safety, worst run of each row")
             say()
-            print_table(("condition", "fault", "obst.", "paper", "ours", "runs", "no effect",
-                         "success", "safe", ""),
-                        [(c.condition, c.fault, c.obstacles, c.paper, c.ours, c.runs,
-                          c.ineffective, c.success, c.safe,
-                          "agrees" if c.agrees else f"differs: run {c.worst_key}")
-                         for c in found if c.table == title])
+            print_table(("condition", *_HEAD), [
+                (c.condition, *_row(c, "agrees", "differs")) for c in found if c.table == title])
         _show_differing(found)
 
 
@@ -101,11 +99,7 @@ class FullCampaign(PaperCampaign):
         say("The paper's rows on the full system, worst run of each row; expected in each: "
             "success, safe\n")
         found = cells(runs)
-        print_table(
-            ("fault", "obst.", "paper", "ours", "runs", "no effect", "success", "safe", ""),
-            [(c.fault, c.obstacles, c.paper, c.ours, c.runs, c.ineffective, c.success, c.safe,
-              "as expected" if c.agrees else f"NOT as expected: run {c.worst_key}")
-             for c in found])
+        print_table(_HEAD, [_row(c, "as expected", "NOT as expected") for c in found])
         _show_differing(found)
 
     def expected(self, runs: Sequence[Run], row: Row) -> dict[str, Any]:
@@ -123,6 +117,11 @@ def _mission(base: Job) -> str:
     if "mission" not in base.options:
         raise UsageError(f"--system {base.system}: it has no missions as those of the paper")
     return str(base.options["mission"])
+
+
+def _row(cell: Cell, well: str, ill: str) -> tuple[Any, ...]:
+    return (cell.fault, cell.obstacles, cell.paper, cell.ours, cell.runs, cell.ineffective,
+            cell.success, cell.safe, well if cell.agrees else f"{ill}: run {cell.worst_key}")
 
 
 def _show_differing(found: Iterable[Cell]) -> None:

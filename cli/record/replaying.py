@@ -27,7 +27,6 @@ from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import Qos, Topic
-from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.layout.layout import application_class
 from rampart.actors.layout.wiring import load_class
@@ -239,16 +238,7 @@ class Replay:
             listener.close()
             raise UsageError(f"--port {self._port}: in use by a run or another replay") from None
         listener.listen(8)
-        answer = msgspec.json.encode(self._info(clock, folder))
-
-        def one() -> None:
-            with contextlib.suppress(OSError):
-                connection, _ = listener.accept()
-                with connection:
-                    if is_same_user(connection):
-                        connection.send(answer)
-
-        loop.add_reader(listener, one)
+        loop.add_reader(listener, run_info.answer, listener, self._info(clock, folder))
         try:
             yield
         finally:
@@ -287,7 +277,8 @@ class Replay:
         kind = page_of(self._known.system)
         page: type[Hmi] = ReplayPage if kind is Hmi else type("ReplayPage", (ReplayPage, kind), {})
         return page(Context(
-            PAGE, 1, clock, SharedBus(bus), {"panels": (*kind.panels, *run.system.panels)}, run,
+            PAGE, 1, clock, SharedBus(bus), {"panels": tuple(
+                panel for panel in (*kind.panels, *run.system.panels) if not panel.stick)}, run,
             topics={topic.key: topic for topic in self._known.topics}))
 
 

@@ -15,8 +15,8 @@ import msgspec
 from rampart.manager.model.order import PartialOrder
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision, Strategy
-from rampart.manager.strategies.decision_words import listing
 from rampart.manager.strategies.escalation import succession
+from rampart.manager.strategies.registry import listing
 
 MAX_MECHANISMS = 14
 """2^14 sets are checked in seconds; above that verification refuses."""

@@ -26,7 +26,7 @@ class Outlook(msgspec.Struct, frozen=True):
     """What is left before the top event, given what has occurred.
 
     Attributes:
-        occurred: Events that have occurred by what is detected, or were given.
+        occurred: Events that have occurred by what is detected.
         left: For each active mechanism the barriers above it that are still idle.
         next_events: Basic events, each of which by itself, with what has occurred, would make the
             top occur; with the idle barriers that are then left, those with the fewest first.
@@ -52,13 +52,12 @@ def _guarded(tree: FaultTree, events: Sequence[str], occurred: Sequence[str],
         name for name in mechanisms if tree.top not in tree.occurring(occurred, event_of[name])))
 
 
-def outlook(spec: SystemSpec, active: Iterable[str], given: Iterable[str] = ()) -> Outlook:
+def outlook(spec: SystemSpec, active: Iterable[str]) -> Outlook:
     """Return what is left before the top event.
 
     Args:
         spec: The system.
         active: Active mechanisms: the event of each has occurred, for its detection says so.
-        given: Events that have occurred besides.
     """
     tree = spec.build_fault_tree()
     ftms = spec.build_ftm_tree()
@@ -66,7 +65,7 @@ def outlook(spec: SystemSpec, active: Iterable[str], given: Iterable[str] = ()) 
     wanted = set(active)
     breached = [name for name in ftms.names if name in wanted]
     idle = [name for name in ftms.names if name not in wanted]
-    occurred = tuple(dict.fromkeys([*(event_of[name] for name in breached), *given]))
+    occurred = tuple(event_of[name] for name in breached)
     left = {name: tuple(upper for upper in ftms.chain(ftms.root, name) if upper in idle)
             for name in breached}
     # If what has occurred suffices already, the next event is looked at by itself.

@@ -6,7 +6,7 @@ do, and minimal are those sets of which no part makes the top occur: the minimal
 
 The way, for trees with hundreds of events and millions of cut sets:
 
-1. *Modules* (`rampart.manager.analysis.modules`): parts that are analysed by themselves.
+1. *Modules* (`rampart.manager.analysis.formula`): parts that are analysed by themselves.
 2. *A binary decision diagram* of each module, by a library (OxiDD), with the variables in the
    sequence of one of several depth-first searches; the first that stays within bounds is taken.
 3. *Minimal solutions* of the diagram as a zero-suppressed one (Rauzy 1993); from that the number
@@ -25,8 +25,7 @@ import msgspec
 from oxidd.bdd import BDDFunction, BDDManager
 from oxidd.util import DDMemoryError
 
-from rampart.manager.analysis.formula import Connective, Formula, search
-from rampart.manager.analysis.modules import prepare
+from rampart.manager.analysis.formula import Connective, Formula, prepare, search
 from rampart.manager.analysis.zbdd import (
     EMPTY,
     UNIT,

@@ -31,7 +31,7 @@ from operator import attrgetter
 
 from msgspec.structs import replace
 
-from rampart.manager.arbitration import detection_track, latching, recovery_track
+from rampart.manager.arbitration import detection_track, recovery_track
 from rampart.manager.arbitration.arbiter_state import (
     DecisionMade,
     Input,
@@ -40,6 +40,8 @@ from rampart.manager.arbitration.arbiter_state import (
     ResetAsked,
     ShadowDiffered,
     State,
+    keep_latched,
+    reset_refusal,
     with_late,
 )
 from rampart.manager.arbitration.detection_track import (
@@ -196,7 +198,7 @@ class Arbiter:
         return self._with_recovery(replace(state, number=number), track)
 
     def _reset(self, state: State, event: ResetAsked) -> tuple[State, tuple[ResetAnswered]]:
-        refusal = latching.refusal(state, event.recovery, self._choose(state)[1])
+        refusal = reset_refusal(state, event.recovery, self._choose(state)[1])
         if not refusal:
             state = self._with_recovery(state, replace(
                 self._track(state, event.recovery), latched=False, adopted=False))
@@ -235,7 +237,7 @@ class Arbiter:
         if failures:
             decision = escalate(decision, failures, self.arrangement)
         kept = [t for t in state.recoveries if t.latched or t.adopted]
-        return chosen, decision, latching.keep(
+        return chosen, decision, keep_latched(
             decision, kept, self.arrangement,
             exclusive=self.decider.strategy.exclusive) if kept else decision
 

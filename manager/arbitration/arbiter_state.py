@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 from msgspec.structs import replace
 
@@ -142,3 +144,52 @@ def with_late(state: State, active: tuple[str, ...], arrangement: Arrangement, n
         name for name, since_s in since
         if name in state.late or (now - since_s > mechanisms.by_name[name].patience_s
                                   and not in_force.issuperset(mechanisms.recover[name]))))
+
+
+def reset_refusal(state: State, recovery: str, decision: Decision) -> str:
+    """Say why a recovery is not reset; "" if it may be.
+
+    Args:
+        state: Of the arbiter.
+        recovery: Name, as it was typed.
+        decision: What would run if nothing were latched.
+    """
+    if recovery not in state.latched:
+        known = recovery in state.desired
+        return "it is not latched" if known else "there is no such recovery module"
+    if not state.oriented:
+        return "not all modules have been heard yet"
+    if recovery in decision.recoveries:
+        return f"the cause persists: {', '.join(decision.active)} active"
+    return ""
+
+
+# -- recoveries that stay in force although nothing asks for them -------------------------------
+# A latched recovery stays until an operator resets it, and a reset is refused while its cause
+# persists. An adopted one was found activated by an arbiter that had just started, and stays until
+# all modules have been heard. Only a safer recovery takes the place of either.
+
+
+def keep_latched(decision: Decision, kept: Sequence[RecoveryTrack], arrangement: Arrangement, *,
+                 exclusive: bool) -> Decision:
+    """Return a decision in which the safest of the kept recoveries stays, or a safer one runs.
+
+    Args:
+        decision: Without regard to what is kept.
+        kept: Latched and adopted recoveries, at least one. Several are only if one drains under
+            another.
+        arrangement: Of the system.
+        exclusive: No repairs run beneath.
+    """
+    order, contracts = arrangement.order, arrangement.mechanisms.contracts
+    safest = min(kept, key=lambda track: order.number[track.name])
+    base = tuple(name for name in decision.recoveries
+                 if name == safest.name or order.is_above(name, safest.name)) or (safest.name,)
+    others = [name for name in decision.recoveries if name not in base]
+    beneath = () if exclusive else tuple(
+        name for name in others if contracts[name].kind.repairs
+        and arrangement.can_join(name, order.mask(base)))
+    why = "is latched until reset" if safest.latched else \
+        "was found activated, and not all modules have been heard yet"
+    return replace(decision, recoveries=base + beneath, rejected=decision.rejected + tuple(
+        (name, f"{safest.name} {why}") for name in others if name not in beneath))

@@ -14,7 +14,7 @@ import msgspec
 from rampart.manager.model.gates import detection_gate, recovery_gate
 from rampart.manager.model.order import PartialOrder
 from rampart.manager.spec.schema import MechanismSpec, SystemSpec
-from rampart.manager.strategies.decision_words import decision_in_words
+from rampart.manager.strategies.registry import decision_in_words
 
 WHATS = ("fault-tree", "ftm-tree", "order")
 """What can be drawn."""

@@ -124,9 +124,7 @@ COMMAND_FIELDS = ("command", "env", "folder", "limits", "heartbeat", "publishes"
                   "stand_in")
 """What can be said of a node that has a command only."""
 
-_NO_COMMAND = {field.name: field.default_factory() if field.default is msgspec.NODEFAULT
-               else field.default
-               for field in msgspec.structs.fields(NodeSpec) if field.name in COMMAND_FIELDS}
+_NO_COMMAND = {field: getattr(NodeSpec("none", Kind.WORLD), field) for field in COMMAND_FIELDS}
 
 
 def find_wrong_commands(nodes: Iterable[NodeSpec]) -> Iterator[Finding]:

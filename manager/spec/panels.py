@@ -13,6 +13,8 @@ import msgspec
 from rampart.manager.spec.tables import Table
 
 MAX_PANELS = 40
+LARGEST = 1e9
+"""Greatest number of a stick."""
 MAX_KEPT = 32
 """Fields of all plots and maps together: of each, some minutes are kept for a page that opens."""
 
@@ -30,6 +32,7 @@ _SHOWS: dict[str, tuple[tuple[str, ...], frozenset[str]]] = {
     "states": ((TEXT, TRUTH), frozenset({"of"})),
     "text": (ANYTHING, frozenset({"unit"})),
     "map": ((NUMBER,), frozenset({"extent_m"})),
+    "stick": ((NUMBER,), frozenset({"held", "scale"})),
     "script": ((), frozenset()),
 }
 """What a panel may show: which kinds of fields that takes, and which options."""
@@ -37,11 +40,15 @@ _OPTIONS = sorted(frozenset().union(*(options for _, options in _SHOWS.values())
 
 
 class Shown(NamedTuple):
-    """A field that a panel shows: by which of its keys, and of which kinds it may be."""
+    """A field of a panel: by which of its keys, of which kinds it may be, and who says it.
+
+    `is_said`: the page publishes it; others are heard.
+    """
 
     key: str
     field: str
     kinds: tuple[str, ...]
+    is_said: bool = False
 
 
 class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
@@ -55,6 +62,8 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         states: A text, as one of the states in `of`.
         text: The latest value of a field.
         map: x and y, m, and if there is a third one the heading, rad, counted from x to y.
+        stick: One or two numbers of the messages of a topic, which the page publishes while an
+            operator holds the stick: how far it is forward, and how far to the left.
         script: A JavaScript module that draws it, of the files of the page's class.
         min: Lower end of a gauge (0 if left out) or of a plot (its least value).
         max: Upper end of a gauge (1 if left out) or of a plot (its greatest value).
@@ -63,6 +72,9 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         of: States that are shown in this order; one that is not listed is shown besides.
         extent_m: x and y of the lower left and of the upper right corner of a map; what it has to
             hold if left out.
+        held: A truth value of a stick's messages: whether an operator holds it.
+        scale: What the numbers of a stick are when it is at its end; the bounds of their types if
+            left out, 1 where these have none. A negative one turns the direction round.
         columns: How wide it is; as much as suits it if left out.
     """
 
@@ -73,6 +85,7 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
     states: FieldText | None = None
     text: FieldText | None = None
     map: Annotated[tuple[FieldText, ...], msgspec.Meta(min_length=2, max_length=3)] | None = None
+    stick: Annotated[tuple[FieldText, ...], msgspec.Meta(min_length=1, max_length=2)] | None = None
     script: Annotated[str, msgspec.Meta(pattern=r"^[a-z_]+\.js\Z")] | None = None
     min: float | None = None
     max: float | None = None
@@ -80,6 +93,8 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
     seconds: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
     of: Annotated[tuple[_Short, ...], msgspec.Meta(max_length=40)] = ()
     extent_m: tuple[float, float, float, float] | None = None
+    held: FieldText | None = None
+    scale: Annotated[tuple[float, ...], msgspec.Meta(max_length=2)] = ()
     columns: Annotated[int, msgspec.Meta(ge=0, le=6)] = 0
 
     def __post_init__(self) -> None:
@@ -102,6 +117,29 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         if box is not None and not (box[0] < box[2] and box[1] < box[3]):
             raise ValueError(f"{self.title!r}: extent_m: x0, y0, x1, y1 with x0 < x1 and y0 < y1 "
                              "is right")
+        if self.stick is not None:
+            self._check_stick(self.stick)
+
+    def _check_stick(self, numbers: tuple[FieldText, ...]) -> None:
+        fields = (*numbers, *((self.held,) if self.held else ()))
+        keys = dict.fromkeys(field.partition(":")[0] for field in fields)
+        if len(keys) > 1:
+            raise ValueError(f"{self.title!r}: stick: fields of {' and '.join(keys)}; those of one "
+                             "topic are right")
+        if len({*fields}) < len(fields):
+            raise ValueError(f"{self.title!r}: stick: {', '.join(fields)}: each field once is "
+                             "right")
+        if self.scale and len(self.scale) != len(numbers):
+            raise ValueError(f"{self.title!r}: scale = {[*self.scale]}: one number for each of "
+                             f"{', '.join(numbers)} is right")
+        if not all(1e-9 <= abs(scale) <= LARGEST for scale in self.scale):
+            raise ValueError(f"{self.title!r}: scale = {[*self.scale]}: numbers other than 0, at "
+                             f"most {LARGEST:g} are right")
+
+    @property
+    def topic(self) -> str:
+        """Key of the topic on which its stick is told, "" if it is none."""
+        return self.stick[0].partition(":")[0] if self.stick else ""
 
     @property
     def kind(self) -> str:
@@ -114,12 +152,14 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         return self.seconds if self.plot else 600.0 if self.map else 0.0
 
     def fields(self) -> Iterator[Shown]:
-        """Yield the fields that it shows."""
+        """Yield the fields that it shows, or says."""
         kinds, _ = _SHOWS[self.kind]
         value = getattr(self, self.kind)
         if kinds:
             for field in (value,) if isinstance(value, str) else value:
-                yield Shown(self.kind, field, kinds)
+                yield Shown(self.kind, field, kinds, bool(self.stick))
+        if self.held:
+            yield Shown("held", self.held, (TRUTH,), True)
 
     def _ends(self) -> tuple[float | None, float | None]:
         if self.gauge is None:
@@ -133,6 +173,10 @@ def problem_of(panels: Sequence[Panel]) -> str:
     twice = next((title for title in titles if titles.count(title) > 1), None)
     if twice is not None:
         return f"panel {twice!r}: there are two of this title; each panel needs its own"
+    told = [panel.topic for panel in panels if panel.stick]
+    rival = next((panel for panel in panels if told.count(panel.topic) > 1), None)
+    if rival is not None:
+        return f"panel {rival.title!r}: another stick is told on {rival.topic} too; one is right"
     if len(panels) > MAX_PANELS:
         return f"{len(panels)} panels; at most {MAX_PANELS} are right"
     kept = sum(1 for panel in panels if panel.kept_s for _ in panel.fields())

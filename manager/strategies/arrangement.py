@@ -11,7 +11,7 @@ from functools import lru_cache, reduce
 from operator import or_
 
 from rampart.manager.model.mechanisms import Mechanisms
-from rampart.manager.model.order import PartialOrder, Tree, UnknownElementError
+from rampart.manager.model.order import PartialOrder, Tree
 
 
 class Arrangement:
@@ -48,16 +48,8 @@ class Arrangement:
                 or mechanisms.harms(other, name))) for name in order.names}
 
     def masks(self, active: Iterable[str]) -> tuple[int, int]:
-        """Return the active mechanisms as a mask of `tree`, their recoveries as one of `order`.
-
-        Raises:
-            UnknownElementError: A name that is no mechanism.
-        """
-        try:
-            bits = reduce(or_, map(self._bits.__getitem__, active), 0)
-        except KeyError as error:
-            raise UnknownElementError(f"unknown mechanism {error.args[0]!r}; known: "
-                                      f"{', '.join(self.mechanisms.names)}") from None
+        """Return the active mechanisms as a mask of `tree`, their recoveries as one of `order`."""
+        bits = reduce(or_, map(self._bits.__getitem__, active), 0)
         return bits & self._ftms, bits >> self._width
 
     def demanded(self, active: Iterable[str]) -> tuple[str, ...]:

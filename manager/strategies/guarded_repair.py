@@ -82,9 +82,10 @@ class GuardedRepair:
             return 2, (guard,), ()  # for the sake of those that ask for it, and they are active
         dominant = arrangement.tree.names[arrangement.tree.lowest_common_in(ftms)]
         above = (1 << len(order.names)) - 1
-        for number in _numbers(rms):
-            above &= order.up_set[number]
-        least = {order.names[i] for i in _numbers(above) if not order.below[i] & above}
+        for name in order.members(rms):
+            above &= order.up_set[order.number[name]]
+        least = {name for name in order.members(above)
+                 if not order.below[order.number[name]] & above}
         if not least:
             return 4, recover[dominant], (dominant,)
         preferred = chain(recover[dominant], arrangement.mechanisms.recoveries)
@@ -104,13 +105,3 @@ class GuardedRepair:
             for name, why in turned_down(order, taken, candidates))
         return msgspec.structs.replace(
             decision, path=dominance(order, taken, candidates) or taken, rejected=tuple(rejected))
-
-
-def _numbers(mask: int) -> list[int]:
-    """Return the numbers of the bits in a mask, lowest first."""
-    numbers = []
-    while mask:
-        lowest = mask & -mask
-        numbers.append(lowest.bit_length() - 1)
-        mask ^= lowest
-    return numbers

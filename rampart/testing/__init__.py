@@ -6,9 +6,8 @@ Nothing here knows a robot. Failed expectations are `AssertionError`s; pytest is
 from rampart.testing.ports import free_base_port, free_port
 from rampart.testing.real_run import HEEDS_SIGNALS, RealRun
 from rampart.testing.timeline import Ear, play, table, wake
-from rampart.testing.virtual import Heard, VirtualSystem, run, turns
+from rampart.testing.virtual import Heard, VirtualSystem, run, turns, virtual_run
 from rampart.testing.waiting import eventually, wait_until
-from rampart.testing.whole_run import virtual_run
 
 __all__ = [
     "HEEDS_SIGNALS", "Ear", "Heard", "RealRun", "VirtualSystem", "eventually", "free_base_port",

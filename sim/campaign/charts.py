@@ -8,12 +8,15 @@ counted in the outermost bar, and the axis says so.
 from __future__ import annotations
 
 import math
+import statistics
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from rampart.sim.campaign.wording import count, seconds
+from rampart.sim.campaign.statistics import by_kind, count, seconds
+from rampart.sim.campaign.store import Run
 from rampart.sim.runs.report import MINUS, margin_text
+from rampart.sim.runs.trial import Trial
 
 WIDTH = 520.0
 """Of the drawing, in its own units; text is 14 of them high."""
@@ -183,13 +186,59 @@ def _lane(top: float, axis: Axis, label: str, values: Sequence[Value], note: str
             round(left + 0.5, 2), round(base - height, 2), round(right - left - 1, 2),
             round(height, 2), round(red, 2),
             f"{count(len(there), 'run')}, {span}" + (f", {unsafe} unsafe" if unsafe else "")))
-    ordered = sorted(each.value for each in values)
-    middle = None
-    if ordered:
-        half = len(ordered) // 2
-        middle = round(axis.place_of_mark((ordered[half] + ordered[-half - 1]) / 2), 2)
+    middle = round(axis.place_of_mark(
+        statistics.median(each.value for each in values)), 2) if values else None
     return Lane(top, top + _TEXT, base, label, note, tuple(bars), middle)
 
 
 def _round_time(value_s: float) -> str:
     return f"{value_s * 1e3:.0f} ms" if value_s < 0.9995 else f"{value_s:.0f} s"
+
+
+def distributions(runs: Sequence[Run], trial: type[Trial]) -> list[Chart]:
+    """Return the charts of some runs; those without anything to show are left out.
+
+    Args:
+        runs: of one system.
+        trial: of that system.
+    """
+    counted = [run for run in runs if run.result.counts]
+    faulty = [run for run in counted if run.job.ftm and run.job.faults]
+    made = []
+    for name, title, words, done in (
+            ("detected_after_s", "Time to detect",
+             "From the injection of the fault to the first detection, with FTM.", "detected"),
+            ("recovered_after_s", "Time to recover",
+             "From the injection to the moment when nothing was left to recover, with FTM.",
+             "recovered")):
+        lanes: list[tuple[str, list[Value], str]] = []
+        never = []
+        for kind, there in by_kind(faulty).items():
+            values = [Value(value, not run.result.safe) for run in there
+                      if (value := getattr(run.result, name)) is not None]
+            if values:
+                lanes.append((kind, values, _beside(len(values), len(there), f"not {done}")))
+            else:
+                never.append(f"{kind} ({count(len(there), 'run')})")
+        if lanes:
+            more = f" Never {done}: {', '.join(never)}." if never else ""
+            axis = time_axis([each.value for _, values, _ in lanes for each in values])
+            made.append(chart(title, words + more, axis, lanes))
+    for ftm, title in ((True, "Smallest margin with FTM"), (False, "Smallest margin without FTM")):
+        margins = {kind: [Value(run.result.margin, not run.result.safe) for run in there]
+                 for kind, there in by_kind(r for r in counted if r.job.ftm == ftm).items()}
+        every = [each.value for there in margins.values() for each in there]
+        if any(map(math.isfinite, every)):
+            exact = ("" if trial.exact_below is None else
+                     f" Measured exactly below {trial.exact_below:g} {trial.margin_unit} only.")
+            made.append(chart(
+                title, f"The smallest of: {', '.join(trial.margins.values())}.{exact}",
+                margin_axis([v for v in every if math.isfinite(v)], trial.exact_below,
+                                   trial.margin_unit),
+                [(kind, there, count(len(there), "run"))
+                 for kind, there in margins.items()]))
+    return made
+
+
+def _beside(known: int, of: int, without: str) -> str:
+    return count(of, "run") + (f", {of - known:,} {without}" if known < of else "")

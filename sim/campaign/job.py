@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -22,15 +23,18 @@ from rampart.actors.run.run_plan import RunPlan, load_system, tailor
 from rampart.files import toml, working_folder
 from rampart.files.reading import read_text
 from rampart.manager.spec.adaptation import Action, Change, adapt
+from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.specification import check_document, read_document
 from rampart.sim.campaign.defaults import PATIENCE_S
-from rampart.sim.faults.faults import Faults, faults_of
+from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.record import RunRecord
-from rampart.sim.runs.trial import Trial, trial_class
+from rampart.sim.runs.trial import trial_class
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
 from rampart.sim.virtual.network import find_network
+
+T = TypeVar("T")
 
 
 class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -246,29 +250,20 @@ def read_document_of(system: str) -> tuple[str, dict[str, Any]]:
     return str(file), read_document(read_text(file, toml.MAX_SIZE), str(file))
 
 
-@lru_cache(maxsize=8)
-def faults_of_system(system: str) -> Faults:
-    """Return the faults of the robot of a system, given as in `Job`.
+def _of_system(made: Callable[[SystemSpec], T]) -> Callable[[str], T]:
+    """Return a function of a system's name or file that keeps what is made of its spec."""
+    @lru_cache(maxsize=8)
+    def of_system(system: str) -> T:
+        file, document = read_document_of(system)
+        return made(check_document(document, file))
 
-    Raises:
-        ValueError: there is no such system, or it is unsound.
-    """
-    file, document = read_document_of(system)
-    return faults_of(check_document(document, file))
-
-
-@lru_cache(maxsize=8)
-def application_of_system(system: str) -> type[Application]:
-    """Return the application of a system; arguments and errors as of `faults_of_system`."""
-    file, document = read_document_of(system)
-    return application_class(check_document(document, file))
+    return of_system
 
 
-@lru_cache(maxsize=8)
-def trial_of_system(system: str) -> type[Trial]:
-    """Return what a run of a system is; arguments and errors as of `faults_of_system`."""
-    file, document = read_document_of(system)
-    return trial_class(check_document(document, file))
+# Each raises a ValueError if there is no such system, or it is unsound.
+faults_of_system = _of_system(faults_of)
+application_of_system = _of_system(application_class)
+trial_of_system = _of_system(trial_class)
 
 
 def application_of_job(job: Job) -> Application:

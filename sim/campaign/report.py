@@ -17,20 +17,38 @@ from typing import Any
 from markupsafe import Markup
 
 from rampart.actors.layout.wiring import import_class
-from rampart.sim.campaign.distributions import distributions
-from rampart.sim.campaign.grouping import Condition, by_kind, conditions, in_common
+from rampart.sim.campaign.charts import distributions
 from rampart.sim.campaign.job import trial_of_system
 from rampart.sim.campaign.named import Section
-from rampart.sim.campaign.statistics import Row, Spread, rate, table, total
+from rampart.sim.campaign.statistics import (
+    Condition,
+    Row,
+    Spread,
+    badness,
+    by_kind,
+    conditions,
+    count,
+    in_common,
+    interval,
+    kind_of,
+    percent,
+    rate,
+    seconds,
+    table,
+    total,
+)
 from rampart.sim.campaign.store import Run
-from rampart.sim.campaign.wording import count, interval, percent, seconds
-from rampart.sim.campaign.worst_runs import story, worth_showing
-from rampart.sim.runs.pictures import RunPictures
-from rampart.sim.runs.report import NONE, environment, margin_text, write_atomically
+from rampart.sim.runs.record import RunRecord
+from rampart.sim.runs.report import (
+    NONE,
+    Moment,
+    RunPictures,
+    environment,
+    margin_text,
+    write_atomically,
+)
 from rampart.sim.runs.trial import Trial
 from rampart.sim.runs.virtual_run import VirtualResult
-
-__all__ = ["Campaign", "headline", "render", "worth_showing", "write_campaign_report"]
 
 FILE_NAME = "report.html"
 
@@ -123,11 +141,11 @@ def headline(runs: Sequence[Run]) -> str:
     if not all(run.result.judged for run in runs):
         detected = sum(run.result.detected_after_s is not None for run in faulty)
         restarts = sum(run.result.restarts for run in runs)
-        return (f"{_runs(len(runs))} without a judge: of {len(faulty):,} with a fault "
+        return (f"{count(len(runs), 'run')} without a judge: of {len(faulty):,} with a fault "
                 f"{sum(run.result.effective for run in faulty):,} had an effect and {detected:,} "
                 f"were detected; {count(restarts, 'restart')}.")
     if not faulty:
-        return (f"{_runs(len(runs))} without a fault: {_many(runs, 'unsafe')}, "
+        return (f"{count(len(runs), 'run')} without a fault: {_many(runs, 'unsafe')}, "
                 f"{_many(runs, 'complete')}.")
     odd = sum(run.result.counts and not run.result.effective for run in faulty)
     parts: list[str] = []
@@ -141,17 +159,13 @@ def headline(runs: Sequence[Run]) -> str:
         parts.append(f"In {odd:,} of these the fault had no effect; what ends badly counts all "
                      "the same.")
     if lost := sum(not run.result.counts for run in faulty):
-        parts.append(f"In {_runs(lost)}{' more' if parts else ''} the fault had no effect.")
+        parts.append(f"In {count(lost, 'run')}{' more' if parts else ''} the fault had no effect.")
     return " ".join(parts).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def _breakable(text: str) -> Markup:
     """Return a name, escaped, that may be broken behind its separators."""
     return Markup("<wbr>").join(re.split(r"(?<=[:/_])", text))
-
-
-def _runs(number: int) -> str:
-    return count(number, "run")
 
 
 def _many(runs: Sequence[Run], what: str, more: str = "") -> str:
@@ -161,8 +175,8 @@ def _many(runs: Sequence[Run], what: str, more: str = "") -> str:
     found = rate(sum(not run.result.safe for run in runs), len(runs))
     number = f"{found.count:,}" if found.count else "none"
     sure = interval(found) if found.count else f"at most {percent(found.high)} %"
-    return (f"{number} of {_runs(found.of)} {more}{'was' if found.count == 1 else 'were'} unsafe "
-            f"(95 % interval: {sure})")
+    return (f"{number} of {count(found.of, 'run')} {more}"
+            f"{'was' if found.count == 1 else 'were'} unsafe (95 % interval: {sure})")
 
 
 # -- tables ------------------------------------------------------------------------------------
@@ -275,3 +289,56 @@ def _margin(value: float | None, trial: type[Trial]) -> str:
 def _failures(runs: Iterable[Run]) -> list[tuple[str, str]]:
     """Return key and text of the actors that ended by an error of the program."""
     return [(run.job.key, text) for run in runs for text in run.result.failures]
+
+
+_DECISIONS = 8
+
+
+def worth_showing(runs: Sequence[Run], most: int = 6) -> list[Run]:
+    """Return the runs that are worth a look: the worst ones, worst first.
+
+    Each shows another fault. An unprotected robot is unsafe as a matter of course, so runs
+    without fault tolerance get at most half of the places that runs with it could fill, and an
+    unsafe run with it comes before all others. Runs in which nothing went wrong are left out.
+    """
+    ranked = sorted(runs, key=_rank, reverse=True)
+    different: dict[tuple[bool, tuple[str, ...]], Run] = {}
+    for run in ranked:
+        bad = not (run.result.safe and run.result.success)
+        if bad or (run.job.faults and run.result.effective):
+            faults = tuple(sorted(fault.fault for fault in run.job.faults))
+            different.setdefault((run.job.ftm, faults), run)
+    protected = [run for run in different.values() if run.job.ftm]
+    bare = [run for run in different.values() if not run.job.ftm]
+    bare = bare[:max(most // 2, most - len(protected))]
+    return sorted([*protected[:most - len(bare)], *bare], key=_rank, reverse=True)
+
+
+def story(run: Run, record: RunRecord, narrowest_s: float | None) -> dict[str, Any]:
+    """Return what is shown of one of the worst runs: what happened when.
+
+    Args:
+        run: of the campaign.
+        record: of the same run, made again.
+        narrowest_s: when the smallest margin was measured.
+    """
+    result = run.result
+    detected_s = (None if result.injected_s is None or result.detected_after_s is None
+                  else result.injected_s + result.detected_after_s)
+    marks = [Moment(at_s, kind, name) for kind, name, at_s in (
+        ("end", "end of the run", result.duration_s),
+        ("fault", "fault injected", result.injected_s),
+        ("detected", "first detection", detected_s),
+        ("narrow", "smallest margin", narrowest_s if result.safe else None),
+        ("unsafe", "first unsafe", result.unsafe_s)) if at_s is not None]
+    return {
+        "key": run.job.key, "fault": run.job.text(), "run": run, "kind": kind_of(run.job),
+        "marks": marks,
+        "moments": sorted([*marks, *(Moment(d.t_s, "", d.words)
+                                     for d in record.decisions[:_DECISIONS])]),
+        "more": max(0, len(record.decisions) - _DECISIONS),
+    }
+
+
+def _rank(run: Run) -> tuple[bool, tuple[bool, bool, float]]:
+    return (run.job.ftm and not run.result.safe, badness(run))

@@ -7,6 +7,7 @@ here: to crash a node, kill it (`kill-node`).
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -24,6 +25,9 @@ from rampart.sim.faults.topic_faults import closed, topic_fault
 from rampart.sim.faults.wrong_numbers import Sizes
 
 PROCESS_FAULTS = ("kill", "stop", "wedge", "slow")
+
+_TOLD_LATER_S = 0.0
+"""Of an order in the plan: how long it lasts is filled in when the page orders it."""
 
 
 class Faults:
@@ -104,17 +108,23 @@ class Faults:
 
         A crash is a button of the node, and `MODE:TOPIC` the page puts together itself.
         """
-        found = [NamedFault(f.name, f.title, f.group, f.duration_s, injections=f.orders(""))
+        found = [NamedFault(f.name, f.title, f.group, _for_the_plan(f.duration_s),
+                            injections=f.orders("", _TOLD_LATER_S))
                  for f in self.named.values()]
         for name, (kind, title) in self.titled.items():
             orders = self.own(name, "", None)
             if not isinstance(orders, tuple):
                 raise TypeError(f"{name}: the page can order messages only")
-            found.append(NamedFault(
-                name, title, kind, orders[0].message.duration_s, orders=tuple(
-                    FaultOrder(o.topic.key, msgspec.json.encode(o.message).decode())
-                    for o in orders)))
+            lasts_s = _for_the_plan(orders[0].message.duration_s)
+            plain = [o.with_(duration_s=_TOLD_LATER_S) for o in orders]
+            found.append(NamedFault(name, title, kind, lasts_s, orders=tuple(
+                FaultOrder(o.topic.key, msgspec.json.encode(o.message).decode()) for o in plain)))
         return tuple(found)
+
+
+def _for_the_plan(lasts_s: float) -> float | None:
+    """Return how long a fault lasts as the plan says it, which is JSON and has no infinity."""
+    return None if math.isinf(lasts_s) else lasts_s
 
 
 def faults_of(spec: SystemSpec) -> Faults:

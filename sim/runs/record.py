@@ -16,7 +16,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
-from rampart.manager.strategies.decision_words import decision_in_words
+from rampart.manager.strategies.registry import decision_in_words
 from rampart.sim.faults.scenario import FaultOutcome
 
 KEPT = 10_000

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jinja2
 import msgspec
+from markupsafe import Markup
 
 from rampart.sim.runs.record import Interval, RunRecord
 
@@ -168,3 +169,47 @@ def ticks_of(duration_s: float) -> list[dict[str, Any]]:
     step_s = next((t for t in _TICKS if duration_s / t <= 10), 7200)
     return [{"left": round(100 * i * step_s / duration_s, 3), "text": clock(i * step_s)[:-2]}
             for i in range(int(duration_s // step_s) + 1)]
+
+
+class Moment(NamedTuple):
+    """Something that happened at `at_s`, simulated seconds; the kind chooses its symbol.
+
+    Kinds: fault, detected, narrow (the smallest margin), unsafe, end; "" without a symbol.
+    """
+
+    at_s: float
+    kind: str
+    name: str
+
+
+class RunPictures:
+    """Draws nothing; a robot's trial names a class derived from it, see `Trial.pictures`.
+
+    Args:
+        records: of all runs that are to be drawn.
+    """
+
+    style = Markup("")
+    """CSS that the pictures need."""
+
+    words = ""
+    """What a reader has to know to read them."""
+
+    def __init__(self, records: Sequence[Any]) -> None:
+        del records
+
+    def definitions(self) -> Markup:
+        """Return what several pictures refer to, such as a map, as HTML."""
+        return Markup("")
+
+    def picture(self, record: RunRecord, key: str, title: str, marks: Sequence[Moment]) -> Markup:
+        """Return the picture of a run as HTML.
+
+        Args:
+            record: of the run.
+            key: that makes ids in the page unique.
+            title: of the run.
+            marks: what is to be marked in it.
+        """
+        del record, key, title, marks
+        return Markup("")

@@ -157,6 +157,13 @@ class Trial:
         del why
         return self.recorder.record(now_s, faults=self.outcomes())
 
+    def concluded(self, verdict: Verdict, now_s: float, why: str) -> RunRecord:
+        """Return the record of a run that has ended for a reason, and was judged."""
+        return self.recorder.record(
+            now_s, faults=self.outcomes(), mission="success" if verdict.success else "fail",
+            safety=_SAFETY[verdict.safe],
+            reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
+
     def summary(self, record: RunRecord) -> dict[str, Any]:
         """Return what scripts rely on: the last line of stdout with --json."""
         return {
@@ -232,11 +239,7 @@ class JudgedTrial(Trial):
 
     def conclude(self, now_s: float, why: str) -> RunRecord:
         """Return the record of the run with the judge's verdict, and what became of faults."""
-        verdict = self._judge.verdict()
-        return self.recorder.record(
-            now_s, faults=self.outcomes(), mission="success" if verdict.success else "fail",
-            safety=_SAFETY[verdict.safe],
-            reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
+        return self.concluded(self._judge.verdict(), now_s, why)
 
     def judgement(self, record: RunRecord) -> Verdict:
         """Return the judge's verdict."""

@@ -26,10 +26,14 @@ from rampart.actors.runtime import checkpoint
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.guard import PERIOD_S, SUPERVISOR_PATIENCE_S
-from rampart.actors.supervision.processes import Living, ProcessHandle, SpawnerUnavailableError
+from rampart.actors.supervision.processes import (
+    ProcessHandle,
+    RunProcess,
+    SpawnerUnavailableError,
+)
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.supervisor import Supervisor
-from rampart.sim.virtual.timing import drawer, measured
+from rampart.sim.virtual.network import drawer, measured
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
 FIRST_PID = 1000
@@ -178,9 +182,9 @@ class VirtualMachine:
 
     # -- Processes: what the supervisor asks for ------------------------------------------------
 
-    def living(self) -> list[Living]:
+    def living(self) -> list[RunProcess]:
         """Return the processes that are there, the supervisor's own included."""
-        return [Living(p.names, p.pid, p.incarnation) for p in self._processes.values()]
+        return [RunProcess(p.pid, 0, 0, p.names, p.incarnation) for p in self._processes.values()]
 
     def fork(self, names: tuple[str, ...], incarnation: int) -> int:
         """Start a process; its first word comes after the measured time."""

@@ -17,7 +17,7 @@ from rampart.cli import output
 from rampart.cli.main import main
 from rampart.sim.runs.record import RunRecorder
 from rampart.testing import RealRun
-from tests import ROOT
+from tests import CELL, ROOT
 
 
 def refused(capsys, *arguments: str, code: int = 2) -> str:
@@ -76,14 +76,15 @@ def test_a_fault_of_a_process_with_what_does_not_go_with_it(capsys, arguments, l
 
 
 def test_every_object_says_its_format(capsys):
-    for arguments in (("check", "cell"), ("explain", "cell"), ("decide", "M_CURTAIN", "--system",
-                      "cell"), ("topic", "info", "manager/status", "--system", "cell")):
+    for arguments in (("check", str(CELL)), ("explain", str(CELL)), (
+            "decide", "M_CURTAIN", "--system", str(CELL)), (
+            "topic", "info", "manager/status", "--system", str(CELL))):
         assert main([*arguments, "--json"]) == 0
         assert next(iter(json.loads(capsys.readouterr().out).items())) == ("format", 1)
 
 
 def test_the_list_of_faults_is_of_the_system_that_is_named(capsys):
-    assert main(["inject", "--list", "--system", "cell"]) == 0
+    assert main(["inject", "--list", "--system", str(CELL)]) == 0
     told = capsys.readouterr().out
     nodes = told.splitlines()[-1].strip().split(", ")
     assert {"supervisor", "camera", "valve", "D_CURTAIN", "R_HOLD"} <= set(nodes)

@@ -10,7 +10,7 @@ import pytest
 
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
-from tests import ROOT
+from tests import CELL, ROOT
 from tests.whole.checkpoint_runs import write_short_mission
 
 
@@ -33,7 +33,7 @@ def test_messages_and_help_say_what_was_typed(capsys, start, name):
 
 def test_a_system_without_an_application_offers_no_options_or_examples_of_a_robot(capsys):
     with pytest.raises(SystemExit):
-        launch.main(["--system", "cell", "--help"])
+        launch.main(["--system", str(CELL), "--help"])
     told = capsys.readouterr().out
     assert "--airport" not in told
     assert "osmosis_control" not in told

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from contextlib import AsyncExitStack
 
 import msgspec
 import pytest
 
 from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -43,6 +45,7 @@ class Everything(Actor):
         self.obstacles: dict[str, m.ObstacleCommand] = {}
         self.resets = 0
         self.orders: list[bm.Injection] = []
+        self.actuator_faults: list[m.ActuatorFault] = []
         self.time_s = 0.0
 
     @every(0.1)
@@ -63,6 +66,20 @@ class Everything(Actor):
         self.list_obstacles()
         if self.holders:
             self.publish(ftm_topics.HOLDS, fm.Holds("brake", self.holders))
+
+    @on(topics.ACTUATOR_FAULT)
+    def actuator(self, message: m.ActuatorFault, _header: Header) -> None:
+        def tell(affected: int, *, finished: bool) -> None:
+            self.publish(bus_topics.INJECTION_REPORT, bm.InjectionReport(
+                message.injection, self.name, affected, finished, ""))
+
+        self.actuator_faults.append(message)
+        if message.duration_s == 0:
+            tell(0, finished=True)
+            return
+        tell(1, finished=False)
+        if math.isfinite(message.duration_s):
+            self.call_later(message.duration_s, lambda: tell(40, finished=True))
 
     def list_obstacles(self) -> None:
         self.publish(topics.OBSTACLES, m.ObstacleList(tuple(self.obstacles.values())))
@@ -305,6 +322,20 @@ async def test_an_injection_acts_and_tells_how_many_messages_it_affected(run, ca
     assert injection["finished"] is True
     assert 10 < injection["affected"] < 30
     assert len(run.node.orders) == 1, "copies of an order must not reach the actor"
+
+
+async def test_a_fault_of_the_robot_s_own_is_carried_out_by_its_node(run, capsys):
+    code, out, _ = await run.call(capsys, "inject", "stuck-wheel:rear-left", "--duration", "1")
+    assert (code, out) == (0, "stuck-wheel:rear-left: in force at simulator for 1 s\n"
+                              "stuck-wheel:rear-left: over, 40 ticks changed\n")
+    (ordered,) = run.node.actuator_faults
+    assert (ordered.wheel, ordered.duration_s) == ("rear left", 1.0)
+    code, out, _ = await run.call(capsys, "inject", "brake-failure", "--duration", "inf", "--json")
+    told = json.loads(out)
+    assert (code, told["effective"], told["fault"]) == (0, True, "brake-failure")
+    (one,) = told["injections"]
+    assert (one["topic"], one["mode"], one["duration_s"], one["finished"]) == (
+        "world/actuator_fault", None, None, False)
 
 
 async def test_an_injection_at_once_returns_while_the_fault_lasts(run, capsys):

@@ -24,6 +24,7 @@ from rampart.cli.operate.inject_verbs import choose
 from rampart.cli.output import UsageError
 from rampart.sim.campaign.job import read_document_of
 from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
+from tests import CELL
 from tests.porter_actors import write_porter_system
 
 
@@ -111,7 +112,7 @@ def _no_runs_of_others(monkeypatch):
 @pytest.mark.parametrize("verb", ["verify", "cut-sets", "table", "tree", "topic list"])
 def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     shown = []
-    for spec in (["cell"], ["--system", "cell"], []):
+    for spec in ([str(CELL)], ["--system", str(CELL)], []):
         assert main([*verb.split(), *spec, "--json"]) == 0
         shown.append(told(capsys))
     assert shown[0] == shown[1] != shown[2]
@@ -132,7 +133,7 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["table", "--differing"], ["--differing", "--strategy"]),
     (["table", "--strategy", "safety-first", "--strategy", "bravely"], ["'bravely'"]),
     (["table", "--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
-    (["verify", "no.toml"], ["rampart: no.toml: No such file", "name of a shipped one: cell, os"]),
+    (["verify", "no.toml"], ["rampart: no.toml: No such file", "name of a shipped one: os"]),
     (["inject", "gremlins"], ["'gremlins'", "`rampart inject --list`"]),
     (["inject", "laser-dropuot"], ["did you mean laser-dropout?"]),
     (["inject", "laser-drift"], ["'laser-drift'", "quartz"]),
@@ -143,7 +144,11 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["inject", "drop:inject/report"], ["injections themselves"]),
     (["inject", "drop:detection/{name}"], ["no topic"]),
     (["inject", "wrong-graph", "--add", "x_m=1"], ["--add", "--topic"]),
-    (["inject", "wrong-graph", "--system", "cell"], ["--system cell: goes with --list"]),
+    (["inject", "wrong-graph", "--system", "osmosis"], ["--system osmosis: goes with --list"]),
+    (["inject", "obstacle-ahead"], ["beside a run; start one with --fault obstacle-ahead@"]),
+    (["inject", "weak-wheel:nose"], ["no wheel 'nose'; there are: front-left"]),
+    (["inject", "stuck-wheel", "--share", "0.5"], ["--share goes with a fault of a topic"]),
+    (["inject", "stuck-wheel", "--mode", "drop"], ["--mode goes with a fault of a topic"]),
     (["inject", "wrong-graph", "--share", "0"], ["--share 0"]),
     (["inject", "wrong-graph", "--share", "1.5"], ["--share 1.5"]),
     (["inject", "wrong-graph", "--share", "nan"], ["--share nan"]),
@@ -219,6 +224,7 @@ def test_the_list_has_a_part_for_each_group_and_a_line_for_each_topic(capsys):
     text = told(capsys)
     lines = {line.split()[0]: line for line in text.splitlines() if line}
     assert {"command-not-updated", "laser-dropout", "localization/pose"} <= set(lines)
+    assert lines["brake-failure"].split(maxsplit=1)[1] == "30  the brakes do not brake"
     assert lines["summit_xl/brake"].endswith("all but corrupt")
     assert "world/truth" not in lines
     assert "inject/report" not in lines
@@ -376,18 +382,17 @@ def test_the_help_of_each_verb_teaches_with_examples(path, parser, capsys):
 
 def test_a_file_comes_before_a_system_that_ships_for_all_who_look_for_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "cell").mkdir()
+    (tmp_path / "paper").mkdir()
     (tmp_path / "osmosis").write_text("")
-    asked = ("paper", "cell", "osmosis", "nowhere", "x" * 300)
+    asked = ("paper", "osmosis", "nowhere", "x" * 300)
     assert [shipped.find(name) for name in asked] == [
-        shipped.SHIPPED / "paper.toml", shipped.SHIPPED / "cell.toml", Path("osmosis"),
-        Path("nowhere"), Path("x" * 300)]
+        shipped.SHIPPED / "paper.toml", Path("osmosis"), Path("nowhere"), Path("x" * 300)]
     with pytest.raises(UsageError, match="name too long; a spec is right"):
         systems.load("x" * 300)
-    assert systems.load("cell").name == "cell"
-    (tmp_path / "cell").rmdir()
-    (tmp_path / "cell").write_bytes(shipped.DEFAULT.read_bytes())
-    assert systems.load("cell").name == "osmosis"
+    assert systems.load("paper").name == "paper"
+    (tmp_path / "paper").rmdir()
+    (tmp_path / "paper").write_bytes(shipped.DEFAULT.read_bytes())
+    assert systems.load("paper").name == "osmosis"
     read_document_of.cache_clear()  # what a campaign's job runs is what was checked
-    assert read_document_of("cell")[1]["name"] == "osmosis"
+    assert read_document_of("paper")[1]["name"] == "osmosis"
     read_document_of.cache_clear()

@@ -12,7 +12,7 @@ from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import topics
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import markdown, uses
-from tests import ROOT, porter_actors
+from tests import ROOT, porter_actors, system_file
 from tests.porter_actors import AXLE, LOAD, write_porter_system
 
 DOCUMENT = ROOT / "topics.md"
@@ -36,15 +36,17 @@ def test_ground_truth_is_read_by_no_node_of_the_controller():
 
 
 @pytest.mark.parametrize("name", ["paper", "osmosis", "cell"])
-def test_the_shipped_systems_have_the_common_topics_and_no_other(name):
-    assert system_topics(systems.load(name)) == (ftm_topics.ALL if name == "cell" else topics.ALL)
+def test_whole_systems_have_the_common_topics_and_no_other(name):
+    assert system_topics(systems.load(str(system_file(name)))) == (
+        ftm_topics.ALL if name == "cell" else topics.ALL)
 
 
 def test_who_asks_only_for_a_robot_s_own_topics_loads_no_actor_that_ships(tmp_path, monkeypatch):
     loaded = []
     monkeypatch.setattr("rampart.actors.layout.system_topics.load_class",
                         lambda path: loaded.append(path) or load_class(path))
-    assert [own_topics(systems.load(name)) for name in ("paper", "osmosis", "cell")] == [()] * 3
+    assert [own_topics(systems.load(str(system_file(name))))
+            for name in ("paper", "osmosis", "cell")] == [()] * 3
     assert loaded == []
     assert own_topics(systems.load(str(write_porter_system(tmp_path)))) == (LOAD, AXLE)
 

@@ -15,14 +15,14 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Header
-from rampart.actors.supervision.node_process import _complain
 from rampart.cli.look import top_view
 from rampart.cli.look.topic_verbs import in_line
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.output import print_json, print_table, say, say_text, warn
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.files.plain_text import one_line, printable
-from rampart.sim.osmosis.trial.console import MissionConsole
+from rampart.files.streams import complain
+from rampart.sim.osmosis.trial.mission_trial import MissionConsole
 from rampart.sim.runs.console import LINES_PER_S, REPORTS_PER_S
 from tests.fuzz.handler_fuzz import system
 from tests.fuzz.message_extremes import TEXTS, all_topics
@@ -67,7 +67,7 @@ def test_what_tools_print_is_harmless_whatever_they_are_told(text, capsys):
     print_table(("node",), [(text,)])
     print_json({"by": text})
     say(in_line(fm.Reset(text, text)))
-    _complain(text)
+    complain(text)
     out, err = capsys.readouterr()
     assert harmless(out + err)
     *_, end, reset = [line for line in out.splitlines() if line]

@@ -37,14 +37,14 @@ from rampart.sim.campaign.store import _NO_RUN, _run
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
-from tests import ROOT
+from tests import CELL, ROOT
 from tests.actors.osmosis.airport.test_formats import GRAPH, SCALE, TOML
 from tests.actors.recording.samples import documents, pose
 from tests.fuzz.samples import sample
 from tests.fuzz.target import target
 
 SYSTEMS = ROOT / "systems"
-_CELL = (SYSTEMS / "cell.toml").read_text("utf-8")
+_CELL = CELL.read_text("utf-8")
 _PAPER = (SYSTEMS / "paper.toml").read_text("utf-8")
 _SMALL = """
 name = "small"

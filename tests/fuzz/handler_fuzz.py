@@ -29,7 +29,6 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from rampart import systems as shipped
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.layout import Layout, load_run
@@ -53,6 +52,7 @@ from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.console import Console
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from tests import system_file
 from tests.fuzz.message_extremes import Drawer, all_topics
 
 SYSTEMS = ("osmosis", "paper", "cell")
@@ -88,7 +88,7 @@ class SlowError(Exception):
 
 @dataclass(frozen=True)
 class System:
-    """A shipped system with what its actors share; nothing listens on a port."""
+    """A system with what its actors share; nothing listens on a port."""
 
     spec: SystemSpec
     plan: RunPlan
@@ -99,9 +99,9 @@ class System:
 
 @cache
 def system(name: str) -> System:
-    """Return a shipped system by its name."""
-    spec = systems.load(name)
-    plan = RunPlan("fuzz", system_file=str(shipped.find(name)), launcher_pid=1,
+    """Return a system by its name."""
+    spec = systems.load(str(system_file(name)))
+    plan = RunPlan("fuzz", system_file=str(system_file(name)), launcher_pid=1,
                    options={} if name == "cell" else {"obstacles": 1})
     run = load_run(plan, spec)
     layout = Layout(plan, spec, run.application)

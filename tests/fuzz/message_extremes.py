@@ -21,6 +21,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.osmosis import topics
 from rampart.cli import systems
+from tests import system_file
 
 Plain = Any
 Edge = tuple[str, Plain, bool]
@@ -52,7 +53,7 @@ _EMPTY: tuple[tuple[Any, Plain], ...] = (
 def all_topics() -> tuple[Topic[Any], ...]:
     """Return the topics of the shipped systems, each key once."""
     found = {topic.key: topic for name in ("paper", "osmosis", "cell")
-             for topic in system_topics(systems.load(name))}
+             for topic in system_topics(systems.load(str(system_file(name))))}
     return tuple({**{topic.key: topic for topic in topics.ALL}, **found}.values())
 
 

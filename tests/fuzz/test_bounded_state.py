@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-import rampart.sim.osmosis.trial.console
+import rampart.sim.osmosis.trial.mission_trial
 import rampart.sim.osmosis.trial.record
 import rampart.sim.runs.console
 import rampart.sim.runs.record
@@ -160,7 +160,7 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
     monkeypatch.setattr(rampart.sim.runs.record, "KEPT", 500)
     monkeypatch.setattr(rampart.sim.osmosis.trial.record, "TRACK_KEPT", 500)
     monkeypatch.setattr(rampart.sim.runs.console, "MANY", 500)
-    monkeypatch.setattr(rampart.sim.osmosis.trial.console, "MOST", 500)
+    monkeypatch.setattr(rampart.sim.osmosis.trial.mission_trial, "MOST", 500)
     of = system("osmosis")
     run = MissionTrial(of.run, 60.0, io.StringIO())
     picture, views = RunPicture(OsmosisLines()), OsmosisViews()

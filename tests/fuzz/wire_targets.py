@@ -23,8 +23,8 @@ from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.run.run_info import RunInfo, read_info
 from rampart.actors.runtime.checkpoint import StateError
+from rampart.actors.runtime.process_usage import parse_stat
 from rampart.actors.supervision.process_title import parse_title
-from rampart.actors.supervision.process_usage import parse_stat
 from rampart.actors.supervision.spawner import Adapt, ForkRequest, Ping, Reply, Request, SetOrigin
 from rampart.actors.web.access import Access, page_url, shown_token
 from rampart.manager.actor import MANAGER_STATE
@@ -119,7 +119,7 @@ _READER = RequestReader(OSMOSIS_REQUESTS)
 
 @target("page-request", refuses=(RequestError,), kind="json", samples=lambda: [
         b'{"type":"reset","recovery":"RM1"}', b'{"type":"order","action":"pause","reason":"x"}',
-        b'{"type":"stick","held":true,"ticket":3,"forward":0.5,"left":-1}',
+        b'{"type":"stick","panel":"Drive","held":true,"ticket":3,"forward":0.5,"left":-1}',
         b'{"type":"inject","fault":"gps-bias","duration_s":5,"permanent":false}',
         b'{"type":"signal","node":"hmi","signal":"KILL"}', b'{"type":"strategy","name":"x"}'])
 def page_request(data: bytes) -> None:

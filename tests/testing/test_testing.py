@@ -20,6 +20,7 @@ from rampart.testing import (
     wait_until,
     wake,
 )
+from tests import CELL
 
 
 class Failing(Actor):
@@ -79,7 +80,7 @@ def test_one_hears_what_nodes_say_and_forgeries_are_rejected():
 
 def test_a_node_that_no_file_has_is_named():
     async def scenario():
-        async with VirtualSystem.load("cell") as system:
+        async with VirtualSystem.load(CELL) as system:
             system.start_node("camera")
             system.start_node("nobody")
 

@@ -3,15 +3,16 @@
 import pytest
 
 from rampart.testing import virtual_run
+from tests import CELL
 
 
 def test_a_system_runs_with_its_faults_as_long_as_it_is_told():
-    done = virtual_run("cell", "kill:gripper@1", seconds=3.0, seed=4)
+    done = virtual_run(CELL, "kill:gripper@1", seconds=3.0, seed=4)
     assert done.record.restarts["gripper"] == 1
     assert done.failures == ()
-    assert done.trace == virtual_run("cell", "kill:gripper@1", seconds=3.0, seed=4).trace
+    assert done.trace == virtual_run(CELL, "kill:gripper@1", seconds=3.0, seed=4).trace
 
 
 def test_a_system_without_an_end_has_to_be_told_when():
-    with pytest.raises(ValueError, match=r"cell: has no \[end\]"):
-        virtual_run("cell")
+    with pytest.raises(ValueError, match=r"cell\.toml: has no \[end\]"):
+        virtual_run(CELL)

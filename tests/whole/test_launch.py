@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from rampart.actors.osmosis.airport.formats import load_world
+from rampart.actors.osmosis.airport.formats import load_with_truth
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun, free_base_port
-from tests import ROOT
+from tests import CELL, ROOT
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
 
@@ -27,7 +27,7 @@ EVERYBODY_BUT_THE_MISSION_MANAGER = (
 
 
 def test_the_world_of_the_tests_is_the_one_they_think():
-    truth = load_world("vallombre").light_factors
+    truth = load_with_truth("vallombre")[1].light_factors
     assert {n for n, f in truth.items() if n.startswith("A") and f < 0.5} == set(BROKEN_A)
 
 
@@ -239,7 +239,7 @@ BAD_USAGE = [
     (["--report", __file__], f"--report {__file__}: no directory that can be written (File exists"),
     (["--system", "/tmp"], "--system /tmp: is a directory; a spec is right, or the name of a"),
     (["--system", sys.executable], f"{sys.executable}: $: not UTF-8 text"),
-    (["--airport", str(ROOT / "systems" / "cell.toml")], "cell.toml: title: 'Pick and place behi"),
+    (["--airport", str(CELL)], "cell.toml: title: 'Pick and place behi"),
     (["--fault", "gps-bias@goal99"], "--fault gps-bias@goal99: mission AB has 5 goals"),
 ]
 

@@ -18,9 +18,10 @@ from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
 from rampart.manager.strategies.registry import decide
 from rampart.testing import RealRun
+from tests import CELL as FILE
 from tests import ROOT
 
-TEXT = (ROOT / "systems" / "cell.toml").read_text(encoding="utf-8")
+TEXT = FILE.read_text(encoding="utf-8")
 CELL = parse_specification(TEXT, "cell.toml")
 
 
@@ -126,7 +127,7 @@ def test_hazards_are_in_the_user_s_own_words():
 
 @pytest.mark.processes
 def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_from(tmp_path):
-    with RealRun(tmp_path, "cell", "--duration", "40") as run:
+    with RealRun(tmp_path, str(FILE), "--duration", "40") as run:
         run.wait_for("ctrl-C ends it")
         run.sleep_until(1.0)
         run.kill("arm_controller")
@@ -155,8 +156,8 @@ def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_fro
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["--system", "cell", "--mission", "A"], "--mission: no option of the launcher or of cell"),
-    (["--system", "cell", "--duration", "-1"], "--duration -1: must be above 0"),
+    (["--system", str(FILE), "--mission", "A"], "--mission: no option of the launcher or of cell"),
+    (["--system", str(FILE), "--duration", "-1"], "--duration -1: must be above 0"),
     (["--duration", "5"], "--duration 5: a mission ends by itself"),
     (["--shadow", "bold"], "--shadow bold: unknown strategy; known: safety-first"),
 ])
@@ -168,9 +169,9 @@ def test_bad_usage_is_one_line(arguments, words, tmp_path):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_the_verbs_take_it_by_name():
-    for verb in (["verify", "cell", "--json"], ["cut-sets", "cell", "--json"],
-                 ["table", "--system", "cell", "--json"]):
+def test_the_verbs_take_it():
+    for verb in (["verify", str(FILE), "--json"], ["cut-sets", str(FILE), "--json"],
+                 ["table", "--system", str(FILE), "--json"]):
         done = subprocess.run([sys.executable, "-m", "rampart.cli.main", *verb], cwd=ROOT,
                               capture_output=True, text=True, check=False, timeout=60)
         assert done.returncode == 0, done.stderr
@@ -179,6 +180,7 @@ def test_the_verbs_take_it_by_name():
 
 def test_under_its_own_strategy_every_property_holds():
     done = subprocess.run(
-        [sys.executable, "-m", "rampart.cli.main", "verify", "cell", "--strict", "--strategy",
-         CELL.strategy], cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
+        [sys.executable, "-m", "rampart.cli.main", "verify", str(FILE), "--strict",
+         "--strategy", CELL.strategy], cwd=ROOT, capture_output=True, text=True, check=False,
+        timeout=60)
     assert done.returncode == 0, done.stdout

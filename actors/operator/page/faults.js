@@ -82,7 +82,7 @@ export class Faults {
     const mode = chosen.endsWith(":") ? chosen.slice(0, -1) : "";
     const fault = this.known.get(chosen);
     $("fault-topic").parentElement.hidden = !mode;
-    $("fault-duration").placeholder = fault ? fault.duration_s : this.ownDuration;
+    $("fault-duration").placeholder = fault ? fault.duration_s ?? "for good" : this.ownDuration;
     $("fault-duration").disabled = $("fault-permanent").checked;
     say($("fault-title"), fault ? fault.title : WAYS[mode] || "");
   }

@@ -1,7 +1,8 @@
-// What panels can show of fields of topics. A field's section of the picture is named as the field,
+// What panels can show of fields of topics, and a stick that says them. A field's section of the picture is named as the field,
 // "topic:field", and has its value, whether that is stale, and where the past is shown its time.
 
 import { element, figure, say, svg } from "./dom.js";
+import { Stick } from "./stick.js";
 
 const label = (field) => field.slice(field.indexOf(":") + 1);
 
@@ -314,4 +315,4 @@ class Place extends Remembering {
   }
 }
 
-export const WIDGETS = Object.fromEntries([Gauge, Plot, Table, States, Text, Place].map((kind) => [kind.kind, kind]));
+export const WIDGETS = Object.fromEntries([Gauge, Plot, Table, States, Text, Place, Stick].map((kind) => [kind.kind, kind]));

@@ -38,16 +38,7 @@ def load_airport(name_or_path: str | Path, scale: MaskScale | None = None) -> Ai
     Raises:
         AirportError: one line that names file, field, value and what would be right.
     """
-    return _load(name_or_path, scale)[0]
-
-
-def load_world(name_or_path: str | Path, scale: MaskScale | None = None) -> WorldTruth:
-    """Load the truth about an airport's lights, for the simulator only.
-
-    Raises:
-        AirportError: as `load_airport`.
-    """
-    return _load(name_or_path, scale)[1]
+    return load_with_truth(name_or_path, scale)[0]
 
 
 def load_mission(name_or_path: str | Path, airport: Airport) -> Mission:
@@ -81,7 +72,13 @@ def files_of(source: Path) -> list[Path]:
     return [source, *sorted([*foreign.images_beside(source), *source.parent.glob("*.miss")])]
 
 
-def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, WorldTruth]:
+def load_with_truth(name_or_path: str | Path,
+                    scale: MaskScale | None = None) -> tuple[Airport, WorldTruth]:
+    """Load an airport as `load_airport`, and the truth about its lights, for the simulator only.
+
+    Raises:
+        AirportError: as `load_airport`.
+    """
     with readable(name_or_path, "give a file that exists"):
         path = _find(name_or_path)
         own = path.suffix == ".toml"

@@ -13,7 +13,6 @@ import itertools
 import math
 from functools import lru_cache
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -23,30 +22,31 @@ from rampart.actors.osmosis.airport.model import Airport, Point, show
 
 Points = npt.NDArray[np.float64]
 
+# What a good route keeps to, in metres.
+CLEARANCE_M = 0.6
+"""From each leg to the prohibited area; half the robot's diagonal and a little."""
 
-class RouteLimits(msgspec.Struct, frozen=True):
-    """What a good route keeps to, in metres.
+START_M = 3.0
+"""From the robot to the nearest point of the route."""
 
-    Args:
-        clearance_m: from each leg to the prohibited area; half the robot's diagonal and a little.
-        start_m: from the robot to the nearest point of the route.
-        end_m: from the last waypoint to the goal.
-        aside_m: from a leg to the nearest edge; a straightened row is off by up to half a metre.
-        last_aside_m: the same for the last leg: a goal within a metre of the graph is headed for
-            from the last node on.
-        approach_m: longest way from the robot to the graph.
-        turnoff_m: longest way from the graph to the goal.
-        step_m: how densely legs are looked at.
-    """
+END_M = 0.2
+"""From the last waypoint to the goal."""
 
-    clearance_m: float = 0.6
-    start_m: float = 3.0
-    end_m: float = 0.2
-    aside_m: float = 0.6
-    last_aside_m: float = 1.6
-    approach_m: float = 12.5
-    turnoff_m: float = 3.2
-    step_m: float = 0.5
+ASIDE_M = 0.6
+"""From a leg to the nearest edge; a straightened row is off by up to half a metre."""
+
+LAST_ASIDE_M = 1.6
+"""The same for the last leg: a goal within a metre of the graph is headed for from the last node
+on."""
+
+APPROACH_M = 12.5
+"""Longest way from the robot to the graph."""
+
+TURNOFF_M = 3.2
+"""Longest way from the graph to the goal."""
+
+STEP_M = 0.5
+"""How densely legs are looked at."""
 
 
 class RouteCheck:
@@ -62,7 +62,6 @@ class RouteCheck:
         ends = np.reshape(
             [(*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges], (-1, 4))
         self._from, self._along = ends[:, :2], ends[:, 2:] - ends[:, :2]
-        self._limits = RouteLimits()
         self._of_shape = lru_cache(maxsize=8)(self._find_in_shape)
 
     def fault(self, waypoints: tuple[Point, ...], robot: Point | None, goal: Point | None) -> str:
@@ -77,14 +76,13 @@ class RouteCheck:
             return "the route has no waypoints"
         if not all(is_sane(*waypoint) for waypoint in waypoints):
             return "a waypoint is not finite, or farther away than anything can be"
-        limits = self._limits
-        if goal is not None and not math.dist(waypoints[-1], goal) <= limits.end_m:
+        if goal is not None and not math.dist(waypoints[-1], goal) <= END_M:
             return (f"the route ends at {show(waypoints[-1])},"
                     f" {math.dist(waypoints[-1], goal):.1f} m from the goal {show(goal)}")
         if robot is not None:
             way = shapely.linestrings(waypoints if len(waypoints) > 1 else waypoints * 2)
             off_m = float(shapely.distance(way, shapely.points(robot)))
-            if not off_m <= limits.start_m:
+            if not off_m <= START_M:
                 return f"the robot at {show(robot)} is {off_m:.1f} m from the route"
         return self._of_shape(waypoints)
 
@@ -102,32 +100,31 @@ class RouteCheck:
         if not shapely.covers(self._allowed, line):
             return "crosses the prohibited area"
         clearance_m = float(shapely.distance(self._boundary, line))
-        if clearance_m < self._limits.clearance_m:
+        if clearance_m < CLEARANCE_M:
             return (f"passes {clearance_m:.2f} m from the prohibited area,"
-                    f" {self._limits.clearance_m:.2f} m is the least")
+                    f" {CLEARANCE_M:.2f} m is the least")
         return ""
 
     def _off_graph(self, a: Point, b: Point, *, first: bool, last: bool) -> str:
         """Why a leg is no part of the graph: it leaves it for longer than it may."""
         length_m = math.dist(a, b)
-        count = 1 + max(1, math.ceil(length_m / self._limits.step_m))
+        count = 1 + max(1, math.ceil(length_m / STEP_M))
         share = np.linspace(0.0, 1.0, count)[:, None]
-        on = self._aside_m(np.array(a) + share * (np.array(b) - np.array(a))) <= (
-            self._limits.last_aside_m if last else self._limits.aside_m)
+        aside_m = self._aside_m(np.array(a) + share * (np.array(b) - np.array(a)))
+        on = aside_m <= (LAST_ASIDE_M if last else ASIDE_M)
         if bool(on.all()):
             return ""
         if not bool(on.any()):
             # From off the graph straight to a goal off the graph: both at the same edge.
-            most_m = self._limits.turnoff_m if first and last else 0.0
+            most_m = TURNOFF_M if first and last else 0.0
             return "" if length_m <= most_m else "lies on no edge of the graph"
         begins, ends = int(np.argmax(on)), count - 1 - int(np.argmax(on[::-1]))
         if not bool(on[begins:ends + 1].all()):
             return "leaves the graph on the way"
-        if begins > 0 and not (first and begins * length_m / (count - 1)
-                               <= self._limits.approach_m):
+        if begins > 0 and not (first and begins * length_m / (count - 1) <= APPROACH_M):
             return "begins off the graph"
         if ends < count - 1 and not (last and (count - 1 - ends) * length_m / (count - 1)
-                                     <= self._limits.turnoff_m):
+                                     <= TURNOFF_M):
             return "ends off the graph"
         return ""
 

@@ -74,7 +74,7 @@ class PilotOutputMonitor(Finding):
         self._asked: deque[tuple[float, float, float]] = deque(maxlen=64)
         self._held: dict[str, tuple[float, float, float]] = {}
         self._newest_s = -math.inf
-        self._first_due_s = start_s + grace_s
+        self._overdue_s = start_s + grace_s
         self._last: tuple[float, float, float] | None = None
         self._wrong = Lasting(self.limits.wrong_s)
         self._well = Lasting(self.limits.hold_s)
@@ -85,12 +85,6 @@ class PilotOutputMonitor(Finding):
     def due_s(self) -> float:
         """When the next output is overdue."""
         return math.inf if self.active else self._overdue_s
-
-    @property
-    def _overdue_s(self) -> float:
-        if self._newest_s == -math.inf:
-            return self._first_due_s
-        return self._newest_s + self.limits.timeout_s
 
     def expire(self, now_s: float) -> None:
         """Conclude from the time without an output."""
@@ -121,6 +115,7 @@ class PilotOutputMonitor(Finding):
             self._last = None
         if is_possible(stamp_s, now_s):
             self._newest_s = max(self._newest_s, min(stamp_s, now_s))
+            self._overdue_s = self._newest_s + self.limits.timeout_s
         fresh = now_s < self._overdue_s
         self.known = self.known or (fresh and self._newest_s > -math.inf)
         last, self._last = self._last, (now_s, linear_mps, angular_radps)

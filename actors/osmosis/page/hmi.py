@@ -1,7 +1,7 @@
 """The operator's page of Osmosis: hands missions and orders to the controller, shows the airport.
 
 What it must not do after a respawn is decided in `submission`, which orders make sense in `orders`,
-who drives in `stick`.
+what a stick does in `driving`.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ class OsmosisHmi(Hmi):
         camera: str = ""
 
     parameters: Parameters
-    outputs = (*Hmi.outputs, topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.JOYSTICK,
-               topics.ACTUATOR_FAULT)
+    outputs = (*Hmi.outputs, topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.ACTUATOR_FAULT)
     requests = OSMOSIS_REQUESTS
     files = Path(__file__).with_name("files")
     panels = (Panel(title="Airport", script="map.js"), Panel(title="Mission", script="mission.js"),
               Panel(title="Safety Pilot", script="pilot.js"),
-              Panel(title="Drive", script="drive.js"))
+              Panel(title="Drive", held=f"{topics.JOYSTICK.key}:dead_man", stick=(
+                  f"{topics.JOYSTICK.key}:forward", f"{topics.JOYSTICK.key}:left")))
     shown = (*Hmi.shown, topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE,
              topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES, topics.LIGHT_MEASURED,
              topics.BASE_STATUS)
@@ -79,7 +79,7 @@ class OsmosisHmi(Hmi):
         return OsmosisState(lights_shown(self._airport) if self._airport else None)
 
     def _make_operating(self) -> Driving:
-        return Driving(self, self._state)
+        return Driving(self, self._state, self._panels)
 
     def _make_camera(self) -> CameraEye | None:
         module = self.parameters.camera

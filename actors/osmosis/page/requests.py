@@ -19,16 +19,4 @@ class OrderRequest(Request, frozen=True, tag="order"):
     reason: Name = ""
 
 
-class StickRequest(Request, frozen=True, tag="stick"):
-    """Where the operator's stick is, and whether the dead man is held.
-
-    `ticket` is the newest that the page was given (`stick`). Forward and left are in [-1, 1].
-    """
-
-    held: bool
-    ticket: int = 0
-    forward: float = 0.0
-    left: float = 0.0
-
-
-OSMOSIS_REQUESTS: tuple[type[Request], ...] = (*REQUESTS, StartRequest, OrderRequest, StickRequest)
+OSMOSIS_REQUESTS: tuple[type[Request], ...] = (*REQUESTS, StartRequest, OrderRequest)

@@ -2,38 +2,10 @@
 
 from __future__ import annotations
 
-from rampart.actors.ftm.messages import RecoveryCommand
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import PilotMode, PilotOrder, PilotStatus
-from rampart.actors.recovery.holding import HeldOrder
-from rampart.actors.recovery.module import RecoveryModule
+from rampart.actors.recovery.holding import HeldOrder, HeldRecovery
 from rampart.actors.runtime.actor import Context, Header, on
-
-
-class HeldRecovery(RecoveryModule):
-    """Gives an order and keeps it in force: base of RM1, RM2, RM5 and RM8.
-
-    Attributes:
-        order: that it gives.
-    """
-
-    order: HeldOrder
-
-    def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Give the order."""
-        self.order.act(command, renewed=renewed)
-
-    def let_go(self) -> None:
-        """End the order."""
-        self.order.let_go()
-
-    def stay_idle(self) -> None:
-        """End an order that an earlier incarnation may have left behind."""
-        self.order.stay_idle()
-
-    def repeat(self) -> None:
-        """Repeat the order or its end."""
-        self.order.repeat()
 
 
 class PilotRecovery(HeldRecovery):

@@ -5,8 +5,7 @@ from __future__ import annotations
 from rampart.actors.ftm.messages import RecoveryCommand
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import BaseStatus, BrakeCommand
-from rampart.actors.osmosis.recovery.controlled_stop import HeldRecovery
-from rampart.actors.recovery.holding import HeldOrder
+from rampart.actors.recovery.holding import HeldOrder, HeldRecovery
 from rampart.actors.runtime.actor import Context, Header, on
 
 _FOUND_ENGAGED = "the brake was found engaged"

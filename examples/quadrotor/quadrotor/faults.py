@@ -7,6 +7,7 @@ the attitude, and this controller does not try to fly on while it spins.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,9 +15,6 @@ from quadrotor import topics as t
 from rampart import Disturbance, Fault, Faults, Order, ScenarioError, Topic
 
 _WEAK, _DRAIN = 0.7, 12.0
-_FOR_GOOD_S = 3600.0
-"""Longer than any flight. (A plan cannot carry infinity to the processes of a run.)"""
-
 _KINDS = {"weak-rotor": "rotor", "battery-drain": "battery"}
 
 
@@ -36,7 +34,7 @@ class QuadrotorFaults(Faults):
                 add_fields={"x_m": 8.0}),
         _sensor("gps-drift", "the GPS drifts north by 0.5 m/s", t.GPS, "corrupt", 60.0,
                 ramp_fields={"y_m": 0.5}),
-        _sensor("gps-dropout", "the GPS has no fix any more", t.GPS, "drop", _FOR_GOOD_S),
+        _sensor("gps-dropout", "the GPS has no fix any more", t.GPS, "drop", math.inf),
         _sensor("barometer-bias", "the barometer says 6 m too little", t.BAROMETER, "corrupt", 30.0,
                 add_fields={"altitude_m": -6.0}),
         _sensor("barometer-stuck", "the barometer repeats itself", t.BAROMETER, "stuck", 60.0),
@@ -61,7 +59,7 @@ class QuadrotorFaults(Faults):
         if kind not in _KINDS:
             return None
         weak = kind == "weak-rotor"
-        lasts_s = _FOR_GOOD_S if duration_s is None else duration_s
+        lasts_s = math.inf if duration_s is None else duration_s
         try:
             rotor = int(details.pop(0)) if weak and details else 0
             factor = float(details.pop(0)) if details else _WEAK if weak else _DRAIN

@@ -1,4 +1,4 @@
-"""The injector of Osmosis: it knows the goals of the mission, and puts obstacles on the way."""
+"""The observer of Osmosis, and its injector, which puts obstacles on the way."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Header, on
 from rampart.sim.faults.injector import Injector, PlannedAction
 from rampart.sim.osmosis.trial.faults import SuddenObstacle
+from rampart.sim.runs.observer import Observer
 
 
 class OsmosisInjector(Injector):
@@ -58,3 +59,18 @@ class OsmosisInjector(Injector):
         if math.isfinite(action.duration_s):
             gone = m.ObstacleCommand(name, False, there.x_m, there.y_m, there.radius_m)
             self.call_later(action.duration_s, lambda: self.publish(topics.OBSTACLE, gone))
+
+
+class OsmosisObserver(Observer):
+    """Passes what the robot says to its sinks as well."""
+
+    @on(topics.MISSION_STATUS)
+    @on(topics.CONTROL_STATUS)
+    @on(topics.LIGHT_MEASURED)
+    @on(topics.POSE)
+    @on(topics.PILOT_STATUS)
+    @on(topics.TRUTH)
+    @on(topics.OBSTACLES)
+    def heard_of_robot(self, message: Any, header: Header) -> None:
+        """Pass one message on."""
+        self.heard(message, header)

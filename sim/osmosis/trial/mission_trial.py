@@ -7,26 +7,93 @@ from typing import Any, TextIO
 
 import msgspec
 
+from rampart.actors.bus.bounds import MOST
+from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
-from rampart.sim.osmosis.trial.console import MissionConsole
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
-from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
-from rampart.sim.osmosis.trial.report import render
+from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder, severity
+from rampart.sim.osmosis.trial.report import headline, render
 from rampart.sim.osmosis.trial.run_end import RunEnd
+from rampart.sim.runs.console import Console
 from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.observer import Sink
-from rampart.sim.runs.record import RunRecord, Safety
+from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import Written, try_report
 from rampart.sim.runs.trial import Trial
 
 _PATIENCE_S = 60.0
-_SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
+
+
+class MissionConsole(Console):
+    """Writes the story of a mission."""
+
+    example = "osmosis_control"
+
+    def __init__(self, stream: TextIO, *more: Any) -> None:
+        super().__init__(stream, *more)
+        self._step = -1
+        self._phase: m.MissionPhase | None = None
+        self._lights: dict[str, m.LightVerdict] = Remembered(MOST)
+        self._mission: m.MissionStatus | None = None
+        self._pilot = ""
+        self._unsafe = (0, False)
+
+    def take(self, topic: Topic[Any], message: Any, header: Header) -> None:
+        """Take one message of the run."""
+        super().take(topic, message, header)
+        if isinstance(message, m.MissionStatus):
+            self._take_mission(message, header.stamp)
+        elif isinstance(message, m.PilotStatus):
+            self._pilot = message.reason if message.stopped else ""
+        elif isinstance(message, m.GroundTruth):
+            self._show(message, header.stamp)
+
+    def conclusion(self, record: RunRecord, report: Path | None) -> None:
+        """Say how it ended, and where the report is, if there is one."""
+        if isinstance(record, MissionRecord):
+            self.say(f"Mission {record.mission_name}: {record.mission}, {record.safety}, "
+                     f"{record.duration_s:.1f} s simulated, {record.distance_m:.0f} m driven.")
+            self.say(headline(record))
+        super().conclusion(record, report)
+
+    def _take_mission(self, status: m.MissionStatus, at: float) -> None:
+        self._mission = status
+        if status.phase is not self._phase:
+            self._phase = status.phase
+            reason = f": {status.reason}" if status.reason else ""
+            self.line(at, f"mission {status.name or '-'} {status.phase.value}{reason}")
+        if status.phase is m.MissionPhase.RUNNING and status.step != self._step:
+            self._step = status.step
+            if status.step < len(status.goals):
+                goal = status.goals[status.step]
+                self.line(at, f"goal {status.step + 1}/{len(status.goals)}: ({goal.x_m:g}, "
+                          f"{goal.y_m:g}), {goal.mode.value}")
+        for light in status.lights:
+            if light.light not in self._lights:
+                self._lights[light.light] = light.verdict
+                if light.verdict is not m.LightVerdict.OK:
+                    self.line(at, f"light {light.light} is {light.verdict.value} "
+                              f"({light.ratio:.0%} of nominal)")
+
+    def _show(self, truth: m.GroundTruth, at: float) -> None:
+        unsafe = (truth.collisions, truth.prohibited_s > 0)
+        if unsafe != self._unsafe:
+            self._unsafe = unsafe
+            self.say(f"[{at:7.2f} s] UNSAFE: " + ("in the prohibited area" if unsafe[1] else "")
+                     + (f" {unsafe[0]} collisions" if unsafe[0] else ""))
+        mission = self._mission
+        step = f"goal {mission.step + 1}/{len(mission.goals)}" if mission and mission.goals \
+            else "no mission"
+        self.show_live(
+            f"{at:7.1f} s  {step}  ({truth.pose.x_m:6.1f}, {truth.pose.y_m:6.1f})  "
+            f"{truth.twist.linear_mps:4.2f} m/s  {len(self._lights)} lights  {self._pilot}", at)
 
 
 class MissionTrial(Trial):
@@ -40,7 +107,7 @@ class MissionTrial(Trial):
     retunings = {"mechanisms as in the paper": {"RM2": {"latched": True}, "RM5": {"latched": True}}}
     margins = {"obstacle_m": "nearest obstacle", "prohibited_m": "nearest prohibited area"}
     exact_below = EXACT_BELOW_M
-    pictures = "rampart.sim.osmosis.trial.run_maps:RunMaps"
+    pictures = "rampart.sim.osmosis.trial.report:RunMaps"
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
                  stream: TextIO | None = None) -> None:
@@ -69,13 +136,9 @@ class MissionTrial(Trial):
         """Return why the run is over, or None while it goes on."""
         return self._end.ended(now_s)
 
-    def conclude(self, now_s: float, why: str) -> MissionRecord:
+    def conclude(self, now_s: float, why: str) -> RunRecord:
         """Return the record of the run with the judge's verdict, and what became of faults."""
-        verdict = self.recorder.judge.verdict()
-        return self.recorder.record(
-            now_s, faults=self.outcomes(), mission="success" if verdict.success else "fail",
-            safety=_SAFETY[verdict.safe],
-            reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
+        return self.concluded(self.recorder.judge.verdict(), now_s, why)
 
     def summary(self, record: RunRecord) -> dict[str, Any]:
         """Return what scripts rely on, the lights too."""
@@ -84,13 +147,8 @@ class MissionTrial(Trial):
 
     def judgement(self, record: RunRecord) -> Verdict:
         """Return what ground truth shows: clearances, and when it became unsafe."""
-        found = _mission(record)
-        return Verdict(
-            success=found.mission == "success", safe=found.safety == "safe", reasons=found.reasons,
-            margins={"obstacle_m": _metres(found.obstacle_clearance_m),
-                     "prohibited_m": _metres(found.prohibited_clearance_m)},
-            severity=_severity(found.prohibited_s, found.collisions),
-            unsafe_s=self.recorder.judge.first_unsafe_s, narrowest_s=found.narrowest_s)
+        del record
+        return self.recorder.judge.verdict()
 
     @classmethod
     def moments(cls, spec: SystemSpec, *, searched: bool = False) -> tuple[float, float]:
@@ -102,8 +160,8 @@ class MissionTrial(Trial):
     def upgraded(cls, result: dict[str, Any]) -> dict[str, Any]:
         """Return a result with its clearances as margins, collisions and trespass as severity."""
         margins = {name: result.pop(name) for name in cls.margins}
-        severity = _severity(result.pop("prohibited_s"), result.pop("collisions"))
-        return {**result, "margins": margins, "severity": severity}
+        bad = severity(result.pop("prohibited_s"), result.pop("collisions"))
+        return {**result, "margins": margins, "severity": bad}
 
     def report(self, record: RunRecord, directory: Path) -> Written:
         """Write as much of the inspection report as can be written."""
@@ -114,11 +172,3 @@ def _mission(record: RunRecord) -> MissionRecord:
     if not isinstance(record, MissionRecord):
         raise TypeError(f"{type(record).__name__}: no record of a mission")
     return record
-
-
-def _severity(prohibited_s: float, collisions: int) -> float:
-    return round(prohibited_s, 3) + collisions
-
-
-def _metres(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)

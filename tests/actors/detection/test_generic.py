@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
 from dataclasses import replace
 from typing import Any
 
@@ -14,11 +13,13 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.detection.disagreement import Disagreement, Vote, agreeing, apart
 from rampart.actors.detection.finding import Sustained
-from rampart.actors.detection.process_usage import ProcessUsage, Usage, read_usage
+from rampart.actors.detection.process_usage import ProcessUsage
 from rampart.actors.detection.progress import Progress, ProgressMonitor, Step
 from rampart.actors.detection.rate import Rate, RateMonitor
 from rampart.actors.detection.threshold import Threshold
+from rampart.actors.detection.unchanged import Unchanged, UnchangedMonitor
 from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.process_usage import ProcessCount
 from rampart.testing import Ear, VirtualSystem, play, run, table
 from tests.tank import LEVEL, PUMP, SECOND, THIRD, TOPICS, Level, Phase, Pump
 
@@ -79,6 +80,13 @@ def followed(monitor: ProgressMonitor):
     return handle
 
 
+def said_to(monitor: UnchangedMonitor):
+    def handle(event: str, now_s: float) -> None:
+        monitor.heard(event.lower(), now_s, anew=event.isupper())
+
+    return handle
+
+
 STEPS = (Step("1", 0.4), Step("2", 0.3, ("3", "1")), Step("3"))
 
 
@@ -106,6 +114,55 @@ def test_a_step_is_not_busy_for_longer_than_it_may_be():
     assert monitor.due_s == pytest.approx(0.6)
     monitor.busy(math.nan)
     assert monitor.due_s == pytest.approx(0.4)
+
+
+# a, b, c ...: a value, A: the same as a, of a new process; x may last. The same for 300 ms is too
+# long; it then has to go on changing for 200 ms.
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "it changes": ("abcabc", "------"),
+    "it is always the same": ("aaaaaa", "---AAA"),
+    "it is the same for a moment": ("aaabaaab", "--------"),
+    "it goes on changing": ("aaaabcde", "---AAA--"),
+    "it changes once": ("aaaabbbbbb", "---AAAAAAA"),
+    "silence is not the same": ("aa......", "--------"),
+    "the same after silence": ("a...a", "----A"),
+    "active, then silence: what was said last stands": ("aaaa...", "---AAAA"),
+    "what may last": ("xxxxxx", "------"),
+    "what may last is a change": ("aaaaxxx", "---AAA-"),
+    "a new process is given time": ("aaAaaaa", "-----AA"),
+}))
+def test_what_never_changes(events, expected):
+    monitor = UnchangedMonitor("it", 0.3, 0.2, may_last=("x",))
+    assert play(monitor, said_to(monitor), events) == expected
+
+
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "silence": ("......", "???---"),
+    "the same from the start": ("aaaaa", "???AA"),
+    "a change": ("abbb", "?---"),
+    "one value says nothing": ("a.....", "???---"),
+    "what may last says something": ("xxxx", "----"),
+}))
+def test_what_never_changes_to_a_module_that_was_respawned(events, expected):
+    monitor = UnchangedMonitor("it", 0.3, 0.2, may_last=("x",), known_after_s=0.3)
+    assert play(monitor, said_to(monitor), events) == expected
+
+
+@pytest.mark.parametrize(("values", "active"), [
+    ((1.0, 1.4, 0.6, 1.2), True), ((1.0, 1.3, 1.6, 1.9), False), ((math.nan,) * 4, True),
+    ((1.0, math.nan, 1.0, math.nan), False), ((True, True, True, True), True)])
+def test_numbers_that_are_the_same(values, active):
+    monitor = UnchangedMonitor("it", 0.3, within=0.5)
+    for i, value in enumerate(values):
+        monitor.heard(value, i / 10)
+    assert monitor.active == active
+
+
+def test_a_level_that_never_changes_accuses_who_says_so():
+    found = reports(Unchanged, levels(1, 2, 2, 2, 2, 3, 4), 1.0, value="tank/level:height_m",
+                    for_s=0.3, clear_s=0.1)
+    assert found == [(0.0, "idle", ""), (0.5, "active", "tank/level:height_m is 2.0 all the time"),
+                     (0.7, "idle", "")]
 
 
 @pytest.mark.parametrize(("one", "other", "angle", "distance"), [
@@ -182,7 +239,8 @@ def test_a_threshold_is_idle_again_when_all_is_well():
     (Threshold, {"value": "tank/level:height_m", "above": 2.0}),
     (Rate, {"topic": "tank/level", "at_least_hz": 5.0}),
     (Disagreement, {"one": "tank/level:height_m", "other": "tank/second:height_m"}),
-    (Progress, {"value": "tank/pump:phase", "steps": [{"at": "idle"}, {"at": "filling"}]})])
+    (Progress, {"value": "tank/pump:phase", "steps": [{"at": "idle"}, {"at": "filling"}]}),
+    (Unchanged, {"value": "tank/level:height_m", "for_s": 1.0})])
 def test_a_respawned_module_claims_nothing_before_it_knows(kind, parameters):
     assert reports(kind, [], 0.15, respawned=True, **parameters) == []
 
@@ -292,7 +350,7 @@ def test_a_node_that_takes_too_much_is_named():
             context = system.context("D", {"watch": ["a"], "processor_share": 0.5,
                                            "memory_mb": 50, "for_s": 1.0, "clear_s": 1.0})
             context = replace(
-                context, usage=lambda pid: Usage(used["busy"], int(used["memory"])))
+                context, usage=lambda pid: ProcessCount(used["busy"], int(used["memory"]), 0.0))
             module = ProcessUsage(context, system.clock.now)
             task = asyncio.create_task(module.run())
             for _ in range(20):
@@ -315,12 +373,4 @@ def test_a_node_that_takes_too_much_is_named():
             await task
 
     run(scenario)
-
-
-def test_the_kernel_is_asked_what_a_process_uses():
-    usage = read_usage(os.getpid())
-    assert usage is not None
-    assert usage.memory_bytes > 1_000_000
-    assert usage.processor_s > 0
-    assert read_usage(2**22 + 1) is None
 

@@ -10,7 +10,7 @@ import pytest
 
 from rampart.actors.layout.layout import Layout
 from rampart.actors.run.run_plan import RunPlan, load_system
-from rampart.systems import SHIPPED
+from tests import system_file
 
 HEAD = """
 from rampart import Actor, Header, Message, Qos, Topic, every, on
@@ -220,6 +220,6 @@ def test_an_end_that_is_none(tank, said, line):
 
 @pytest.mark.parametrize("ftm", [True, False])
 @pytest.mark.parametrize("name", ["osmosis", "paper", "cell"])
-def test_the_shipped_systems_are_sound(name, ftm):
-    plan = RunPlan(system_file=str(SHIPPED / f"{name}.toml"), ftm=ftm)
+def test_whole_systems_are_sound(name, ftm):
+    plan = RunPlan(system_file=str(system_file(name)), ftm=ftm)
     assert Layout(plan, load_system(plan)).members

@@ -231,8 +231,10 @@ def test_whatever_is_fitted_is_json_without_a_long_text_or_list(value):
 
 
 BAD = ["", "{", "[" * 2000, '{"type":' * 400, "null", "7", '"stick"', "[]", '{"type":{}}',
-       '{"type":"stick","held":true,"ticket":' + "9" * 400 + "}", '{"type":"stick","held":"yes"}',
-       '{"type":"stick","held":true,"ticket":-9223372036854775808,"forward":1e308,"left":-1e308}',
+       '{"type":"stick","panel":"Drive","held":true,"ticket":' + "9" * 400 + "}",
+       '{"type":"stick","panel":"Drive","held":"yes"}', '{"type":"stick","panel":"x","held":true}',
+       '{"type":"stick","panel":"Drive","held":true,"ticket":-9223372036854775808,'
+       '"forward":1e308,"left":-1e308}',
        '{"type":"inject","fault":"' + MARKUP + '"}', '{"type":"reset","recovery":"\\u0000"}',
        '{"type":"reset","recovery":"\\ud800"}', '{"type":"order","action":"explode"}',
        '{"type":"seen","version":' + "9" * 30 + "}", '{"type":"seen","version":-1}',
@@ -247,7 +249,7 @@ async def test_nothing_that_a_browser_says_harms_the_node_or_other_pages(world, 
             for text in (*BAD, *(text.encode() for text in BAD), b"\xff\xfe", b"\x00" * 100):
                 with contextlib.suppress(websockets.ConnectionClosed):
                     await bad.send(text)
-            await good.send('{"type":"stick","held":false}')
+            await good.send('{"type":"stick","panel":"Drive","held":false}')
             assert (await hear(good, "stick"))["grip"] == "free"
         for raw in (b"\x00\xff\x80\r\n\r\n", b"GET " + b"/" * 70_000, b"GET / HTTP/9.9\r\n\r\n",
                     b"GET http://[::1/ HTTP/1.1\r\nHost: [\r\n\r\n", b"\x16\x03\x01" + bytes(500),

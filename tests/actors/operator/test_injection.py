@@ -24,9 +24,12 @@ from rampart.actors.operator.injection import (
 from rampart.actors.operator.requests import RefusedError
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S, Order
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
+from rampart.sim.faults.disturbance import Disturbance, Fault
+from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.topic_faults import modes_of
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests.porter_actors import write_porter_system
@@ -193,6 +196,31 @@ def test_all_that_is_offered_survives_the_plan_and_is_sound():
             if isinstance(order.message, bm.Injection):
                 assert flaw(order.message) == ""
         faults.end(ordered.injection, 0.0)
+
+
+class ForEver(Faults):
+    """Both kinds of faults, and both last for ever unless told otherwise."""
+
+    named = {"frozen": Fault("frozen", "", (Disturbance("localization/pose", "freeze"),), (),
+                             math.inf, "sensor")}
+    titled = {"no-brakes": ("actuator", "the brakes are gone")}
+
+    def own(self, fault, injection, duration_s):
+        lasts_s = math.inf if duration_s is None else duration_s
+        return (Order(topics.ACTUATOR_FAULT, m.ActuatorFault(
+            injection, m.ActuatorFaultKind.BRAKE_FAILURE, "", 0.0, lasts_s)),)
+
+
+def test_a_fault_that_lasts_for_ever_survives_the_plan_which_has_no_infinity():
+    plan = msgspec.json.decode(msgspec.json.encode(RunPlan(faults=ForEver().offered())),
+                               type=RunPlan)
+    faults = Injections("r1", plan.faults, KEYS, topics.ROBOT)
+    assert [fault["duration_s"] for fault in faults.choice()["faults"]] == [None, None]
+    for name in ("frozen", "no-brakes"):
+        for lasts_s, expected_s in ((None, math.inf), (4.0, 4.0)):
+            ordered = faults.order(name, 0.0, lasts_s, 0.0)
+            assert ordered.duration_s == expected_s
+            assert [order.message.duration_s for order in ordered.orders] == [expected_s]
 
 
 def test_no_place_is_offered_that_must_not_be_disturbed():

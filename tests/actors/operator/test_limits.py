@@ -10,8 +10,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rampart.actors.operator.limits import BURST, PATIENCE, RATE_HZ, MessageBudget, Verdict
-from rampart.actors.operator.requests import InjectRequest, RequestError, RequestReader
-from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS, StickRequest
+from rampart.actors.operator.requests import (
+    InjectRequest,
+    RequestError,
+    RequestReader,
+    StickRequest,
+)
+from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS
 
 READ = RequestReader(OSMOSIS_REQUESTS).read
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -70,7 +75,7 @@ SCALARS = st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_
 def test_a_stick_message_of_any_content_is_a_sound_request_or_none(fields):
     clean = {k: v for k, v in fields.items() if not (isinstance(v, float) and not math.isfinite(v))}
     try:
-        request = READ(msgspec.json.encode({"type": "stick", **clean}) if all(
+        request = READ(msgspec.json.encode({"type": "stick", "panel": "Drive", **clean}) if all(
             not isinstance(v, int) or abs(v) < 2**63 for v in clean.values()) else b"")
     except RequestError:
         return
@@ -80,8 +85,11 @@ def test_a_stick_message_of_any_content_is_a_sound_request_or_none(fields):
 
 
 @pytest.mark.parametrize("text", [
-    '{"type":"stick","held":true,"forward":NaN}', '{"type":"stick","held":true,"forward":1e999}',
-    '{"type":"stick","held":1}', '{"type":"stick"}', '{"type":"inject","fault":"x","delay_s":-1}',
+    '{"type":"stick","panel":"Drive","held":true,"forward":NaN}',
+    '{"type":"stick","panel":"Drive","held":true,"forward":1e999}',
+    '{"type":"stick","panel":7,"held":true}', '{"type":"stick","held":true}',
+    '{"type":"stick","panel":"Drive","held":1}', '{"type":"stick"}',
+    '{"type":"inject","fault":"x","delay_s":-1}',
     '{"type":"inject","fault":"x","duration_s":0}',
     '{"type":"inject","fault":"x","duration_s":1e9}',
     '{"type":"signal","node":"hmi"}', '{"type":"strategy","name":7}',

@@ -12,10 +12,10 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.operator import stick as hmi_stick
+from rampart.actors.operator.stick import Grip
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.page import stick as hmi_stick
-from rampart.actors.osmosis.page.stick import Grip
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
@@ -28,9 +28,9 @@ pytestmark = pytest.mark.page
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
 LIVE = "document.getElementById('link').textContent === 'live'"
-FREE = "document.getElementById('stick-state').textContent === 'free'"
-WORDS = "document.getElementById('stick-text').textContent"
-PAD = "document.getElementById('stick')"
+FREE = "document.querySelector('.stick-state').textContent === 'free'"
+WORDS = "document.querySelector('.stick-text').textContent"
+PAD = "document.querySelector('.stick')"
 
 
 def alive(world: World):
@@ -55,9 +55,9 @@ def moved(world) -> bool:
     return any(stick != RELEASED for stick in world.others.stick)
 
 
-async def hand_on_the_pad(tab) -> tuple[float, float, float]:
-    """Give the middle of the pad and its radius, when nothing moves it any more."""
-    where = (f"(() => {{ const b = {PAD}.getBoundingClientRect(); return JSON.stringify("
+async def hand_on_the_pad(tab, pad: str = PAD) -> tuple[float, float, float]:
+    """Give the middle of a pad and its radius, when nothing moves it any more."""
+    where = (f"(() => {{ const b = {pad}.getBoundingClientRect(); return JSON.stringify("
              "[b.left + b.width / 2, b.top + b.height / 2, b.width / 2]); })()")
     last, seen = None, await tab.value(where)
     while seen != last:
@@ -71,7 +71,7 @@ async def drives(tab, world, **position: float) -> None:
     """Wait until the robot is told to drive like this."""
     wanted = m.Joystick(position.get("forward", 0.0), position.get("left", 0.0), dead_man=True)
     await eventually(lambda: bool(world.others.stick) and world.others.stick[-1] == wanted)
-    await tab.until("document.getElementById('stick-state').textContent === 'you drive'")
+    await tab.until("document.querySelector('.stick-state').textContent === 'you drive'")
 
 
 async def drive_ahead(tab, world, hmi) -> None:
@@ -169,7 +169,7 @@ async def test_the_page_says_why_teleoperation_does_not_follow_it(world):
         await drive_ahead(tab, world, hmi)
         world.others.publish(ftm_topics.ERROR_REPORT, bm.Diagnostic(
             "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
-        await tab.until("document.getElementById('stick-state').textContent === 'not followed'")
+        await tab.until("document.querySelector('.stick-state').textContent === 'not followed'")
         assert "/dev/input/js0 has the stick" in await tab.value(WORDS)
         await key(tab, "w", down=False)
         await stops(world)
@@ -224,7 +224,7 @@ async def test_the_stick_on_the_screen_and_a_gamepad_drive(world):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until(FREE)
         await tab.value(f"{PAD}.scrollIntoView({{block: 'center'}})")
-        await tab.value("document.getElementById('stick-share').value = 100")
+        await tab.value("document.querySelector('.stick-words input').value = 100")
         x, y, radius = await hand_on_the_pad(tab)
         await mouse(tab, "mousePressed", x, y)
         await mouse(tab, "mouseMoved", x, y - 3 * radius)  # outside: full ahead, no more
@@ -275,15 +275,15 @@ async def test_the_second_operator_sees_who_drives(world):
             async def drive() -> None:
                 nonlocal ticket
                 while True:
-                    await other.send(json.dumps({"type": "stick", "held": True, "ticket": ticket,
-                                                 "forward": 0.25}))
+                    await other.send(json.dumps({"type": "stick", "panel": "Drive", "held": True,
+                                                 "ticket": ticket, "forward": 0.25}))
                     told = await hear(other, "stick")
                     ticket = told["ticket"]
                     assert told["grip"] in (Grip.WAITS, Grip.DRIVES)
                     await asyncio.sleep(0.03)
 
             driving = asyncio.create_task(drive())
-            await tab.until("document.getElementById('stick-state').textContent"
+            await tab.until("document.querySelector('.stick-state').textContent"
                             f" === 'page {number} drives'")
             await tab.value(f"{PAD}.focus()")
             await key(tab, "ArrowDown", down=True)

@@ -21,7 +21,7 @@ from rampart.actors.runtime.actor import Actor
 from rampart.manager.spec.panels import MAX_KEPT, MAX_PANELS, Panel
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import eventually, free_port
-from tests import ROOT
+from tests import CELL, ROOT
 from tests.actors.operator.extremes import LONG, MARKUP, messages
 from tests.actors.operator.world import Others
 from tests.tank import GAUGE, LEVEL, PUMP, TOPICS, VALVE, Level, Phase, Pump
@@ -126,7 +126,7 @@ def test_a_page_without_panels_plots_the_numbers_of_what_comes_regularly():
 
 
 def test_the_cell_s_page_has_nothing_to_plot_and_that_is_no_panel():
-    spec = parse_specification((ROOT / "systems" / "cell.toml").read_text("utf-8"), "cell.toml")
+    spec = parse_specification(CELL.read_text("utf-8"), "cell.toml")
     assert Layout(RunPlan(), spec).members["hmi"].parameters.panels == ()
 
 
@@ -185,8 +185,8 @@ def test_a_panel_that_names_something_wrong_is_refused_in_one_line(panels, line)
 
 
 @pytest.mark.parametrize(("rest", "words"), [
-    ("", "'Level' gives nothing to show; one of gauge, plot, table, states, text, map, script is "
-     "right"),
+    ("", "'Level' gives nothing to show; one of gauge, plot, table, states, text, map, stick, "
+     "script is right"),
     ('gauge = "a:b"\ntext = "a:b"', "'Level' gives gauge and text; one of "),
     ('gauge = "a:b"\nseconds = 3', "'Level': seconds means nothing to a gauge; it takes max, min, "
      "unit"),

@@ -25,6 +25,7 @@ def text(name: str) -> str:
 
 
 ROW = "document.querySelector('tr[data-node=localization]')"
+STICK = "document.querySelector('.stick-state').textContent"
 STATE = f"(({ROW}) || document.createElement('p')).textContent"
 
 
@@ -39,13 +40,13 @@ async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed
         await asyncio.to_thread(run.sleep_until, 1.0)
         async with browser() as tab:
             await tab.show(f"http://127.0.0.1:{port}/")
-            await tab.until(f"{text('stick-state')} === 'free'", 60)
+            await tab.until(f"{STICK} === 'free'", 60)
             assert await tab.value(f"{text('mission-phase')}") == "idle"
             await tab.until("document.getElementById('mission-name').value === 'SHORT'")
             await tab.value("document.getElementById('start').requestSubmit()")
             await tab.until(f"{text('mission-phase')} === 'running'")
 
-            await tab.value("document.getElementById('stick').focus()")
+            await tab.value("document.querySelector('.stick').focus()")
             await key(tab, "ArrowUp", down=True)
             await tab.until(f"{text('pilot-reason')}.includes('the joystick pre-empts')")
             await key(tab, "ArrowUp", down=False)
@@ -72,7 +73,7 @@ async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed
             await kill(tab, "hmi")  # the page's own
             await asyncio.to_thread(
                 run.wait_until, lambda: run.pid("hmi") not in (None, before), 20, "no other HMI")
-            await tab.until(f"{text('link')} === 'live' && {text('stick-state')} === 'free'")
+            await tab.until(f"{text('link')} === 'live' && {STICK} === 'free'")
             assert await tab.value(text("strategy-now")) == "in force: mission-first"
             await tab.until(f"{text('mission-phase')} === 'succeeded'", 120)
         code, result = await asyncio.to_thread(run.result)

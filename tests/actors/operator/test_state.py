@@ -11,7 +11,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.drawing import draw
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.page.state import TRACK_POINTS, OsmosisState
-from rampart.manager.strategies.decision_words import decision_in_words
+from rampart.manager.strategies.registry import decision_in_words
 
 
 def shown(state: OsmosisState, now_s: float = 0.0) -> dict:

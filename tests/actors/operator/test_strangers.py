@@ -76,7 +76,7 @@ async def loads_and_drives(world, at: str, **options) -> None:
     async with open_page(at, **options) as page:
         await Hand(page).take()
         await eventually(lambda: world.others.stick[-1].dead_man)
-        assert (await ask(page, type="stick", held=False))["grip"] == "free"
+        assert (await ask(page, type="stick", panel="Drive", held=False))["grip"] == "free"
         await eventually(lambda: world.others.stick[-1] == RELEASED)
 
 
@@ -121,7 +121,7 @@ async def test_strangers_who_come_again_and_again_take_no_stick_and_close_no_pag
                     await asyncio.sleep(0.01)
                 await loads_beside(at)
                 assert (await hand.hold(0.25))["grip"] in ("drives", "lapsed")
-                assert (await ask(page, type="stick", held=False))["grip"] == "free"
+                assert (await ask(page, type="stick", panel="Drive", held=False))["grip"] == "free"
                 await eventually(lambda: world.others.stick[-1] == RELEASED)
             finally:
                 over.set()

@@ -10,17 +10,15 @@ import pytest
 from rampart.actors.ftm import messages as m
 from rampart.actors.operator.processes import SEARCH_EVERY, ProcessObserver
 from rampart.actors.operator.system import BARRIER, MAX_BOXES, draw_system
+from rampart.actors.runtime.process_usage import ProcessCount, UsageMeter
 from rampart.actors.supervision.process_title import RunProcess
-from rampart.actors.supervision.process_usage import ProcessCount, UsageMeter
 from rampart.manager.spec.schema import EventSpec
 from rampart.manager.spec.specification import parse_specification
-from tests import ROOT
-
-SYSTEMS = ROOT / "systems"
+from tests import system_file
 
 
 def system(name: str):
-    return parse_specification((SYSTEMS / f"{name}.toml").read_text(encoding="utf-8"), name)
+    return parse_specification(system_file(name).read_text(encoding="utf-8"), name)
 
 
 @pytest.mark.parametrize("name", ["osmosis", "paper", "cell"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from contextlib import asynccontextmanager
+from dataclasses import replace
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
@@ -102,7 +103,10 @@ class World:
 
     @asynccontextmanager
     async def hmi(self, incarnation: int = 1, **shared: object):
-        async with self.running(OsmosisHmi(self.context("hmi", incarnation, **shared))) as hmi:
+        context = replace(self.context("hmi", incarnation, **shared),
+                          topics={topic.key: topic for topic in topics.ALL},
+                          parameters={"panels": OsmosisHmi.panels})
+        async with self.running(OsmosisHmi(context)) as hmi:
             yield hmi
 
     def say_running(self, request: m.MissionRequest) -> None:

@@ -419,6 +419,7 @@ async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
                 message = json.loads(text)
                 if message.get("type") == "hello":
                     airport = message["map"]["name"]
+                    assert not any("stick" in panel for panel in message["panels"])
                 elif "replay" in text and message.get("type") not in ("state", "hello"):
                     told = text
                 else:

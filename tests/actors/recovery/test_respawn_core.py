@@ -6,7 +6,6 @@ import asyncio
 
 import pytest
 
-from rampart import systems
 from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topics import HEARTBEAT
 from rampart.actors.ftm import topics
@@ -16,6 +15,7 @@ from rampart.actors.run.run_context import RunContext
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import VirtualSystem
 from rampart.testing import run as virtually
+from tests import CELL
 
 
 def core(*nodes: str) -> RespawnCore:
@@ -45,7 +45,7 @@ def test_a_node_whose_heartbeat_is_overdue_is_named():
 
 
 def test_in_a_fast_system_a_heartbeat_is_overdue_before_the_watchdog_reports_it():
-    text = (systems.SHIPPED / "cell.toml").read_text(encoding="utf-8").replace(
+    text = CELL.read_text(encoding="utf-8").replace(
         "heartbeat_timeout_s = 0.3", "heartbeat_timeout_s = 0.18\nheartbeat_period_s = 0.06")
     run = RunContext(system=parse_specification(text, "cell.toml"))
 

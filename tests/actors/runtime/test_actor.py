@@ -117,6 +117,32 @@ async def test_a_message_arrives_with_its_header(make_bus):
             assert (header.source, header.incarnation, header.stamp) == ("talker", 3, 0.25)
 
 
+class Twice(Listener):
+    """Has two handlers more of what its base class hears."""
+
+    @on(topics.POSE)
+    def second(self, message: m.Pose, header: Header) -> None:
+        self.heard.append((message, header))
+
+    @on(ftm_topics.RESET)
+    def reset_as_well(self, message: fm.Reset, header: Header) -> None:
+        self.heard.append((message, header))
+
+
+async def test_each_handler_of_a_topic_hears_each_message_in_the_order_of_the_classes(make_bus):
+    async with running(Twice, "listener", make_bus) as listener:
+        async with running(Talker, "talker", make_bus) as talker:
+            await eventually(lambda: bool(listener.peers))
+            for x_m in (1.0, 2.0):
+                talker.publish(topics.POSE, m.Pose(x_m, 0.0, 0.0))
+                await eventually(lambda x_m=x_m: listener.heard[-1:] != []
+                                 and listener.heard[-1][0].x_m == x_m)
+            talker.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
+            await eventually(lambda: len(listener.heard) == 6)
+            assert [body.x_m for body, _ in listener.heard[:4]] == [1.0, 1.0, 2.0, 2.0]
+            assert [body.recovery for body, _ in listener.heard[4:]] == ["RM1", "RM1"]
+
+
 async def test_a_watched_peer_is_seen_to_come_and_go(make_bus):
     async with running(Listener, "listener", make_bus) as listener:
         async with running(Talker, "talker", make_bus, incarnation=7):

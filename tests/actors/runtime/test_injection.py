@@ -320,9 +320,9 @@ def test_the_first_effect_is_told_once():
     sent(faults, [11.0])
     assert faults.take_news() == []
     sent(faults, [12.0, 12.1])
-    (news,) = faults.take_news()
-    assert (news.injection, news.topic, news.affected, news.finished, news.reason) == (
-        "i", "localization/pose", 1, False, "")
+    ((order, affected, reason),) = faults.take_news()
+    assert (order.injection, order.topic, affected, reason) == (
+        "i", "localization/pose", 1, "")
     assert faults.take_news() == []
 
 
@@ -408,9 +408,10 @@ def test_a_misfit_that_only_the_message_shows_ends_the_injection_and_leaves_the_
         fields, body, words):
     broken = gate("corrupt", **fields)
     assert broken.apply(KEY, body, 10.0, 10.0).body is body
-    (news,) = broken.take_news()
-    assert (news.injection, news.affected, news.finished) == ("i", 0, True)
-    assert words in news.reason
+    ((order, affected, reason),) = broken.take_news()
+    assert (order.injection, affected) == ("i", 0)
+    assert words in reason
+    assert broken.in_force == {}
     assert broken.apply(KEY, body, 11.0, 11.0).body is body
     assert broken.take_news() == []
     assert broken.expire("i") == 0

@@ -24,7 +24,7 @@ from rampart.actors.run.run_plan import SUPERVISOR, RunPlan, load_document, load
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.patience import Usage
-from rampart.actors.supervision.processes import Living, SpawnerUnavailableError
+from rampart.actors.supervision.processes import RunProcess, SpawnerUnavailableError
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.manager.spec.tables import Supervision
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
@@ -115,11 +115,11 @@ class Machine:
         for ended in list(process.holders):
             ended()
 
-    def living(self) -> list[Living]:
+    def living(self) -> list[RunProcess]:
         self.searches += 1
         if self.look_error:
             raise self.look_error
-        return [Living(p.names, p.pid, p.incarnation)
+        return [RunProcess(p.pid, 0, 0, p.names, p.incarnation)
                 for p in self.processes.values() if not p.killed]
 
     def fork(self, names: tuple[str, ...], incarnation: int) -> int:

@@ -75,7 +75,7 @@ def launched(*arguments: str, cwd: Path, **environment: str) -> subprocess.Compl
 @pytest.mark.parametrize("arguments", [
     ["--hmi-token", TOKEN], [f"--hmi-token={TOKEN}"], ["--hmi-token"],
     ["--virtual", "--hmi-token", TOKEN], ["--no-hmi", "--hmi-token", TOKEN],
-    ["--system", "cell", "--hmi-token", TOKEN]])
+    ["--system", "paper", "--hmi-token", TOKEN]])
 def test_a_token_on_the_command_line_is_refused_and_not_repeated(tmp_path, arguments):
     done = launched(*arguments, "--hmi-host", "0.0.0.0", cwd=tmp_path)
     assert done.returncode == 2

@@ -7,9 +7,9 @@ import json
 import pytest
 
 from rampart.cli.main import main
-from rampart.systems import SHIPPED
+from tests import CELL, system_file
 
-CELL = (SHIPPED / "cell.toml").read_text(encoding="utf-8")
+TEXT = CELL.read_text(encoding="utf-8")
 
 
 def said(capsys, *arguments: str, code: int = 0) -> tuple[str, str]:
@@ -21,14 +21,15 @@ def said(capsys, *arguments: str, code: int = 0) -> tuple[str, str]:
     ("cell", "22 processes, 9 nodes, 8 detection modules, 6 recovery modules, 6 mechanisms"),
     ("paper", "21 processes, 9 nodes, 7 detection modules, 5 recovery modules, 7 mechanisms")])
 def test_a_sound_system(capsys, name, sizes):
-    assert said(capsys, "check", name)[0] == f"{SHIPPED / name}.toml: sound: {sizes}\n"
+    file = str(system_file(name))
+    assert said(capsys, "check", file)[0] == f"{file}: sound: {sizes}\n"
 
 
 def test_a_sound_system_for_scripts(capsys):
-    found = json.loads(said(capsys, "check", "cell", "--json")[0])
+    found = json.loads(said(capsys, "check", str(CELL), "--json")[0])
     assert found == {
         "format": 1, "sound": True, "problem": None, "system": "cell",
-        "file": str(SHIPPED / "cell.toml"), "processes": 22, "nodes": 9, "detection_modules": 8,
+        "file": str(CELL), "processes": 22, "nodes": 9, "detection_modules": 8,
         "recovery_modules": 6, "mechanisms": 6}
 
 
@@ -54,9 +55,9 @@ BROKEN = {
 @pytest.mark.parametrize("verb", ["check", "explain", "verify"])
 def test_a_system_that_is_not_sound_is_one_line_and_exit_code_2(capsys, tmp_path, what, verb):
     (old, new), line = BROKEN[what]
-    assert CELL.count(old) == 1
+    assert TEXT.count(old) == 1
     file = tmp_path / "cell.toml"
-    file.write_text(CELL.replace(old, new))
+    file.write_text(TEXT.replace(old, new))
     out, err = said(capsys, verb, str(file), code=2)
     assert out == ""
     assert err.startswith(f"rampart: {file}: {line}")
@@ -66,14 +67,14 @@ def test_a_system_that_is_not_sound_is_one_line_and_exit_code_2(capsys, tmp_path
 def test_a_system_that_is_not_sound_for_scripts(capsys, tmp_path):
     (old, new), line = BROKEN["class"]
     file = tmp_path / "cell.toml"
-    file.write_text(CELL.replace(old, new))
+    file.write_text(TEXT.replace(old, new))
     out, err = said(capsys, "check", str(file), "--json", code=2)
     assert json.loads(out) == {"format": 1, "sound": False, "problem": f"{file}: {line}"}
     assert err == ""
 
 
 def test_what_a_system_is_in_words(capsys):
-    lines = said(capsys, "explain", "cell")[0].splitlines()
+    lines = said(capsys, "explain", str(CELL))[0].splitlines()
     assert lines[0] == ("Pick and place behind a light curtain (cell), strategy guarded-repair")
     for line in (
             "What is started: 25 processes, 23 nodes",

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from tests import ROOT
+from tests import CELL, ROOT
 
 
 def rampart(*arguments: str, cwd=ROOT) -> subprocess.CompletedProcess[str]:
@@ -32,9 +32,9 @@ def test_counts_are_json_for_scripts():
 
 def test_what_is_exported_is_read_again(tmp_path):
     file = tmp_path / "cell.xml"
-    assert rampart("cut-sets", "cell", "--export", str(file)).returncode == 0
+    assert rampart("cut-sets", str(CELL), "--export", str(file)).returncode == 0
     there, back = (json.loads(rampart("cut-sets", name, "--json").stdout)
-                   for name in ("cell", str(file)))
+                   for name in (str(CELL), str(file)))
     assert [s["events"] for s in there["sets"]] == [s["events"] for s in back["sets"]]
     assert there["by_size"] == back["by_size"]
 

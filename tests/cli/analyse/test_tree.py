@@ -18,15 +18,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rampart.cli import systems
-from rampart.cli.analyse.tree_dot import quote, to_dot
 from rampart.cli.analyse.tree_svg import to_svg
-from rampart.cli.analyse.tree_text import to_text
+from rampart.cli.analyse.tree_text import quote, to_dot, to_text
 from rampart.cli.main import main
 from rampart.manager.drawing.diagram import Box, Diagram, Situation, clean, covers, draw
 from rampart.manager.drawing.placing import place
 from rampart.manager.model.order import PartialOrder
 from rampart.systems import SHIPPED
-from tests import ROOT
+from tests import CELL, ROOT
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -276,7 +275,7 @@ def test_the_hasse_diagram_holds_neighbours_only_and_says_as_much_as_the_order(p
 
 
 def test_the_box_of_a_mechanism_keeps_the_logic_of_its_gates(capsys):
-    assert main(["tree", "--what", "ftm-tree", "--system", "cell"]) == 0
+    assert main(["tree", "--what", "ftm-tree", "--system", str(CELL)]) == 0
     shown = told(capsys)
     assert "Part not where it should be and not Force at the wrist too high → Retract" in shown
     assert "along the last path or Hold position under control" in shown

@@ -19,7 +19,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.run.run_info import RunInfo
 from rampart.actors.runtime.clock import Clock
-from rampart.actors.supervision.process_usage import ProcessCount
+from rampart.actors.runtime.process_usage import ProcessCount
 from rampart.actors.web.guests import ROOM
 from rampart.actors.web.server import WebServer
 from rampart.cli import following

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.cli.osmosis.keyboard_stick import HOLD_S, KeyboardStick
+from rampart.cli.osmosis.joystick_verb import HOLD_S, KeyboardStick
 from rampart.cli.terminal import KeyDecoder
 
 

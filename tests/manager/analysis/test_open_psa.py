@@ -13,7 +13,7 @@ from rampart.manager.analysis.cut_sets import CutSets
 from rampart.manager.analysis.formula import formula_of
 from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
 from rampart.manager.spec.specification import parse_specification
-from tests import ROOT
+from tests import system_file
 from tests.manager.bench import paper
 
 
@@ -179,7 +179,7 @@ def test_nested_formulas_have_the_minimal_sets_that_brute_force_finds(top, lone,
 
 @pytest.mark.parametrize("system", ["osmosis", "cell"])
 def test_what_is_exported_comes_back_the_same(system):
-    path = ROOT / "systems" / f"{system}.toml"
+    path = system_file(system)
     spec = parse_specification(path.read_text(encoding="utf-8"), path.name)
     back = read_open_psa(write_open_psa(spec), "out.xml")
     there = formula_of(spec.build_fault_tree())

@@ -12,14 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart import systems
 from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.specification import (
     SpecificationError,
     check_document,
     parse_specification,
 )
-from tests import ROOT
+from tests import CELL, ROOT, system_file
 from tests.manager.bench import PAPER, paper
 
 FILE = "systems/paper.toml"
@@ -478,7 +477,7 @@ def test_a_byte_order_mark_is_no_part_of_the_text():
 
 
 def test_without_a_robot_timeouts_are_five_periods_of_what_they_wait_for():
-    cell = (systems.SHIPPED / "cell.toml").read_text(encoding="utf-8")
+    cell = CELL.read_text(encoding="utf-8")
     before, _, rest = cell.partition("[timing]")
     left = rest.partition("# ---- Nodes")[2]
     said = "control_period_s = 0.1\nheartbeat_timeout_s = 0.3\nmanager_timeout_s = 0.7\n"
@@ -526,7 +525,7 @@ def test_the_core_of_the_manager_imports_nothing_but_itself_and_how_files_are_re
             assert not {"time", "asyncio", "random"} & set(modules), path
 
 
-SHIPPED = {name: tomllib.loads((ROOT / "systems" / f"{name}.toml").read_text(encoding="utf-8"))
+SHIPPED = {name: tomllib.loads(system_file(name).read_text(encoding="utf-8"))
            for name in ("paper", "osmosis", "cell")}
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8)

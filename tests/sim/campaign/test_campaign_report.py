@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis.airport.drawing import draw
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.sim.campaign import charts
-from rampart.sim.campaign.grouping import by_kind, conditions, in_common, kind_of
 from rampart.sim.campaign.job import DecisionTaken, Job, RunResult
 from rampart.sim.campaign.report import (
     Campaign,
@@ -27,14 +26,22 @@ from rampart.sim.campaign.report import (
     worth_showing,
     write_campaign_report,
 )
-from rampart.sim.campaign.statistics import badness, rate
+from rampart.sim.campaign.statistics import (
+    badness,
+    by_kind,
+    conditions,
+    in_common,
+    interval,
+    kind_of,
+    percent,
+    rate,
+    seconds,
+)
 from rampart.sim.campaign.store import Run
-from rampart.sim.campaign.wording import interval, percent, seconds
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial import paper_tables
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
-from rampart.sim.osmosis.trial.paper_section import section
-from rampart.sim.osmosis.trial.paper_tables import Decided
+from rampart.sim.osmosis.trial.paper_tables import Decided, section
 from rampart.sim.osmosis.trial.record import MissionRecord, ObstacleSeen, StepResult
 from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.report import margin_text

@@ -22,8 +22,13 @@ from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import DELAY_S, modes_of, systematic_faults
 from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
 from rampart.sim.osmosis.sensors import Gps
-from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, SENSOR_FAULTS, OsmosisFaults
-from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, SENSORS
+from rampart.sim.osmosis.trial.faults import (
+    LEFT_OUT,
+    PAPER_FAULTS,
+    SENSOR_FAULTS,
+    SENSORS,
+    OsmosisFaults,
+)
 from tests.osmosis_system import shipped_system
 from tests.porter_actors import AXLE, LOAD
 

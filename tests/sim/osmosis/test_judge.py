@@ -8,7 +8,7 @@ import pytest
 
 from rampart.actors.osmosis.airport.model import MissionGoal
 from rampart.actors.osmosis.messages import GroundTruth, Pose, Twist
-from rampart.sim.osmosis.trial.judge import Judge, Verdict
+from rampart.sim.osmosis.trial.record import Judge
 
 # Three points along x: taxi to 10, lights to 20, taxi to 30.
 GOALS = (
@@ -36,7 +36,8 @@ def judged(timeline: str, metres_per_step: float = 1.0, start_m: float = 0.0):
 def test_every_point_in_order_and_mode_is_a_success():
     #         0         10        20        30
     judge = judged("TTTTTTTTTTLLLLLLLLLLTTTTTTTTTTT")
-    assert judge.verdict() == Verdict(True, True, ())
+    found = judge.verdict()
+    assert (found.success, found.safe, found.reasons) == (True, True, ())
     assert judge.visit_times_s == [9.0, 19.0, 29.0]
     assert judge.point_m == math.inf
 
@@ -54,7 +55,8 @@ def test_every_point_in_order_and_mode_is_a_success():
 )  # fmt: skip
 def test_a_point_not_reached_or_reached_in_the_wrong_mode_is_a_failure(timeline, visited, reason):
     judge = judged(timeline)
-    assert judge.verdict() == Verdict(False, True, (reason,))
+    found = judge.verdict()
+    assert (found.success, found.safe, found.reasons) == (False, True, (reason,))
     assert len(judge.visit_times_s) == visited
 
 

@@ -10,10 +10,10 @@ import math
 
 import pytest
 
-from rampart.actors.osmosis.airport.formats import load_airport, load_world
+from rampart.actors.osmosis.airport.formats import load_airport, load_with_truth
 from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.sim.osmosis.sensors import LightSensor
-from rampart.sim.osmosis.trial.judge import Judge
+from rampart.sim.osmosis.trial.record import Judge
 from rampart.sim.osmosis.world import World
 
 AIRPORT = load_airport("vallombre")
@@ -46,7 +46,7 @@ def drive(sim: World, judge: Judge, cruise_mps: float = 0.9):
 
 
 def test_mission_ab_is_a_safe_success_within_200_s_and_every_light_is_measured_right():
-    truth = load_world("vallombre")
+    truth = load_with_truth("vallombre")[1]
     sim, judge = World(AIRPORT, truth, seed=3), Judge(AIRPORT.missions["AB"].goals)
     measured = drive(sim, judge)
     verdict = judge.verdict()

@@ -15,8 +15,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.clock import Clock
-from rampart.sim.osmosis.schedule import Schedule
-from rampart.sim.osmosis.simulator import Simulator
+from rampart.sim.osmosis.simulator import Schedule, Simulator
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from tests.osmosis_system import run_context
 

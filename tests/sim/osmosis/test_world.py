@@ -7,7 +7,7 @@ import math
 import pytest
 import shapely
 
-from rampart.actors.osmosis.airport.formats import load_airport, load_world
+from rampart.actors.osmosis.airport.formats import load_with_truth
 from rampart.actors.osmosis.airport.model import (
     Airport,
     Building,
@@ -63,7 +63,7 @@ def test_a_time_that_is_not_finite_is_refused():
 
 
 def test_the_same_seed_gives_the_same_world_bit_for_bit_and_another_seed_another():
-    airport, truth = load_airport("vallombre"), load_world("vallombre")
+    airport, truth = load_with_truth("vallombre")
 
     def record(seed: int) -> list[object]:
         sim = World(airport, truth, seed=seed, obstacles=2)

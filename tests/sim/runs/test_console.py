@@ -12,16 +12,16 @@ from rampart.actors.ftm import topics
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.manager.spec.specification import parse_specification
-from rampart.sim.osmosis.trial.console import MissionConsole
+from rampart.sim.osmosis.trial.mission_trial import MissionConsole
 from rampart.sim.runs.console import Console
-from tests import ROOT
+from tests import system_file
 
 PLAN = RunPlan("r")
 CALM = m.ManagerStatus((), (), (), (), "guarded-repair", 0)
 
 
 def system(name: str):
-    return parse_specification((ROOT / "systems" / f"{name}.toml").read_text("utf-8"), name)
+    return parse_specification(system_file(name).read_text("utf-8"), name)
 
 
 def test_a_module_that_falls_silent_and_is_heard_again_is_told_once_each():

@@ -9,8 +9,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork, find_network
-from rampart.sim.virtual.timing import Timing, drawer, measured
+from rampart.sim.virtual.network import (
+    NETWORKS,
+    NetworkModel,
+    SeededNetwork,
+    Timing,
+    drawer,
+    find_network,
+    measured,
+)
 
 EVEN = Timing((0.0, 10.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
 

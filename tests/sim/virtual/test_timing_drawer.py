@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.sim.virtual.timing import Stock, drawer
+from rampart.sim.virtual.network import Stock, drawer
 
 
 @given(st.lists(st.floats(0, 1e4), min_size=2, max_size=40).map(sorted), st.integers(),

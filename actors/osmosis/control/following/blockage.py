@@ -9,38 +9,29 @@ from __future__ import annotations
 
 import math
 
-import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.control.polyline import Array, Point, Pose2, to_map
 from rampart.actors.osmosis.messages import Blockage
 
+# When a robot counts as blocked.
+AFTER_S = 3.0
+"""So long without progress."""
 
-class BlockageLimits(msgspec.Struct, frozen=True):
-    """When a robot counts as blocked.
+PROGRESS_M = 0.3
+"""So much nearer to the goal along the route is progress."""
 
-    Args:
-        after_s: so long without progress.
-        progress_m: so much nearer to the goal along the route is progress.
-        reach_m: what blocks is at most so far from the robot's centre.
-        half_angle_rad: and at most so far to a side of straight ahead.
-    """
+REACH_M = 3.0
+"""What blocks is at most so far from the robot's centre."""
 
-    after_s: float = 3.0
-    progress_m: float = 0.3
-    reach_m: float = 3.0
-    half_angle_rad: float = math.radians(60)
+HALF_ANGLE_RAD = math.radians(60)
+"""And at most so far to a side of straight ahead."""
 
 
 class BlockageWatch:
-    """Watches one route. All times in simulated seconds.
+    """Watches one route. All times in simulated seconds."""
 
-    Args:
-        limits: when the robot counts as blocked.
-    """
-
-    def __init__(self, limits: BlockageLimits | None = None) -> None:
-        self._limits = limits or BlockageLimits()
+    def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
@@ -58,23 +49,23 @@ class BlockageWatch:
             points: laser echoes in `base_link`, shape (n, 2).
             now_s: now.
         """
-        if self._since_s is None or to_go_m < self._best_m - self._limits.progress_m:
+        if self._since_s is None or to_go_m < self._best_m - PROGRESS_M:
             self._best_m, self._since_s, self._place = to_go_m, now_s, None
             return None
-        if now_s - self._since_s < self._limits.after_s:
+        if now_s - self._since_s < AFTER_S:
             return None
         # What was seen first stays what blocks, lest the place wander as the robot turns.
-        self._place = self._place or nearest_ahead(points, pose, self._limits)
+        self._place = self._place or nearest_ahead(points, pose)
         if self._place is None:
             return None
         return Blockage(*self._place, self._since_s)
 
 
-def nearest_ahead(points: Array, pose: Pose2, limits: BlockageLimits) -> Point | None:
+def nearest_ahead(points: Array, pose: Pose2) -> Point | None:
     """Return the nearest echo ahead of the robot as a point in `map`, or None."""
     distance_m = np.hypot(points[:, 0], points[:, 1])
-    ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) <= limits.half_angle_rad
-    near = np.flatnonzero(ahead & (distance_m <= limits.reach_m))
+    ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) <= HALF_ANGLE_RAD
+    near = np.flatnonzero(ahead & (distance_m <= REACH_M))
     if not len(near):
         return None
     first = near[int(np.argmin(distance_m[near]))]

@@ -19,7 +19,6 @@ from collections import deque
 from collections.abc import Iterable
 from operator import itemgetter
 
-import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.airport.model import Light
@@ -33,33 +32,36 @@ DIM_BELOW = 0.5
 OUT_BELOW = 0.05
 """Ratio below which it is out."""
 
+# What a measurement needs.
+FIT_RADIUS_M = 0.8
+"""Samples within this horizontal distance of a light enter its fit."""
 
-class InspectionLimits(msgspec.Struct, frozen=True):
-    """What a measurement needs.
+SPAN_M = 0.3
+"""Samples at least this far before and behind the light are needed."""
 
-    Args:
-        fit_radius_m: samples within this horizontal distance of a light enter its fit.
-        span_m: samples at least this far before and behind the light are needed.
-        aside_m: the sensor passes at most this far beside the light.
-        largest_gap_m: neighbouring samples of a fit are at most this far apart.
-        least_samples: fewer make no fit.
-        passed_m: a light is passed when the sensor is this far from it again.
-        neighbour_m: lights nearer to each other than this are fitted together.
-        shift_m: largest shift along the way that is tried, for a pose error.
-        pose_gap_s: a sample between two poses farther apart than this is not used.
-        keep_s: samples older than this are forgotten: a robot that waited is no longer sure.
-    """
+ASIDE_M = 0.35
+"""The sensor passes at most this far beside the light."""
 
-    fit_radius_m: float = 0.8
-    span_m: float = 0.3
-    aside_m: float = 0.35
-    largest_gap_m: float = 0.15
-    least_samples: int = 8
-    passed_m: float = 0.9
-    neighbour_m: float = 4.0
-    shift_m: float = 0.15
-    pose_gap_s: float = 0.3
-    keep_s: float = 120.0
+LARGEST_GAP_M = 0.15
+"""Neighbouring samples of a fit are at most this far apart."""
+
+LEAST_SAMPLES = 8
+"""Fewer make no fit."""
+
+PASSED_M = 0.9
+"""A light is passed when the sensor is this far from it again."""
+
+NEIGHBOUR_M = 4.0
+"""Lights nearer to each other than this are fitted together."""
+
+SHIFT_M = 0.15
+"""Largest shift along the way that is tried, for a pose error."""
+
+POSE_GAP_S = 0.3
+"""A sample between two poses farther apart than this is not used."""
+
+KEEP_S = 120.0
+"""Samples older than this are forgotten: a robot that waited is no longer sure."""
 
 
 def verdict(ratio: float) -> LightVerdict:
@@ -79,7 +81,6 @@ class LightInspection:
 
     def __init__(self, lights: Iterable[Light], judged: Iterable[str] = ()) -> None:
         self._lights = tuple(lights)
-        self._limits = InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
         self._x_m, self._y_m = np.ascontiguousarray(self._places.T)
         self.judged: set[str] = set(judged)
@@ -112,7 +113,7 @@ class LightInspection:
         for index in list(self._samples):
             light = self._lights[index]
             distance_m = math.dist(here, (light.x_m, light.y_m))
-            if distance_m < self._limits.passed_m and not ended:
+            if distance_m < PASSED_M and not ended:
                 continue
             samples = self._samples.pop(index)
             intensity_cd = self._fit(index, samples)
@@ -131,9 +132,9 @@ class LightInspection:
             if place is None or not self._lights:
                 continue
             off_m = np.hypot(self._x_m - place[0], self._y_m - place[1])
-            for index in np.flatnonzero(off_m <= self._limits.fit_radius_m):
+            for index in np.flatnonzero(off_m <= FIT_RADIUS_M):
                 samples = self._samples.setdefault(int(index), [])
-                if samples and stamp_s - samples[0][0] > self._limits.keep_s:
+                if samples and stamp_s - samples[0][0] > KEEP_S:
                     samples.clear()
                 samples.append((stamp_s, *place, lux))
 
@@ -145,7 +146,7 @@ class LightInspection:
         if b_s == stamp_s:
             return sensor_position(bx, by, b_yaw)
         a_s, ax, ay, a_yaw = self._poses[after - 1]
-        if after == 0 or b_s - a_s > self._limits.pose_gap_s:
+        if after == 0 or b_s - a_s > POSE_GAP_S:
             return None
         share = (stamp_s - a_s) / (b_s - a_s)
         turn = math.remainder(b_yaw - a_yaw, math.tau)
@@ -154,8 +155,7 @@ class LightInspection:
 
     def _fit(self, index: int, samples: list[tuple[float, float, float, float]]) -> float | None:
         """Return the intensity in candela by least squares, or None if samples are missing."""
-        limits = self._limits
-        if len(samples) < limits.least_samples:
+        if len(samples) < LEAST_SAMPLES:
             return None
         table = np.array(samples)
         places, lux = table[:, 1:3], table[:, 3]
@@ -164,16 +164,16 @@ class LightInspection:
         ahead = relative @ along
         aside = np.abs(relative @ np.array((-along[1], along[0])))
         order = np.argsort(ahead)
-        near = np.abs(ahead) < limits.span_m
+        near = np.abs(ahead) < SPAN_M
         gaps = np.diff(ahead[order])
-        if ahead.min() > -limits.span_m or ahead.max() < limits.span_m or not near.any() \
-                or aside[near].min() > limits.aside_m or gaps.max() > limits.largest_gap_m:
+        if ahead.min() > -SPAN_M or ahead.max() < SPAN_M or not near.any() \
+                or aside[near].min() > ASIDE_M or gaps.max() > LARGEST_GAP_M:
             return None
-        others = np.hypot(*(self._places - self._places[index]).T) <= limits.neighbour_m
+        others = np.hypot(*(self._places - self._places[index]).T) <= NEIGHBOUR_M
         others[index] = False
         columns = np.concatenate(((index,), np.flatnonzero(others)))
         best = (math.inf, 0.0)
-        for shift_m in np.linspace(-limits.shift_m, limits.shift_m, 31):
+        for shift_m in np.linspace(-SHIFT_M, SHIFT_M, 31):
             moved = places + shift_m * along
             offsets = moved[:, None, :] - self._places[None, columns, :]
             kernel = illuminance_per_candela(np.hypot(offsets[:, :, 0], offsets[:, :, 1]))

@@ -28,7 +28,12 @@ from msgspec.structs import replace
 
 from rampart.actors.osmosis.airport.model import Light
 from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M
-from rampart.actors.osmosis.control.following import light_inspection
+from rampart.actors.osmosis.control.following.light_inspection import (
+    ASIDE_M,
+    FIT_RADIUS_M,
+    PASSED_M,
+    LightInspection,
+)
 from rampart.actors.osmosis.control.following.light_row import LightRow
 from rampart.actors.osmosis.control.polyline import Polyline
 from rampart.actors.osmosis.messages import LightMeasurement, MissionStatus, Mode, Route
@@ -75,7 +80,6 @@ class LightLedger:
 
     def __init__(self, lights: Sequence[Light]) -> None:
         self._lights = tuple(lights)
-        self._limits = light_inspection.InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
         self._names = frozenset(light.name for light in self._lights)
         self._sent_s: dict[str, float] = {}
@@ -128,12 +132,12 @@ class LightLedger:
         feet = line.coordinates(self._places, 0.0, line.length_m)
         return tuple(sorted(
             (float(s), light.name) for (s, n), light in zip(feet, self._lights, strict=True)
-            if abs(n) <= self._limits.aside_m and 0.0 < s < line.length_m))
+            if abs(n) <= ASIDE_M and 0.0 < s < line.length_m))
 
     def leave_out(self, row: Iterable[tuple[float, str]], s_m: float) -> None:
         """Give up the lights under the sensor of a robot that drives round an obstacle there."""
         sensor_m = s_m + SENSOR_FORWARD_M
-        out = tuple(name for at_m, name in row if abs(at_m - sensor_m) <= self._limits.fit_radius_m
+        out = tuple(name for at_m, name in row if abs(at_m - sensor_m) <= FIT_RADIUS_M
                     and name not in self.judged and name not in self.kept.given_up)
         if out:
             self.kept = replace(self.kept, given_up=(*self.kept.given_up, *out))
@@ -155,8 +159,8 @@ class LightLedger:
         """
         if self._shown is None:
             return None
-        judged, limits = self.judged, self._limits
-        passed_m = s_m + SENSOR_FORWARD_M - (0.0 if ended else limits.passed_m + ROOM_M / 4)
+        judged = self.judged
+        passed_m = s_m + SENSOR_FORWARD_M - (0.0 if ended else PASSED_M + ROOM_M / 4)
         for at_m, name in row:
             if at_m > passed_m or name in judged or name in self.kept.given_up:
                 continue
@@ -166,7 +170,7 @@ class LightLedger:
                 continue
             self._gone_back_for = name
             # Turned forward again there, the sensor has the whole of the pass before it.
-            to_s_m = at_m - limits.fit_radius_m - SENSOR_FORWARD_M - ROOM_M
+            to_s_m = at_m - FIT_RADIUS_M - SENSOR_FORWARD_M - ROOM_M
             return Detour(name, max(to_s_m, 0.0))
         return None
 
@@ -187,7 +191,7 @@ class RowInspection:
     def __init__(self, lights: tuple[Light, ...], *, goes_back: bool) -> None:
         self._lights = lights
         self._goes_back = goes_back
-        self.inspection = light_inspection.LightInspection(lights)
+        self.inspection = LightInspection(lights)
         self._mission_id: str | None = None
         self._goal: tuple[str, int, Mode] | None = None
         self._due: dict[str, None] = {}
@@ -206,8 +210,7 @@ class RowInspection:
         if route.mission_id != self._mission_id:
             self._mission_id = route.mission_id
             self.ledger.begin(route.mission_id)
-            self.inspection = light_inspection.LightInspection(
-                self._lights, judged=self.ledger.judged)
+            self.inspection = LightInspection(self._lights, judged=self.ledger.judged)
         goal = (*route.which, route.mode)
         if goal != self._goal:
             self._goal, self._due = goal, {}

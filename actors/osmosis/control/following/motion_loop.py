@@ -8,7 +8,7 @@ between the yaw rate that was commanded and the one that the poses show is integ
 
 What keeps it harmless:
 
-* A difference as small as a healthy base's is none (`dead_band_radps`): without a fault nothing is
+* A difference as small as a healthy base's is none (`DEAD_BAND_RADPS`): without a fault nothing is
   added, and the commands are the same to the bit.
 * The reference is what a healthy base would do, delayed and ramped, so accelerating is no error.
 * Bounded, and the sum stays within the turn rate's bound. While the robot stands, because it is
@@ -23,32 +23,31 @@ from __future__ import annotations
 
 import math
 
-import msgspec
+# How the loop behaves.
+GAIN_PER_S = 1.5
+"""Of the integral."""
 
+MOST_RADPS = 0.8
+"""It adds at most this."""
 
-class LoopLimits(msgspec.Struct, frozen=True):
-    """How the loop behaves.
+DEAD_BAND_RADPS = 0.12
+"""A smaller difference is that of a healthy base."""
 
-    Args:
-        gain_per_s: of the integral.
-        most_radps: it adds at most this.
-        dead_band_radps: a smaller difference is that of a healthy base.
-        leak_s: time constant in which what was added is forgotten.
-        lag_s: time constant of a healthy base and of the way to it.
-        standing_mps, standing_radps: slower, the robot stands.
-        gap_s: poses farther apart than this say nothing about a rate.
-        window_s: over which the yaw rate is measured.
-    """
+LEAK_S = 20.0
+"""Time constant in which what was added is forgotten."""
 
-    gain_per_s: float = 1.5
-    most_radps: float = 0.8
-    dead_band_radps: float = 0.12
-    leak_s: float = 20.0
-    lag_s: float = 0.2
-    standing_mps: float = 0.05
-    standing_radps: float = 0.05
-    gap_s: float = 0.5
-    window_s: float = 0.15
+LAG_S = 0.2
+"""Time constant of a healthy base and of the way to it."""
+
+STANDING_MPS = 0.05
+STANDING_RADPS = 0.05
+"""Slower, the robot stands."""
+
+GAP_S = 0.5
+"""Poses farther apart than this say nothing about a rate."""
+
+WINDOW_S = 0.15
+"""Over which the yaw rate is measured."""
 
 
 class MotionLoop:
@@ -59,7 +58,6 @@ class MotionLoop:
     """
 
     def __init__(self, max_angular_radps: float) -> None:
-        self._limits = LoopLimits()
         self._top = max_angular_radps
         self._poses: list[tuple[float, float, float, float]] = []
         self._rate_radps = 0.0
@@ -74,20 +72,19 @@ class MotionLoop:
 
         One that is not in the loop would wind up: what it commands is not what the base does.
         """
-        most = self._limits.most_radps
-        self.added_radps = max(-most, min(most, added_radps))
+        self.added_radps = max(-MOST_RADPS, min(MOST_RADPS, added_radps))
         self._adopted_until_s = until_s
 
     def pose(self, stamp_s: float, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Take a pose in `map`, true at `stamp_s`."""
-        poses, limits = self._poses, self._limits
+        poses = self._poses
         if poses and not stamp_s > poses[-1][0]:
             return
         self._now_s = stamp_s
-        if poses and stamp_s - poses[-1][0] > limits.gap_s:
+        if poses and stamp_s - poses[-1][0] > GAP_S:
             poses.clear()
         poses.append((stamp_s, x_m, y_m, yaw_rad))
-        while len(poses) > 2 and stamp_s - poses[1][0] >= limits.window_s - 1e-9:
+        while len(poses) > 2 and stamp_s - poses[1][0] >= WINDOW_S - 1e-9:
             poses.pop(0)
         then_s, then_x_m, then_y_m, then_yaw_rad = poses[0]
         if stamp_s > then_s:
@@ -104,19 +101,17 @@ class MotionLoop:
             angular_radps: turn rate that is meant.
             dt_s: since the last call.
         """
-        limits = self._limits
-        follow = 1.0 - math.exp(-dt_s / limits.lag_s)
+        follow = 1.0 - math.exp(-dt_s / LAG_S)
         self._expected_radps += follow * (angular_radps - self._expected_radps)
-        self.added_radps *= math.exp(-dt_s / limits.leak_s)
+        self.added_radps *= math.exp(-dt_s / LEAK_S)
         if (linear_mps, angular_radps) == (0.0, 0.0):
             return 0.0
-        stands = (self._speed_mps < limits.standing_mps
-                  and abs(self._rate_radps) < limits.standing_radps)
+        stands = self._speed_mps < STANDING_MPS and abs(self._rate_radps) < STANDING_RADPS
         in_the_loop = self._measured and not stands and self._now_s >= self._adopted_until_s
         short = self._expected_radps - self._rate_radps if in_the_loop else 0.0
-        short = math.copysign(max(abs(short) - limits.dead_band_radps, 0.0), short)
-        added = self.added_radps + limits.gain_per_s * short * dt_s
-        added = max(-limits.most_radps, min(limits.most_radps, added))
+        short = math.copysign(max(abs(short) - DEAD_BAND_RADPS, 0.0), short)
+        added = self.added_radps + GAIN_PER_S * short * dt_s
+        added = max(-MOST_RADPS, min(MOST_RADPS, added))
         wanted = angular_radps + added
         turn = max(-self._top, min(self._top, wanted))
         if turn == wanted or abs(added) < abs(self.added_radps):

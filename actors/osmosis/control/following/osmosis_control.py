@@ -65,13 +65,13 @@ class OsmosisControl(Actor):
         super().__init__(context)
         system, airport = context.run.system, Osmosis.of(context).airport
         parameters = self.parameters
-        self._lights = RowInspection(airport.lights, goes_back=system.layers.checkpoints) \
-            if topics.LIGHT_MEASURED in self.outputs else None
+        measures = topics.LIGHT_MEASURED in self.outputs
+        self._lights = RowInspection(airport.lights if measures else (),
+                                     goes_back=measures and system.layers.checkpoints)
         self.core = RouteControl(
             system, airport, self.report_diagnostic, context.clock.now(),
             RowLimits(pass_after_s=parameters.pass_after_s or math.inf),
-            lights=self._lights,
-            check=RouteCheck(airport) if parameters.check_route else None,
+            lights=self._lights, check=RouteCheck(airport) if parameters.check_route else None,
             bridge=DeadReckoning(parameters.bridge_m) if parameters.bridge_m else None,
             loop=MotionLoop(system.robot.top_turn_rate_radps) if parameters.yaw_loop else None,
             has_standby=parameters.has_standby)
@@ -88,8 +88,7 @@ class OsmosisControl(Actor):
     @on(topics.MISSION_STATUS)
     def mission(self, message: m.MissionStatus, _header: Header) -> None:
         """Hear which lights the Mission Manager has."""
-        if self._lights:
-            self._lights.hear(message)
+        self._lights.hear(message)
 
     @on(topics.POSE)
     def pose(self, message: m.Pose, header: Header) -> None:
@@ -112,8 +111,7 @@ class OsmosisControl(Actor):
     @on(topics.LIGHT)
     def light(self, message: m.LightSample, header: Header) -> None:
         """Take a reading of the light sensor."""
-        if self._lights:
-            self._lights.inspection.sample(header.stamp, message.illuminance_lux)
+        self._lights.inspection.sample(header.stamp, message.illuminance_lux)
 
     @on(topics.GOAL)
     def goal(self, message: m.GoalOrder, _header: Header) -> None:
@@ -167,5 +165,5 @@ class OsmosisControl(Actor):
     def repeat(self) -> None:
         """Repeat the status for whoever joined late."""
         self.publish(topics.CONTROL_STATUS, self.core.status)
-        for light in self._lights.to_send_again(self.clock.now()) if self._lights else ():
+        for light in self._lights.to_send_again(self.clock.now()):
             self.publish(topics.LIGHT_MEASURED, light)

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.control.following.escape import Deviation, Escape, EscapeLimits
-from rampart.actors.osmosis.control.following.potential_field import FieldGains, field
+from rampart.actors.osmosis.control.following.potential_field import field
 from rampart.actors.osmosis.control.polyline import (
     Array,
     Hull,
@@ -161,16 +161,14 @@ class PathFollower(Follower):
         waypoints: the route in `map`, at least one point.
         hull: footprint of the robot.
         limits: speeds and distances.
-        gains: shape of the potential field.
         escape: room for passing obstacles.
         near_s_m: arc length at which the robot was last known to be, for one that resumes.
     """
 
     def __init__(self, waypoints: tuple[Point, ...], hull: Hull | None = None,
-                 limits: MotionLimits | None = None, gains: FieldGains | None = None,
-                 escape: EscapeLimits | None = None, *, near_s_m: float | None = None) -> None:
+                 limits: MotionLimits | None = None, escape: EscapeLimits | None = None, *,
+                 near_s_m: float | None = None) -> None:
         super().__init__(waypoints, hull, limits, near_s_m)
-        self._gains = gains or FieldGains()
         self._room = escape or EscapeLimits()
         self._escape = Escape(self._hull, self._room)
 
@@ -234,7 +232,7 @@ class PathFollower(Follower):
             dx, dy = self._beside(s_m + reach_m, way.offset_m, x_m, y_m)
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         target_x, target_y = cos * dx + sin * dy, cos * dy - sin * dx
-        field_x, field_y = field(target_x, target_y, points, self._hull, self._gains)
+        field_x, field_y = field(target_x, target_y, points, self._hull)
         bearing = math.atan2(field_y, field_x)
         along = wrap_angle(heading - yaw_rad)
         outwards = wrap_angle(bearing - along) * n_m > 0.0

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 
-import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.control.polyline import Array, Hull
@@ -22,22 +21,19 @@ from rampart.actors.osmosis.control.polyline import Array, Hull
 _NEAR_M = 0.1
 """Nearer than this to the target the attraction fades."""
 
+# Shape of the field.
+INFLUENCE_M = 0.9
+"""The distance d_s from the hull at which repulsion begins."""
 
-class FieldGains(msgspec.Struct, frozen=True):
-    """Shape of the field.
+REPULSION = 0.06
+"""At 0.06 an echo 0.1 m aside turns the way by 28 degrees."""
 
-    Args:
-        influence_m: d_s, the distance from the hull at which repulsion begins.
-        repulsion: alpha; at 0.06 an echo 0.1 m aside turns the way by 28 degrees.
-        least_distance_m: distances below this repel no stronger.
-        least_advance: part of the attraction which opposing repulsion leaves, so that the field
-            turns the robot aside but never about.
-    """
+LEAST_DISTANCE_M = 0.05
+"""Distances below this repel no stronger."""
 
-    influence_m: float = 0.9
-    repulsion: float = 0.06
-    least_distance_m: float = 0.05
-    least_advance: float = 0.15
+LEAST_ADVANCE = 0.15
+"""Part of the attraction which opposing repulsion leaves, so that the field turns the robot aside
+but never about."""
 
 
 def clusters(points: Array, gap_m: float = 0.5) -> list[Array]:
@@ -46,19 +42,19 @@ def clusters(points: Array, gap_m: float = 0.5) -> list[Array]:
     return np.split(points, np.flatnonzero(steps > gap_m) + 1)
 
 
-def repulsion(points: Array, hull: Hull, gains: FieldGains) -> tuple[float, float]:
+def repulsion(points: Array, hull: Hull) -> tuple[float, float]:
     """Sum over the obstacles of the push of each one's nearest echo, in `base_link`.
 
     One echo per obstacle: else the push would depend on the laser's resolution.
     """
     push_x = push_y = 0.0
-    if not len(points) or float(hull.distance(points).min()) >= gains.influence_m:
+    if not len(points) or float(hull.distance(points).min()) >= INFLUENCE_M:
         return push_x, push_y  # as nearly always
     for cluster in clusters(points):
         distances = hull.distance(cluster)
         nearest = int(np.argmin(distances))
-        distance_m = max(float(distances[nearest]), gains.least_distance_m)
-        if distance_m >= gains.influence_m:
+        distance_m = max(float(distances[nearest]), LEAST_DISTANCE_M)
+        if distance_m >= INFLUENCE_M:
             continue
         x_m, y_m = (float(v) for v in cluster[nearest])
         away_x = min(max(x_m, -hull.half_length_m), hull.half_length_m) - x_m
@@ -66,14 +62,13 @@ def repulsion(points: Array, hull: Hull, gains: FieldGains) -> tuple[float, floa
         norm = math.hypot(away_x, away_y)
         if norm < 1e-9:  # inside the hull: away from the centre is all there is to say
             away_x, away_y, norm = -x_m, -y_m, max(math.hypot(x_m, y_m), 1e-9)
-        size = gains.repulsion * (1.0 / distance_m - 1.0 / gains.influence_m)
+        size = REPULSION * (1.0 / distance_m - 1.0 / INFLUENCE_M)
         push_x += size * away_x / norm
         push_y += size * away_y / norm
     return push_x, push_y
 
 
-def field(target_x_m: float, target_y_m: float, points: Array, hull: Hull,
-          gains: FieldGains) -> tuple[float, float]:
+def field(target_x_m: float, target_y_m: float, points: Array, hull: Hull) -> tuple[float, float]:
     """Return the field's vector at the robot, in `base_link`; its direction is where to go.
 
     Args:
@@ -81,16 +76,15 @@ def field(target_x_m: float, target_y_m: float, points: Array, hull: Hull,
         target_y_m: point of attraction in `base_link`.
         points: laser echoes in `base_link`, shape (n, 2), in the order of the sweep.
         hull: footprint of the robot.
-        gains: shape of the field.
     """
     # A unit vector to the target, shrinking linearly near it (paper's conic-quadratic).
     scale = max(math.hypot(target_x_m, target_y_m), _NEAR_M)
     pull_x, pull_y = target_x_m / scale, target_y_m / scale
-    push_x, push_y = repulsion(points, hull, gains)
+    push_x, push_y = repulsion(points, hull)
     pull = math.hypot(pull_x, pull_y)
     if pull < 1e-9:
         return push_x, push_y
     ahead_x, ahead_y = pull_x / pull, pull_y / pull
-    along = max(pull + push_x * ahead_x + push_y * ahead_y, gains.least_advance * pull)
+    along = max(pull + push_x * ahead_x + push_y * ahead_y, LEAST_ADVANCE * pull)
     aside = ahead_x * push_y - ahead_y * push_x
     return along * ahead_x - aside * ahead_y, along * ahead_y + aside * ahead_x

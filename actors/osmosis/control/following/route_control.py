@@ -102,7 +102,7 @@ class RouteControl:
         tell: reports what is wrong: context, reason, and of what.
         now_s: now.
         row: how rows of lights are followed.
-        lights: measures lights; None for a standby, which leaves them to the active one.
+        lights: measures lights; of none for a standby, which leaves them to the active one.
         check: checks a route before it is followed. A bad one is refused: the robot stands, or
             follows the good one that it has for the same goal.
         bridge: knows where the robot is while the pose is stale; beyond its bound the robot stops.
@@ -115,7 +115,7 @@ class RouteControl:
 
     def __init__(
         self, system: SystemSpec, airport: Airport, tell: Callable[[str, str, str], None],
-        now_s: float, row: RowLimits, *, lights: RowInspection | None = None,
+        now_s: float, row: RowLimits, *, lights: RowInspection,
         check: RouteCheck | None = None, bridge: DeadReckoning | None = None,
         loop: MotionLoop | None = None, has_standby: bool = False,
     ) -> None:
@@ -150,14 +150,13 @@ class RouteControl:
         if route is None or not self._resumes:
             return None
         return ControlKept(
-            self._lights.ledger.kept if self._lights else LightsKept(route.mission_id), route,
+            self._lights.ledger.kept, route,
             self._follower.progress_m if self._follower else None, self._row_start)
 
     def restore(self, kept: ControlKept) -> None:
         """Know what a predecessor knew; the robot goes on when the route is there."""
         self._last, self._row_start = kept, kept.row_start
-        if self._lights:
-            self._lights.ledger.restore(kept.lights)
+        self._lights.ledger.restore(kept.lights)
 
     # -- what it hears --------------------------------------------------------------------------
 
@@ -169,8 +168,7 @@ class RouteControl:
         if not is_sane(*place):
             return
         self._pose = place
-        if self._lights:
-            self._lights.inspection.pose(stamp_s, *place)
+        self._lights.inspection.pose(stamp_s, *place)
         if self._loop:
             self._loop.pose(stamp_s, *place)
 
@@ -226,9 +224,8 @@ class RouteControl:
             self._row_start = route.waypoints[0]
         self._route = route
         self._follower = self._follower_of(route)
-        if self._lights:
-            self._lights.begin(
-                route, self._follower if isinstance(self._follower, LightRow) else None)
+        self._lights.begin(
+            route, self._follower if isinstance(self._follower, LightRow) else None)
         self._watch.restart()
         self._blocked = None
         self._last = ControlKept()
@@ -305,7 +302,7 @@ class RouteControl:
 
         They are sent before the arrival is, so that none comes too late.
         """
-        if not self._lights or self._motion is None or not isinstance(self._follower, LightRow):
+        if self._motion is None or not isinstance(self._follower, LightRow):
             return []
         return self._lights.measure(now_s, arrived=self._motion.arrived)
 
@@ -323,7 +320,7 @@ class RouteControl:
     def _look_back(self) -> bool:
         """Go back for a light that was missed; return whether one of the row is missing yet."""
         motion, row, lights = self._motion, self._follower, self._lights
-        if motion is None or lights is None or not isinstance(row, LightRow):
+        if motion is None or not isinstance(row, LightRow):
             return False
         light = lights.look_back(row, arrived=motion.arrived)
         if light:
@@ -346,7 +343,7 @@ class RouteControl:
         return m.ControlStatus(
             mission_id, step, phase, motion.waypoint, motion.distance_to_go_m,
             (self._blocked,) if self._blocked else (), self._why_refused,
-            self._lights.missed if self._lights and motion.arrived else (),
+            self._lights.missed if motion.arrived else (),
             (row.back_to,) if row and row.back_to is not None else (),
             row.is_passing if row else False,
             follower.aside_m if isinstance(follower, PathFollower) else 0.0,

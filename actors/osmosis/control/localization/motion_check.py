@@ -58,30 +58,6 @@ IMU_PARITY = ParityLimits(step=0.02, sum=0.02, forget_s=2.0, fastest=3.6)
 Two hundredths of a radian per second reach the sum's limit in 1.4 s."""
 
 
-class Trust:
-    """Whether a source is believed, and since when it has been without a flaw.
-
-    Attributes:
-        reason: why it is not believed; "" if it is.
-    """
-
-    __slots__ = ("_clean_since_s", "reason")
-
-    def __init__(self) -> None:
-        self.reason = ""
-        self._clean_since_s = -math.inf
-
-    def flaw(self, reason: str, stamp_s: float) -> None:
-        """Note a flaw: it is not believed from now on; the first reason stays."""
-        self.reason = self.reason or reason
-        self._clean_since_s = stamp_s
-
-    def clean(self, stamp_s: float) -> None:
-        """Note a message without a flaw."""
-        if self.reason and stamp_s - self._clean_since_s >= BACK_AFTER_S:
-            self.reason = ""
-
-
 @dataclass(slots=True)
 class Source:
     """What is known of any source.
@@ -89,14 +65,25 @@ class Source:
     Attributes:
         name: for people.
         fresh_s: greatest age of a reading that counts as present.
-        trust: whether it is believed.
+        distrust: why it is not believed; "" if it is.
         stamp_s: of the newest reading.
     """
 
     name: str
     fresh_s: float
-    trust: Trust = field(default_factory=Trust, init=False)
+    distrust: str = field(default="", init=False)
     stamp_s: float = field(default=-math.inf, init=False)
+    _clean_since_s: float = field(default=-math.inf, init=False)
+
+    def flaw(self, reason: str, stamp_s: float) -> None:
+        """Note a flaw: it is not believed from now on; the first reason stays."""
+        self.distrust = self.distrust or reason
+        self._clean_since_s = stamp_s
+
+    def clean(self, stamp_s: float) -> None:
+        """Note a message without a flaw."""
+        if self.distrust and stamp_s - self._clean_since_s >= BACK_AFTER_S:
+            self.distrust = ""
 
     def fresh(self, now_s: float) -> bool:
         """Whether there is a present reading."""
@@ -104,12 +91,12 @@ class Source:
 
     def usable(self, now_s: float) -> bool:
         """Whether there is one, and it is believed."""
-        return not self.trust.reason and now_s - self.stamp_s <= self.fresh_s
+        return not self.distrust and now_s - self.stamp_s <= self.fresh_s
 
     def why_not(self, now_s: float) -> str:
         """Return why it is not in use, or ""."""
-        if self.trust.reason or self.usable(now_s):
-            return self.trust.reason
+        if self.distrust or self.usable(now_s):
+            return self.distrust
         return "never heard" if self.stamp_s == -math.inf else "silent or late"
 
 
@@ -131,7 +118,7 @@ class OdometryCheck(Source):
 
         Returns:
             None for the first message, one after a gap, an old one, one that is no number, and
-            one with a flaw; `trust` may deny more.
+            one with a flaw; `distrust` may deny more.
         """
         pose = x_m, y_m, yaw_rad = reading.pose.x_m, reading.pose.y_m, reading.pose.yaw_rad
         linear_mps = reading.twist.linear_mps
@@ -151,14 +138,14 @@ class OdometryCheck(Source):
         off_x, off_y = dx - linear_mps * dt_s * cos, dy - linear_mps * dt_s * sin
         if abs(linear_mps) > limits.fastest or math.hypot(off_x, off_y) > limits.step + dt_s**2:
             self._sum = (0.0, 0.0)
-            self.trust.flaw("pose and twist contradict each other", stamp_s)
+            self.flaw("pose and twist contradict each other", stamp_s)
             return None
         keep = max(0.0, 1.0 - dt_s / limits.forget_s)
         self._sum = sum_x, sum_y = self._sum[0] * keep + off_x, self._sum[1] * keep + off_y
         if sum_x * sum_x + sum_y * sum_y > limits.sum**2:
-            self.trust.flaw("pose and twist drift apart", stamp_s)
+            self.flaw("pose and twist drift apart", stamp_s)
         else:
-            self.trust.clean(stamp_s)
+            self.clean(stamp_s)
         return dt_s, forward_m, turn
 
 
@@ -199,13 +186,13 @@ class ImuCheck(Source):
         self._sum = self._sum * max(0.0, 1.0 - dt_s / limits.forget_s) + off
         if abs(rate_radps) > limits.fastest or not -limits.step < off < limits.step:
             self._sum = 0.0
-            self.trust.flaw("heading and turning rate contradict each other", stamp_s)
+            self.flaw("heading and turning rate contradict each other", stamp_s)
         elif abs(self._sum) > limits.sum:
-            self.trust.flaw("heading and turning rate drift apart", stamp_s)
+            self.flaw("heading and turning rate drift apart", stamp_s)
         elif self._flat >= _FLAT_READINGS:
-            self.trust.flaw("repeats the same reading", stamp_s)
-        elif self.trust.reason:
-            self.trust.clean(stamp_s)
+            self.flaw("repeats the same reading", stamp_s)
+        elif self.distrust:
+            self.clean(stamp_s)
 
     def heading_at(self, stamp_s: float) -> float:
         """Return the heading at a time near the newest message, rad, not wrapped."""

@@ -29,7 +29,7 @@ from typing import NamedTuple
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.plausible import is_sane
 from rampart.actors.osmosis.control.localization import position_source as positions
-from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck, Trust
+from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
 from rampart.actors.osmosis.control.polyline import wrap_angle
@@ -111,9 +111,9 @@ class PoseFilter:
         if step is None or self._ekf is None:
             return
         dt_s, forward_m, turn_rad = step
-        if wheels.trust.reason:
+        if wheels.distrust:
             if abs(forward_m / dt_s - self._speed_mps) > _OTHER_SPEED_MPS:
-                wheels.trust.flaw(wheels.trust.reason, stamp_s)
+                wheels.flaw(wheels.distrust, stamp_s)
             return
         self._speed_mps = reading.twist.linear_mps
         rest_s = stamp_s - self._time_s
@@ -202,7 +202,7 @@ class PoseFilter:
             return
         x_m, y_m = self._bring_up(ekf, source, stamp_s - then_s)
         if source.repeats >= _GPS_REPEATS:
-            source.trust.flaw("repeats the same fix", stamp_s)
+            source.flaw("repeats the same fix", stamp_s)
         self._compare(ekf, stamp_s)
         variance = max(accuracy_m, limits.gps_sd_m) ** 2
         fits = source.repeats < _GPS_REPEATS and (
@@ -237,8 +237,8 @@ class PoseFilter:
         x_m = source.reading[0] + on_m * math.cos(ekf.yaw_rad)
         y_m = source.reading[1] + on_m * math.sin(ekf.yaw_rad)
         # While it is not clear who is wrong, and later of who is, nothing is taken for usual.
-        sure = self._pose.trust.reason or self._gps.trust.reason
-        doubted = source.trust.reason if sure else (math.hypot(*self._apart) > self.limits.apart_m)
+        sure = self._pose.distrust or self._gps.distrust
+        doubted = source.distrust if sure else (math.hypot(*self._apart) > self.limits.apart_m)
         source.see((x_m - self._track[0], y_m - self._track[1]), dt_s,
                    math.inf if doubted else self.limits.witness_s)
         return x_m, y_m
@@ -259,11 +259,11 @@ class PoseFilter:
             apart[1] + _APART_GAIN * (pose.offset[1] - gps.offset[1] - apart[1]))
         apart_m = math.hypot(*apart)
         by_pose, by_gps = pose.deviation_m, gps.deviation_m
-        excluded = pose.trust.reason or gps.trust.reason
+        excluded = pose.distrust or gps.distrust
         if apart_m <= limits.apart_m:
             if min(by_pose, by_gps) > _WHEELS_ASTRAY_M and not (
-                    excluded or self._wheels.trust.reason):
-                self._wheels.trust.flaw("drifts against both positions", stamp_s)
+                    excluded or self._wheels.distrust):
+                self._wheels.flaw("drifts against both positions", stamp_s)
                 pose.start_over()
                 gps.start_over()
             return
@@ -276,11 +276,11 @@ class PoseFilter:
             self._exclude(ekf, gps, apart_m, stamp_s)
         elif apart_m > limits.contradiction_m:
             for source, other in ((pose, gps), (gps, pose)):
-                source.trust.flaw(f"contradicts {other.name} by {apart_m:.1f} m", stamp_s)
+                source.flaw(f"contradicts {other.name} by {apart_m:.1f} m", stamp_s)
 
     def _exclude(self, ekf: PlanarEkf, source: PositionSource, apart_m: float, stamp_s: float
                  ) -> None:
-        source.trust.flaw(f"moves otherwise than the others, {apart_m:.1f} m", stamp_s)
+        source.flaw(f"moves otherwise than the others, {apart_m:.1f} m", stamp_s)
         # It has been taken in until now; what was farther off than this failed the gate.
         doubt_m = min(apart_m, self.limits.contradiction_m / 2)
         ekf.doubt(doubt_m, doubt_m / 10)
@@ -288,58 +288,58 @@ class PoseFilter:
     def _judge(self, ekf: PlanarEkf, source: PositionSource, other: PositionSource, fits: bool
                ) -> bool:
         """Note whether a reading fits; return whether to take it in."""
-        stamp_s, trust = source.stamp_s, source.trust
+        stamp_s = source.stamp_s
         apart_m = math.hypot(*self._apart)
-        if source.deviation_m > _WHEELS_ASTRAY_M and not trust.reason \
+        if source.deviation_m > _WHEELS_ASTRAY_M and not source.distrust \
                 and not other.usable(stamp_s) \
                 and self._wheels.usable(stamp_s) and self._gyro.usable(stamp_s):
             # One against one. Who is wrong is not known; dead reckoning is wrong more slowly.
             self._exclude(ekf, source, source.deviation_m, stamp_s)
         if fits:
             source.fails = 0
-            if trust.reason:
+            if source.distrust:
                 if apart_m > self.limits.apart_m if other.fresh(stamp_s) else (
                         source.deviation_m > _WHEELS_ASTRAY_M):
-                    trust.flaw(trust.reason, stamp_s)
+                    source.flaw(source.distrust, stamp_s)
                 else:
-                    trust.clean(stamp_s)
-                    if not trust.reason:
+                    source.clean(stamp_s)
+                    if not source.distrust:
                         source.start_over()
-            return not trust.reason
+            return not source.distrust
         source.fails += 1
-        if trust.reason:
-            trust.flaw(trust.reason, stamp_s)
+        if source.distrust:
+            source.flaw(source.distrust, stamp_s)
         if other.fails and other.fresh(stamp_s) and self._together >= _MORE_THAN_CHANCE:
             self._believe_both(ekf, stamp_s)
-        elif source.fails >= source.patience and not trust.reason:
-            trust.flaw("does not fit the motion", stamp_s)
+        elif source.fails >= source.patience and not source.distrust:
+            source.flaw("does not fit the motion", stamp_s)
         return False
 
     def _believe_both(self, ekf: PlanarEkf, stamp_s: float) -> None:
         """Neither position fits the filter, and they agree: it was the prediction that failed."""
         pose, gps = self._pose, self._gps
         if abs(wrap_angle(pose.reading[2] - ekf.yaw_rad)) > _GYRO_ASTRAY_RAD:
-            self._gyro.trust.flaw("its turns do not fit the positions", stamp_s)
+            self._gyro.flaw("its turns do not fit the positions", stamp_s)
             self._gyro_used = None
         else:
-            self._wheels.trust.flaw("does not fit the positions", stamp_s)
+            self._wheels.flaw("does not fit the positions", stamp_s)
         x_m, y_m = (o + t for o, t in zip(pose.offset, self._track, strict=True))
         ekf.doubt(1.0, 1.0)
         ekf.update_position(x_m, y_m, self.limits.absolute_sd_m**2)
         ekf.update_heading(pose.reading[2], self.limits.absolute_sd_rad**2)
         self._apart = (0.0, 0.0)
         for source in (pose, gps):
-            source.trust, source.fails = Trust(), 0
+            source.distrust, source.fails = "", 0
             source.start_over()
 
     def _weigh_gyro(self, ekf: PlanarEkf, stamp_s: float) -> None:
         """Keep an excluded gyro excluded while it turns otherwise than the robot."""
-        trust = self._gyro.trust
-        if trust.reason:
-            off = wrap_angle(self._gyro.yaw_rad - ekf.yaw_rad)
+        gyro = self._gyro
+        if gyro.distrust:
+            off = wrap_angle(gyro.yaw_rad - ekf.yaw_rad)
             if abs(wrap_angle(off - self._gyro_off)) > _GYRO_ASTRAY_RAD:
                 self._gyro_off = off
-                trust.flaw(trust.reason, stamp_s)
+                gyro.flaw(gyro.distrust, stamp_s)
 
     # -- start ----------------------------------------------------------------------------------
 

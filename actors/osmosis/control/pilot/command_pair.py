@@ -21,38 +21,37 @@ from __future__ import annotations
 
 import math
 
-import msgspec
-
 Command = tuple[float, float]
 """Linear velocity, m/s, and turn rate, rad/s, of `base_link`."""
 
 FORGET_S = 5.0
 """So long after the last comparison a doubt is over."""
 
+# When the standby drives, and when the two disagree.
+TAKEOVER_S = 0.2
+"""Age of the active one's command at which a fresher standby drives: four periods."""
 
-class PairLimits(msgspec.Struct, frozen=True):
-    """When the standby drives, and when the two disagree.
+RETURN_S = 0.5
+"""How long the active one must have been good to drive again."""
 
-    Args:
-        takeover_s: age of the active one's command at which a fresher standby drives: four periods.
-        return_s: how long the active one must have been good to drive again.
-        settling_s: how long a respawned follower takes to accelerate from its zero: meanwhile the
-            other drives, and a difference raises no new doubt.
-        linear_mps: difference of speed that is none.
-        angular_radps: difference of turn rate that is none.
-        doubt_s: how long they must have differed.
-        reassured_s: how long they must have agreed again.
-        caution_mps: top speed while in doubt.
-    """
+SETTLING_S = 1.5
+"""How long a respawned follower takes to accelerate from its zero: meanwhile the other drives, and
+a difference raises no new doubt."""
 
-    takeover_s: float = 0.2
-    return_s: float = 0.5
-    settling_s: float = 1.5
-    linear_mps: float = 0.25
-    angular_radps: float = 0.35
-    doubt_s: float = 0.15
-    reassured_s: float = 0.3
-    caution_mps: float = 0.3
+LINEAR_MPS = 0.25
+"""Difference of speed that is none."""
+
+ANGULAR_RADPS = 0.35
+"""Difference of turn rate that is none."""
+
+DOUBT_S = 0.15
+"""How long they must have differed."""
+
+REASSURED_S = 0.3
+"""How long they must have agreed again."""
+
+CAUTION_MPS = 0.3
+"""Top speed while in doubt."""
 
 
 class CommandPair:
@@ -61,8 +60,7 @@ class CommandPair:
     Times are simulated seconds. Commands that the gate refused are None.
     """
 
-    def __init__(self, limits: PairLimits) -> None:
-        self._limits = limits
+    def __init__(self) -> None:
         self._active: Command | None = None
         self._active_s = -math.inf
         self._good_from_s = -math.inf
@@ -76,15 +74,14 @@ class CommandPair:
 
     def active(self, command: Command | None, stamp_s: float, incarnation: int, now: float) -> None:
         """Take Osmosis Control's command, or None for a refused one."""
-        limits = self._limits
         if self._is_reborn(0, incarnation):
-            self._good_from_s = self._settled_s = now + limits.settling_s
+            self._good_from_s = self._settled_s = now + SETTLING_S
         elif command is None:
             self._good_from_s = math.inf
         elif self._good_from_s == math.inf or (
-                now - self._active_s > limits.takeover_s and self._active_s > -math.inf):
+                now - self._active_s > TAKEOVER_S and self._active_s > -math.inf):
             # It makes good what was wrong or late; a first command has nothing to make good.
-            self._good_from_s = now + limits.return_s
+            self._good_from_s = now + RETURN_S
         self._active, self._active_s = command, max(stamp_s, self._active_s)
         self._compare(now)
 
@@ -92,7 +89,7 @@ class CommandPair:
                 ) -> None:
         """Take the standby's command, or None for a refused one."""
         if self._is_reborn(1, incarnation):
-            self._settled_s = now + self._limits.settling_s
+            self._settled_s = now + SETTLING_S
         self._standby, self._standby_s = command, max(stamp_s, self._standby_s)
         self._compare(now)
 
@@ -101,25 +98,23 @@ class CommandPair:
         return 0 < before < incarnation
 
     def _compare(self, now: float) -> None:
-        limits = self._limits
         a, b = self._active, self._standby
-        if a is None or b is None or now - min(self._active_s, self._standby_s) > limits.takeover_s:
+        if a is None or b is None or now - min(self._active_s, self._standby_s) > TAKEOVER_S:
             return
         self._compared_s = now
-        if abs(a[0] - b[0]) > limits.linear_mps or abs(a[1] - b[1]) > limits.angular_radps:
+        if abs(a[0] - b[0]) > LINEAR_MPS or abs(a[1] - b[1]) > ANGULAR_RADPS:
             self._agreed_since_s = math.inf
             if now >= self._settled_s:
                 self._apart_since_s = min(self._apart_since_s, now)
             return
         self._agreed_since_s = min(self._agreed_since_s, now)
-        doubt = now - self._apart_since_s >= limits.doubt_s
-        if not doubt or now - self._agreed_since_s >= limits.reassured_s:
+        doubt = now - self._apart_since_s >= DOUBT_S
+        if not doubt or now - self._agreed_since_s >= REASSURED_S:
             self._apart_since_s = math.inf
 
     def in_doubt(self, now: float) -> bool:
         """Whether the two have differed for long enough, and have not agreed since."""
-        return (now - self._apart_since_s >= self._limits.doubt_s
-                and now - self._compared_s <= FORGET_S)
+        return now - self._apart_since_s >= DOUBT_S and now - self._compared_s <= FORGET_S
 
     def choice(self, active: tuple[Command | None, str], standby: Command | None, now: float
                ) -> tuple[Command | None, str]:
@@ -130,11 +125,10 @@ class CommandPair:
             standby: the standby's, or None.
             now: now.
         """
-        limits = self._limits
         command, why = active
         if standby is None:
             return self._carefully(command, now) if command is not None else (None, why)
-        late = now - self._active_s > limits.takeover_s and self._standby_s > self._active_s
+        late = now - self._active_s > TAKEOVER_S and self._standby_s > self._active_s
         if command is None or late or now < self._good_from_s:
             reason = why or ("no fresh command" if late else "the other is not good for long yet")
             standby, doubt = self._carefully(standby, now)
@@ -148,5 +142,5 @@ class CommandPair:
         """Return a command no faster than caution allows, and why."""
         if not self.in_doubt(now):
             return command, ""
-        top = self._limits.caution_mps
-        return (max(-top, min(top, command[0])), command[1]), "active and standby disagree"
+        linear_mps = max(-CAUTION_MPS, min(CAUTION_MPS, command[0]))
+        return (linear_mps, command[1]), "active and standby disagree"

@@ -22,7 +22,7 @@ import msgspec
 from rampart.actors.bus.envelope import AHEAD_S, Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.ftm.holders import Holders
-from rampart.actors.osmosis.control.pilot.command_pair import CommandPair, PairLimits
+from rampart.actors.osmosis.control.pilot.command_pair import CommandPair
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array
 from rampart.actors.osmosis.messages import PilotMode, PilotOrder, Twist
@@ -79,7 +79,6 @@ class GateLimits(msgspec.Struct, frozen=True):
     manager_timeout_s: float = 0.5
     settling_s: float = 0.45
     room: StoppingRoom = StoppingRoom()
-    pair: PairLimits = PairLimits()
 
 
 class GateOutput(msgspec.Struct, frozen=True, gc=False):
@@ -126,7 +125,7 @@ class SafetyGate:
             True, PilotMode.STOP, "too many unknown modules order something"))
         self._auto = _Line()
         self._standby = _Line()
-        self._pair = CommandPair(limits.pair)
+        self._pair = CommandPair()
         self._stick = _Line()
         self._manager_heard_s = -math.inf
         self._points: Array = NO_POINTS

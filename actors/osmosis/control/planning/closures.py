@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 
 import msgspec
 
+from rampart.actors.bus.limits import Remembered
 from rampart.actors.osmosis.airport.model import Point
 from rampart.actors.osmosis.control.planning.route_search import Edge
 
@@ -33,7 +34,7 @@ class Closures(msgspec.Struct):
 
     gap_m: float = 1.0
     lasts_s: float = 60.0
-    _until_s: dict[Point, float] = {}
+    _until_s: dict[Point, float] = msgspec.field(default_factory=lambda: Remembered(MOST_PLACES))
 
     def close(self, place: Point, now_s: float) -> None:
         """Close the graph round a place in `map`; one near it that was closed before is renewed."""
@@ -41,8 +42,6 @@ class Closures(msgspec.Struct):
             if math.dist(known, place) <= self.gap_m:
                 self._until_s[known] = now_s + self.lasts_s
                 return
-        if len(self._until_s) >= MOST_PLACES:
-            del self._until_s[next(iter(self._until_s))]
         self._until_s[place] = now_s + self.lasts_s
 
     def reopen(self) -> None:

@@ -19,28 +19,28 @@ from rampart.actors.osmosis.airport.model import Attachment, Point, foot, show
 
 Edge = tuple[str, str]
 
+# How far start and goal may be from the graph, in metres.
+NODE_SNAP_M = 0.3
+"""A node at most this much farther than the nearest edge wins over the edge."""
 
-class SearchLimits(msgspec.Struct, frozen=True):
-    """How far start and goal may be from the graph, in metres.
+START_REACH_M = 12.0
+"""Farthest distance of the robot from the graph."""
 
-    Args:
-        node_snap_m: a node at most this much farther than the nearest edge wins over the edge.
-        start_reach_m: farthest distance of the robot from the graph.
-        goal_reach_m: farthest distance of a goal from the graph; keep it within the pavement.
-        approach_m: a start farther than this from the graph gets a leg of its own back to it.
-        cut_m: a goal at most this far from the graph is headed for directly; to a farther one
-            the robot turns off where it is nearest, so as to stay on the pavement.
-        straight_m: a row whose inner points are within this of the straight line is straight.
-        row_begins_m: a row begins at the first node of the way if that is at most this far away.
-    """
+GOAL_REACH_M = 3.0
+"""Farthest distance of a goal from the graph; keep it within the pavement."""
 
-    node_snap_m: float = 0.3
-    start_reach_m: float = 12.0
-    goal_reach_m: float = 3.0
-    approach_m: float = 2.0
-    cut_m: float = 1.0
-    straight_m: float = 0.5
-    row_begins_m: float = 1.0
+APPROACH_M = 2.0
+"""A start farther than this from the graph gets a leg of its own back to it."""
+
+CUT_M = 1.0
+"""A goal at most this far from the graph is headed for directly; to a farther one the robot turns
+off where it is nearest, so as to stay on the pavement."""
+
+STRAIGHT_M = 0.5
+"""A row whose inner points are within this of the straight line is straight."""
+
+ROW_BEGINS_M = 1.0
+"""A row begins at the first node of the way if that is at most this far away."""
 
 
 class PlannedRoute(msgspec.Struct, frozen=True):
@@ -51,7 +51,7 @@ class PlannedRoute(msgspec.Struct, frozen=True):
 
 
 def plan_route(nodes: Mapping[str, Point], edges: Iterable[Edge], start: Point, goal: Point, *,
-               straight: bool = False, limits: SearchLimits | None = None) -> PlannedRoute:
+               straight: bool = False) -> PlannedRoute:
     """Return a shortest route over the graph.
 
     Args:
@@ -62,16 +62,14 @@ def plan_route(nodes: Mapping[str, Point], edges: Iterable[Edge], start: Point, 
         straight: light verification: inner waypoints of a straight row are left out, and the row
             begins at its node, if that is near, and not where the robot is: from there the line
             would be at a slant and lead past beside the first light.
-        limits: snapping distances.
     """
-    limits = limits or SearchLimits()
     if not all(map(math.isfinite, (*start, *goal))):
         return PlannedRoute((), f"start {show(start)} or goal {show(goal)} is not a finite point")
     usable = sorted({(min(edge), max(edge)) for edge in edges if edge[0] != edge[1]})
     joined: list[Attachment] = []
-    reaches = ((start, "start", limits.start_reach_m), (goal, "goal", limits.goal_reach_m))
+    reaches = ((start, "start", START_REACH_M), (goal, "goal", GOAL_REACH_M))
     for point, what, reach_m in reaches:
-        snap = _snap(nodes, usable, point, limits.node_snap_m)
+        snap = _snap(nodes, usable, point)
         if snap is None:
             return PlannedRoute((), "the graph has no edge that is open")
         if snap.distance_m > reach_m:
@@ -81,22 +79,21 @@ def plan_route(nodes: Mapping[str, Point], edges: Iterable[Edge], start: Point, 
     path = _search(nodes, usable, joined[0], joined[1])
     if path is None:
         return PlannedRoute((), f"no way in the graph from {show(start)} to {show(goal)}")
-    if joined[1].distance_m <= limits.cut_m:
+    if joined[1].distance_m <= CUT_M:
         path[-1] = goal
     else:
         path.append(goal)
-    if joined[0].distance_m > limits.approach_m:
+    if joined[0].distance_m > APPROACH_M:
         path.insert(0, start)
     waypoints = _without_repeats(path)
     if straight:
-        if len(waypoints) > 2 and math.dist(*waypoints[:2]) <= limits.row_begins_m:
+        if len(waypoints) > 2 and math.dist(*waypoints[:2]) <= ROW_BEGINS_M:
             del waypoints[0]
-        waypoints = _straightened(waypoints, limits.straight_m)
+        waypoints = _straightened(waypoints)
     return PlannedRoute(tuple(waypoints), "")
 
 
-def _snap(nodes: Mapping[str, Point], edges: list[Edge], point: Point,
-          node_snap_m: float) -> Attachment | None:
+def _snap(nodes: Mapping[str, Point], edges: list[Edge], point: Point) -> Attachment | None:
     """Return the nearest place on the open part of the graph."""
     best: Attachment | None = None
     for a, b in edges:
@@ -108,7 +105,7 @@ def _snap(nodes: Mapping[str, Point], edges: list[Edge], point: Point,
         return None
     for name in sorted({name for edge in edges for name in edge}):
         distance_m = math.dist(point, nodes[name])
-        if distance_m <= best.distance_m + (node_snap_m if best.a != best.b else 0.0):
+        if distance_m <= best.distance_m + (NODE_SNAP_M if best.a != best.b else 0.0):
             best = Attachment(nodes[name], distance_m, name, name)
     return best
 
@@ -166,9 +163,9 @@ def _without_repeats(path: list[Point]) -> list[Point]:
     return kept
 
 
-def _straightened(path: list[Point], straight_m: float) -> list[Point]:
+def _straightened(path: list[Point]) -> list[Point]:
     """Return the ends alone if the row between them is straight, else the path as it is."""
     first, last = path[0], path[-1]
-    if all(math.dist(point, foot(point, first, last)) <= straight_m for point in path[1:-1]):
+    if all(math.dist(point, foot(point, first, last)) <= STRAIGHT_M for point in path[1:-1]):
         return [first, last] if len(path) > 1 else path
     return path

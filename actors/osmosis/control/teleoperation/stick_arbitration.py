@@ -16,6 +16,7 @@ import math
 
 import msgspec
 
+from rampart.actors.bus.limits import Remembered
 from rampart.actors.osmosis.messages import Joystick
 
 TIMEOUT_S = 0.3
@@ -46,7 +47,7 @@ class StickArbiter:
     def __init__(self) -> None:
         self.holder = ""
         self._heard_s = -math.inf
-        self._barred: dict[str, bool] = {}
+        self._barred: dict[str, bool] = Remembered(_REMEMBERED)
         """Sources that have to let go first, and whether they know; the newest are remembered."""
 
     def offer(self, source: str, stick: Joystick, stamp_s: float, now_s: float) -> Ruling:
@@ -90,5 +91,3 @@ class StickArbiter:
     def _bar(self, source: str, *, told: bool) -> None:
         self._barred.pop(source, None)
         self._barred[source] = told
-        if len(self._barred) > _REMEMBERED:
-            del self._barred[next(iter(self._barred))]

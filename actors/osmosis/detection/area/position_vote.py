@@ -19,7 +19,6 @@ Times are simulated seconds, positions are in `map`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.plausible import is_possible, is_sane
@@ -31,32 +30,33 @@ WHEELS = "dead reckoning"
 
 Place = tuple[float, float]
 
+# When witnesses agree; docs/localization.md says where the numbers come from.
+APART_M = 0.3
+"""Two positions farther apart than this differ."""
 
-@dataclass(frozen=True, slots=True)
-class VoteLimits:
-    """When witnesses agree; docs/localization.md says where the numbers come from.
+DEVIATION_M = 0.35
+"""A position that has moved otherwise than the wheels by more differs from them."""
 
-    Args:
-        apart_m: two positions farther apart than this differ.
-        deviation_m: a position that has moved otherwise than the wheels by more differs from them.
-        clearly: how many times greater the deviation of the wrong one must be.
-        forget_s: time constant of the deviation.
-        position_fresh_s: greatest age of the other position.
-        gps_fresh_s: greatest age of a fix.
-        wheels_fresh_s: greatest age of odometry, and of the IMU's heading.
-        differing: fixes in a row that must differ before it counts.
-        agreeing: fixes in a row that must agree before who was wrong is believed again.
-    """
+CLEARLY = 2.0
+"""How many times greater the deviation of the wrong one must be."""
 
-    apart_m: float = 0.3
-    deviation_m: float = 0.35
-    clearly: float = 2.0
-    forget_s: float = 5.0
-    position_fresh_s: float = 0.25
-    gps_fresh_s: float = 0.35
-    wheels_fresh_s: float = 0.2
-    differing: int = 2
-    agreeing: int = 4
+FORGET_S = 5.0
+"""Time constant of the deviation."""
+
+POSITION_FRESH_S = 0.25
+"""Greatest age of the other position."""
+
+GPS_FRESH_S = 0.35
+"""Greatest age of a fix."""
+
+WHEELS_FRESH_S = 0.2
+"""Greatest age of odometry, and of the IMU's heading."""
+
+DIFFERING = 2
+"""Fixes in a row that must differ before it counts."""
+
+AGREEING = 4
+"""Fixes in a row that must agree before who was wrong is believed again."""
 
 
 class Track:
@@ -186,18 +186,16 @@ class PositionVote:
 
     Args:
         name: of the position that is not GPS.
-        limits: when witnesses agree.
 
     Attributes:
         outlier: name of the position that is outvoted; "" if none is.
         compared: whether both positions were ever held against each other.
     """
 
-    def __init__(self, name: str, limits: VoteLimits | None = None) -> None:
-        self.limits = limits = limits or VoteLimits()
-        self.track = Track(limits.wheels_fresh_s)
-        self.position = Witness(name, limits.position_fresh_s)
-        self.gps = Witness(GPS, limits.gps_fresh_s)
+    def __init__(self, name: str) -> None:
+        self.track = Track(WHEELS_FRESH_S)
+        self.position = Witness(name, POSITION_FRESH_S)
+        self.gps = Witness(GPS, GPS_FRESH_S)
         self.outlier = ""
         self.compared = False
         self.apart_m = 0.0
@@ -228,7 +226,7 @@ class PositionVote:
 
     def _usable(self, witness: Witness, stamp_s: float, place: Place, now_s: float) -> bool:
         return (stamp_s > witness.stamp_s and is_sane(*place)
-                and -AHEAD_S <= now_s - stamp_s <= self.limits.gps_fresh_s)
+                and -AHEAD_S <= now_s - stamp_s <= GPS_FRESH_S)
 
     def _forget_s(self, witness: Witness) -> float:
         """While it is not clear who is wrong, and later of who is, nothing is taken for usual.
@@ -237,40 +235,40 @@ class PositionVote:
         """
         if self.outlier == witness.name or (self._differing > 0 and not self.outlier):
             return math.inf
-        alone = not self._agreeing and witness.deviation_m > self.limits.deviation_m
-        return math.inf if alone else self.limits.forget_s
+        alone = not self._agreeing and witness.deviation_m > DEVIATION_M
+        return math.inf if alone else FORGET_S
 
     # -- judgement ------------------------------------------------------------------------------
 
     def _compare(self, now_s: float) -> None:
-        limits, position, gps = self.limits, self.position, self.gps
+        position, gps = self.position, self.gps
         self.compared = True
         self.apart_m = math.dist(position.offset, gps.offset)
-        if self.apart_m <= limits.apart_m:
+        if self.apart_m <= APART_M:
             self._differing = 0
             self._agreeing += 1
-            if self.outlier and self._agreeing >= limits.agreeing:
+            if self.outlier and self._agreeing >= AGREEING:
                 self.outlier = ""
                 position.restart()
                 gps.restart()
             return
         self._agreeing = 0
         self._differing += 1
-        if self.outlier or self._differing < limits.differing or not self.wheels_fresh(now_s):
+        if self.outlier or self._differing < DIFFERING or not self.wheels_fresh(now_s):
             return
         for wrong, other in ((position, gps), (gps, position)):
-            if wrong.deviation_m > limits.clearly * other.deviation_m \
-                    and other.deviation_m <= limits.deviation_m:
+            if wrong.deviation_m > CLEARLY * other.deviation_m \
+                    and other.deviation_m <= DEVIATION_M:
                 self.outlier = wrong.name
                 other.restart()
 
     def wheels_fresh(self, now_s: float) -> bool:
         """Whether odometry is heard."""
-        return now_s - self.track.stamp_s <= self.limits.wheels_fresh_s
+        return now_s - self.track.stamp_s <= WHEELS_FRESH_S
 
     def agreeing(self, now_s: float) -> tuple[str, ...]:
         """Return the names of two witnesses that agree now; none if there are no two."""
-        limits, position, gps = self.limits, self.position, self.gps
+        position, gps = self.position, self.gps
         sure = not self.outlier and not self._differing
         if sure and position.fresh(now_s) and gps.fresh(now_s):
             return (position.name, GPS)
@@ -278,6 +276,6 @@ class PositionVote:
             return ()
         for witness, other in ((gps, position), (position, gps)):
             alone = self.outlier == other.name or (sure and not other.fresh(now_s))
-            if alone and witness.fresh(now_s) and witness.deviation_m <= limits.deviation_m:
+            if alone and witness.fresh(now_s) and witness.deviation_m <= DEVIATION_M:
                 return (witness.name, WHEELS)
         return ()

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from rampart.actors.osmosis.airport.errors import AirportError
-from rampart.actors.osmosis.airport.formats import load_airport, load_mission, load_world
+from rampart.actors.osmosis.airport.formats import load_airport, load_mission, load_with_truth
 from rampart.actors.osmosis.airport.mask import MaskScale
 
 TOML = """
@@ -94,7 +94,7 @@ def test_our_own_format_gives_lights_missions_obstacles_and_pavement(tmp_path):
 
 def test_the_truth_about_lights_is_read_apart_from_the_airport(tmp_path):
     path = write_toml(tmp_path, TOML)
-    airport, truth = load_airport(path), load_world(path)
+    airport, truth = load_with_truth(path)
     assert [light.nominal_cd for light in airport.lights] == [200, 200, 200]
     assert truth.intensity_cd(airport) == {"R01": 200, "R02": 50, "R03": 200}
 

@@ -11,7 +11,7 @@ import shapely
 from shapely.geometry import LineString
 from shapely.ops import substring
 
-from rampart.actors.osmosis.airport.formats import load_airport, load_world, shipped_airports
+from rampart.actors.osmosis.airport.formats import load_airport, load_with_truth, shipped_airports
 from rampart.actors.osmosis.airport.photometry import (
     SENSOR_FORWARD_M,
     SENSOR_HEIGHT_M,
@@ -87,7 +87,7 @@ def test_light_verification_legs_pass_over_every_light_of_the_row():
 
 
 def test_three_lights_are_out_and_three_are_dim():
-    factors = load_world("vallombre").light_factors
+    factors = load_with_truth("vallombre")[1].light_factors
     assert sum(f == 0 for f in factors.values()) == 3
     assert sum(0 < f < 0.5 for f in factors.values()) == 3
 

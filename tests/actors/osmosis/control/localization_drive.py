@@ -21,7 +21,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.runtime.injection import FaultGate, Outgoing
 from rampart.sim.faults.disturbance import Fault
-from rampart.sim.osmosis.schedule import Schedule
+from rampart.sim.osmosis.simulator import Schedule
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.sim.osmosis.world import World
 

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.detection.bounds import BoundsCheck
+from rampart.actors.detection.finding import Sustained
+from rampart.actors.osmosis.detection.bounds import beyond
 from rampart.testing import play, table
 
 COMMANDS = {
@@ -18,12 +19,12 @@ COMMANDS = {
 }
 
 
-def checker(**changes: float) -> BoundsCheck:
-    return BoundsCheck(1.0, 2.0, **{"hold_s": 0.3, **changes})
+def checker(**changes: float) -> Sustained:
+    return Sustained(0.0, **{"clear_s": 0.3, **changes})
 
 
-def command(check: BoundsCheck):
-    return lambda event, now_s: check.command(*COMMANDS[event], now_s)
+def command(check: Sustained):
+    return lambda event, now_s: check.note(beyond(*COMMANDS[event], 1.0, 2.0), now_s)
 
 
 # small letters and 0 are within bounds, V R T are beyond, n and i are no numbers
@@ -59,16 +60,15 @@ def test_a_respawned_check_claims_nothing_before_it_knows(events, expected):
 
 def test_the_reason_names_value_and_limit_of_the_first_bad_command():
     check = checker()
-    check.command(2.5, 0.0, 0.0)
-    check.command(0.0, 9.0, 0.1)
+    check.note(beyond(2.5, 0.0, 1.0, 2.0), 0.0)
+    check.note(beyond(0.0, 9.0, 1.0, 2.0), 0.1)
     assert check.reason == "commanded speed 2.50 m/s exceeds 1 m/s"
 
 
 @given(st.floats(), st.floats())
 def test_active_if_and_only_if_the_command_is_out_of_bounds(linear, angular):
-    check = checker()
-    check.command(linear, angular, 0.0)
+    fault = beyond(linear, angular, 1.0, 2.0)
     outside = not abs(linear) <= 1.0 + 2.1e-6 or not abs(angular) <= 2.0 + 3.1e-6
     inside = abs(linear) <= 1.0 and abs(angular) <= 2.0
-    assert check.active or not outside
-    assert not (check.active and inside)
+    assert fault or not outside
+    assert not (fault and inside)

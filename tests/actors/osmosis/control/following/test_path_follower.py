@@ -7,12 +7,7 @@ from hypothesis import strategies as st
 
 from rampart.actors.osmosis.control.following.escape import Escape, EscapeLimits
 from rampart.actors.osmosis.control.following.path_follower import PathFollower
-from rampart.actors.osmosis.control.following.potential_field import (
-    FieldGains,
-    clusters,
-    field,
-    repulsion,
-)
+from rampart.actors.osmosis.control.following.potential_field import clusters, field, repulsion
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import Polyline, scan_points, wrap_angle
 from tests.actors.osmosis.control.world import HULL, Circle, World, drive
@@ -167,25 +162,24 @@ def test_behind_the_obstacle_the_offset_shrinks_with_the_way_gone():
 
 
 def test_repulsion_pushes_away_and_only_within_its_influence():
-    gains = FieldGains()
-    near_left = repulsion(np.array(((0.0, 0.6),)), HULL, gains)
+    near_left = repulsion(np.array(((0.0, 0.6),)), HULL)
     assert near_left[1] < 0.0 == near_left[0]
-    assert repulsion(np.array(((0.0, 0.307 + 0.91),)), HULL, gains) == (0.0, 0.0)
-    nearer = repulsion(np.array(((0.0, 0.4),)), HULL, gains)
+    assert repulsion(np.array(((0.0, 0.307 + 0.91),)), HULL) == (0.0, 0.0)
+    nearer = repulsion(np.array(((0.0, 0.4),)), HULL)
     assert nearer[1] < near_left[1]
 
 
 def test_repulsion_does_not_depend_on_the_number_of_echoes():
     one = np.array(((0.0, 0.6),))
     many = np.column_stack((np.zeros(30), 0.6 + np.linspace(0.0, 0.3, 30)))
-    assert repulsion(one, HULL, FieldGains()) == pytest.approx(
-        repulsion(many, HULL, FieldGains()))
+    assert repulsion(one, HULL) == pytest.approx(
+        repulsion(many, HULL))
     assert len(clusters(np.array(((0, 1), (0, 1.1), (3, 1), (3, 1.2))))) == 2
 
 
 @given(st.floats(-0.3, 0.3), st.floats(0.4, 2.0))
 def test_the_field_never_turns_the_robot_about(y_m, x_m):
-    x, _ = field(1.0, 0.0, np.array(((x_m, y_m),)), HULL, FieldGains())
+    x, _ = field(1.0, 0.0, np.array(((x_m, y_m),)), HULL)
     assert x > 0.0
 
 

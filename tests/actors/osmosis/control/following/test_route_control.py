@@ -10,6 +10,7 @@ import pytest
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
+from rampart.actors.osmosis.control.following.light_ledger import RowInspection
 from rampart.actors.osmosis.control.following.light_row import RowLimits
 from rampart.actors.osmosis.control.following.route_control import PERIOD_S, RouteControl
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER
@@ -31,7 +32,7 @@ class Bench:
         self.told: list[tuple[str, str, str]] = []
         self.core = RouteControl(
             SYSTEM, AIRPORT, lambda *what: self.told.append(what), 0.0, RowLimits(),
-            **parts)
+            lights=RowInspection((), goes_back=False), **parts)
         self.now_s = 0.0
 
     def drive(self, seconds: float, *, localized: bool = True) -> list[m.Twist]:

@@ -12,18 +12,21 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
-from rampart.actors.osmosis.control.following.motion_loop import LoopLimits, MotionLoop
+from rampart.actors.osmosis.control.following.motion_loop import (
+    DEAD_BAND_RADPS,
+    MOST_RADPS,
+    MotionLoop,
+)
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.osmosis.control.following.path_follower import PathFollower
 from rampart.actors.osmosis.control.following.standby_control import StandbyControl
-from rampart.actors.osmosis.control.pilot.command_pair import FORGET_S, CommandPair, PairLimits
+from rampart.actors.osmosis.control.pilot.command_pair import FORGET_S, CommandPair
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import PilotMode
 from rampart.actors.recovery.respawn import Ask, RespawnCore, accused
 
 PERIOD_S = 0.05
-LIMITS = PairLimits()
 
 
 class Bench:
@@ -171,7 +174,7 @@ commands = st.one_of(st.none(), st.tuples(st.floats(-1, 1), st.floats(-2, 2)))
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(commands, commands, st.booleans(), st.booleans()), max_size=25))
 def test_whatever_comes_what_drives_lies_between_zero_and_what_one_of_the_two_wants(steps):
-    pair, now, lives = CommandPair(LIMITS), 0.0, [1, 1]
+    pair, now, lives = CommandPair(), 0.0, [1, 1]
     last = [None, None]
     for active, standby, active_dies, standby_dies in steps:
         now += PERIOD_S
@@ -293,7 +296,7 @@ def drive(loop, drag_radps, seconds, meant=lambda _t: 0.2, speed_mps=0.8):
 def test_a_constant_drag_is_compensated_up_to_the_dead_band(drag_radps):
     loop = MotionLoop(2.0)
     rates, _ = drive(loop, drag_radps, 8.0)
-    assert rates[-1] == pytest.approx(0.2, abs=LoopLimits().dead_band_radps + 0.05)
+    assert rates[-1] == pytest.approx(0.2, abs=DEAD_BAND_RADPS + 0.05)
 
 
 @pytest.mark.parametrize("meant", [
@@ -323,7 +326,7 @@ def test_a_drag_that_is_over_is_unlearnt():
     loop = MotionLoop(2.0)
     drive(loop, -0.7, 6.0)
     rates, _ = drive(loop, 0.0, 8.0)
-    assert rates[-1] == pytest.approx(0.2, abs=LoopLimits().dead_band_radps + 0.05)
+    assert rates[-1] == pytest.approx(0.2, abs=DEAD_BAND_RADPS + 0.05)
 
 
 @settings(max_examples=40, deadline=None)
@@ -334,8 +337,8 @@ def test_whatever_the_poses_say_the_sum_keeps_its_bound_and_so_does_what_is_adde
         loop.pose(tick * PERIOD_S, place, -place, yaw)
         turn = loop.turn(0.5, meant, PERIOD_S)
         assert abs(turn) <= 2.0
-        assert abs(loop.added_radps) <= LoopLimits().most_radps
-        assert abs(turn - meant) <= LoopLimits().most_radps + 1e-9
+        assert abs(loop.added_radps) <= MOST_RADPS
+        assert abs(turn - meant) <= MOST_RADPS + 1e-9
 
 
 def test_a_loop_that_only_listens_adds_what_the_other_does_until_that_is_silent():

@@ -14,11 +14,7 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.control.following.blockage import (
-    BlockageLimits,
-    BlockageWatch,
-    nearest_ahead,
-)
+from rampart.actors.osmosis.control.following.blockage import BlockageWatch, nearest_ahead
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
 from rampart.actors.osmosis.control.planning.closures import Closures, without
 from rampart.actors.osmosis.control.planning.graph_planner import GraphPlanner
@@ -93,7 +89,7 @@ HERE = (10.0, 5.0, math.pi / 2)
 
 
 def test_no_progress_with_something_ahead_is_a_blockage_since_the_last_progress():
-    watch = BlockageWatch(BlockageLimits(after_s=3.0))
+    watch = BlockageWatch()
     for now_s, to_go_m in ((0.0, 20.0), (1.0, 19.0), (2.0, 18.9), (3.0, 18.8), (3.9, 18.8)):
         assert watch.update(to_go_m, HERE, AHEAD, now_s) is None
     found = watch.update(18.8, HERE, AHEAD, 4.0)
@@ -109,7 +105,7 @@ def test_who_stands_on_an_empty_runway_is_not_blocked():
 
 
 def test_another_route_begins_anew():
-    watch = BlockageWatch(BlockageLimits(after_s=3.0))
+    watch = BlockageWatch()
     watch.update(20.0, HERE, AHEAD, 0.0)
     assert watch.update(20.0, HERE, AHEAD, 3.0) is not None
     watch.restart()
@@ -118,10 +114,9 @@ def test_another_route_begins_anew():
 
 
 def test_what_is_ahead_is_the_nearest_echo_in_front_within_reach():
-    limits = BlockageLimits(reach_m=3.0)
-    assert nearest_ahead(np.array([(3.5, 0.0)]), HERE, limits) is None
-    assert nearest_ahead(np.array([(-1.0, 0.0)]), HERE, limits) is None
-    assert nearest_ahead(NO_POINTS, HERE, limits) is None
+    assert nearest_ahead(np.array([(3.5, 0.0)]), HERE) is None
+    assert nearest_ahead(np.array([(-1.0, 0.0)]), HERE) is None
+    assert nearest_ahead(NO_POINTS, HERE) is None
 
 
 # ---- light verification -------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import Airport, StartPose
-from rampart.actors.osmosis.airport.route_check import RouteCheck, RouteLimits
+from rampart.actors.osmosis.airport.route_check import CLEARANCE_M, RouteCheck
 from rampart.actors.osmosis.control.planning.closures import without
 from rampart.actors.osmosis.control.planning.route_search import plan_route
 
@@ -69,7 +69,7 @@ def test_a_straight_way_to_the_goal_is_good_only_if_it_runs_along_the_graph_on_p
     if CHECK.fault((robot, target), robot, target) == "":
         assert shapely.covers(AIRPORT.allowed, line)
         clearance_m = shapely.distance(AIRPORT.allowed.boundary, line)
-        assert clearance_m >= RouteLimits().clearance_m
+        assert clearance_m >= CLEARANCE_M
         for share in np.linspace(0, 1, 20):
             point = line.interpolate(share, normalized=True)
             near_end = min(math.dist(robot, (point.x, point.y)) / 12.5,

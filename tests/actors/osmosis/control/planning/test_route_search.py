@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.control.planning.route_search import SearchLimits, plan_route
+from rampart.actors.osmosis.control.planning.route_search import plan_route
 
 SQUARE = {"A": (0.0, 0.0), "B": (20.0, 0.0), "C": (20.0, 20.0), "D": (0.0, 20.0)}
 RING = [("A", "B"), ("B", "C"), ("C", "D"), ("D", "A")]
@@ -104,6 +104,5 @@ def test_a_goal_well_off_the_line_is_turned_to_where_it_is_nearest():
 
 
 def test_a_robot_far_from_the_graph_first_comes_back_to_it():
-    limits = SearchLimits(approach_m=2.0)
-    plan = plan_route(SQUARE, RING, (10.0, -5.0), (20.0, 0.0), limits=limits)
+    plan = plan_route(SQUARE, RING, (10.0, -5.0), (20.0, 0.0))
     assert plan.waypoints == ((10.0, -5.0), (10.0, 0.0), (20.0, 0.0))

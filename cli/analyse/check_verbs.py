@@ -1,4 +1,4 @@
-"""`rampart explain`: what a system is, before it is started."""
+"""`rampart check` and `explain`: is a system sound, and what is it, before it is started."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rampart.actors.layout.layout import Layout, Unit
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR
 from rampart.cli import systems
 from rampart.cli.look import topic_catalogue as catalogue
-from rampart.cli.output import print_json, print_table, say
+from rampart.cli.output import UsageError, print_json, print_table, say
 from rampart.cli.verbs import JSON, add_verb
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.manager.strategies.arrangement import arrange
@@ -87,7 +87,9 @@ class Explanation(msgspec.Struct, frozen=True):
 
 
 def add(verbs: Any) -> None:
-    """Add the verb to the parser."""
+    """Add the verbs to the parser."""
+    add_verb(verbs, "check", "is a system sound? All that is known without running it", check,
+             systems.choice(), JSON)
     add_verb(verbs, "explain", "what is started, who talks to whom, what a fault leads to", run,
              systems.choice(), JSON)
 
@@ -102,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
     Examples:
       rampart explain
       rampart explain my_system.toml
-      rampart explain cell --json
+      rampart explain paper --json
 
     exit code: 0, 2 a system that `rampart check` refuses, or bad usage
     """
@@ -218,3 +220,38 @@ def _decided(found: Consequence) -> str:
         told.append(f"{name}; if it fails: {' > '.join(after)}" if after
                     else f"{name}, the last resort")
     return ", ".join(told) or "no recovery"
+
+
+def check(options: argparse.Namespace) -> int:
+    """Check a system, and say what is wrong with it, or how large it is.
+
+    Check all of a system that can be checked before it runs, as a start does: the
+    specification, the time budget, classes and parameters of all actors, application
+    and judge, and that what each node hears is published by somebody.
+
+    Examples:
+      rampart check
+      rampart check my_system.toml && rampart run --system my_system.toml
+      rampart check paper --json
+
+    exit code: 0 sound, 2 not sound (one line says where) or bad usage
+    """
+    try:
+        layout = systems.check(options.system)
+    except UsageError as error:
+        if not options.json:
+            raise
+        print_json({"sound": False, "problem": str(error)})
+        return 2
+    spec = layout.spec
+    sizes = {"processes": len(layout.units), "nodes": len(spec.nodes),
+             "detection modules": len(spec.detections), "recovery modules": len(spec.recoveries),
+             "mechanisms": len(spec.mechanisms)}
+    if options.json:
+        print_json({"sound": True, "problem": None, "system": spec.name,
+                    "file": layout.plan.system_file,
+                    **{name.replace(" ", "_"): count for name, count in sizes.items()}})
+    else:
+        say(f"{layout.plan.system_file}: sound: "
+            f"{', '.join(f'{count} {name}' for name, count in sizes.items())}")
+    return 0

@@ -1,4 +1,4 @@
-"""Who has the stick, and whether what it says may still be believed. Pure.
+"""Who has a stick, and whether what it says may still be believed; and its messages.
 
 Several pages may be open, one drives: the first that holds its dead man has the stick until it
 lets go, closes, or falls silent. The others are told.
@@ -10,18 +10,24 @@ operator sees a robot of long ago. Either way it does not count as held.
 
 Whoever lost the stick while holding it (silent, late, out of bounds), or held it in vain, has to
 let go before it can take it: the robot does not start by itself when a connection recovers, nor
-because somebody else let go.
+because somebody else let go. All this is `StickDesk`, which is pure; `Stick` tells the robot.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 from rampart.actors.bus.limits import Remembered
-from rampart.actors.osmosis.page.requests import StickRequest
+from rampart.actors.layout.chosen_topics import steered
+from rampart.actors.operator.requests import StickRequest
+from rampart.actors.runtime.actor import Actor
+from rampart.manager.spec.panels import Panel
 
 SILENCE_S = 0.3
 """A page that was not heard for so long has let go (real seconds)."""
@@ -29,6 +35,10 @@ SILENCE_S = 0.3
 TICKET_S = 0.3
 """So old a ticket is too old: a round trip and the page's period must fit (real seconds)."""
 
+PERIOD_S = 0.1
+"""Simulated seconds between messages of a held stick whose topic says no rate."""
+
+_SHORTEST_S = 0.001
 _KEPT_TICKETS = 64
 _ROUNDING = 1e-6
 
@@ -55,7 +65,7 @@ class StickAnswer:
 
 
 class StickDesk:
-    """The stick of all pages together. Pages are numbers; times are real seconds.
+    """A stick of all pages together. Pages are numbers; times are real seconds.
 
     Attributes:
         holder: the page that has the stick, as far as is known; `expire` first.
@@ -126,23 +136,99 @@ class StickDesk:
         return Grip.DRIVES, ""
 
 
-def effect(*, pilot_heard: bool, mode: str, forbids: str, brake: bool, dead_nodes: tuple[str, ...]
-           ) -> tuple[bool, str]:
-    """Return whether the stick has any effect now, and in words why not, or what it does.
+class Stick:
+    """A panel's stick: tells the robot where it is, again and again while it is held.
+
+    At a high rate a page is too slow for the robot; so the message is repeated as often as the rate
+    of its topic says. Whoever lets go, or is taken to have, is told to the robot once: as the
+    message at rest.
 
     Args:
-        pilot_heard: whether the Safety Pilot was heard lately.
-        mode: of the Safety Pilot.
-        forbids: why it lets nobody drive, "" if it does.
-        brake: whether the base's brake is engaged.
-        dead_nodes: which of the nodes between stick and wheels do not run.
+        actor: the page's node.
+        panel: that declares it.
+        changed: called when it is held or let go, with the reason if nobody meant it.
+
+    Attributes:
+        desk: who has it.
+        note: what there is to tell of it, "" for nothing.
+
+    Raises:
+        ValueError: the node knows no such topic.
     """
-    for is_so, why in ((dead_nodes, f"{', '.join(dead_nodes)} does not run"),
-                       (not pilot_heard, "the Safety Pilot is not heard"),
-                       (brake, "the brake is engaged (emergency stop)"),
-                       (forbids, forbids)):
-        if is_so:
-            return False, f"no effect: {why}"
-    if mode == "teleoperation":
-        return True, "the robot obeys the stick alone; it stands while you let go"
-    return True, "the stick overrides the mission while you hold it; let go and the mission goes on"
+
+    def __init__(self, actor: Actor, panel: Panel, changed: Callable[[str], None]) -> None:
+        self.desk = StickDesk()
+        self.note = ""
+        self._actor = actor
+        self._topic = actor.chosen_topic(panel.topic)
+        self._name = self._topic.member(panel.topic) or None
+        self._message = steered(panel, self._topic)
+        self._changed = changed
+        self._period_s = 1 / self._topic.rate_hz if self._topic.rate_hz > 0 else PERIOD_S
+        self._sent_s = -math.inf
+        self._ticking: asyncio.TimerHandle | None = None
+
+    def start(self) -> None:
+        """Let go in case a former incarnation died while a page held it."""
+        self._say(None)
+
+    def stop(self) -> None:
+        """Let go; the node ends."""
+        if self._ticking is not None:
+            self._ticking.cancel()
+            self._ticking = None
+        if self.desk.holder is not None:
+            self._say(None)
+
+    def move(self, page: int, request: StickRequest) -> dict[str, Any]:
+        """Take a page's message and return what to tell it."""
+        before = self.desk.holder
+        answer = self.desk.move(page, request, asyncio.get_running_loop().time())
+        if answer.grip is Grip.DRIVES:
+            self._drive()
+            if before != page:
+                self.note = ""
+                self._changed("")
+        elif before is not None and self.desk.holder is None:
+            self._release(answer.text)
+        return {"type": "stick", "panel": request.panel, "grip": answer.grip, "text": answer.text,
+                "ticket": answer.ticket}
+
+    def left(self, page: int) -> None:
+        """Take note that a page was closed; if it drove, the robot stops."""
+        if self.desk.gone(page):
+            self._release("the page that drove was closed")
+
+    def _say(self, position: tuple[float, float] | None) -> None:
+        self._actor.publish(self._topic, self._message(position), name=self._name)
+
+    def _drive(self) -> None:
+        """Publish where it is held, and see to it that it is repeated or missed."""
+        loop = asyncio.get_running_loop()
+        at = self.desk.position(loop.time())
+        if at is not None:
+            self._sent_s = self._actor.clock.now()
+            self._say(at)
+        if self._ticking is None:
+            self._tick_later(loop)
+
+    def _tick_later(self, loop: asyncio.AbstractEventLoop) -> None:
+        period_s = min(SILENCE_S / 6, self._period_s / self._actor.clock.rate)
+        self._ticking = loop.call_later(max(period_s, _SHORTEST_S), self._tick)
+
+    def _tick(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._ticking = None
+        lapsed = self.desk.expire(loop.time())
+        if lapsed is not None:
+            self._release(f"page {lapsed} was silent for {SILENCE_S:g} s")
+        if self.desk.holder is not None:
+            if self._actor.clock.now() - self._sent_s >= self._period_s:
+                self._drive()
+            self._tick_later(loop)
+
+    def _release(self, why: str) -> None:
+        """Tell the robot that it was let go, and the pages why if nobody meant it."""
+        self._say(None)
+        self.note = why
+        self._changed(why)

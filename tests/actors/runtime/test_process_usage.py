@@ -9,7 +9,7 @@ import sys
 import psutil
 import pytest
 
-from rampart.actors.supervision.process_usage import (
+from rampart.actors.runtime.process_usage import (
     ProcessCount,
     UsageMeter,
     parse_stat,

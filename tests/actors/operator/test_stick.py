@@ -6,19 +6,19 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.page.requests import StickRequest
-from rampart.actors.osmosis.page.stick import SILENCE_S, TICKET_S, Grip, StickDesk, effect
+from rampart.actors.operator.requests import StickRequest
+from rampart.actors.operator.stick import SILENCE_S, TICKET_S, Grip, StickDesk
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 PERIOD_S = 0.05
 
 
 def hold(desk: StickDesk, page: int, now_s: float, ticket: int = 0, at=(0.5, 0.0)):
-    return desk.move(page, StickRequest(True, ticket, *at), now_s)
+    return desk.move(page, StickRequest("Drive", True, ticket, *at), now_s)
 
 
 def let_go(desk: StickDesk, page: int, now_s: float):
-    return desk.move(page, StickRequest(False), now_s)
+    return desk.move(page, StickRequest("Drive", False), now_s)
 
 
 def drive(desk: StickDesk, page: int, begin_s: float, end_s: float) -> int:
@@ -155,7 +155,7 @@ def test_whatever_pages_send_one_drives_at_most_and_only_with_fresh_news(message
         choice = {"newest": mine[-1:], "old": mine[:1], "another's": others[-1:], "none": []}
         number, at_s = (choice[which] or [(0, -9.0)])[0]
         holder = desk.holder
-        answer = desk.move(page, StickRequest(held, number, forward, 0.0), now_s)
+        answer = desk.move(page, StickRequest("Drive", held, number, forward, 0.0), now_s)
         if not held:
             must_let_go.discard(page)
         if answer.grip in (Grip.LATE, Grip.REFUSED, Grip.TAKEN):
@@ -174,18 +174,3 @@ def test_whatever_pages_send_one_drives_at_most_and_only_with_fresh_news(message
             assert desk.holder == holder
         assert desk.position(now_s + SILENCE_S + 1e-6) is None
         mine.append((answer.ticket, now_s))
-
-
-@pytest.mark.parametrize(("known", "works", "text"), [
-    ({}, True, "overrides the mission"),
-    ({"mode": "teleoperation"}, True, "obeys the stick alone"),
-    ({"forbids": "RM2: it is stale", "mode": "stop"}, False, "no effect: RM2: it is stale"),
-    ({"brake": True}, False, "the brake is engaged"),
-    ({"pilot_heard": False}, False, "the Safety Pilot is not heard"),
-    ({"dead_nodes": ("teleoperation",), "brake": True}, False, "teleoperation does not run"),
-])
-def test_the_page_says_whether_the_stick_has_an_effect_and_why_not(known, works, text):
-    heard = {"pilot_heard": True, "mode": "auto", "forbids": "", "brake": False, "dead_nodes": ()}
-    got, words = effect(**heard | known)
-    assert got is works
-    assert text in words

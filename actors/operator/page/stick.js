@@ -1,4 +1,4 @@
-// Driving from the page: arrow keys or WASD, a stick to drag, a gamepad. Each is its own dead man.
+// A stick: arrow keys or WASD, a pad to drag, a gamepad. Each is its own dead man.
 //
 // While something is held, the position is sent 20 times a second with the newest ticket of the
 // HMI; silence is letting go. Whatever ends the hold (key up, pointer up, focus lost, tab hidden,
@@ -8,7 +8,7 @@
 // of one, without focus, or so long that the connection must be stalled. It has to be let go first:
 // the robot moves because somebody presses, never because something recovers.
 
-import { element, pill, say } from "../dom.js";
+import { element, pill, say } from "./dom.js";
 
 const PERIOD_MS = 50;
 const PATIENCE_MS = 1000;  // so long a press may wait until it drives; see `answered`
@@ -21,9 +21,14 @@ const KEYS = {
 
 const clip = (value) => Math.min(Math.max(value, -1), 1);
 
-export default class Drive {
+export class Stick {
+  static kind = "stick";
+
   constructor(room, page) {
     this.send = page.send;
+    this.panel = page.declared.title;
+    this.axes = page.declared.stick.length;  // forward alone, or left as well
+    this.gamepads = false;  // a gamepad is for the first stick of a page
     this.keys = new Set();
     this.dragged = null;
     this.held = false;
@@ -43,27 +48,31 @@ export default class Drive {
   }
 
   build(room) {
-    const made = (tag, id, className, text) => Object.assign(element(tag, className, text), { id });
+    const named = (tag, what) => Object.assign(element(tag), { id: `${room.title.id}-${what}` });
     room.section.classList.add("operate");
-    room.section.id = "drive-panel";
-    this.state = made("span", "stick-state", "pill warn", "not connected");
-    room.title.append(" ", this.state);
-    this.pad = made("div", "stick", "stick");
+    const state = element("span", "stick-state");
+    this.state = element("span", "pill warn", "not connected");
+    state.append(this.state);
+    room.title.append(" ", state);
+    this.pad = element("div", this.axes > 1 ? "stick" : "stick upright");
     this.pad.tabIndex = 0;
+    this.wanted = this.axes > 1 ? "arrow keys or W A S D" : "up or down key, W or S";
     this.pad.setAttribute("role", "application");
-    this.pad.setAttribute("aria-label", "Stick: hold the arrow keys or W A S D to drive");
-    this.pad.setAttribute("aria-describedby", "drive-how stick-text");
-    this.knob = made("div", "stick-knob", "stick-knob");
+    this.pad.setAttribute("aria-label", `Stick: hold the ${this.wanted} to drive`);
+    this.knob = element("div", "stick-knob");
     this.pad.append(this.knob);
-    const words = element("div", "drive-words");
+    const words = element("div", "stick-words");
     const speed = element("label", "", "Speed ");
-    this.share = Object.assign(made("input", "stick-share"), { type: "range", min: 10, max: 100, step: 10, value: 50 });
+    this.share = Object.assign(element("input"), { type: "range", min: 10, max: 100, step: 10, value: 50 });
     speed.append(this.share);
-    this.words = made("p", "stick-text");
+    this.how = named("p", "how");
+    this.how.className = "quiet";
+    this.words = named("p", "text");
+    this.words.className = "stick-text";
     this.words.setAttribute("role", "status");
-    words.append(made("p", "drive-how", "quiet", "Drag the stick, or click it and hold the arrow keys or W A S D, "
-      + "or hold a shoulder button of a gamepad. Letting go stops."), speed, this.words);
-    const row = element("div", "drive-row");
+    this.pad.setAttribute("aria-describedby", `${this.how.id} ${this.words.id}`);
+    words.append(this.how, speed, this.words);
+    const row = element("div", "stick-row");
     row.append(this.pad, words);
     room.body.append(row);
   }
@@ -96,7 +105,7 @@ export default class Drive {
       this.letGo();  // a browser need not tell which keys are let go under one of these
       return;
     }
-    if (!(event.code in KEYS)) return;
+    if (!KEYS[event.code]?.slice(0, this.axes).some(Boolean)) return;
     event.preventDefault();  // do not scroll
     if (down && event.repeat && !this.keys.has(event.code)) return;  // held since before: press anew
     if (down) this.keys.add(event.code); else this.keys.delete(event.code);
@@ -107,6 +116,7 @@ export default class Drive {
     const box = this.pad.getBoundingClientRect();
     const radius = box.width / 2;
     let [x, y] = [(event.clientX - box.left) / radius - 1, (event.clientY - box.top) / radius - 1];
+    if (this.axes < 2) x = 0;
     const length = Math.hypot(x, y);
     if (length > 1) { x /= length; y /= length; }
     this.dragged = [-y, -x];
@@ -131,10 +141,10 @@ export default class Drive {
 
   /** The same, whoever has the focus. */
   pressed() {
-    for (const pad of navigator.getGamepads ? navigator.getGamepads() : []) {
+    for (const pad of this.gamepads && navigator.getGamepads ? navigator.getGamepads() : []) {
       if (!pad || !pad.connected || !SHOULDERS.some((i) => pad.buttons[i]?.pressed)) continue;
       const axis = (i) => (Math.abs(pad.axes[i] || 0) < DEAD_ZONE ? 0 : pad.axes[i]);
-      return [-axis(1), -axis(0)];
+      return [-axis(1), this.axes > 1 ? -axis(0) : 0];
     }
     return null;
   }
@@ -185,21 +195,28 @@ export default class Drive {
     if (!this.held) return;
     this.held = false;
     clearInterval(this.timer);
-    this.send({ type: "stick", held: false });
+    this.send({ type: "stick", panel: this.panel, held: false });
   }
 
   speak() {
     const at = this.position();
     if (!at) { this.update(); return; }
-    this.send({ type: "stick", held: true, ticket: this.ticket, forward: at[0], left: at[1] });
+    this.send({ type: "stick", panel: this.panel, held: true, ticket: this.ticket, forward: at[0], left: at[1] });
   }
 
   // ---- what the HMI says ------------------------------------------------------------------------
 
+  begin(hello) {
+    this.gamepads = hello.panels.find((panel) => panel.stick).title === this.panel;
+    const gamepad = this.gamepads ? ", or hold a shoulder button of a gamepad" : "";
+    say(this.how, `Drag the stick, or click it and hold the ${this.wanted}${gamepad}. Letting go stops.`);
+  }
+
   receive(message) {
     if (message.type === "operating") this.introduced(message.page);
-    if (message.type === "stick") this.answered(message);
-    return message.type === "stick";
+    if (message.type !== "stick" || message.panel !== this.panel) return false;
+    this.answered(message);
+    return true;
   }
 
   introduced(page) {
@@ -245,7 +262,7 @@ export default class Drive {
 
   show(picture, changed) {
     if (!changed.has("operating")) return;
-    this.status = picture.operating;
+    this.status = picture.operating.sticks[this.panel];
     this.draw();
   }
 

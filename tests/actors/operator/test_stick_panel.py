@@ -1,0 +1,361 @@
+"""A stick that is declared: checked at load, and told to the robot while it is held."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+from contextlib import asynccontextmanager
+from typing import Annotated
+
+import msgspec
+import pytest
+from rampart.cli.analyse.explain_verb import explain
+
+from rampart.actors.bus.fields import Steered
+from rampart.actors.bus.messages import Message
+from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.layout.layout import Layout
+from rampart.actors.layout.wiring import published
+from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.limits import BURST
+from rampart.actors.operator.stick import TICKET_S
+from rampart.actors.runtime.actor import Actor, Header, on
+from rampart.manager.spec.panels import Panel
+from rampart.testing import eventually
+from tests import ROOT
+from tests.actors.operator.test_operating import Hand as Driver
+from tests.actors.operator.test_operating import ask, open_page
+from tests.actors.operator.test_panels import PAGE, Speaks, hmi, layout, panel
+from tests.actors.operator.world import hear, served
+from tests.tank import HAND, LEVEL, PUMP, Hand
+
+FIELDS = 'stick = ["tank/hand:forward", "tank/hand:left"]'
+HELD = 'held = "tank/hand:held"'
+DRIVE = Panel(title="Drive", stick=("tank/hand:forward", "tank/hand:left"), held="tank/hand:held",
+              scale=(0.5, -4.0))
+AT_REST = Hand(0.0)
+
+
+class Steps(Message):
+    """A motor that counts, and a name that somebody has to say."""
+
+    steps: Annotated[int, msgspec.Meta(ge=-10, le=100)]
+    name: str
+    fast: Annotated[float, msgspec.Meta(ge=1.0)] = 1.0
+    open_end: Annotated[float, msgspec.Meta(gt=-1.0, lt=1.0)] = 0.0
+
+
+class Place(Message):
+    """A number within."""
+
+    at: Hand = AT_REST
+    count: int = 0
+
+
+STEPS = Topic("tank/steps", Steps, Qos.COMMAND, 0.0, "", "Steps of a motor.")
+PLACE = Topic("tank/place/{name}", Place, Qos.COMMAND, 0.0, "", "Where each of some is to go.")
+
+
+class Driven(Actor):
+    """Obeys the stick."""
+
+    @on(HAND)
+    def hand(self, message: Hand, _header: Header) -> None:
+        pass
+
+    @on(STEPS)
+    def steps(self, message: Steps, _header: Header) -> None:
+        pass
+
+    @on(PLACE)
+    def place(self, message: Place, _header: Header) -> None:
+        pass
+
+    optional_inputs = (STEPS, PLACE, HAND)
+
+
+class Needs(Driven):
+    """Cannot do without the stick."""
+
+    optional_inputs = (STEPS, PLACE)
+
+
+class Rival(Actor):
+    """Says what the operator says."""
+
+    outputs = (HAND,)
+
+
+class Commands(Actor):
+    """Commands one of those that the operator commands."""
+
+    outputs = (PLACE,)
+
+    @classmethod
+    def output_names(cls, _topic, _name, _parameters):
+        return ("b",)
+
+
+class OwnHmi(Hmi):
+    """A page that brings its stick along."""
+
+    panels = (Panel(title="Hand", stick=("tank/hand:forward",)),)
+
+
+def node(kind: str) -> str:
+    return f'[[node]]\nname = "{kind.lower()}"\nactor = "{__name__}:{kind}"\nkind = "control"\n'
+
+
+def laid_out(rest: str, *nodes: str, page: str = PAGE) -> Layout:
+    return layout(panel("Drive", rest) if rest else "", page + "".join(map(node, nodes)))
+
+
+def refused(rest: str, *nodes: str, **page: str) -> str:
+    with pytest.raises(ValueError, match=r".") as caught:
+        laid_out(rest, *nodes, **page)
+    return str(caught.value)
+
+
+# ---- at load ------------------------------------------------------------------------------------
+
+
+def test_the_page_publishes_what_its_stick_says_and_does_not_hear_it():
+    found = laid_out(f"{FIELDS}\n{HELD}", "Needs")
+    page = found.members["page"]
+    assert "tank/hand" in published(page)
+    assert page.hears == {}
+    assert found.topics == {"tank/hand": HAND}
+    assert "needs" in found._partners["page"]
+
+
+def test_without_the_stick_nothing_publishes_what_the_robot_needs():
+    assert "node needs: hears 'tank/hand', which nothing publishes" in refused("", "Needs")
+
+
+def test_a_stick_of_the_page_s_class_is_checked_as_one_of_the_specification():
+    own = PAGE.replace("rampart.actors.operator.hmi:Hmi", f"{__name__}:OwnHmi")
+    assert "tank/hand" in published(laid_out("", "Needs", page=own).members["page"])
+    assert refused("", "Driven", "Rival", page=own).startswith(
+        "tank.toml: page: panel 'Hand': stick: node rival publishes 'tank/hand' as well")
+    assert refused(FIELDS, "Driven", page=own) == (
+        "tank.toml: page: panel 'Hand': another stick is told on tank/hand too; one is right")
+
+
+def test_a_member_of_a_family_has_a_stick_and_the_others_are_somebody_else_s():
+    found = laid_out('stick = ["tank/place/a:count"]', "Driven", "Commands")
+    assert published(found.members["page"])["tank/place/{name}"] == ("a",)
+    assert "node commands publishes 'tank/place/b' as well, and may move what" in refused(
+        'stick = ["tank/place/b:count"]', "Driven", "Commands")
+
+
+@pytest.mark.parametrize(("rest", "line"), [
+    ('stick = ["tank/hnad:forward"]',
+     "tank.toml: page: panel 'Drive': stick: no actor has a topic 'tank/hnad'; the nearest: "
+     "tank/hand"),
+    ('stick = ["tank/hand:forwards"]',
+     "tank.toml: page: panel 'Drive': stick: topic tank/hand: forwards: Hand has no field "
+     "'forwards'; did you mean forward?"),
+    ('stick = ["tank/hand:held"]',
+     "tank.toml: page: panel 'Drive': stick: topic tank/hand: held is a truth; a number is right"),
+    (f'{FIELDS}\nheld = "tank/hand:left"', "'Drive': stick: tank/hand:forward, tank/hand:left, "
+     "tank/hand:left: each field once is right"),
+    ('stick = ["tank/hand:forward"]\nheld = "tank/hand:left"',
+     "tank.toml: page: panel 'Drive': held: topic tank/hand: left is a number; a truth is right"),
+    ('stick = ["tank/hand:forward", "tank/level:height_m"]',
+     "'Drive': stick: fields of tank/hand and tank/level; those of one topic are right"),
+    (f'{FIELDS}\nheld = "tank/pump:running"',
+     "'Drive': stick: fields of tank/hand and tank/pump; those of one topic are right"),
+    (f"{FIELDS}\nscale = [1.0]",
+     "'Drive': scale = [1.0]: one number for each of tank/hand:forward, tank/hand:left is right"),
+    (f"{FIELDS}\nscale = [1.0, 0.0]",
+     "'Drive': scale = [1.0, 0.0]: numbers other than 0, at most 1e+09 are right"),
+    (f"{FIELDS}\nscale = [0.1, nan]", "scale"),
+    (f"{FIELDS}\nscale = [0.1, inf]", "scale"),
+    (f"{FIELDS}\nseconds = 3", "'Drive': seconds means nothing to a stick; it takes held, scale"),
+    ('text = "tank/hand:left"\nheld = "tank/hand:held"',
+     "'Drive': held means nothing to a text; it takes unit"),
+    ("stick = []", "tank.toml: $.panel[0].stick = []: "),
+    ('stick = ["tank/hand"]', "tank.toml: $.panel[0].stick[0] = 'tank/hand': expected "
+     "'topic:field'"),
+    ('stick = ["tank/steps:steps"]',
+     "tank.toml: page: panel 'Drive': stick: topic tank/steps: nothing says what name of Steps "
+     "is; a default in its class is right"),
+    ('stick = ["tank/place/a:at.forward"]',
+     "tank.toml: page: panel 'Drive': stick: topic tank/place/a: at.forward: a whole field of "
+     "Place is right: at, count"),
+    (f"{FIELDS}\nscale = [1.0, 1.0]",
+     "tank.toml: page: panel 'Drive': stick: topic tank/hand: forward = -1 at full stick: Expected "
+     "`float` >= -0.5; a scale within its bounds is right"),
+])
+def test_a_stick_that_cannot_be_is_refused_in_one_line(rest, line):
+    said = refused(rest, "Driven")
+    assert line in said
+    assert said.startswith("tank.toml: ")
+    assert "\n" not in said
+
+
+def test_the_example_of_the_document_is_sound():
+    document = (ROOT / "docs" / "hmi.md").read_text("utf-8").partition("### A stick of your own")[2]
+    toml = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)[0]
+    found = layout(toml.replace("tug/stick", "tank/hand"), PAGE + node("Needs"))
+    assert [p.stick for p in found.members["page"].parameters.panels] == [DRIVE.stick]
+
+
+def test_who_publishes_what_a_stick_says_is_explained():
+    talk = {talk.topic: talk for talk in explain(laid_out(FIELDS, "Needs")).talks}["tank/hand"]
+    assert (talk.from_, talk.to) == (("page",), ("needs",))
+
+
+def test_two_publishers_of_a_stick():
+    assert refused(FIELDS, "Driven", "Rival") == (
+        "tank.toml: page: panel 'Drive': stick: node rival publishes 'tank/hand' as well, and may "
+        "move what an operator let go of; a topic of the stick's own is right (or several = True "
+        "in the Topic)")
+
+
+def test_two_sticks_on_one_topic_are_refused():
+    assert refused(f"{FIELDS}\n" + panel("Again", FIELDS), "Driven") == (
+        "tank.toml: $.panel: panel 'Drive': another stick is told on tank/hand too; one is right")
+
+
+# ---- its messages -------------------------------------------------------------------------------
+
+
+def test_a_number_goes_from_bound_to_bound_and_is_0_at_rest():
+    said = Steered(Hand, ("forward", "left"), "held")
+    assert said((1.0, 1.0)) == Hand(2.0, 1.0, True)
+    assert said((-1.0, -1.0)) == Hand(-0.5, -1.0, True)
+    assert said((0.5, 0.0)) == Hand(1.0, 0.0, True)
+    assert said(None) == Hand(0.0, 0.0, False)
+    turned = Steered(Hand, ("left", "forward"), "", (-4.0, 0.5))
+    assert turned((0.5, 1.0)) == Hand(0.5, -2.0)
+    assert math.copysign(1.0, turned(None).left) == 1.0
+
+
+def test_a_whole_number_stays_one():
+    said = Steered(Place, ("count",), "", (7.0,))
+    assert said((0.5, 0.0)) == Place(count=4)
+    assert type(said((1.0, 0.0)).count) is int
+
+
+@pytest.mark.parametrize(("name", "words"), [
+    ("fast", "fast = 0 at rest: Expected `float` >= 1.0; a scale within its bounds is right"),
+    ("open_end", "open_end = -1 at full stick: Expected `float` > -1.0; a scale within its bounds"),
+])
+def test_a_number_that_cannot_be_0_or_not_at_its_end_is_refused(name, words):
+    class Named(Steps):
+        steps: int = 0
+        name: str = ""
+
+    with pytest.raises(ValueError, match=r".") as caught:
+        Steered(Named, (name,))
+    assert words in str(caught.value)
+
+
+# ---- while somebody holds it --------------------------------------------------------------------
+
+
+class Robot(Speaks):
+    """Hears the stick."""
+
+    outputs = (*Speaks.outputs, LEVEL, PUMP)
+
+    def __init__(self, context) -> None:
+        super().__init__(context)
+        self.hands: list[Hand] = []
+
+    @on(HAND)
+    def hand(self, message: Hand, _header: Header) -> None:
+        self.hands.append(message)
+
+
+@asynccontextmanager
+async def driven(world, *panels: Panel):
+    """A page with a stick, and a robot that hears it."""
+    robot = Robot(world.context("robot", 1))
+    async with world.running(robot), world.running(hmi(world, panels or (DRIVE,))) as page:
+        yield robot, page, await served(page)
+
+
+async def rests(robot: Robot) -> None:
+    """Wait until the robot is told to rest, and see that it is told nothing more."""
+    await eventually(lambda: bool(robot.hands) and robot.hands[-1] == AT_REST)
+    count = len(robot.hands)
+    await asyncio.sleep(0.1)
+    assert len(robot.hands) == count
+
+
+@pytest.mark.usefixtures("patient")
+async def test_it_is_told_again_and_again_while_it_is_held_and_at_rest_once(world):
+    async with driven(world) as (robot, _, at):
+        await eventually(lambda: robot.hands == [AT_REST])  # a former incarnation may have driven
+        async with open_page(at) as page:
+            hand = Driver(page)
+            await hand.take()
+            await hand.hold(0.5, 0.25)
+            count = len(robot.hands)
+            await eventually(lambda: len(robot.hands) >= count + 5)
+            assert robot.hands[-1] == Hand(0.25, -1.0, True)
+            await ask(page, type="stick", panel="Drive", held=False)
+            await rests(robot)
+    assert robot.hands.count(AT_REST) == 2
+
+
+async def test_a_page_that_falls_silent_closes_or_is_late_has_let_go(world, monkeypatch):
+    async with driven(world) as (robot, _, at):
+        async with open_page(at) as page:
+            await Driver(page).take()
+            await rests(robot)
+        async with open_page(at) as page:
+            await Driver(page).take()
+        await rests(robot)
+        async with open_page(at) as page:
+            hand = Driver(page)
+            await hand.take()
+            monkeypatch.setattr("rampart.actors.operator.stick.TICKET_S", -1.0)
+            assert (await hand.hold())["grip"] == "late"
+            await rests(robot)
+            monkeypatch.setattr("rampart.actors.operator.stick.TICKET_S", TICKET_S)
+            assert (await hand.hold())["grip"] == "lapsed"
+            await rests(robot)
+
+
+@pytest.mark.usefixtures("patient")
+async def test_what_is_no_message_of_this_stick_moves_nothing(world):
+    async with driven(world) as (robot, _, at):
+        async with open_page(at) as page:
+            told = await ask(page, type="stick", panel="Drvie", held=True)
+            assert told == {"type": "error", "text": "no stick 'Drvie'; there are: Drive"}
+            for wrong in ('"forward":NaN', '"forward":1e999', '"left":"x"', '"forward":[1]'):
+                await page.send(f'{{"type":"stick","panel":"Drive","held":true,{wrong}}}')
+                assert "not understood" in (await hear(page, "error"))["text"]
+            hand = Driver(page)
+            await hand.take()
+            for _ in range(3 * BURST):
+                await page.send('{"type":"stick","panel":"Drive","held":true,"forward":-1e308}')
+            told = await hear(page, "stick")
+            assert (told["grip"], told["text"]) == (
+                "refused", "forward = -1e+308: must be between -1 and 1; the stick was taken from "
+                "you, let go first")
+            assert "too many messages" in (await hear(page, "error"))["text"]
+            await rests(robot)
+    assert {hand.forward for hand in robot.hands} <= {0.0, 0.25}
+
+
+@pytest.mark.usefixtures("patient")
+async def test_two_sticks_are_held_by_two_pages_and_each_by_one(world):
+    place = Panel(title="Place", stick=("tank/hand:forward",))
+    level = Panel(title="Level", stick=("tank/level:height_m",), scale=(3.0,))
+    async with driven(world, place, level) as (robot, _, at):
+        async with open_page(at) as one, open_page(at) as two:
+            await Driver(one, "Level").take()
+            other = Driver(two, "Level")
+            assert (await other.hold())["text"] == "page 1 has the stick"
+            await Driver(two, "Place").take()
+            shown = (await hear(two, "state"))["operating"]["sticks"]
+            while not all(stick["holder"] for stick in shown.values()):
+                shown = (await hear(two, "state"))["operating"]["sticks"]
+            assert {name: stick["holder"] for name, stick in shown.items()} == {
+                "Place": 2, "Level": 1}
+        await eventually(lambda: robot.hands[-1] == AT_REST)

@@ -1,0 +1,22 @@
+"""What Osmosis makes of a stick, as its page says it."""
+
+from __future__ import annotations
+
+import pytest
+
+from rampart.actors.osmosis.page.driving import effect
+
+
+@pytest.mark.parametrize(("known", "works", "text"), [
+    ({}, True, "overrides the mission"),
+    ({"mode": "teleoperation"}, True, "obeys the stick alone"),
+    ({"forbids": "RM2: it is stale", "mode": "stop"}, False, "no effect: RM2: it is stale"),
+    ({"brake": True}, False, "the brake is engaged"),
+    ({"pilot_heard": False}, False, "the Safety Pilot is not heard"),
+    ({"dead_nodes": ("teleoperation",), "brake": True}, False, "teleoperation does not run"),
+])
+def test_the_page_says_whether_the_stick_has_an_effect_and_why_not(known, works, text):
+    heard = {"pilot_heard": True, "mode": "auto", "forbids": "", "brake": False, "dead_nodes": ()}
+    got, words = effect(**heard | known)
+    assert got is works
+    assert text in words
