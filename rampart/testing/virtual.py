@@ -277,7 +277,7 @@ def virtual_run(system: str | Path, *faults: str, seconds: float | None = None,
     """
     file = systems.find(str(system))
     working_folder.admit(file.parent)
-    chosen = RunPlan(system_file=str(file), **plan)
+    chosen = RunPlan(**{"system_file": str(file), "virtual": True, **plan})
     spec = load_system(chosen)
     trial = trial_class(spec)(load_run(chosen, spec), seconds)
     if not trial.patient and trial.limit_s is None:

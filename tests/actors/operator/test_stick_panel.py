@@ -10,7 +10,6 @@ from typing import Annotated
 
 import msgspec
 import pytest
-from rampart.cli.analyse.explain_verb import explain
 
 from rampart.actors.bus.fields import Steered
 from rampart.actors.bus.messages import Message
@@ -21,6 +20,7 @@ from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.limits import BURST
 from rampart.actors.operator.stick import TICKET_S
 from rampart.actors.runtime.actor import Actor, Header, on
+from rampart.cli.analyse.check_verbs import explain
 from rampart.manager.spec.panels import Panel
 from rampart.testing import eventually
 from tests import ROOT
