@@ -15,7 +15,7 @@ TOPICS = ("drop:rotors/pilot@10", "stuck:rotors/pilot@10", "delay:rotors/pilot@1
           "stuck:setpoint@10", "corrupt:setpoint@10", "freeze:estimate@10", "stuck:estimate@10",
           "corrupt:estimate@10", "drop:mission/goal@10", "corrupt:mission/goal@10",
           "stuck:sensors/gps@10", "delay:sensors/gps@10", "corrupt:pilot/status@10")
-UNSAFE_WITHOUT = ("battery-drain:20@4", "gps-dropout@10", "stuck:rotors/pilot@10",
+UNSAFE_WITHOUT = ("battery-drain:16@4", "gps-dropout@10", "stuck:rotors/pilot@10",
                   "stuck:setpoint@10", "stuck:estimate@10")
 
 
