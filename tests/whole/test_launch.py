@@ -94,11 +94,10 @@ FAULTS = {
 }
 
 
-# On processes one fault of each recovery; RM1's is below, with its reset. All of them in virtual
-# time: test_virtual_run.py.
-@pytest.mark.parametrize("fault", [
-    fault if fault in {"command-not-updated", "localization-not-updated"}
-    else pytest.param(fault, marks=pytest.mark.slow) for fault in FAULTS])
+# With every change RM2 and RM5 in test_virtual_run.py, where real runs are compared with virtual
+# ones; RM1 below, with its reset; all of them in virtual time.
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
 def test_with_ftm_a_fault_leaves_the_robot_safe(tmp_path, fault):
     module, recoveries = FAULTS[fault]
     with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2", "--patience", "8") as run:

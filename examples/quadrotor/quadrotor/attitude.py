@@ -129,11 +129,14 @@ class AttitudeFilter:
 class VerticalFilter:
     """Height and vertical speed from acceleration and air pressure.
 
+    A barometer that jumps is taken for wrong, as far as speed goes: from then on it counts from
+    where it is now. A speed that followed it would hit the ground when the bias goes away again.
+
     Attributes:
         height_m, speed_mps: upwards.
     """
 
-    _BAND_RADPS, _JUMP_M = 0.8, 2.0
+    _BAND_RADPS, _JUMP_M = 0.8, 1.0
 
     def __init__(self) -> None:
         self.height_m = self.speed_mps = 0.0
@@ -150,8 +153,9 @@ class VerticalFilter:
         if not math.isfinite(altitude_m) or altitude_m == self._last_m:
             return
         self._last_m = altitude_m
-        if not self._known:
+        off_m = altitude_m - self.height_m
+        if not self._known or abs(off_m) > self._JUMP_M:
             self.height_m, self._known = altitude_m, True
-        off_m = min(max(altitude_m - self.height_m, -self._JUMP_M), self._JUMP_M)
+            return
         self.height_m += 1.4 * self._BAND_RADPS * step_s * off_m
         self.speed_mps += self._BAND_RADPS ** 2 * step_s * off_m

@@ -10,11 +10,13 @@ import math
 
 from quadrotor.rotation import Quaternion, inverse, leaning, product, up
 from quadrotor.topics import Estimate, Goal
-from quadrotor.vehicle import G_MPS2, HOVER_N, INERTIA_KGM2, MASS_KG, Thrusts, Vector, mix
+from quadrotor.vehicle import G_MPS2, HOVER_N, INERTIA_KGM2, MASS_KG, Thrusts, Vector, mix, wrench
 
 MOST_ACCEL_MPS2 = 3.0
 """Horizontally: a tilt of 17°."""
 CLIMB_MPS = 1.5
+_FOLLOW_SHARE = 0.02
+"""Of what another one's trim differs, with each word of the speed controllers (50 Hz): 1 s."""
 _LIGHT_SHARE = 0.85
 """With less thrust than this share of the weight it may stand on the ground: no trim is learnt."""
 STEP_S = 0.01
@@ -83,8 +85,18 @@ class AttitudeControl:
         """Forget the trim: on the ground it says nothing."""
         self._rest, self.trim = [0.0, 0.0, 0.0], 0.0
 
-    def step(self, accel_mps2: Vector, yaw_rad: float, q: Quaternion, rate_radps: Vector
-             ) -> Thrusts:
+    def follow(self, thrusts_n: Thrusts) -> None:
+        """Take over the trim of another one that flies, from what it asks of the rotors.
+
+        Torques that last are what the vehicle has to be trimmed by: on average it does not turn.
+        """
+        if all(map(math.isfinite, thrusts_n)):
+            for i, torque_nm in enumerate(wrench(thrusts_n)[1]):
+                trim = bounded(torque_nm / INERTIA_KGM2[i], self._MOST_REST_RADPS2[i])
+                self._rest[i] += _FOLLOW_SHARE * (trim - self._rest[i])
+
+    def step(self, accel_mps2: Vector, yaw_rad: float, q: Quaternion, rate_radps: Vector,
+             *, flies: bool = True) -> Thrusts:
         """Return the thrust of each rotor, N.
 
         Args:
@@ -92,6 +104,7 @@ class AttitudeControl:
             yaw_rad: asked for.
             q: attitude.
             rate_radps: in `base_link`.
+            flies: whether this is carried out; nothing is learnt from what is not.
         """
         force = accel_mps2[0], accel_mps2[1], max(accel_mps2[2] + G_MPS2, 2.0)
         length = math.sqrt(sum(part * part for part in force))
@@ -103,7 +116,7 @@ class AttitudeControl:
         for i in range(3):
             asked = bounded(sign * wrong[i + 1] * speeds[i], 4.0 if i < 2 else 1.0)
             short = asked - rate_radps[i]
-            if force[2] > _LIGHT_SHARE * G_MPS2:
+            if flies and force[2] > _LIGHT_SHARE * G_MPS2:
                 self._rest[i] = bounded(self._rest[i] + self._REST_HZ2[i] * short * STEP_S,
                                         self._MOST_REST_RADPS2[i])
             torque.append(INERTIA_KGM2[i] * (self._RATE_HZ[i] * short + self._rest[i]))

@@ -16,11 +16,10 @@ import numpy.typing as npt
 
 from quadrotor import topics as t
 from quadrotor.rotation import Quaternion, tilt, yaw
-from quadrotor.vehicle import MOST_THRUST_N, Thrusts, Vector
+from quadrotor.rotors import SpeedControllers
+from quadrotor.vehicle import MOST_THRUST_N, Vector
 
 STEP_S = 0.002
-IDLE_N = 0.3
-"""Thrust of a rotor whose speed controller gets no commands any more: it turns, no more."""
 
 _MODEL = Path(__file__).with_name("quadrotor.xml")
 _DRAG_NSPM = 0.3
@@ -46,11 +45,11 @@ class Physics:
         seed: of wind and noise.
         wind_mps: mean wind; its direction follows from the seed.
         charge: of the battery, from 0 to 1.
-        hold_s: how long the speed controllers carry out a command that is not renewed.
+        rotors: what drives them.
         start_s: simulated time now.
     """
 
-    def __init__(self, seed: int, wind_mps: float, charge: float, hold_s: float,
+    def __init__(self, seed: int, wind_mps: float, charge: float, rotors: SpeedControllers,
                  start_s: float) -> None:
         self._model = mujoco.MjModel.from_xml_path(str(_MODEL))
         self._data = mujoco.MjData(self._model)
@@ -60,9 +59,7 @@ class Physics:
         self._gust = np.zeros(3)
         self._imu_off = np.concatenate([self._dice.normal(0.0, 0.001, (3, 3)),
                                         self._dice.normal(0.0, 0.03, (3, 3))], axis=1)
-        self._hold_s = hold_s
-        self._commanded: Thrusts = (0.0,) * 4
-        self._commanded_s = -math.inf
+        self._rotors = rotors
         self._start_s = start_s
         self._steps = 0
         self._air_s = 0.0
@@ -71,18 +68,6 @@ class Physics:
         self.charge = charge
         self.touch_speed_mps = self.touch_tilt_rad = self.highest_tilt_rad = 0.0
         mujoco.mj_forward(self._model, self._data)
-
-    def command(self, thrusts: Thrusts, stamp_s: float) -> bool:
-        """Have the rotors follow a command; return whether it makes sense."""
-        if not all(0.0 <= f <= MOST_THRUST_N * 1.01 for f in thrusts):
-            return False
-        self._commanded, self._commanded_s = thrusts, stamp_s
-        return True
-
-    @property
-    def command_age_s(self) -> float:
-        """For how long no command came, s; 0 before the first."""
-        return max(self.now_s - self._commanded_s, 0.0) if self._commanded_s > -math.inf else 0.0
 
     @property
     def turning(self) -> bool:
@@ -124,9 +109,7 @@ class Physics:
                        * _GUST_MPS * math.sqrt(2 * each_s / _GUST_S))
         data.xfrc_applied[1, :3] = -_DRAG_NSPM * (data.qvel[:3] - self._wind - self._gust)
         most_n = MOST_THRUST_N * min(1.0, max(self.charge, 0.0) / _EMPTY)
-        commanded = self._commanded if self.command_age_s <= self._hold_s else (
-            tuple(min(f, IDLE_N) for f in self._commanded))
-        for i, thrust_n in enumerate(commanded):
+        for i, thrust_n in enumerate(self._rotors.turn(self.now_s)):
             data.ctrl[i] = min(thrust_n, most_n) * self.health.rotors[i]
         self.charge = max(0.0, self.charge - self.health.drain * self.current_a * each_s
                           / _CAPACITY_AS)
@@ -170,7 +153,8 @@ class Physics:
 
     def esc(self) -> t.EscStatus:
         """Read the rotors' speed controllers."""
-        return t.EscStatus(self.command_age_s, self.turning)
+        return t.EscStatus(self._rotors.age_s(self.now_s), self.turning, self._rotors.obeys,
+                           self._rotors.thrusts)
 
     def truth(self) -> t.Truth:
         """Return what is so."""

@@ -1,4 +1,4 @@
-"""The pilot: the last instance before the rotors. Keeps the attitude, and chooses whom to follow.
+"""A pilot: the last instance before the rotors. Keeps the attitude, and chooses whom to follow.
 
 In flight there is no standing still: whoever does nothing falls. So the pilot always flies, by the
 best that it has, from top to bottom:
@@ -10,9 +10,10 @@ best that it has, from top to bottom:
    and then goes down gently. Wind carries it along.
 
 The attitude loop runs here and not in the flight controller, so that the death of that one costs
-nothing. When the pilot dies itself the speed controllers of the rotors carry out its last command
-for `dead_man_timeout_s`, and then idle; it has to be back by then. Its successor takes over the
-attitude that the estimator knows.
+nothing. There are two pilots, and both fly all the time; the speed controllers of the rotors say
+whom they obey (`rotors.py`). The other one learns nothing from what it asks for in vain, follows
+the trim of the one that flies, and keeps silent on `pilot/status`. A pilot that is restarted takes
+over the attitude that the estimator knows.
 """
 
 from __future__ import annotations
@@ -108,12 +109,14 @@ class Pilot(Actor):
             level_descent_mps: without an estimate.
             return_mps: on the way home.
             most_tilt_rad: asked of the attitude loop.
+            first: whether it takes itself for the one that flies while it hears nothing of that.
         """
 
         descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 0.9
         level_descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 0.8
         return_mps: Positive = 2.5
         most_tilt_rad: Annotated[float, msgspec.Meta(gt=0, lt=0.8)] = 0.4
+        first: bool = True
 
     parameters: Parameters
     outputs = (t.ROTORS, t.PILOT)
@@ -133,6 +136,8 @@ class Pilot(Actor):
         self._held: tuple[str, Vector] | None = None
         self._source, self._source_s = "", self.clock.now()
         self._last_n = _IDLE
+        self._esc: t.EscStatus | None = None
+        self._esc_s = -math.inf
         self._light_s = 0.0
         self._landed = context.incarnation == 1
         self._stays = False
@@ -171,6 +176,19 @@ class Pilot(Actor):
         """Take a yaw."""
         if math.isfinite(message.yaw_rad):
             self._yaw_rad = message.yaw_rad
+
+    @on(t.ESC)
+    def esc(self, message: t.EscStatus, header: Header) -> None:
+        """Hear whom the rotors obey; follow the trim of another one."""
+        self._esc, self._esc_s = message, header.stamp
+        if not self._flies():
+            self._attitude.follow(message.thrust_n)
+
+    def _flies(self) -> bool:
+        """Whether the rotors obey this pilot, as far as it knows."""
+        if self._esc is None or self.clock.now() - self._esc_s > FRESH_S:
+            return self.parameters.first
+        return self._esc.obeys == self.name
 
     @on(t.ESTIMATE)
     def estimate(self, message: t.Estimate, header: Header) -> None:
@@ -226,7 +244,8 @@ class Pilot(Actor):
             self._attitude.reset()
             self._last_n = _IDLE
         else:
-            self._last_n = self._attitude.step(asked, yaw_rad, self._filter.q, rate)
+            self._last_n = self._attitude.step(
+                asked, yaw_rad, self._filter.q, rate, flies=self._flies())
         self.publish(t.ROTORS, t.RotorCommand(self._last_n))
 
     def _asked(self, now_s: float) -> tuple[Vector, float]:
@@ -286,9 +305,13 @@ class Pilot(Actor):
         return 0.0, 0.0, bounded(2.0 * wrong_mps + self._rest_mps2, 3.0)
 
     def _see_ground(self, upward_mps2: float, force_mps2: float) -> None:
-        """Whoever asks for little thrust and feels his whole weight stands on the ground."""
+        """Whoever asks for little thrust and feels his whole weight stands on the ground.
+
+        If the rotors obey the other pilot, that one has to ask for little, too.
+        """
         before = self._landed
-        thrust_mps2 = sum(self._last_n) / MASS_KG
+        told_n = self._last_n if self._flies() or self._esc is None else self._esc.thrust_n
+        thrust_mps2 = max(sum(self._last_n), sum(told_n)) / MASS_KG
         if self._landed:
             said = self._setpoint if self._source == "setpoint" and not self._stays else None
             self._landed = not (said is not None and said.fly and upward_mps2 > 0.5)
@@ -304,8 +327,8 @@ class Pilot(Actor):
 
     @every(0.05)
     def say(self) -> None:
-        """Say how it flies."""
-        if self._filter.known:
+        """Say how it flies, if it does."""
+        if self._filter.known and self._flies():
             self.publish(t.PILOT, t.PilotStatus(
                 self.mode, self._source, self._landed, tilt(self._filter.q), self._filter.q,
                 self._imus.sound, self._attitude.trim, self._refused))

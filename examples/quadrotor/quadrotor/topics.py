@@ -141,10 +141,19 @@ class RotorCommand(Message, frozen=True):
 
 
 class EscStatus(Message, frozen=True):
-    """Age of the command that the speed controllers carry out, and whether the rotors turn."""
+    """What the rotors' speed controllers do.
+
+    Attributes:
+        command_age_s: of the command that they carry out.
+        turning: whether the rotors turn.
+        obeys: name of the pilot whose command it is.
+        thrust_n: what that one asked for.
+    """
 
     command_age_s: float
     turning: bool
+    obeys: Text
+    thrust_n: tuple[float, float, float, float]
 
 
 class Truth(Message, frozen=True):
@@ -208,5 +217,7 @@ GOAL = Topic("mission/goal", Goal, Qos.STATE, 10.0, "map", "Where to fly.")
 MISSION = Topic("mission/state", MissionState, Qos.STATE, 5.0, "", "Step of the mission.")
 SETPOINT = Topic("setpoint", Setpoint, Qos.SENSOR, 50.0, "map", "What the pilot is asked for.")
 PILOT_ORDER = Topic("pilot/order", PilotOrder, Qos.COMMAND, 0.0, "", "Mode asked of the pilot.")
-PILOT = Topic("pilot/status", PilotStatus, Qos.STATE, 20.0, "map", "What the pilot does.")
-ROTORS = Topic("rotors", RotorCommand, Qos.SENSOR, 100.0, "base_link", "Thrust of the rotors.")
+PILOT = Topic("pilot/status", PilotStatus, Qos.STATE, 20.0, "map",
+              "What the pilot does whom the rotors obey.", several=True)
+ROTORS = Topic("rotors/{name}", RotorCommand, Qos.SENSOR, 100.0, "base_link",
+               "Thrust of the rotors, by each pilot.")

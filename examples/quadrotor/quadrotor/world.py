@@ -15,6 +15,7 @@ import msgspec
 
 from quadrotor import topics as t
 from quadrotor.physics import Physics
+from quadrotor.rotors import SpeedControllers
 from rampart import (
     INJECTION_REPORT,
     Actor,
@@ -42,6 +43,7 @@ class World(Actor):
             seed: of wind and noise.
             dead_man: whether the speed controllers idle when commands cease.
             dead_man_timeout_s: how long they carry out the last one.
+            pilots: whom they obey; the one that comes first is preferred.
             wind_mps: mean wind, from a direction that the seed chooses.
             charge: of the battery at the start, from 0 to 1.
         """
@@ -49,6 +51,7 @@ class World(Actor):
         seed: int = 0
         dead_man: bool = True
         dead_man_timeout_s: Positive = 0.4
+        pilots: Annotated[tuple[t.Text, ...], msgspec.Meta(min_length=1)] = ("pilot", "reserve")
         wind_mps: NonNegative = 1.0
         charge: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.9
 
@@ -58,9 +61,10 @@ class World(Actor):
     def on_start(self) -> None:
         """Put the vehicle on the ground."""
         said = self.parameters
+        self._rotors = SpeedControllers(
+            said.pilots, said.dead_man_timeout_s if said.dead_man else math.inf)
         self.physics = physics = Physics(
-            said.seed, said.wind_mps, said.charge,
-            said.dead_man_timeout_s if said.dead_man else math.inf, self.clock.now())
+            said.seed, said.wind_mps, said.charge, self._rotors, self.clock.now())
         self._faults: dict[tuple[str, int], tuple[t.BodyFault, float, int]] = {}
         self._ticks = 0
         read: list[tuple[Topic[Any], Callable[[], Any]]] = [
@@ -72,7 +76,8 @@ class World(Actor):
     @on(t.ROTORS)
     def rotors(self, message: t.RotorCommand, header: Header) -> None:
         """Pass a command to the speed controllers."""
-        if not self.physics.command(message.thrust_n, min(header.stamp, self.clock.now())):
+        stamp_s = min(header.stamp, self.clock.now())
+        if not self._rotors.command(header.source, message.thrust_n, stamp_s):
             self.report_diagnostic("rotors", "a thrust that no rotor has", header.source)
 
     @on(t.BODY_FAULT)

@@ -88,6 +88,19 @@ def test_a_disturbance_that_stays_is_trimmed_and_tells_of_a_weak_rotor():
     assert control.trim > 0.05
 
 
+def test_who_does_not_fly_takes_over_the_trim_of_the_one_that_does():
+    flies, waits = AttitudeControl(), AttitudeControl()
+    for tick in range(600):
+        rate = (-0.4 if tick < 100 else 0.0, 0.0, 0.0)
+        thrusts = flies.step((0.0, 0.0, 0.0), 0.0, LEVEL, rate)
+        waits.step((0.0, 0.0, 0.0), 0.0, LEVEL, (0.3, 0.0, 0.0), flies=False)
+        if tick % 2 == 0:
+            waits.follow(thrusts)
+    assert waits.trim == pytest.approx(flies.trim, rel=0.1)
+    waits.follow((math.nan,) * 4)
+    assert math.isfinite(waits.trim)
+
+
 def test_on_the_ground_no_trim_is_learnt():
     control = AttitudeControl()
     for _ in range(100):

@@ -6,19 +6,21 @@ from flights import fly
 VEHICLE = ("weak-rotor@10", "weak-rotor:3@18", "battery-drain@8")
 SENSORS = ("gps-bias@10", "gps-drift@8", "gps-dropout@10", "barometer-bias@10",
            "barometer-stuck@4", "imu-bias@8", "imu-noise@8", "imu-stuck@8", "heading-bias@9")
-PROCESSES = ("kill:pilot@10", "stop:pilot@11", "wedge:pilot@6.2", "kill:estimator@10",
-             "wedge:estimator@10", "kill:flight_controller@10", "stop:flight_controller@10",
-             "kill:mission@10", "wedge:mission@10", "kill:ftm_manager@10")
-TOPICS = ("drop:rotors@10", "stuck:rotors@10", "delay:rotors@10", "drop:setpoint@10",
+PROCESSES = ("kill:pilot@10", "stop:pilot@11", "wedge:pilot@6.2", "kill:reserve@10",
+             "kill:estimator@10", "wedge:estimator@10", "kill:flight_controller@10",
+             "stop:flight_controller@10", "kill:mission@10", "wedge:mission@10",
+             "kill:ftm_manager@10")
+TOPICS = ("drop:rotors/pilot@10", "stuck:rotors/pilot@10", "delay:rotors/pilot@10",
+          "stuck:rotors/reserve@10", "drop:setpoint@10",
           "stuck:setpoint@10", "corrupt:setpoint@10", "freeze:estimate@10", "stuck:estimate@10",
           "corrupt:estimate@10", "drop:mission/goal@10", "corrupt:mission/goal@10",
           "stuck:sensors/gps@10", "delay:sensors/gps@10", "corrupt:pilot/status@10")
-UNSAFE_WITHOUT = ("battery-drain:20@4", "gps-dropout@10", "kill:pilot@10", "stop:pilot@11",
-                  "drop:rotors@10", "stuck:rotors@10", "stuck:setpoint@10", "stuck:estimate@10")
+UNSAFE_WITHOUT = ("battery-drain:16@4", "gps-dropout@10", "stuck:rotors/pilot@10",
+                  "stuck:setpoint@10", "stuck:estimate@10")
 
 
 IN_CI = {"weak-rotor@10", "gps-bias@10", "imu-bias@8", "kill:pilot@10", "wedge:pilot@6.2",
-         "kill:estimator@10", "stuck:setpoint@10", "corrupt:estimate@10", "drop:rotors@10"}
+         "kill:estimator@10", "stuck:setpoint@10", "corrupt:estimate@10", "stuck:rotors/pilot@10"}
 """Flown with every change; the others with `make test-slow`."""
 
 
@@ -81,6 +83,22 @@ def test_the_mechanism_against_a_fault_is_the_one_that_acts(fault, mechanism, re
 @pytest.mark.slow
 def test_a_short_loss_of_the_gps_costs_a_pause_and_no_more():
     assert sound(fly("gps-dropout@10+2")).success
+
+
+def test_two_pilots_that_die_together_are_replaced_before_the_rotors_idle():
+    assert sound(fly("kill:pilot@10", "kill:reserve@10", seconds=14.0)).safe
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["kill:pilot@10", "wedge:pilot@10", "slow:pilot@10",
+                                   "drop:rotors/pilot@10"])
+def test_the_reserve_needs_no_mechanism(fault):
+    assert sound(fly(fault, ftm=False)).success
+
+
+@pytest.mark.slow
+def test_a_barometer_that_is_right_again_on_the_way_down_does_no_harm():
+    assert sound(fly("barometer-bias@9.17+3.6", seed=1777906562)).safe
 
 
 @pytest.mark.slow

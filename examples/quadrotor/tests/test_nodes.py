@@ -8,6 +8,7 @@ import pytest
 from flights import SYSTEM
 from quadrotor import topics as t
 from quadrotor.control import G_MPS2
+from quadrotor.vehicle import HOVER_N
 
 from rampart.testing import VirtualSystem, run
 
@@ -22,19 +23,22 @@ def noisy():
 class Bench:
     """A pilot, and whoever keeps it supplied with what a test says."""
 
-    def __init__(self, system):
+    def __init__(self, system, name="pilot"):
         self.system = system
         self.status = system.hear(t.PILOT)
         self.rotors = system.hear(t.ROTORS)
-        system.start_node("pilot")
+        system.start_node(name)
 
-    async def feed(self, seconds, *, estimate=True, setpoint=True, up=0.0, height_m=5.0):
+    async def feed(self, seconds, *, estimate=True, setpoint=True, up=0.0, height_m=5.0,
+                   obeys=""):
         for _ in range(round(seconds / 0.02)):
             for topic in t.IMUS:
                 reading = t.Imu(noisy(), 0.0, 0.0, 0.0, 0.0, G_MPS2 + noisy())
                 self.system.say(topic, reading, "world")
             self.system.say(t.HEADING, t.Heading(0.0), "world")
             self.system.say(t.BAROMETER, t.Barometer(height_m + noisy()), "world")
+            if obeys:
+                self.system.say(t.ESC, t.EscStatus(0.0, True, obeys, (HOVER_N,) * 4), "world")
             if estimate:
                 self.system.say(t.ESTIMATE, t.Estimate(
                     noisy(), 0.0, height_m, 0.0, 0.0, 0.0, 0.0, LEVEL, 0.0), "estimator")
@@ -42,7 +46,7 @@ class Bench:
                 self.system.say(t.SETPOINT, t.Setpoint(True, 0.0, 0.0, up, 0.0),
                                 "flight_controller")
             await asyncio.sleep(0.02)
-        return self.status[-1].message
+        return self.status[-1].message if self.status else None
 
     async def order(self, mode, source):
         self.system.say(t.PILOT_ORDER, t.PilotOrder(mode), source)
@@ -113,6 +117,37 @@ def test_who_asks_for_little_and_feels_his_weight_stands_and_after_an_order_stay
         assert (await bench.feed(1.0, up=2.0)).landed
 
     on_the_bench(scenario)
+
+
+def test_a_pilot_whom_the_rotors_do_not_obey_commands_on_and_says_nothing():
+    async def scenario(bench):
+        said, told = len(bench.status), len(bench.rotors)
+        await bench.feed(0.5, obeys="reserve")
+        assert len(bench.status) <= said + 1
+        assert len(bench.rotors) > told + 40
+        await bench.feed(0.5)  # nothing is heard of the speed controllers: it takes itself for it
+        assert len(bench.status) > said + 5
+
+    on_the_bench(scenario)
+
+
+def test_who_does_not_fly_does_not_take_the_others_flight_for_the_ground():
+    async def scenario(bench):
+        await bench.feed(1.0, up=-4.0, obeys="reserve")
+        assert bench.rotors[-1].message.thrust_n != (0.0,) * 4
+
+    on_the_bench(scenario)
+
+
+def test_the_reserve_speaks_when_it_flies():
+    async def play():
+        async with VirtualSystem.load(SYSTEM) as system:
+            bench = Bench(system, "reserve")
+            assert await bench.feed(1.0) is None
+            assert await bench.feed(1.0, obeys="pilot") is None
+            assert (await bench.feed(0.5, obeys="reserve")).mode == "NORMAL"
+
+    run(play)
 
 
 def test_a_pilot_that_was_killed_on_the_ground_stays_there():

@@ -92,6 +92,17 @@ def test_vertical_speed_comes_from_pressure_and_acceleration():
     assert vertical.speed_mps == pytest.approx(-0.5, abs=0.15)
 
 
+def test_a_barometer_that_jumps_there_and_back_does_not_pass_for_speed():
+    vertical, fastest_mps = VerticalFilter(), 0.0
+    for tick in range(2000):
+        vertical.step(0.0, 0.01)
+        if tick % 5 == 0:
+            bias_m = -6.0 if 500 < tick < 900 else 0.0
+            vertical.measured(5.0 + bias_m + DICE.gauss(0.0, 0.1), 0.05)
+        fastest_mps = max(fastest_mps, abs(vertical.speed_mps))
+    assert fastest_mps < 0.2
+
+
 def fix(x_m=0.0, speed_mps=0.0):
     return t.GpsFix(x_m + DICE.gauss(0.0, 1e-4), 0.0, 5.0, speed_mps, 0.0, 0.0)
 
