@@ -25,7 +25,7 @@ from typing import NoReturn
 import msgspec
 from msgspec.structs import replace
 
-from rampart.actors.bus.run_folder import issue, issued, socket_path
+from rampart.actors.bus.run_folder import issue, issued, register_of, socket_path
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.layout import Layout, adapted_system, load_run
@@ -186,11 +186,15 @@ class Spawner:
 
     def _become(self, request: ForkRequest, connection: socket.socket) -> NoReturn:
         folder = self._layout.plan.folder
+        is_spawner = request.names[0].startswith("spawner_")
 
         def born() -> None:
             if not _answer(connection, Reply()):
                 os._exit(0)  # not waited for any more: another one may have its place
             connection.close()
+            newest = max(register_of(folder)(name) or 0 for name in request.names)
+            if newest >= request.incarnation and not is_spawner:
+                os._exit(0)  # asked for too late: a later one had its place, or has
             issue(folder, request.names, request.incarnation)
 
         code = 1
@@ -201,7 +205,7 @@ class Spawner:
                 if key.fd not in {lifeline, connection.fileno()}:
                     key.fileobj.close()  # type: ignore[union-attr]
             self._selector.close()
-            if request.names[0].startswith("spawner_"):
+            if is_spawner:
                 name = request.names[0].removeprefix("spawner_")
                 sibling = Spawner(name, self._layout, self._run, lifeline)
                 sibling.take_title()

@@ -278,7 +278,7 @@ def test_a_second_run_on_the_same_ports_is_refused_and_does_not_disturb_the_firs
         assert second.returncode == 2
         assert "in use" in second.stderr
         assert "Traceback" not in second.stderr
-        assert len(find_processes(run.port)) == 24
+        assert len(find_processes(run.port)) == 26
         time.sleep(2)
         assert "crashed" not in run.story
 
@@ -295,7 +295,7 @@ def test_two_runs_side_by_side_do_not_know_of_each_other(tmp_path):
             assert "DM1 respawned" not in one.story
             os.kill(two.process.pid, signal.SIGKILL)
             two.wait_until(lambda: find_processes(two.port) == [], 2, "processes were left")
-        assert len(find_processes(one.port)) == 24
+        assert len(find_processes(one.port)) == 26
 
 
 @pytest.mark.slow
