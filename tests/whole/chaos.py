@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rampart.actors.bus.zenoh_bus import ROUTERS
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
 from rampart.actors.run.run_plan import SUPERVISOR
@@ -70,11 +71,11 @@ class Targets:
 
 
 def targets(spec: SystemSpec) -> Targets:
-    """Return the processes of a system, one name for each, supervisor and spawners included."""
+    """Return the processes of a system, one name for each, and those that every system has."""
     nodes = {unit: members[0] for unit, members in spec.processes().items()}
     world = tuple(n.name for n in nodes.values() if n.kind is Kind.WORLD)
     mortal = tuple(n.name for n in nodes.values() if n.kind is not Kind.WORLD)
-    return Targets((*mortal, SUPERVISOR, *SPAWNERS), world)
+    return Targets((*mortal, SUPERVISOR, *SPAWNERS, *ROUTERS), world)
 
 
 def each_in_every_way(of: Targets, seed: int, pause_s: tuple[float, float]) -> list[Hit]:

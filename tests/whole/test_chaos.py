@@ -16,7 +16,7 @@ from tests.whole.leak_counts import Counts, leaks
 
 SHIPPED = ROOT / "systems" / "osmosis.toml"
 PAUSE_S = (0.8, 2.0)
-ALL_FOUR = ("mission_manager", "osmosis_control", "safety_pilot", "ftm_manager", "supervisor")
+ALL_FOUR = ("mission_manager", "router_a", "safety_pilot", "ftm_manager", "supervisor")
 
 
 def write_row(directory: Path) -> Path:
@@ -30,8 +30,8 @@ def test_everybody_is_hit_in_every_way_and_the_world_is_only_stopped():
     everybody = targets(check_document(
         read_document(SHIPPED.read_text(encoding="utf-8"), SHIPPED.name), SHIPPED.name))
     hits = each_in_every_way(everybody, 1, PAUSE_S)
-    assert {"hmi", "safety_pilot", "ftm_manager", "supervisor", "spawner_a", "spawner_b", "DM13",
-            "RM8", "standby_control"} <= set(everybody.mortal)
+    assert {"hmi", "safety_pilot", "ftm_manager", "supervisor", "spawner_a", "spawner_b",
+            "router_a", "router_b", "DM13", "RM8", "standby_control"} <= set(everybody.mortal)
     assert sorted((h.name, h.way) for h in hits) == sorted(
         [*[("simulator", "STOP")] * 4, *((name, way) for name in everybody.mortal for way in WAYS)])
 
