@@ -127,6 +127,8 @@ def explain(layout: Layout) -> Explanation:
 def _processes(layout: Layout) -> Iterator[Process]:
     for name in (SUPERVISOR, *_SPAWNERS):
         yield Process(name, {}, "supervision", _LAUNCHER)
+    for name in layout.routers:
+        yield Process(name, {}, "supervision", SUPERVISOR)
     for unit in layout.units.values():
         yield Process(unit.name, {node.name: node.actor for node in unit.nodes}, unit.kind,
                       _respawner(layout, unit))
@@ -151,7 +153,7 @@ def _talks(spec: SystemSpec) -> Iterator[Talk]:
 
 def _guards(layout: Layout) -> Iterator[Guard]:
     yield Guard(_LAUNCHER, (SUPERVISOR, *_SPAWNERS), "restarts it")
-    by: dict[str, list[str]] = {}
+    by: dict[str, list[str]] = {SUPERVISOR: list(layout.routers)}
     for unit in layout.units.values():
         by.setdefault(_respawner(layout, unit), []).append(unit.name)
     by.pop("", None)

@@ -77,10 +77,11 @@ def test_what_a_system_is_in_words(capsys):
     lines = said(capsys, "explain", str(CELL))[0].splitlines()
     assert lines[0] == ("Pick and place behind a light curtain (cell), strategy guarded-repair")
     for line in (
-            "What is started: 25 processes, 23 nodes",
+            "What is started: 27 processes, 23 nodes",
             "gripper_unit       control      supervisor        gripper (StubNode), valve (StubNode"
             ")",
             "  launcher: supervisor, spawner_a, spawner_b: restarts it",
+            "router_a           supervision  supervisor",
             "  R_RESTART_VISION: camera, part_finder: has it restarted, when the manager decides "
             "so",
             "  D_VISION_CRASH: camera, part_finder: notices that it is dead, stopped or hung",
