@@ -127,7 +127,7 @@ async def test_the_page_draws_so_many_lights_and_says_how_many_it_leaves_out(wor
         async with world.hmi(hmi_port=free_port(), airport=with_lights(3000)) as hmi:
             await tab.show(f"http://{await served(hmi)}/")
             await tab.until(LIVE)
-            assert await tab.value(f"{lights}.length") == MAX_LIGHTS
+            await tab.until(f"{lights}.length === {MAX_LIGHTS}")
             assert await tab.value("document.getElementById('left-out').textContent") == (
                 f"Too much to show: {3000 - MAX_LIGHTS} of the lights left out.")
             state = f"[...{lights}].filter((one) => one.classList.contains('out')).length"

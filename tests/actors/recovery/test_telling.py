@@ -252,10 +252,10 @@ def layout(**changes: str) -> Layout:
     return Layout(RunPlan(system_file="tank.toml"), parse_specification(text, "tank.toml"))
 
 
-def test_the_topics_that_parameters_name_make_partners():
+def test_the_topics_that_parameters_name_are_heard_and_published():
     found = layout()
-    assert "gauge" in found._partners["D"]
-    assert "gauge" in found._partners["R"]
+    assert "tank/level" in found.members["D"].hears
+    assert "tank/order" in found.members["R"].publishes
     assert found.topics == {"tank/level": LEVEL, "tank/order": ORDER}
 
 
