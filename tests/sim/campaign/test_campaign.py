@@ -586,8 +586,10 @@ def test_a_robot_s_own_topics_can_fail_like_all_others(tmp_path, capsys):
     assert rampart([*own, "--list", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)["topic"]
     assert {"drop:porter/load", "stuck:porter/axle/rear"} <= set(listed)
+    (tmp_path / "NEAR.miss").write_text("x=-27,y=-8,taxi=1\n")
     assert rampart([*own, "--fault", "drop:porter/*@2+1", "--obstacles", "0", "--jobs", "1",
-                    "--out", str(tmp_path / "out"), "--json"]) == 0
+                    "--mission", str(tmp_path / "NEAR.miss"), "--out", str(tmp_path / "out"),
+                    "--json"]) == 0
     assert {row["fault"]: row["ineffective"] for row in json.loads(capsys.readouterr().out)} == {
         "drop:porter/load": 0, "drop:porter/axle/front": 1, "drop:porter/axle/rear": 1}
 
