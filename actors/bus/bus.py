@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -15,6 +16,9 @@ Deliver = Callable[[str, bytes], None]
 
 PeerChange = Callable[[str, int, bool], None]
 """Called on the event loop with node, incarnation, and whether it is there."""
+
+
+_LOOK_S = 0.005
 
 
 class BusError(Exception):
@@ -30,6 +34,10 @@ class Bus(Protocol):
     """
 
     bursts: bool
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it has been opened, and not closed since."""
 
     async def open(self) -> None:
         """Join the bus and announce this node.
@@ -63,7 +71,7 @@ class SharedBus:
     For an actor that is not announced: it is there as long as the owner of the session.
 
     Args:
-        owner: The bus; opened before this one.
+        owner: The bus; it is opened by somebody else, perhaps later.
     """
 
     bursts = True
@@ -73,8 +81,15 @@ class SharedBus:
         self._open = False
 
     async def open(self) -> None:
-        """Nothing to do: the owner has opened it."""
+        """Wait until the owner has opened it."""
+        while not self._owner.is_open:  # noqa: ASYNC110 polled, some milliseconds at most
+            await asyncio.sleep(_LOOK_S)
         self._open = True
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is open."""
+        return self._open
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Send over the owner's session."""

@@ -185,6 +185,11 @@ class ZenohBus:
                                f"({f'node {self._node}' if self._node else 'tool'})")
             await asyncio.sleep(_LOOK_S)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a session."""
+        return self._session is not None
+
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Send to all present subscribers of the key."""
         publisher = self._publishers.get(key)

@@ -107,6 +107,11 @@ class VirtualBus:
         self._open = True
         self._hub.announce(self.node, self._incarnation, alive=True)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it has joined, and not been cut off."""
+        return self._open
+
     def soon(self, call: Callable[[], None]) -> None:
         """Run a call on the event loop after the present one, if this bus is open then."""
         asyncio.get_running_loop().call_soon(lambda: call() if self._open else None)

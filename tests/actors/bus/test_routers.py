@@ -15,7 +15,7 @@ from itertools import pairwise
 import pytest
 
 from rampart.actors.bus import zenoh_bus
-from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.bus import BusError, SharedBus
 from rampart.actors.bus.run_folder import socket_path
 from rampart.actors.bus.zenoh_bus import ROUTERS, ZenohBus, endpoint, endpoints
 from rampart.actors.osmosis import topics
@@ -211,3 +211,19 @@ async def test_numbers_of_one_client_arrive_in_their_sequence_over_a_change(rout
             0.3, routers.send, "router_a", signal.SIGKILL)
         await send_until(writer, lambda: len(heard) > 80)
         assert all(int(one) < int(other) for one, other in pairwise(heard))
+
+
+async def test_an_actor_that_shares_a_bus_waits_until_that_is_open(routers, sockets):
+    bus = ZenohBus("", 0, endpoints(sockets))
+    shared = SharedBus(bus)
+    async with asyncio.TaskGroup() as group:
+        opening = group.create_task(shared.open())
+        group.create_task(bus.open())
+        await asyncio.sleep(0.1)
+        assert not opening.done()
+        await routers.start("router_a")
+    heard: list[bytes] = []
+    shared.subscribe(topics.POSE, topics.POSE.at(), lambda _key, payload: heard.append(payload))
+    async with client(sockets) as writer:
+        await send_until(writer, lambda: heard)
+    await bus.close()
