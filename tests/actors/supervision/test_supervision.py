@@ -19,6 +19,7 @@ import pytest
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Diagnostic
+from rampart.actors.bus.zenoh_bus import ROUTERS
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeTable, ProcessEvent, RespawnRequest
 from rampart.actors.layout.layout import Layout
@@ -405,6 +406,26 @@ async def test_a_process_that_nobody_holds_neither_keeps_its_node_down_nor_stays
         await eventually(lambda: [p.pid for p in find_processes(port) if "DM1" in p.names]
                          == [witness.pid("DM1")])
         assert sum(e.node == "DM1" and e.event == "respawned" for e in witness.events) < 5
+
+
+async def test_with_the_supervisor_and_both_routers_gone_all_three_come_back(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        victims = ("supervisor", *ROUTERS)
+        old = {name: process(launcher.plan.base_port, name) for name in victims}
+        for pid in old.values():
+            os.kill(pid, signal.SIGKILL)
+        await eventually(lambda: all(
+            witness.state(name)[0] == "running" and witness.pid(name) != old[name]
+            for name in victims), 15)
+        await eventually(lambda: all(r.state.value == "running" for r in witness.table.nodes), 15)
+
+
+async def test_a_stopped_router_is_replaced_and_costs_no_node_its_process(tmp_path):
+    async with running(tmp_path) as (_, witness):
+        others = {r.name: r.pid for r in witness.table.nodes if r.name != "router_a"}
+        os.kill(witness.pid("router_a"), signal.SIGSTOP)
+        await eventually(lambda: witness.state("router_a") == ("running", 2))
+        assert {r.name: r.pid for r in witness.table.nodes if r.name != "router_a"} == others
 
 
 async def forked(client: SpawnerClient, name: str, incarnation: int) -> int:

@@ -212,6 +212,8 @@ REFUSED = {
                                  ["$.detection[0].name = 'DM1': duplicate name"]),
     "reserved node name": ([('name = "hmi"', 'name = "supervisor"')],
                            ["$.node[4].name = 'supervisor': duplicate name, reserved"]),
+    "reserved name of a router": ([('name = "hmi"', 'name = "router_b"')],
+                                  ["$.node[4].name = 'router_b': duplicate name, reserved"]),
     "reserved process": ([('name = "hmi"', 'name = "hmi"\nprocess = "spawner"')],
                          ["node hmi: process = 'spawner': reserved"]),
     "duplicate mechanism": ([('name = "FTM2"', 'name = "FTM1"')],
