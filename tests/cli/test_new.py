@@ -65,7 +65,8 @@ def test_what_it_makes_runs_on_processes(tmp_path, monkeypatch):
     command = f"{Path(sys.executable).with_name('rampart')} run --json --duration 4"
     rule = (robot / "Makefile").read_text().replace("$(RAMPART) run", command)
     (robot / "Makefile").write_text(rule)
-    done = subprocess.run(["make", "run"], cwd=robot, text=True, capture_output=True, check=False,
+    done = subprocess.run(["make", "--no-print-directory", "run"], cwd=robot, text=True,
+                          capture_output=True, check=False,
                           env={**os.environ, "PYTHONPATH": str(ROOT)})
     assert json.loads(done.stdout.splitlines()[-1])["safety"] == "safe", done.stderr
 
