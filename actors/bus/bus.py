@@ -55,6 +55,13 @@ class Bus(Protocol):
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:
         """Have `deliver` called for each message on keys that match."""
 
+    def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
+        """Have `deliver` called once with the newest message on each key that matches.
+
+        As far as it was published and its publisher is there; commands are not kept. `answered` is
+        called after the last of them, or when no answer is waited for any more.
+        """
+
     def watch(self, node: str, changed: PeerChange) -> None:
         """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
 
@@ -105,6 +112,12 @@ class SharedBus:
         self._owner.subscribe(
             topic, key_expression,
             lambda key, payload: deliver(key, payload) if self._open else None)
+
+    def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
+        """Ask in the owner's session."""
+        self._owner.latest(
+            key_expression, lambda key, payload: deliver(key, payload) if self._open else None,
+            lambda: answered() if self._open else None)
 
     def watch(self, node: str, changed: PeerChange) -> None:
         """Watch in the owner's session."""

@@ -13,16 +13,16 @@ from typing import Any, ClassVar, TypeVar
 import msgspec
 
 from rampart.actors.bus.topic import Members, Topic
-from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
+from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, INJECT, INJECTION_REPORT
 
 F = TypeVar("F", bound=Callable[..., None])
 
 
-BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, HELLO, DIAGNOSTIC, INJECTION_REPORT)
+BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, DIAGNOSTIC, INJECTION_REPORT)
 """What every actor publishes besides its own outputs."""
 
-BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
-"""What every actor hears besides its own inputs: injections from tools, hellos from newcomers."""
+BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT,)
+"""What every actor hears besides its own inputs: injections from tools."""
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
