@@ -159,12 +159,22 @@ class ZenohBus:
         self._held: list[Any] = []
         self._leaving: dict[tuple[str, int, PeerChange], asyncio.TimerHandle] = {}
 
-    async def open(self) -> None:
-        """Open the session, and announce this node.
+    def take_name(self, node: str, incarnation: int, recorder: RecorderConnection | None) -> None:
+        """Be the bus of this node from now on; the session may be open already."""
+        self._node, self._incarnation, self._recorder = node, incarnation, recorder
+
+    async def open(self, *, announce: bool = True) -> None:
+        """Open the session, unless it is open, and announce this node.
 
         Raises:
             BusError: the endpoint is in use or invalid, or there is no router.
         """
+        if self._session is None:
+            await self._open()
+        if announce:
+            self.announce()
+
+    async def _open(self) -> None:
         self._loop = asyncio.get_running_loop()
         try:
             self._session = (await self._joined(self._loop) if self._listen is None
@@ -175,8 +185,11 @@ class ZenohBus:
             raise BusError(f"{self._listen} is in use by another process {node}"
                            if "acquire lock" in text
                            else f"cannot open {self._listen} {node}: {text}") from None
+
+    def announce(self) -> None:
+        """Tell those who watch this node that it is there."""
         if self._node:
-            self._held.append(self._session.liveliness().declare_token(
+            self._held.append(self._require().liveliness().declare_token(
                 f"{_ALIVE}/{self._node}/{self._incarnation}"))
 
     async def _joined(self, loop: asyncio.AbstractEventLoop) -> zenoh.Session:

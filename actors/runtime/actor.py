@@ -22,7 +22,7 @@ import msgspec
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from rampart.actors.bus.fields import Field
-from rampart.actors.bus.limits import ReportLimit
+from rampart.actors.bus.limits import Remembered, ReportLimit
 from rampart.actors.bus.messages import Diagnostic, Heartbeat, Injection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, INJECT
@@ -41,6 +41,9 @@ _OFTEN_HZ = 7.0
 _PERIODS = 3
 """What is published so often at least is of no use to a newcomer when it is so many periods old:
 its publisher is silent, and only the next message shows that it is not."""
+
+_UNSENT = 256
+"""So many messages one that waits to be the node keeps: the newest of each topic, all commands."""
 
 _PATIENCE_S = 0.02
 """So long one that replaces another waits at most for what was published before it came."""
@@ -83,6 +86,9 @@ class Actor(Declared):
             context.clock.now, expected=context.incarnation > 1)
         self._dispatcher = Dispatcher(context.bus.bursts, self._overflowed)
         self._timers = Timers(context.clock, self._dispatcher)
+        self._waits = context.waits
+        self._unsent: Remembered[tuple[str, int], tuple[Topic[Any], bytes]] = Remembered(_UNSENT)
+        self._unkept: Callable[[], None] = lambda: None
         self._questions = 0
         self._is_at_work = False
         self._sequence = 0
@@ -195,7 +201,14 @@ class Actor(Declared):
         return self._timers.later(delay_s, call)
 
     def kept(self, form: StateFormat[S]) -> S | None:
-        """Return the state to go on from, in `on_start`: the newest sound one, or None."""
+        """Return the state to go on from, in `on_start`: the newest sound one, or None.
+
+        Raises:
+            RuntimeError: it is a hot spare, and the state still belongs to another process.
+        """
+        if self._waits == "hot":
+            raise RuntimeError(f"{type(self).__name__} keeps checkpoints: its class has to say "
+                               "most_spare = 'warm'")
         return self._keeper.kept(form)
 
     def keep(self, form: StateFormat[S], state: S) -> None:
@@ -204,7 +217,10 @@ class Actor(Declared):
         On return it survives this process. What goes wrong is reported and does not raise: the
         node goes on without.
         """
-        self._keeper.keep(form, state)
+        if self._waits:
+            self._unkept = partial(self._keeper.keep, form, state)
+        else:
+            self._keeper.keep(form, state)
 
     def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
         """Publish an error report: one a second per context and offender, and few in all."""
@@ -217,7 +233,18 @@ class Actor(Declared):
         """End the actor after the items that already wait."""
         self._dispatcher.stop()
 
-    # -- what happens to its process in virtual time --------------------------------------------
+    # -- what happens to its process ------------------------------------------------------------
+
+    def promote(self) -> None:
+        """Be the node from now on, if it waits for that: keep and send what was held back."""
+        if self._waits:
+            self._waits = ""
+            self._unkept()
+            if self._bus.is_open:  # else it announces itself when that is so
+                self._bus.announce()
+            for (key, _), (topic, payload) in self._unsent.items():
+                self._bus.publish(topic, key, payload)
+            self._unsent.clear()
 
     def abandon(self) -> None:
         """Have nothing more run when its task is cancelled: what SIGKILL does."""
@@ -241,7 +268,7 @@ class Actor(Declared):
             BusError: the bus could not be opened.
             Exception: whatever a handler raised.
         """
-        await self._bus.open()
+        await self._bus.open(announce=not self._waits)
         try:
             self._set_up()
             await self._dispatcher.run()
@@ -365,6 +392,11 @@ class Actor(Declared):
         if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
             self.report_diagnostic("not sent", too_long(payload), key)
             return
+        if self._waits:
+            is_command = topic.qos is Qos.COMMAND
+            if not (is_command and self._waits == "hot"):  # that is given once, by who speaks
+                self._unsent[key, sequence if is_command else 0] = topic, payload
+            return
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
 
@@ -384,6 +416,8 @@ class Actor(Declared):
 
     @on(INJECT)
     def _on_injection(self, order: Injection, _header: Header) -> None:
+        if self._waits:  # it is meant for the process that was there
+            return
         topic = self.published(order.topic, self.name, self.parameters) or (
             next((self.context.topics[named.key] for named in
                   topics_named(self.parameters)["published"] if named.key == order.topic), None))

@@ -135,6 +135,9 @@ class Declared(Handlers):
     Class attributes:
         outputs: topics it publishes; publishing another one raises.
         node_kind: what a node of this class has to be, "" for anything.
+        most_spare: the most that a spare process of it may be. "hot": set up beside the one that
+            speaks, in silence. "warm": set up, in silence, when that has ended; for one that keeps
+            checkpoints. "none": neither, for `on_start` takes a port, or starts a program.
         Parameters: what the system spec may say of it, by field: type, range and default. A class
             that takes more derives its own from that of its base class.
     """
@@ -145,6 +148,7 @@ class Declared(Handlers):
     parameters: Parameters
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
     node_kind: ClassVar[str] = ""
+    most_spare: ClassVar[str] = "hot"
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
