@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import socket
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -145,6 +146,8 @@ class ZenohBus:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._arrived: deque[Callable[[], None]] = deque()
         self._woken = False
+        self._bell = -1
+        self._after_burst: list[Callable[[], None]] | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._held: list[Any] = []
         self._leaving: dict[tuple[str, int, PeerChange], asyncio.TimerHandle] = {}
@@ -165,6 +168,8 @@ class ZenohBus:
             raise BusError(f"{self._listen} is in use by another process {node}"
                            if "acquire lock" in text
                            else f"cannot open {self._listen} {node}: {text}") from None
+        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._loop.add_reader(self._bell, self._drain)
         if self._node:
             self._held.append(self._session.liveliness().declare_token(
                 f"{_ALIVE}/{self._node}/{self._incarnation}"))
@@ -265,6 +270,10 @@ class ZenohBus:
             self._recorder.close()
         if session is not None:
             await asyncio.to_thread(session.close)
+            bell, self._bell = self._bell, -1
+            if self._loop is not None:
+                self._loop.remove_reader(bell)
+            os.close(bell)
 
     def _require(self) -> zenoh.Session:
         if self._session is None:
@@ -273,19 +282,35 @@ class ZenohBus:
 
     def _hand_over(self, call: Callable[[], None]) -> None:
         self._arrived.append(call)
-        if not self._woken and self._loop is not None:
+        if not self._woken:
             self._woken = True  # a race here costs one extra wake-up, never a message
             try:
-                self._loop.call_soon_threadsafe(self._drain)
-            except RuntimeError:  # the loop has closed: the actor is gone, so is its mail
+                os.eventfd_write(self._bell, 1)  # half of what `call_soon_threadsafe` costs
+            except OSError:  # the bus is not open, or not any more: the actor is gone, so is its mail
                 self._arrived.clear()
+                self._woken = False
 
     def _drain(self) -> None:
-        self._woken = False
+        os.eventfd_read(self._bell)
+        self._woken = False  # after the reading: who finds it set still rings, or is drained below
+        self._after_burst = after = []
         while self._session is not None and self._arrived:
-            try:
-                self._arrived.popleft()()
-            except Exception as error:  # what else has arrived is not to wait for the next message
-                asyncio.get_running_loop().call_exception_handler({
-                    "message": f"{self._node or 'tool'}: a message could not be handed over",
-                    "exception": error})
+            self._try(self._arrived.popleft())
+        self._after_burst = None
+        for call in after:
+            self._try(call)
+
+    def _try(self, call: Callable[[], None]) -> None:
+        try:
+            call()
+        except Exception as error:  # what else has arrived is not to wait for the next message
+            asyncio.get_running_loop().call_exception_handler({
+                "message": f"{self._node or 'tool'}: a message could not be handed over",
+                "exception": error})
+
+    def after_burst(self, call: Callable[[], None]) -> None:
+        """Have `call` made when all that has arrived was delivered; soon if nothing has."""
+        if self._after_burst is not None:
+            self._after_burst.append(call)
+        else:
+            asyncio.get_running_loop().call_soon(call)
