@@ -53,6 +53,12 @@ _HELLOS_PER_S = 200
 """From one node, which publishes one when it starts. A router leaves out what is above: for each
 hello all others repeat their states, so such a flood is worst."""
 
+_THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "
+            "acc: (handover: app), net: (handover: app))")
+"""Of Zenoh in each process: one that reads and one that writes. By default a thread that waits for
+sockets wakes one of two others for each message that has come, which reads it. Reading and writing
+on one thread is no choice: they wait for each other, and no link comes to be."""
+
 _REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
 _LOOK_S = 0.002
 
@@ -62,6 +68,9 @@ _DELIVERY = {
     Qos.SENSOR: (zenoh.Priority.DATA, zenoh.CongestionControl.DROP),
     Qos.STATE: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP),
     Qos.COMMAND: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK)}
+
+
+os.environ.setdefault("ZENOH_RUNTIME", _THREADS)  # read when the first session is opened
 
 
 def endpoint(folder: str, name: str) -> str:
@@ -286,14 +295,15 @@ class ZenohBus:
             self._woken = True  # a race here costs one extra wake-up, never a message
             try:
                 os.eventfd_write(self._bell, 1)  # half of what `call_soon_threadsafe` costs
-            except OSError:  # the bus is not open, or not any more: the actor is gone, so is its mail
+            except OSError:  # the bus is not open any more: the actor is gone, so is its mail
                 self._arrived.clear()
                 self._woken = False
 
     def _drain(self) -> None:
         os.eventfd_read(self._bell)
         self._woken = False  # after the reading: who finds it set still rings, or is drained below
-        self._after_burst = after = []
+        after: list[Callable[[], None]] = []
+        self._after_burst = after
         while self._session is not None and self._arrived:
             self._try(self._arrived.popleft())
         self._after_burst = None
