@@ -131,6 +131,20 @@ def _answering(where: Sequence[str]) -> list[str]:
     return [one for _, one in sorted(found)]
 
 
+class _Bell:
+    """What a Zenoh thread rings; closed with the last one that could, so never while one does.
+
+    Attributes:
+        number: of its descriptor.
+    """
+
+    def __init__(self) -> None:
+        self.number = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+
+    def __del__(self) -> None:
+        os.close(self.number)
+
+
 class ZenohBus:
     """One actor's Zenoh session.
 
@@ -155,7 +169,7 @@ class ZenohBus:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._arrived: deque[Callable[[], None]] = deque()
         self._woken = False
-        self._bell = -1
+        self._bell = _Bell()
         self._after_burst: list[Callable[[], None]] | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._held: list[Any] = []
@@ -177,8 +191,7 @@ class ZenohBus:
             raise BusError(f"{self._listen} is in use by another process {node}"
                            if "acquire lock" in text
                            else f"cannot open {self._listen} {node}: {text}") from None
-        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._loop.add_reader(self._bell, self._drain)
+        self._loop.add_reader(self._bell.number, self._drain)
         if self._node:
             self._held.append(self._session.liveliness().declare_token(
                 f"{_ALIVE}/{self._node}/{self._incarnation}"))
@@ -279,10 +292,7 @@ class ZenohBus:
             self._recorder.close()
         if session is not None:
             await asyncio.to_thread(session.close)
-            bell, self._bell = self._bell, -1
-            if self._loop is not None:
-                self._loop.remove_reader(bell)
-            os.close(bell)
+            asyncio.get_running_loop().remove_reader(self._bell.number)
 
     def _require(self) -> zenoh.Session:
         if self._session is None:
@@ -290,17 +300,15 @@ class ZenohBus:
         return self._session
 
     def _hand_over(self, call: Callable[[], None]) -> None:
+        if self._session is None:  # the actor is gone, so is its mail
+            return
         self._arrived.append(call)
         if not self._woken:
             self._woken = True  # a race here costs one extra wake-up, never a message
-            try:
-                os.eventfd_write(self._bell, 1)  # half of what `call_soon_threadsafe` costs
-            except OSError:  # the bus is not open any more: the actor is gone, so is its mail
-                self._arrived.clear()
-                self._woken = False
+            os.eventfd_write(self._bell.number, 1)  # costs less than `call_soon_threadsafe`
 
     def _drain(self) -> None:
-        os.eventfd_read(self._bell)
+        os.eventfd_read(self._bell.number)
         self._woken = False  # after the reading: who finds it set still rings, or is drained below
         after: list[Callable[[], None]] = []
         self._after_burst = after
