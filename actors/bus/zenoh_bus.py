@@ -59,11 +59,14 @@ _ANSWERS_PER_S = 500
 _ANSWER_S = 1.0
 """Real seconds that the newest message of a topic is waited for; nothing else waits meanwhile."""
 
+_RUNTIME = "ZENOH_RUNTIME"
 _THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "
             "acc: (handover: app), net: (handover: app))")
-"""Of Zenoh in each process: one that reads and one that writes. By default a thread that waits for
+"""Of Zenoh in a client: one that reads and one that writes. By default a thread that waits for
 sockets wakes one of two others for each message that has come, which reads it. Reading and writing
-on one thread is no choice: they wait for each other, and no link comes to be."""
+on one thread is no choice: they wait for each other, and no link comes to be. Routers keep a thread
+for each task: many links come and go there, and Zenoh holds locks while it waits for other tasks.
+"""
 
 _REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
 _LOOK_S = 0.002
@@ -74,9 +77,6 @@ _DELIVERY = {
     Qos.SENSOR: (zenoh.Priority.DATA, zenoh.CongestionControl.DROP),
     Qos.STATE: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP),
     Qos.COMMAND: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK)}
-
-
-os.environ.setdefault("ZENOH_RUNTIME", _THREADS)  # read when the first session is opened
 
 
 def endpoint(folder: str, name: str) -> str:
@@ -137,6 +137,16 @@ def _answering(where: Sequence[str]) -> list[str]:
             except OSError:  # none, or so many wait to be let in that none is
                 continue
     return [one for _, one in sorted(found)]
+
+
+def _open_client(dial: Sequence[str]) -> zenoh.Session:
+    if _RUNTIME in os.environ:
+        return zenoh.open(session_config(None, dial))
+    os.environ[_RUNTIME] = _THREADS  # read when a process opens its first session
+    try:
+        return zenoh.open(session_config(None, dial))
+    finally:
+        del os.environ[_RUNTIME]  # commands that this process starts have their own
 
 
 class _Bell:
@@ -227,7 +237,7 @@ class ZenohBus:
             try:
                 if found:
                     both = [*found, *(one for one in self._dial if one not in found)]
-                    return zenoh.open(session_config(None, both))
+                    return _open_client(both)
             except zenoh.ZError:  # it ended in this moment
                 pass
             if loop.time() > until_s:
