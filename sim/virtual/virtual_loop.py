@@ -12,6 +12,7 @@ they are posted, with two arguments, and stand in the heap as they are.
 from __future__ import annotations
 
 import asyncio
+import os
 import selectors
 from collections.abc import Callable, Iterable
 from contextvars import Context
@@ -57,7 +58,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(self) -> None:
-        self._files = selectors.DefaultSelector()
+        self._files = selectors.PollSelector()  # of its own after a fork, as an epoll is not
         super().__init__(self._files)
         self._watched = self._files.get_map()  # one is the loop's own wake-up pipe
         self.now_s = 0.0
@@ -166,6 +167,21 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _report(self, callback: Any, error: BaseException) -> None:
         self.call_exception_handler({
             "message": f"Exception in callback {callback!r}", "exception": error})
+
+
+def fork() -> int:
+    """Fork this process within a call of its virtual loop, which goes on in parent and child.
+
+    All that a virtual run consists of is memory: both have it, and it is the same run up to here.
+
+    Returns:
+        The child's process id; 0 in the child.
+    """
+    loop = asyncio.get_running_loop()
+    pid = os.fork()
+    if pid == 0:
+        asyncio._set_running_loop(loop)  # which asyncio takes away from a child
+    return pid
 
 
 class VirtualClock(Clock):
