@@ -48,6 +48,28 @@ class _Call:
         return self._when
 
 
+class _Files(selectors.PollSelector):
+    """What the loop watches besides its timers; of its own after a fork, as an epoll is not.
+
+    Attributes:
+        count: how many files; asked after each timer, for which its map is too slow.
+    """
+
+    count = 0
+
+    def register(self, *args: Any, **more: Any) -> selectors.SelectorKey:
+        """Watch a file."""
+        key = super().register(*args, **more)
+        self.count = len(self.get_map())
+        return key
+
+    def unregister(self, *args: Any) -> selectors.SelectorKey:
+        """Watch it no more."""
+        key = super().unregister(*args)
+        self.count = len(self.get_map())
+        return key
+
+
 class VirtualLoop(asyncio.SelectorEventLoop):
     """A loop whose time stands still while it works, and jumps when it would wait.
 
@@ -58,9 +80,8 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(self) -> None:
-        self._files = selectors.PollSelector()  # of its own after a fork, as an epoll is not
+        self._files = _Files()
         super().__init__(self._files)
-        self._watched = self._files.get_map()  # one is the loop's own wake-up pipe
         self.now_s = 0.0
         self._count = 0
         # When, count, a posted callback and its arguments; or instead of these None, a `_Call`.
@@ -115,7 +136,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _run_once(self) -> None:
         # asyncio's own step, called by `run_forever`, with the waiting left out.
         ready, files = self._ready, self._files  # type: ignore[attr-defined]
-        if len(self._watched) > 1:
+        if files.count > 1:  # one is the loop's own wake-up pipe
             self._process_events(files.select(0))  # type: ignore[attr-defined]
         if ready:
             for _ in range(len(ready)):
@@ -128,7 +149,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
     def _let_time_pass(self) -> None:
         """Move the clock from timer to timer and make all calls due, while nothing else is."""
-        timers, ready, watched = self._timers, self._ready, self._watched  # type: ignore[attr-defined]
+        timers, ready, files = self._timers, self._ready, self._files  # type: ignore[attr-defined]
         while timers:
             when, _, callback, first, second = heappop(timers)
             if callback is None and first._cancelled:
@@ -148,7 +169,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
                 if not timers or timers[0][0] > now_s or timers[0][1] > last:
                     break
                 _, _, callback, first, second = heappop(timers)
-            if ready or self._stopping or len(watched) > 1:  # type: ignore[attr-defined]
+            if ready or self._stopping or files.count > 1:  # type: ignore[attr-defined]
                 return
 
     def _make(self, call: _Call) -> None:
