@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import os
 import selectors
+import warnings
 from collections.abc import Callable, Iterable
 from contextvars import Context
 from heapq import heapify, heappop, heappush
@@ -199,7 +200,9 @@ def fork() -> int:
         The child's process id; 0 in the child.
     """
     loop = asyncio.get_running_loop()
-    pid = os.fork()
+    with warnings.catch_warnings():  # of numpy's idle threads, which are prepared for a fork
+        warnings.simplefilter("ignore", DeprecationWarning)
+        pid = os.fork()
     if pid == 0:
         asyncio._set_running_loop(loop)  # which asyncio takes away from a child
     return pid
