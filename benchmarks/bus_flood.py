@@ -41,7 +41,7 @@ from rampart.cli.session import Session, connect
 
 ROOT = Path(__file__).resolve().parents[1]
 PORT = 8680
-KINDS = ("garbage", "reports", "hello", "names")
+KINDS = ("garbage", "reports", "questions", "names")
 PER_S = 40_000
 _POINT = load_airport("vallombre").prohibited_polygon().representative_point()
 _GRASS = (_POINT.x, _POINT.y)
@@ -51,9 +51,10 @@ import sys, time, zenoh
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm, topics as ftm_topics
 from rampart.actors.bus.envelope import Header, encode
-from rampart.actors.bus.messages import Hello
+from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.zenoh_bus import session_config
 kind, per_s, seconds, dial = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), sys.argv[4:]
+order = Injection("i", "no/topic", "drop", 1.0)
 report = fm.DetectionReport(fm.DetectionState.IDLE, "", (), 0.0)
 def message(i):
     if kind == "garbage":
@@ -61,7 +62,9 @@ def message(i):
     if kind == "reports":
         return ftm_topics.DETECTION.at("DM99"), encode(Header("DM99", 1, i, 0.0), report)
     name = f"stranger{i % 26_000}" if kind == "names" else "stranger"
-    return bus_topics.HELLO.at("stranger"), encode(Header(name, 1, i, 0.0), Hello())
+    return bus_topics.INJECT.at(), encode(Header(name, 1, i, 0.0), order)
+def ask():
+    session.get(ftm_topics.DETECTION.pattern, lambda reply: None, timeout=0.1)
 with zenoh.open(session_config(None, dial)) as session:
     time.sleep(1)
     publishers, begun, sent = {}, time.monotonic(), 0
@@ -69,6 +72,9 @@ with zenoh.open(session_config(None, dial)) as session:
         due = int(passed * per_s)
         while sent < due:
             sent += 1
+            if kind == "questions":
+                ask()
+                continue
             key, payload = message(sent)
             if key not in publishers:
                 publishers[key] = session.declare_publisher(

@@ -61,6 +61,7 @@ ABSENCE_S = 0.3
 class FtmManager(Actor):
     """Hears all detection and recovery modules, commands the recovery modules."""
 
+    most_spare = "warm"
     outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.SHADOW, topics.RESPAWN,
                topics.MANAGER_STATUS, topics.ADAPTATION, topics.ADAPTED_SYSTEM)
 

@@ -39,12 +39,15 @@ class Bus(Protocol):
     def is_open(self) -> bool:
         """Whether it has been opened, and not closed since."""
 
-    async def open(self) -> None:
-        """Join the bus and announce this node.
+    async def open(self, *, announce: bool = True) -> None:
+        """Join the bus, if that has not been done, and announce this node.
 
         Raises:
             BusError: an endpoint is taken or invalid.
         """
+
+    def announce(self) -> None:
+        """Tell those who watch this node that it is there."""
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Send to all present subscribers of the key, without waiting for them."""
@@ -54,6 +57,13 @@ class Bus(Protocol):
 
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:
         """Have `deliver` called for each message on keys that match."""
+
+    def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
+        """Have `deliver` called once with the newest message on each key that matches.
+
+        As far as it was published and its publisher is there; commands are not kept. `answered` is
+        called after the last of them, or when no answer is waited for any more.
+        """
 
     def watch(self, node: str, changed: PeerChange) -> None:
         """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
@@ -80,11 +90,14 @@ class SharedBus:
         self._owner = owner
         self._open = False
 
-    async def open(self) -> None:
+    async def open(self, *, announce: bool = True) -> None:  # noqa: ARG002
         """Wait until the owner has opened it."""
         while not self._owner.is_open:  # noqa: ASYNC110 polled, some milliseconds at most
             await asyncio.sleep(_LOOK_S)
         self._open = True
+
+    def announce(self) -> None:
+        """Nothing: who shares a session is not announced."""
 
     @property
     def is_open(self) -> bool:
@@ -105,6 +118,12 @@ class SharedBus:
         self._owner.subscribe(
             topic, key_expression,
             lambda key, payload: deliver(key, payload) if self._open else None)
+
+    def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
+        """Ask in the owner's session."""
+        self._owner.latest(
+            key_expression, lambda key, payload: deliver(key, payload) if self._open else None,
+            lambda: answered() if self._open else None)
 
     def watch(self, node: str, changed: PeerChange) -> None:
         """Watch in the owner's session."""

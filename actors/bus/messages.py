@@ -42,10 +42,6 @@ class Heartbeat(Message, frozen=True):
     overflowed: Count
 
 
-class Hello(Message, frozen=True):
-    """A node has just started: who has states to tell repeats them now, not at the next period."""
-
-
 class Diagnostic(Message, frozen=True):
     """An error report: who, in what context, why, and what offended (OTP's four fields)."""
 

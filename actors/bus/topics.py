@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection, InjectionReport
+from rampart.actors.bus.messages import Diagnostic, Heartbeat, Injection, InjectionReport
 from rampart.actors.bus.topic import Qos, Topic
 
 HEARTBEAT = Topic("heartbeat/{name}", Heartbeat, Qos.STATE, 7, "",
                   "Proof that the event loop of node {name} turns.")
-HELLO = Topic("hello/{name}", Hello, Qos.COMMAND, 0, "",
-              "Node {name} has started; the others repeat their states for it.")
 DIAGNOSTIC = Topic("diagnostic/{name}", Diagnostic, Qos.COMMAND, 0, "",
                    "Error report of node {name}.")
 INJECT = Topic("inject/order", Injection, Qos.COMMAND, 0, "",

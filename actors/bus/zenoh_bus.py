@@ -10,8 +10,10 @@ meanwhile is lost, as on any network.
 vanishes says that a node is gone only if it has not come back after `SETTLE_S`. What the kernel
 knows is told at once: `gone`.
 
-Zenoh calls back on threads of its own. They only append to a deque and wake the event loop once
-per burst; everything else happens on the loop.
+Zenoh calls back on the thread that reads the socket (`indirect=False`): by default each subscriber
+has a thread of its own, which costs a millisecond to declare, as much again when the process ends,
+and a wake-up for each message. What is called only appends to a deque and wakes the event loop once
+per burst, or answers with what was published last; everything else happens on the loop.
 """
 
 from __future__ import annotations
@@ -19,18 +21,20 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import zenoh
+from zenoh.handlers import Callback
 
 from rampart.actors.bus.bus import BusError, Deliver, PeerChange
+from rampart.actors.bus.limits import RateLimit
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import socket_path
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.bus.topics import HELLO
 from rampart.actors.bus.unix_peer import peer, process_state
 
 ROUTERS = ("router_a", "router_b")
@@ -48,9 +52,11 @@ HANDSHAKE_MS = 300
 """A handshake that takes longer is given up on either side: what connects and says nothing holds
 one of the hundred places that Zenoh has for handshakes no longer than this."""
 
-_HELLOS_PER_S = 200
-"""From one node, which publishes one when it starts. A router leaves out what is above: for each
-hello all others repeat their states, so such a flood is worst."""
+_ANSWERS_PER_S = 500
+"""To newcomers, which ask once for each topic that they hear. Who asks more often floods."""
+
+_ANSWER_S = 1.0
+"""Real seconds that the newest message of a topic is waited for; nothing else waits meanwhile."""
 
 _REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
 _LOOK_S = 0.002
@@ -71,6 +77,11 @@ def endpoint(folder: str, name: str) -> str:
 def endpoints(folder: str) -> list[str]:
     """Return the endpoints of the routers in the folder of a run."""
     return [endpoint(folder, name) for name in ROUTERS]
+
+
+def _direct(call: Callable[[Any], None], end: Callable[[], None] = lambda: None) -> Callback[Any]:
+    """Return a handler that is called on the thread that reads; `end` when no more will come."""
+    return Callback(call, end, indirect=False)
 
 
 def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
@@ -97,9 +108,6 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/link/tx/lease": LEASE_MS}
-    if listen:
-        settings["downsampling"] = [{"messages": ["put"], "flows": ["ingress"], "rules": [
-            {"key_expr": HELLO.pattern, "freq": _HELLOS_PER_S}]}]
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
@@ -146,15 +154,27 @@ class ZenohBus:
         self._arrived: deque[Callable[[], None]] = deque()
         self._woken = False
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._latest: dict[str, bytes] = {}
+        self._answers = RateLimit(_ANSWERS_PER_S)
         self._held: list[Any] = []
         self._leaving: dict[tuple[str, int, PeerChange], asyncio.TimerHandle] = {}
 
-    async def open(self) -> None:
-        """Open the session, and announce this node.
+    def take_name(self, node: str, incarnation: int, recorder: RecorderConnection | None) -> None:
+        """Be the bus of this node from now on; the session may be open already."""
+        self._node, self._incarnation, self._recorder = node, incarnation, recorder
+
+    async def open(self, *, announce: bool = True) -> None:
+        """Open the session, unless it is open, and announce this node.
 
         Raises:
             BusError: the endpoint is in use or invalid, or there is no router.
         """
+        if self._session is None:
+            await self._open()
+        if announce:
+            self.announce()
+
+    async def _open(self) -> None:
         self._loop = asyncio.get_running_loop()
         try:
             self._session = (await self._joined(self._loop) if self._listen is None
@@ -165,8 +185,11 @@ class ZenohBus:
             raise BusError(f"{self._listen} is in use by another process {node}"
                            if "acquire lock" in text
                            else f"cannot open {self._listen} {node}: {text}") from None
+
+    def announce(self) -> None:
+        """Tell those who watch this node that it is there."""
         if self._node:
-            self._held.append(self._session.liveliness().declare_token(
+            self._held.append(self._require().liveliness().declare_token(
                 f"{_ALIVE}/{self._node}/{self._incarnation}"))
 
     async def _joined(self, loop: asyncio.AbstractEventLoop) -> zenoh.Session:
@@ -193,11 +216,17 @@ class ZenohBus:
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Send to all present subscribers of the key."""
         publisher = self._publishers.get(key)
+        is_new = publisher is None
         if publisher is None:
             priority, congestion_control = _DELIVERY[topic.qos]
             publisher = self._publishers[key] = self._require().declare_publisher(
                 key, priority=priority, express=True, congestion_control=congestion_control)
         publisher.put(payload)
+        if topic.qos is not Qos.COMMAND:
+            self._latest[key] = payload
+            if is_new:
+                self._held.append(self._require().declare_queryable(
+                    key, _direct(lambda query: self._answer(query, key))))
         if self._recorder is not None:
             self._recorder.take(key, payload)
 
@@ -212,7 +241,31 @@ class ZenohBus:
             key, payload = str(sample.key_expr), sample.payload.to_bytes()
             self._hand_over(lambda: deliver(key, payload))
 
-        self._held.append(self._require().declare_subscriber(key_expression, arrived))
+        self._held.append(self._require().declare_subscriber(key_expression, _direct(arrived)))
+
+    def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
+        """Have `deliver` called on the event loop with the newest message of each living publisher.
+
+        Whoever is stopped does not answer; whose loop hangs does, for Zenoh's threads do it.
+        """
+
+        def arrived(reply: zenoh.Reply) -> None:  # runs on a Zenoh thread
+            sample = reply.ok
+            if sample is not None:
+                key, payload = str(sample.key_expr), sample.payload.to_bytes()
+                self._hand_over(lambda: deliver(key, payload))
+
+        priority, _ = _DELIVERY[Qos.STATE]
+        self._require().get(
+            key_expression, _direct(arrived, lambda: self._hand_over(answered)),
+            target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
+            allowed_destination=zenoh.Locality.REMOTE, timeout=_ANSWER_S, priority=priority,
+            congestion_control=zenoh.CongestionControl.DROP, express=True)
+
+    def _answer(self, query: zenoh.Query, key: str) -> None:  # runs on a Zenoh thread
+        payload = self._latest.get(key)
+        if payload is not None and self._answers.allows(time.monotonic()):
+            query.reply(key, payload, express=True)
 
     def watch(self, node: str, changed: PeerChange) -> None:
         """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
@@ -229,8 +282,8 @@ class ZenohBus:
 
         session = self._require()
         self._held.append(session.liveliness().declare_subscriber(
-            f"{_ALIVE}/{node}/*", arrived, history=True))
-        self._held.append(session.declare_subscriber(f"{_GONE}/{node}/*", arrived))
+            f"{_ALIVE}/{node}/*", _direct(arrived), history=True))
+        self._held.append(session.declare_subscriber(f"{_GONE}/{node}/*", _direct(arrived)))
 
     def _token(self, node: str, incarnation: int, alive: bool, changed: PeerChange) -> None:
         assert self._loop is not None  # noqa: S101 for the type checker
@@ -260,6 +313,7 @@ class ZenohBus:
         session, self._session = self._session, None
         self._held.clear()
         self._publishers.clear()
+        self._latest.clear()
         self._arrived.clear()
         if self._recorder is not None:
             self._recorder.close()

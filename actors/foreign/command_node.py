@@ -48,6 +48,7 @@ class CommandNode(Actor):
         hears: TopicsHeard = ()
 
     parameters: Parameters
+    most_spare = "none"
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

@@ -16,6 +16,7 @@ from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.chosen_topics import choose_topics, with_pages
 from rampart.actors.layout.connections import check_connections, check_heard, publishers_of
 from rampart.actors.layout.wiring import (
+    SPARES,
     Member,
     import_class,
     load_class,
@@ -99,6 +100,11 @@ class Layout:
         self.members, self.topics = choose_topics(
             with_pages(own, spec, ordered, file), (*known, *judged), file)
         self._check(judge, (*ftm_topics.ALL, *known), file)
+
+    def spare_of(self, names: Collection[str]) -> str:
+        """Return which spare the process of these actors is to have; the least that one allows."""
+        return min((self.members[name].spare if name in self.members else "none"
+                    for name in names), key=SPARES.index)
 
     def _check(self, judge: Any, known: Collection[Topic[Any]], file: str) -> None:
         """Check who hears and publishes what; raises as the constructor."""

@@ -49,6 +49,7 @@ class Member:
     parameters: Actor.Parameters
     table: str = "parameters."
     kind: Kind = Kind.SUPERVISION
+    spare: str = "none"
     hears: Mapping[str, Members] = field(default_factory=dict)
     publishes: Mapping[str, Members] = field(default_factory=dict)
 
@@ -133,7 +134,26 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
         if problem := problem_of(panels):
             raise ValueError(f"{file}: {node.name}: {problem}")
     return Member(node.name, actor, read_parameters(
-        actor.Parameters, given, file, f"{path}: parameters", spec), kind=node.kind)
+        actor.Parameters, given, file, f"{path}: parameters", spec), kind=node.kind,
+        spare=_spare(node, actor, f"{file}: {path}"))
+
+
+SPARES = ("none", "warm", "hot")
+
+
+def _spare(node: NodeSpec, actor: type[Actor], path: str) -> str:
+    """Return which spare a node is to have.
+
+    Raises:
+        ValueError: its class does not allow that.
+    """
+    most = "none" if node.kind is Kind.WORLD else actor.most_spare
+    if not node.spare:
+        return min(most, "warm", key=SPARES.index)
+    if SPARES.index(node.spare) > SPARES.index(most):
+        raise ValueError(
+            f"{path}: spare = {node.spare!r}: {actor.__name__} allows {most!r} at most")
+    return node.spare
 
 
 def shows_panels(actor: type[Actor]) -> bool:

@@ -66,6 +66,7 @@ class Hmi(Actor):
     parameters: Parameters
     panels: ClassVar[tuple[Panel, ...]] = ()
     files: ClassVar[Path | None] = None
+    most_spare = "none"
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECT)
     requests: ClassVar[tuple[type[Request], ...]] = REQUESTS

@@ -22,10 +22,10 @@ import msgspec
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from rampart.actors.bus.fields import Field
-from rampart.actors.bus.limits import RateLimit, ReportLimit
-from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
+from rampart.actors.bus.limits import Remembered, ReportLimit
+from rampart.actors.bus.messages import Diagnostic, Heartbeat, Injection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
+from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, INJECT
 from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.context import Context
@@ -37,14 +37,16 @@ from rampart.actors.runtime.timer import Timer, Timers
 
 __all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
 
-_REPEATED_SOON_HZ = 7.0
-"""A state that is repeated this often anyway is not repeated for a newcomer."""
+_OFTEN_HZ = 7.0
+_PERIODS = 3
+"""What is published so often at least is of no use to a newcomer when it is so many periods old:
+its publisher is silent, and only the next message shows that it is not."""
 
-_HELLOS_PER_S = 100
-"""More newcomers in a simulated second than a system has nodes are no newcomers."""
+_UNSENT = 256
+"""So many messages one that waits to be the node keeps: the newest of each topic, all commands."""
 
-_STRANGE_HELLOS_PER_S = 5
-"""Of those that are no nodes of the system."""
+_PATIENCE_S = 0.02
+"""So long one that replaces another waits at most for what was published before it came."""
 
 
 def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any, Header], None]:
@@ -84,15 +86,16 @@ class Actor(Declared):
             context.clock.now, expected=context.incarnation > 1)
         self._dispatcher = Dispatcher(context.bus.bursts, self._overflowed)
         self._timers = Timers(context.clock, self._dispatcher)
+        self._waits = context.waits
+        self._unsent: Remembered[tuple[str, int], tuple[Topic[Any], bytes]] = Remembered(_UNSENT)
+        self._unkept: Callable[[], None] = lambda: None
+        self._questions = 0
+        self._is_at_work = False
         self._sequence = 0
         self._rejected = 0
         self._abandoned = False
         self._reports = ReportLimit()
-        self._hellos = RateLimit(_HELLOS_PER_S)
-        self._strange_hellos = RateLimit(_STRANGE_HELLOS_PER_S)
-        self._answer_due = False
-        self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
-        self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
+        self._outlets: dict[str | tuple[str, str], str] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
         self._may_publish.update(
             self.chosen_topic(name.key).key for name in topics_named(self.parameters)["published"])
@@ -173,27 +176,24 @@ class Actor(Declared):
         Raises:
             ValueError: the topic is not declared in `outputs`.
         """
-        key, is_kept = self._outlets.get(
+        key = self._outlets.get(
             topic.key if name is None else (topic.key, name)) or self._outlet(topic, name)
         if stamp is None:
             stamp = self.clock.now()
-        if is_kept:
-            self._states[key] = (topic, body, stamp)
         (self._injections.send if self._in_force else self.send)(topic, key, body, stamp)
 
-    def _outlet(self, topic: Topic[Any], name: str | None) -> tuple[str, bool]:
-        """Return the key of a topic, and whether its last message is kept for newcomers."""
+    def _outlet(self, topic: Topic[Any], name: str | None) -> str:
+        """Return the key of a topic."""
         if topic.key not in self._may_publish:
             raise ValueError(f"{type(self).__name__} publishes {topic.key}, "
                              "which its outputs do not declare")
-        outlet = (topic.at(name or self.name) if topic.is_family else topic.at(),
-                  topic.qos is Qos.STATE and topic.rate_hz < _REPEATED_SOON_HZ)
+        outlet = topic.at(name or self.name) if topic.is_family else topic.at()
         self._outlets[topic.key if name is None else (topic.key, name)] = outlet
         return outlet
 
     def has_readers(self, topic: Topic[Any]) -> bool:
         """Whether somebody may be listening to one of its topics, as far as the bus can know."""
-        key, _ = self._outlets.get(topic.key) or self._outlet(topic, None)
+        key = self._outlets.get(topic.key) or self._outlet(topic, None)
         return self._bus.has_readers(key)
 
     def call_later(self, delay_s: float, call: Callable[[], None]) -> Timer:
@@ -201,7 +201,14 @@ class Actor(Declared):
         return self._timers.later(delay_s, call)
 
     def kept(self, form: StateFormat[S]) -> S | None:
-        """Return the state to go on from, in `on_start`: the newest sound one, or None."""
+        """Return the state to go on from, in `on_start`: the newest sound one, or None.
+
+        Raises:
+            RuntimeError: it is a hot spare, and the state still belongs to another process.
+        """
+        if self._waits == "hot":
+            raise RuntimeError(f"{type(self).__name__} keeps checkpoints: its class has to say "
+                               "most_spare = 'warm'")
         return self._keeper.kept(form)
 
     def keep(self, form: StateFormat[S], state: S) -> None:
@@ -210,7 +217,10 @@ class Actor(Declared):
         On return it survives this process. What goes wrong is reported and does not raise: the
         node goes on without.
         """
-        self._keeper.keep(form, state)
+        if self._waits:
+            self._unkept = partial(self._keeper.keep, form, state)
+        else:
+            self._keeper.keep(form, state)
 
     def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
         """Publish an error report: one a second per context and offender, and few in all."""
@@ -223,7 +233,18 @@ class Actor(Declared):
         """End the actor after the items that already wait."""
         self._dispatcher.stop()
 
-    # -- what happens to its process in virtual time --------------------------------------------
+    # -- what happens to its process ------------------------------------------------------------
+
+    def promote(self) -> None:
+        """Be the node from now on, if it waits for that: keep and send what was held back."""
+        if self._waits:
+            self._waits = ""
+            self._unkept()
+            if self._bus.is_open:  # else it announces itself when that is so
+                self._bus.announce()
+            for (key, _), (topic, payload) in self._unsent.items():
+                self._bus.publish(topic, key, payload)
+            self._unsent.clear()
 
     def abandon(self) -> None:
         """Have nothing more run when its task is cancelled: what SIGKILL does."""
@@ -247,7 +268,7 @@ class Actor(Declared):
             BusError: the bus could not be opened.
             Exception: whatever a handler raised.
         """
-        await self._bus.open()
+        await self._bus.open(announce=not self._waits)
         try:
             self._set_up()
             await self._dispatcher.run()
@@ -267,19 +288,34 @@ class Actor(Declared):
             handler = _all_of([*handlers, *self._chosen.pop(topic.key, ())])
             names = self.names(topic, self.name, self.parameters) if topic.is_family else None
             for key in [topic.pattern] if names is None else map(topic.at, names):
-                self._bus.subscribe(topic, key, self._receiver(topic, handler))
+                self._hear(topic, key, handler)
         for key, handlers in self._chosen.items():
             topic = self.chosen_topic(key)
             where = topic.pattern if key == topic.key else f"{ROOT}/{key}"
-            self._bus.subscribe(topic, where, self._receiver(topic, _all_of(handlers)))
+            self._hear(topic, where, _all_of(handlers))
         for node in self.watches(self.name, self.parameters):
             self._bus.watch(node, self._peer_changed)
         self.on_start()
-        self.publish(HELLO, Hello())
         self._beat()
         self._timers.every(self.context.heartbeat_period_s, "_beat", self._beat)
-        for period_s, method in self._periodic:
-            self._timers.every(period_s, method, getattr(self, method))
+        if self._incarnation == 1 or not self._questions:  # there is nothing to be heard yet
+            self._go_to_work()
+        else:
+            self.call_later(_PATIENCE_S, self._go_to_work)
+
+    def _question_answered(self) -> None:
+        """Begin as soon as all that was published before is known."""
+        self._questions -= 1
+        if self._questions == 0:
+            self._dispatcher.put("go to work", self._go_to_work)
+
+    def _go_to_work(self) -> None:
+        """Start the periodic work: of one that replaces another, at once."""
+        if not self._is_at_work:
+            self._is_at_work = True
+            for period_s, method in self._periodic:
+                self._timers.every(period_s, method, getattr(self, method),
+                                   at_once=self._incarnation > 1)
 
     async def _tear_down(self) -> None:
         self._timers.cancel()
@@ -302,6 +338,20 @@ class Actor(Declared):
         self.context.failed(error)
 
     # -- mail -----------------------------------------------------------------------------------
+
+    def _hear(self, topic: Topic[Any], where: str, handler: Callable[[Any, Header], None]) -> None:
+        """Hear what is published from now on, and what was published last if it is no command."""
+        self._bus.subscribe(topic, where, self._receiver(topic, handler))
+        now = self.clock.now
+
+        def take(message: Any, header: Header) -> None:
+            if topic.rate_hz < _OFTEN_HZ or now() - header.stamp <= _PERIODS / topic.rate_hz:
+                handler(message, header)
+
+        if topic.qos is Qos.COMMAND:
+            return
+        self._questions += 1
+        self._bus.latest(where, self._receiver(topic, take), self._question_answered)
 
     def _receiver(self, topic: Topic[Any],
                   handler: Callable[[Any, Header], None]) -> Callable[[str, bytes], None]:
@@ -342,6 +392,11 @@ class Actor(Declared):
         if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
             self.report_diagnostic("not sent", too_long(payload), key)
             return
+        if self._waits:
+            is_command = topic.qos is Qos.COMMAND
+            if not (is_command and self._waits == "hot"):  # that is given once, by who speaks
+                self._unsent[key, sequence if is_command else 0] = topic, payload
+            return
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
 
@@ -361,27 +416,10 @@ class Actor(Declared):
 
     @on(INJECT)
     def _on_injection(self, order: Injection, _header: Header) -> None:
+        if self._waits:  # it is meant for the process that was there
+            return
         topic = self.published(order.topic, self.name, self.parameters) or (
             next((self.context.topics[named.key] for named in
                   topics_named(self.parameters)["published"] if named.key == order.topic), None))
         if topic is not None:
             self._injections.order(order, topic)
-
-    # -- newcomers ------------------------------------------------------------------------------
-
-    @on(HELLO)
-    def _on_hello(self, _hello: Hello, header: Header) -> None:
-        if header.source == self.name or self._answer_due:
-            return
-        members = self.context.members
-        known = not members or header.source in members
-        if (self._hellos if known else self._strange_hellos).allows(self.clock.now()):
-            self._repeat_states()
-        else:  # one answer for all of them, when the flood has lasted a second
-            self._answer_due = True
-            self.call_later(1.0, self._repeat_states)
-
-    def _repeat_states(self) -> None:
-        self._answer_due = False
-        for key, (topic, body, stamp) in list(self._states.items()):
-            (self._injections.send if self._in_force else self.send)(topic, key, body, stamp)

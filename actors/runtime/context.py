@@ -36,6 +36,7 @@ class Context:
         register: returns the incarnation of a node that was issued last, None if it is not known.
         members: names of all nodes of the system; what others make it remember is bounded.
         topics: those that parameters of the system's nodes name, by key.
+        waits: "warm" or "hot" if it is set up as that, to be silent until `promote`.
         usage: returns what a process has used of the machine.
     """
 
@@ -52,4 +53,5 @@ class Context:
     register: Register = lambda _node: None
     members: frozenset[str] = frozenset()
     topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
+    waits: str = ""
     usage: Callable[[int], ProcessCount | None] = read_count

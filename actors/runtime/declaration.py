@@ -13,16 +13,16 @@ from typing import Any, ClassVar, TypeVar
 import msgspec
 
 from rampart.actors.bus.topic import Members, Topic
-from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
+from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, INJECT, INJECTION_REPORT
 
 F = TypeVar("F", bound=Callable[..., None])
 
 
-BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, HELLO, DIAGNOSTIC, INJECTION_REPORT)
+BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, DIAGNOSTIC, INJECTION_REPORT)
 """What every actor publishes besides its own outputs."""
 
-BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
-"""What every actor hears besides its own inputs: injections from tools, hellos from newcomers."""
+BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT,)
+"""What every actor hears besides its own inputs: injections from tools."""
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
@@ -135,6 +135,9 @@ class Declared(Handlers):
     Class attributes:
         outputs: topics it publishes; publishing another one raises.
         node_kind: what a node of this class has to be, "" for anything.
+        most_spare: the most that a spare process of it may be. "hot": set up beside the one that
+            speaks, in silence. "warm": set up, in silence, when that has ended; for one that keeps
+            checkpoints. "none": neither, for `on_start` takes a port, or starts a program.
         Parameters: what the system spec may say of it, by field: type, range and default. A class
             that takes more derives its own from that of its base class.
     """
@@ -145,6 +148,7 @@ class Declared(Handlers):
     parameters: Parameters
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
     node_kind: ClassVar[str] = ""
+    most_spare: ClassVar[str] = "hot"
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003

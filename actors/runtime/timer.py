@@ -69,14 +69,15 @@ class Timers:
             self._clock.source_time(self._clock.now() + delay_s), due)
         return timer
 
-    def every(self, period_s: float, name: str, call: Callable[[], None]) -> None:
-        """Have `call` made each `period_s` simulated seconds, first after one period.
+    def every(self, period_s: float, name: str, call: Callable[[], None], *,
+              at_once: bool = False) -> None:
+        """Have `call` made each `period_s` simulated seconds, first after one period or at once.
 
         A call that is late skips; it does not catch up.
         """
         loop, clock, slot = asyncio.get_running_loop(), self._clock, f"timer {name}"
         post_at = getattr(loop, "post_at", loop.call_at)  # cheaper, on a virtual loop
-        due_s = clock.now() + period_s
+        due_s = clock.now() + (0.0 if at_once else period_s)
 
         def tick(*_: None) -> None:
             nonlocal due_s

@@ -24,10 +24,12 @@ import asyncio
 import contextlib
 import os
 import signal
+import socket
 import threading
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +43,7 @@ from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 from rampart.actors.runtime.clock import Clock
-from rampart.actors.supervision.process_title import end_run, kill, set_title
+from rampart.actors.supervision.process_title import WAITING, end_run, kill, set_title
 from rampart.actors.supervision.unseen import tell_of_callbacks
 from rampart.files.streams import complain
 from rampart.manager.spec.schema import Kind
@@ -68,20 +70,36 @@ def exit_with_launcher(lifeline: int, launcher: int, folder: str) -> None:
 
 def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
                loop: asyncio.AbstractEventLoop, *,
-               failed: Callable[[Exception], None] = lambda _error: None) -> Actor:
-    """Build one actor of the system with its bus, not yet running; `failed` is told its error."""
+               failed: Callable[[Exception], None] = lambda _error: None,
+               bus: ZenohBus | None = None, waits: str = "") -> Actor:
+    """Build one actor of the system, not yet running.
+
+    Args:
+        layout: of the run.
+        name: of the actor.
+        incarnation: of its process.
+        run: what all actors of the run have in common.
+        loop: that it will run on.
+        failed: is told its error.
+        bus: that it is to have, open already; None for one of its own.
+        waits: "warm" or "hot" if it is to be silent until it is promoted.
+    """
     member = layout.members.get(name) or router(name)
     clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
     folder = layout.plan.folder
-    own = endpoint(folder, name) if name in ROUTERS else None
-    bus = ZenohBus(name, incarnation, [one for one in endpoints(folder) if one != own], own,
-                   RecorderConnection(layout.plan.base_port))
+    recorder = RecorderConnection(layout.plan.base_port)
+    if bus is None:
+        own = endpoint(folder, name) if name in ROUTERS else None
+        bus = ZenohBus(name, incarnation, [one for one in endpoints(folder) if one != own], own,
+                       recorder)
+    else:
+        bus.take_name(name, incarnation, recorder)
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
-        members=frozenset((*layout.members, *layout.routers)), topics=layout.topics))
+        members=frozenset((*layout.members, *layout.routers)), topics=layout.topics, waits=waits))
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
@@ -92,20 +110,47 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
     return SqliteCheckpoints(Path(plan.checkpoints, f"{name}.sqlite"), plan.run_id, incarnation)
 
 
-def node_main(layout: Layout, names: tuple[str, ...], incarnation: int, run: RunContext,
-              lifeline: int, *, born: Callable[[], None] = lambda: None) -> int:
+@dataclass(frozen=True)
+class Role:
+    """Who a process is to be.
+
+    Attributes:
+        names: of the actors.
+        incarnation: of the process.
+        born: called when it has its title, before it does anything that others see; it may not
+            return, if the process is not wanted any more.
+        waits: "warm" or "hot" if it is to be set up first and wait to be born, else "".
+        told: if it waits, called when something has come for it by its connection: returns whether
+            it is to be born now. It does not return if it is not wanted any more.
+        connection: by which it is told.
+    """
+
+    names: tuple[str, ...]
+    incarnation: int
+    born: Callable[[], None] = lambda: None
+    waits: str = ""
+    told: Callable[[], bool] = lambda: True
+    connection: socket.socket | None = None
+
+
+def node_main(layout: Layout, role: Role, run: RunContext, lifeline: int) -> int:
+    """Run the actors of one process to their end and return the exit code; see `live`."""
+    return asyncio.run(live(layout, role, run, lifeline))
+
+
+async def live(layout: Layout, role: Role, run: RunContext, lifeline: int,
+               bus: ZenohBus | None = None) -> int:
     """Run the actors of one process to their end and return the exit code.
 
     Args:
         layout: of the run.
-        names: of the actors.
-        incarnation: of the process.
+        role: who they are.
         run: what all actors of the run have in common.
         lifeline: read end of the pipe; see above.
-        born: called as soon as the process has its title, before it does anything that others see.
+        bus: open already, if there is one.
     """
     told: list[Exception] = []
-    launcher, who = layout.plan.launcher_pid, f"{'+'.join(names)} #{incarnation}"
+    launcher, who = layout.plan.launcher_pid, f"{'+'.join(role.names)} #{role.incarnation}"
 
     def tell(error: Exception) -> None:  # at once: what replaces this process may kill it
         told.append(error)
@@ -113,18 +158,21 @@ def node_main(layout: Layout, names: tuple[str, ...], incarnation: int, run: Run
         _log_traceback(layout.plan.error_log, who, error)
 
     try:
-        set_title(layout.plan.base_port, launcher, names, incarnation)
-        born()
-        if any(node.kind is Kind.WORLD for node in layout.spec.nodes if node.name in names):
+        if not role.waits:
+            _take_title(layout, role, role.names)
+            role.born()
+        else:
+            _take_title(layout, role, (f"{WAITING}{'.'.join(role.names)}",))
+        if any(node.kind is Kind.WORLD for node in layout.spec.nodes if node.name in role.names):
             go_first()
         exit_with_launcher(lifeline, launcher, layout.plan.folder)
         for number in (signal.SIGINT, signal.SIGHUP):  # ctrl-C is the launcher's to handle
             signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGUSR2, wedge)
-        asyncio.run(_run_actors(layout, names, incarnation, run, tell))
+        await _run_actors(layout, role, run, tell, bus)
     except BusError as error:
         if error not in told:
-            complain(f"{'+'.join(names)}: {error}")
+            complain(f"{'+'.join(role.names)}: {error}")
         return EXIT_BUS
     except Exception as error:  # the last stop before the exit code: nothing may pass unseen
         if error not in told:
@@ -133,16 +181,34 @@ def node_main(layout: Layout, names: tuple[str, ...], incarnation: int, run: Run
     return EXIT_OK
 
 
-async def _run_actors(layout: Layout, names: tuple[str, ...], incarnation: int, run: RunContext,
-                      failed: Callable[[Exception], None]) -> None:
+def _take_title(layout: Layout, role: Role, names: tuple[str, ...]) -> None:
+    set_title(layout.plan.base_port, layout.plan.launcher_pid, names, role.incarnation)
+
+
+async def _run_actors(layout: Layout, role: Role, run: RunContext,
+                      failed: Callable[[Exception], None], bus: ZenohBus | None) -> None:
     loop = asyncio.get_running_loop()
-    tell_of_callbacks(loop, lambda line: complain(f"{'+'.join(names)} #{incarnation}: {line}"))
-    actors = [make_actor(layout, name, incarnation, run, loop, failed=failed) for name in names]
+    tell_of_callbacks(
+        loop, lambda line: complain(f"{'+'.join(role.names)} #{role.incarnation}: {line}"))
+    actors = [make_actor(layout, name, role.incarnation, run, loop, failed=failed,
+                         bus=bus if name == role.names[0] else None, waits=role.waits)
+              for name in role.names]
 
     def stop_all() -> None:
         for actor in actors:
             actor.stop()
 
+    def told(connection: socket.socket) -> None:
+        if not role.told():
+            return
+        loop.remove_reader(connection)
+        _take_title(layout, role, role.names)
+        role.born()
+        for actor in actors:
+            actor.promote()
+
+    if role.connection is not None:
+        loop.add_reader(role.connection, told, role.connection)
     loop.add_signal_handler(signal.SIGTERM, stop_all)
     tasks = [asyncio.create_task(actor.run()) for actor in actors]
     try:

@@ -21,6 +21,9 @@ from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.foreign.program import LOGS
 from rampart.actors.foreign.strays import kill_strays
 
+WAITING = "spare."
+"""In the title of a process that waits to be a node, before the name of that."""
+
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 
 

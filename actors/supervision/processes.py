@@ -14,7 +14,7 @@ import select
 import signal
 import time
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Literal, Protocol
 
 from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.ftm.messages import AdaptedSystem
@@ -78,6 +78,16 @@ class Processes(Protocol):
             SpawnerUnavailableError: No spawner could do it now; likewise.
             OSError: Likewise, for want of memory or descriptors.
         """
+
+    def prepare(self, names: tuple[str, ...], incarnation: int,
+                kind: Literal["warm", "hot"]) -> None:
+        """Have a process made ready for these actors, silent, for `fork` to take if it can."""
+
+    def is_ready(self, names: tuple[str, ...]) -> bool:
+        """Whether there is one, which neither hangs nor is stopped, as far as is known."""
+
+    def forget(self, names: tuple[str, ...]) -> None:
+        """End a process that was made ready and is not wanted."""
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Take hold of a process; `ended` is called on the event loop when it ends.

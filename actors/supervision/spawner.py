@@ -12,6 +12,7 @@ caller that does not wait any more has closed the connection (see `spawner_clien
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import gc
 import os
@@ -19,26 +20,38 @@ import selectors
 import signal
 import socket
 import sys
+import time
 from pathlib import Path
-from typing import NoReturn
+from typing import Literal, NoReturn
 
 import msgspec
 from msgspec.structs import replace
 
 from rampart.actors.bus.run_folder import issue, issued, register_of, socket_path
 from rampart.actors.bus.unix_peer import is_same_user
+from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.layout import Layout, adapted_system, load_run
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
-from rampart.actors.supervision.node_process import node_main, wedge
+from rampart.actors.supervision.node_process import Role, live, node_main, wedge
 from rampart.actors.supervision.process_title import end_run, set_title
+from rampart.actors.supervision.spare import Spare, wait
 from rampart.files import streams, working_folder
 from rampart.manager.spec.tables import Supervision
 
 NAMES = ("a", "b")
 MAX_DATAGRAM = 160_000
 """A changed system spec has to fit; unix sockets take 200 kB by default."""
+
+_PAUSE_S = 0.25
+"""A spare is forked when for so long no other process was; longer, up to ..."""
+
+_PAUSE_MAX_S = 8.0
+"""... this, if the one before ended by itself."""
+
+_LOOK_S = 1.0
+"""Seconds between two looks whether a spare is stopped."""
 
 _BACKLOG = 64
 """So many may wait to be accepted: all processes of a run, each asked for on a connection."""
@@ -49,6 +62,12 @@ class ForkRequest(msgspec.Struct, frozen=True, tag="fork"):
 
     names: tuple[str, ...]
     incarnation: int
+    waits: Literal["", "warm", "hot"] = ""
+    """Not "" if it is to be silent, and to answer now, to pings, and to `Go`: it is the node."""
+
+
+class Go(msgspec.Struct, frozen=True, tag="go"):
+    """Be the node that you were made ready for."""
 
 
 class Ping(msgspec.Struct, frozen=True, tag="ping"):
@@ -74,7 +93,7 @@ class Reply(msgspec.Struct, frozen=True):
     sender: int = 0
 
 
-Request = ForkRequest | Ping | SetOrigin | Adapt
+Request = ForkRequest | Go | Ping | SetOrigin | Adapt
 
 
 class Loaded(msgspec.Struct, frozen=True):
@@ -103,6 +122,10 @@ class Spawner:
         self._run = run
         self._lifeline = lifeline
         self._selector = selectors.DefaultSelector()
+        self._kept = layout.spec.supervision.spares
+        self._spares: list[Spare] = []
+        self._forked_s = time.monotonic()
+        self._pause_s = _PAUSE_S
 
     def open(self) -> None:
         """Take the title and the address.
@@ -133,7 +156,7 @@ class Spawner:
         signal.signal(signal.SIGUSR2, wedge)
         self._selector.register(self._lifeline, selectors.EVENT_READ, self._launcher_gone)
         while True:
-            for key, _ in self._selector.select():
+            for key, _ in self._selector.select(self._look_after_spares()):
                 key.data(key.fileobj)
 
     def _accept(self, listener: socket.socket) -> None:
@@ -169,53 +192,152 @@ class Spawner:
         self._selector.unregister(connection)
         connection.close()
 
-    def _obey(self, request: Ping | SetOrigin | Adapt) -> None:
+    def _obey(self, request: Go | Ping | SetOrigin | Adapt) -> None:
+        if isinstance(request, Go):
+            raise ValueError("this is no process that waits")
         if isinstance(request, SetOrigin):
             self._layout.plan = replace(self._layout.plan, origin_s=request.origin_s)
         elif isinstance(request, Adapt):
             self._layout, self._run = adapted_system(self._layout, self._run, request.adapted)
+        if not isinstance(request, Ping):
+            for spare in self._spares:  # they know the system as it was
+                self._forget(spare)
+                spare.end()
 
     def _fork(self, request: ForkRequest, connection: socket.socket) -> None:
         for name in request.names:
             if name not in {*self._layout.members, *self._layout.routers,
                             *(f"spawner_{n}" for n in NAMES)}:
                 raise ValueError(f"unknown node {name!r}")
-        if os.fork() == 0:
+        self._forked_s = time.monotonic()
+        if not self._hand_over(request, connection) and os.fork() == 0:
             self._become(request, connection)
         self._let_go(connection)  # the child answers; if it cannot, its end is the answer
 
     def _become(self, request: ForkRequest, connection: socket.socket) -> NoReturn:
-        folder = self._layout.plan.folder
-        is_spawner = request.names[0].startswith("spawner_")
+        code = 1
+        try:
+            self._leave(connection)
+            if request.names[0].startswith("spawner_"):
+                name = request.names[0].removeprefix("spawner_")
+                sibling = Spawner(name, self._layout, self._run, self._lifeline)
+                sibling.take_title()
+                if not _answer(connection, Reply()):
+                    os._exit(0)
+                connection.close()
+                sibling.open()
+                sibling.serve()
+            code = node_main(self._layout, self._role(request, connection), self._known(),
+                             self._lifeline)
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+
+    def _leave(self, kept: socket.socket) -> None:
+        """Close in a child what is the spawner's."""
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        for key in list(self._selector.get_map().values()):
+            if key.fd not in {self._lifeline, kept.fileno()}:
+                key.fileobj.close()  # type: ignore[union-attr]
+        self._selector.close()
+
+    def _known(self) -> RunContext:
+        return dataclasses.replace(
+            self._run, known_incarnations=issued(self._layout.plan.folder))
+
+    def _role(self, request: ForkRequest, connection: socket.socket) -> Role:
+        folder, names = self._layout.plan.folder, request.names
+
+        def told() -> bool:
+            try:
+                said = msgspec.json.decode(connection.recv(MAX_DATAGRAM), type=Request)
+            except (OSError, msgspec.MsgspecError):
+                os._exit(0)
+            if isinstance(said, Go):
+                return True
+            _answer(connection, Reply())
+            return False
 
         def born() -> None:
             if not _answer(connection, Reply()):
                 os._exit(0)  # not waited for any more: another one may have its place
             connection.close()
-            newest = max(register_of(folder)(name) or 0 for name in request.names)
-            if newest >= request.incarnation and not is_spawner:
+            newest = max(register_of(folder)(name) or 0 for name in names)
+            if newest >= request.incarnation:
                 os._exit(0)  # asked for too late: a later one had its place, or has
-            issue(folder, request.names, request.incarnation)
+            issue(folder, names, request.incarnation)
 
+        if request.waits:
+            _answer(connection, Reply())
+        return Role(names, request.incarnation, born, request.waits, told,
+                    connection if request.waits else None)
+
+    # -- spares ---------------------------------------------------------------------------------
+
+    def _hand_over(self, request: ForkRequest, connection: socket.socket) -> bool:
+        """Give a request to a spare; False if there is none for it."""
+        if self._layout.spare_of(request.names) == "none":
+            return False
+        while ready := [spare for spare in self._spares if spare.is_ready]:
+            self._forget(ready[0])
+            if ready[0].take(msgspec.json.encode(request), connection):
+                return True
+        return False
+
+    def _look_after_spares(self) -> float | None:
+        """Fork a spare if one is missing; return in how many seconds to look again, if at all.
+
+        Not while processes are being started, and the later the more often spares have ended.
+        """
+        if self._kept == 0:
+            return None
+        for spare in [one for one in self._spares if not one.is_fit()]:
+            self._forget(spare)
+            spare.end()
+        missing = self._kept - len(self._spares)
+        wait_s = self._forked_s + self._pause_s - time.monotonic()
+        if missing and wait_s <= 0:
+            self._forked_s = time.monotonic()
+            self._fork_spare()
+        return max(_PAUSE_S, wait_s) if missing else _LOOK_S
+
+    def _fork_spare(self) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        pid = os.fork()
+        if pid == 0:
+            ours.close()
+            self._be_spare(theirs)
+        theirs.close()
+        spare = Spare(pid, ours)
+        self._spares.append(spare)
+        self._selector.register(ours, selectors.EVENT_READ, lambda _: self._hear(spare))
+
+    def _hear(self, spare: Spare) -> None:
+        if spare.heard():
+            self._pause_s = _PAUSE_S
+        else:
+            self._pause_s = min(2 * self._pause_s, _PAUSE_MAX_S)
+            self._forget(spare)
+            spare.control.close()
+
+    def _forget(self, spare: Spare) -> None:
+        self._selector.unregister(spare.control)
+        self._spares = [one for one in self._spares if one is not spare]
+
+    def _be_spare(self, control: socket.socket) -> NoReturn:
         code = 1
         try:
-            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-            lifeline = self._lifeline
-            for key in list(self._selector.get_map().values()):
-                if key.fd not in {lifeline, connection.fileno()}:
-                    key.fileobj.close()  # type: ignore[union-attr]
-            self._selector.close()
-            if is_spawner:
-                name = request.names[0].removeprefix("spawner_")
-                sibling = Spawner(name, self._layout, self._run, lifeline)
-                sibling.take_title()
-                born()
-                sibling.open()
-                sibling.serve()
-            code = node_main(
-                self._layout, request.names, request.incarnation,
-                dataclasses.replace(self._run, known_incarnations=issued(folder)), lifeline,
-                born=born)
+            self._leave(control)
+            plan = self._layout.plan
+            set_title(plan.base_port, plan.launcher_pid, (f"spare_{self.name}",), 1)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+            async def begin(data: bytes, connection: socket.socket, bus: ZenohBus) -> int:
+                role = self._role(msgspec.json.decode(data, type=ForkRequest), connection)
+                return await live(self._layout, role, self._known(), self._lifeline, bus)
+
+            code = asyncio.run(wait(control, plan.folder, begin))
         finally:
             sys.stdout.flush()
             sys.stderr.flush()

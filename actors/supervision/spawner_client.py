@@ -21,14 +21,15 @@ import contextlib
 import select
 import socket
 import time
+from typing import Literal
 
 import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE
-from rampart.actors.bus.unix_peer import is_same_user, receive_signed
+from rampart.actors.bus.unix_peer import is_same_user, process_state, receive_signed
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.supervision import spawner as protocol
-from rampart.actors.supervision.process_title import find_process, kill
+from rampart.actors.supervision.process_title import WAITING, find_process, kill
 from rampart.actors.supervision.spawner import NAMES, Reply, Request
 
 WAIT_S = 0.05
@@ -40,6 +41,13 @@ PATIENCE_S = 0.25
 time longer, for on a machine that is busy enough the new process cannot answer sooner either."""
 
 START_PATIENCE_S = 10.0
+
+_SILENT_S = 2.0
+"""One that waits and does not answer for so long is replaced; if it only lacks a processor, that
+costs no more than the fork."""
+
+_GO_S = 0.005
+"""One that waits to be promoted answers sooner, unless it is still being set up or hangs."""
 
 
 class SpawnerUnavailableError(Exception):
@@ -58,7 +66,9 @@ class _Asked:
 
         self._connection = connection
         self._unanswered = 0
+        self._first = 0
         self.sent = False
+        self.waits = False
         self.patience_s = PATIENCE_S
         self._since_s = time.monotonic()
         self._reply: Reply | None = None
@@ -68,10 +78,27 @@ class _Asked:
         """Whether another spawner is to be asked."""
         return time.monotonic() - self._since_s > self.patience_s
 
+    def turns(self) -> bool:
+        """Whether one that waits has answered what it was asked last; ask it again."""
+        while self._reply is None and self._is_readable(0.0):
+            self._read()
+        now_s = time.monotonic()
+        if self._reply is not None or (self._unanswered and now_s - self._since_s > _SILENT_S):
+            return False
+        if not self._unanswered and now_s - self._since_s > _SILENT_S / 2:
+            self._since_s = now_s
+            self.send(protocol.Ping())
+        return True
+
+    @property
+    def may_turn(self) -> bool:
+        """Whether the process that waits at the other end is not stopped, as far as is known."""
+        return not self._first or process_state(self._first) not in "TtXZ"
+
     def send(self, *requests: Request) -> None:
         """Send requests, one after the other."""
         self.sent = True
-        self._unanswered = len(requests)
+        self._unanswered += len(requests)
         try:
             for request in requests:
                 self._connection.send(msgspec.json.encode(request))
@@ -82,13 +109,15 @@ class _Asked:
         """Return the answer, or None if there is none after so many seconds."""
         until_s = time.monotonic() + wait_s
         while self._reply is None:
-            left_s = max(0.0, until_s - time.monotonic())
-            poll = select.poll()
-            poll.register(self._connection, select.POLLIN)
-            if not poll.poll(left_s * 1000):
+            if not self._is_readable(max(0.0, until_s - time.monotonic())):
                 return None
             self._read()
         return self._reply
+
+    def _is_readable(self, wait_s: float) -> bool:
+        poll = select.poll()
+        poll.register(self._connection, select.POLLIN)
+        return bool(poll.poll(wait_s * 1000))
 
     def withdraw(self) -> Reply:
         """Take the requests back, unless they are answered; see above why that is certain."""
@@ -110,12 +139,20 @@ class _Asked:
         """Forget it, answered or not."""
         self._connection.close()
 
+    def dismiss(self) -> None:
+        """Have the process end that waits at the other end, also if it is stopped or hangs."""
+        for pid in {self.withdraw().sender, self._first} - {0}:
+            process = find_process(pid)
+            if process is not None and process.names[0].startswith(WAITING):
+                kill(pid)
+
     def _read(self) -> None:
         sender = 0
         try:
             data, sender = receive_signed(self._connection, protocol.MAX_DATAGRAM)
             self._unanswered -= 1
-            if data and self._unanswered > 0:
+            if data and (self._unanswered > 0 or self.waits):
+                self._first = sender
                 return
             reply = msgspec.json.decode(data, type=Reply) if data else Reply(error="no answer")
         except OSError as error:
@@ -144,6 +181,7 @@ class SpawnerClient:
         self._launcher = launcher
         self._forks: dict[tuple[str, ...], tuple[int, _Asked]] = {}
         self._pings: dict[str, _Asked] = {}
+        self._ready: dict[tuple[str, ...], tuple[int, _Asked]] = {}
         self._slow: set[str] = set()
         self._adapt: protocol.Adapt | None = None
 
@@ -159,9 +197,9 @@ class SpawnerClient:
                 incarnation, which goes on waiting.
             SpawnerUnavailableError: no spawner could do it, or none has answered for long.
         """
-        requests: list[Request] = [protocol.ForkRequest(names, incarnation)]
-        if self._adapt is not None:  # a spawner may have loaded the file as it was
-            requests.insert(0, self._adapt)
+        if child := self._promoted(names, incarnation):
+            return child
+        requests = self._requests(protocol.ForkRequest(names, incarnation))
         asked = self._resumed(names, incarnation)
         queue = [n for n in sorted(NAMES, key=lambda n: n in self._slow)
                  if names != (f"spawner_{n}",) and (asked is None or n != asked.spawner)]
@@ -190,6 +228,32 @@ class SpawnerClient:
             asked = other
         raise SpawnerUnavailableError("; ".join(failures))
 
+    def prepare(self, names: tuple[str, ...], incarnation: int,
+                kind: Literal["warm", "hot"]) -> None:
+        """Have a process made ready that `fork` makes the node; if that is not possible, none is.
+
+        Until then it is silent. Another incarnation, or `forget`, ends it.
+        """
+        self.forget(names)
+        asked = self._reach([name for name in NAMES if name not in self._slow], [])
+        if asked is not None:
+            asked.waits = True
+            asked.send(*self._requests(protocol.ForkRequest(names, incarnation, kind)))
+            self._ready[names] = incarnation, asked
+
+    def is_ready(self, names: tuple[str, ...]) -> bool:
+        """Whether a process was made ready and turns, as far as is known."""
+        _, asked = self._ready.get(names, (0, None))
+        if asked is not None and not asked.turns():
+            self.forget(names)
+        return names in self._ready
+
+    def forget(self, names: tuple[str, ...]) -> None:
+        """End the process that was made ready, if there is one."""
+        _, asked = self._ready.pop(names, (0, None))
+        if asked is not None:
+            asked.dismiss()
+
     def turns(self, name: str) -> bool:
         """Whether a spawner answers; one that does not is asked once, however often this is."""
         asked, wait_s = self._pings.pop(name, None), 0.0
@@ -217,7 +281,8 @@ class SpawnerClient:
     def adapt(self, adapted: AdaptedSystem) -> None:
         """Have the spawners fork by a changed system from now on, those still to come included."""
         self._adapt = protocol.Adapt(adapted)
-
+        for names in list(self._ready):  # they know the system as it was
+            self.forget(names)
         for name in NAMES:
             asked = self._reach([name], [])
             if asked is not None:  # one that does not answer now reads it first when it turns
@@ -229,8 +294,31 @@ class SpawnerClient:
             asked.withdraw()
         for asked in self._pings.values():
             asked.close()
+        for names in list(self._ready):
+            self.forget(names)
         self._forks.clear()
         self._pings.clear()
+
+    def _requests(self, request: Request) -> list[Request]:
+        # A spawner may have loaded the file as it was.
+        return [request] if self._adapt is None else [self._adapt, request]
+
+    def _promoted(self, names: tuple[str, ...], incarnation: int) -> int:
+        """Make the process that is ready the node and return its pid; 0 if there is none."""
+        of, asked = self._ready.pop(names, (0, None))
+        if asked is None:
+            return 0
+        if of == incarnation:
+            asked.waits = False
+            asked.send(protocol.Go())
+            reply = asked.reply(_GO_S)
+            if reply is None and asked.may_turn:
+                reply = asked.reply(WAIT_S)
+            reply = reply or asked.withdraw()
+            if child := self._child(reply, names, incarnation):
+                return child
+        asked.dismiss()
+        return 0
 
     def _resumed(self, names: tuple[str, ...], incarnation: int) -> _Asked | None:
         before, asked = self._forks.pop(names, (incarnation, None))

@@ -64,6 +64,9 @@ _SEARCH_S = 0.05
 _GONE_S = 0.002
 """Wall seconds between two looks whether a process that was killed is gone."""
 
+_WANTED_S = 1.0
+"""Wall seconds that a process which was made ready waits for the decision that it is wanted."""
+
 _RETRY_S = 0.05
 _ASK_AGAIN_S = 0.01
 
@@ -236,15 +239,38 @@ class Supervisor(Actor):
 
     @every(0.5)
     def repeat(self) -> None:
-        """Repeat the node table for those who joined late."""
+        """Repeat the node table for those who joined late, and see to the spares."""
         self._publish_table()
+        self._look_at_spares()
 
     def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
         if process.pid == pid:  # else it was replaced while the news waited in the mailbox
             process.let_go()
             for name in process.names:
                 self._bus.gone(name, process.incarnation)
+            if not self._owns(process):
+                self._prepare(process)
             self._on(process, Event.ENDED, detail=detail)
+
+    def _prepare(self, process: HeldProcess) -> None:
+        """Have the next process made ready while it is decided whether there is to be one."""
+        if self._layout.spare_of(process.names) == "none" or self._machine.is_ready(process.names):
+            return
+        incarnation = process.highest + 1
+        self._machine.prepare(process.names, incarnation, "warm")
+
+        def forget() -> None:
+            if process.highest < incarnation:
+                self._machine.forget(process.names)
+
+        self.call_later(_WANTED_S * self.clock.rate, forget)
+
+    def _look_at_spares(self) -> None:
+        """Have hot spares made, and those replaced that are gone or hang, not too often."""
+        for process in self._processes.values():
+            if (process.state is State.RUNNING and self._layout.spare_of(process.names) == "hot"
+                    and not self._machine.is_ready(process.names)):
+                self._machine.prepare(process.names, process.highest + 1, "hot")
 
     def _owns(self, process: HeldProcess) -> bool:
         """Whether the supervisor itself brings the process back."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -81,6 +81,9 @@ class NodeSpec(Table, frozen=True):
         actor: Its class, `module:Class`; "" of one that has a command.
         process: Name of the OS process it runs in; "" for one of its own name.
         respawn: Who brings it back: a recovery module, or "supervisor".
+        spare: What its next process is made of. "none": a new one. "warm": one that is connected
+            and waits for a role. "hot": one that hears everything in this role, in silence. "" is
+            the most that its class allows, "warm" at most.
         parameters: For the actor, or for that which stands in for the command. A value of a key
             in `_s` may name a `[timing]` value.
         command: Executable and arguments, in place of an actor.
@@ -98,6 +101,7 @@ class NodeSpec(Table, frozen=True):
     actor: OptionalClassPath = ""
     process: OptionalName = ""
     respawn: Name = "supervisor"
+    spare: Literal["", "none", "warm", "hot"] = ""
     parameters: dict[str, Any] = {}
     command: tuple[str, ...] = ()
     env: dict[str, str] = {}

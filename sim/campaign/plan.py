@@ -25,7 +25,7 @@ LASTS_S = (0.5, 15.0)
 """Random transient faults last between these."""
 
 _FLICKER_S = (0.2, 2.0)
-_DULL = ("diagnostic/", "hello/", "inject/", "manager/shadow", "manager/adaptation",
+_DULL = ("diagnostic/", "inject/", "manager/shadow", "manager/adaptation",
          "manager/system")
 
 

@@ -12,8 +12,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rampart.actors.bus.bus import Deliver, PeerChange
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Qos, Topic
 from rampart.sim.virtual.virtual_loop import VirtualLoop
+
+_ANSWER_S = 0.005
 
 Tap = Callable[[float, str, str, bytes], None]
 """Sees each message as it is sent: when by the loop's clock, source, key, payload."""
@@ -24,6 +26,10 @@ Link = Callable[[float], Sequence[float]]
 
 Route = tuple[Link | None, Deliver, Callable[[Deliver, str, bytes], None]]
 """The link to a reader, what there takes the message, and its bus's `arrive`, for other loops."""
+
+
+def _pattern(expression: str) -> re.Pattern[str]:
+    return re.compile(re.escape(expression).replace(r"\*", "[^/]+"))
 
 
 class Hub:
@@ -40,13 +46,26 @@ class Hub:
         self.alive: dict[str, set[int]] = {}
         self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
         self._routes: dict[str, dict[str, list[Route]]] = {}
+        self._buses: list[VirtualBus] = []
         self._watchers: list[tuple[str, PeerChange, VirtualBus]] = []
 
     def subscribe(self, expression: str, deliver: Deliver, bus: VirtualBus) -> None:
         """Have messages on keys that match delivered to a bus."""
-        pattern = re.compile(re.escape(expression).replace(r"\*", "[^/]+"))
-        self._subscriptions.append((pattern, deliver, bus))
+        self._subscriptions.append((_pattern(expression), deliver, bus))
         self._forget_routes()
+
+    def add(self, bus: VirtualBus) -> None:
+        """Know a bus that has been opened."""
+        self._buses.append(bus)
+
+    def latest(self, expression: str, deliver: Deliver, reader: VirtualBus) -> None:
+        """Send a bus the newest message of each other one on each key that matches."""
+        pattern = _pattern(expression)
+        for bus in self._buses:
+            if bus is not reader:
+                route = self._link(bus.node, reader.node), deliver, reader.arrive
+                for key in filter(pattern.fullmatch, bus.latest_sent):
+                    bus.send([route], key, bus.latest_sent[key])
 
     def watch(self, node: str, changed: PeerChange, bus: VirtualBus) -> None:
         """Have the coming and going of a node told to a bus."""
@@ -54,6 +73,7 @@ class Hub:
 
     def remove(self, bus: VirtualBus) -> None:
         """Forget a bus."""
+        self._buses = [b for b in self._buses if b is not bus]
         self._subscriptions = [s for s in self._subscriptions if s[2] is not bus]
         self._watchers = [w for w in self._watchers if w[2] is not bus]
         self._forget_routes()
@@ -86,12 +106,17 @@ class Hub:
 
 
 class VirtualBus:
-    """One node's access to a `Hub`."""
+    """One node's access to a `Hub`.
+
+    Attributes:
+        latest_sent: By key, except commands.
+    """
 
     bursts = False
 
     def __init__(self, hub: Hub, node: str, incarnation: int = 1) -> None:
         self.node = node
+        self.latest_sent: dict[str, bytes] = {}
         self._hub = hub
         self._routes = hub.routes_from(node)
         self._incarnation = incarnation
@@ -100,11 +125,17 @@ class VirtualBus:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._virtual: VirtualLoop | None = None
 
-    async def open(self) -> None:
+    async def open(self, *, announce: bool = True) -> None:
         """Join the hub."""
+        self._hub.add(self)
         self._loop = loop = asyncio.get_running_loop()
         self._virtual = loop if isinstance(loop, VirtualLoop) else None
         self._open = True
+        if announce:
+            self.announce()
+
+    def announce(self) -> None:
+        """Tell those who watch this node that it is there."""
         self._hub.announce(self.node, self._incarnation, alive=True)
 
     @property
@@ -116,7 +147,7 @@ class VirtualBus:
         """Run a call on the event loop after the present one, if this bus is open then."""
         asyncio.get_running_loop().call_soon(lambda: call() if self._open else None)
 
-    def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:  # noqa: ARG002
+    def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Send to all present subscribers of the key."""
         loop, virtual, hub = self._loop, self._virtual, self._hub
         if not self._open or loop is None:
@@ -125,8 +156,16 @@ class VirtualBus:
         for tap in hub.taps:
             tap(now_s, self.node, key, payload)
         routes = self._routes.get(key)
-        if routes is None:
-            routes = hub.route(self.node, key)
+        self.send(hub.route(self.node, key) if routes is None else routes, key, payload)
+        if topic.qos is not Qos.COMMAND:
+            self.latest_sent[key] = payload
+
+    def send(self, routes: Sequence[Route], key: str, payload: bytes) -> None:
+        """Send a message by some routes only, and past the taps."""
+        loop, virtual = self._loop, self._virtual
+        if loop is None:
+            return
+        now_s = loop.time() if virtual is None else virtual.now_s
         for link, deliver, arrive in routes:
             if virtual is None:
                 loop.call_soon(arrive, deliver, key, payload)
@@ -153,6 +192,17 @@ class VirtualBus:
         """Have `deliver` called for each message on keys that match; no other bus may have it."""
         self._readers.append(deliver)
         self._hub.subscribe(key_expression, deliver, self)
+
+    def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
+        """Have `deliver` called with the newest message of each node that is there.
+
+        The question takes no time, an answer as long as any message; that there will be no more is
+        known after `_ANSWER_S`.
+        """
+        self._readers.append(deliver)
+        self._hub.latest(key_expression, deliver, self)
+        loop = asyncio.get_running_loop()
+        loop.call_later(_ANSWER_S, lambda: answered() if self._open else None)
 
     def watch(self, node: str, changed: PeerChange) -> None:
         """Have `changed` called now if the node is there, and whenever it appears or vanishes."""

@@ -53,7 +53,7 @@ def test_the_environment_names_the_run(capsys, monkeypatch):
 
 def test_a_name_among_many_is_answered_by_the_nearest_three(capsys):
     assert refused(capsys, "topic", "info", "control/comand", "--system", "osmosis") == (
-        "rampart: unknown topic 'control/comand'; the nearest of 50: control/command, "
+        "rampart: unknown topic 'control/comand'; the nearest of 49: control/command, "
         "control/standby_command, control/status\n")
     assert str(output.unknown("topic", "?", map(str, range(20)))) == (
         "unknown topic '?'; none of 20 is like it")
@@ -103,7 +103,7 @@ def story(*events: tuple[float, str], end_s: float) -> tuple[str, ...]:
         recorder.feed(ftm_topics.PROCESS_EVENT,
                       ProcessEvent("pump", what, 1, number // 2 + 1, "supervisor", ""),
                       Header("supervisor", 1, number, at_s))
-    recorder.feed(bus_topics.HELLO, None, Header("pump", 1, 1, 0.0))
+    recorder.feed(bus_topics.HEARTBEAT, None, Header("pump", 1, 1, 0.0))
     return recorder.record(end_s).failing
 
 

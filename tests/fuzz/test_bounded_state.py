@@ -277,8 +277,8 @@ def test_a_node_with_too_much_to_report_says_how_much_it_left_out():
 def test_a_crowd_of_sources_is_reported_once_a_second():
     def crowd(_actor, stranger):
         for number in range(2 * STRANGERS):
-            stranger.publish(bus_topics.HELLO, bus_topics.HELLO.at("x"),
-                             encode(Header(f"s{number}", 1, 1, 0.0), bm.Hello()))
+            stranger.publish(bus_topics.INJECT, bus_topics.INJECT.at(),
+                             encode(Header(f"s{number}", 1, 1, 0.0), order(number)))
 
     reports = during(Quiet, crowd)
     assert [(report["context"], report["count"]) for report in reports] == [("many sources", 1)]

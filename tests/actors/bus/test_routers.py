@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import socket
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import pairwise
@@ -227,3 +228,81 @@ async def test_an_actor_that_shares_a_bus_waits_until_that_is_open(routers, sock
     async with client(sockets) as writer:
         await send_until(writer, lambda: heard)
     await bus.close()
+
+
+def be_writer(folder: str, ready) -> None:
+    """Say one thing, and then hang."""
+
+    async def main() -> None:
+        async with client(folder, "hung") as bus:
+            bus.publish(topics.GOAL, topics.GOAL.at(), b"of one that hangs")
+            await asyncio.sleep(0.2)
+            ready.set()
+            time.sleep(1000)
+
+    asyncio.run(main())
+
+
+def ask(bus: ZenohBus) -> list[bytes]:
+    answers: list[bytes] = []
+    bus.latest(topics.GOAL.at(), lambda _key, payload: answers.append(payload), lambda: None)
+    return answers
+
+
+async def test_who_hangs_tells_what_it_said_last_and_who_is_stopped_is_not_waited_for(
+        routers, sockets):
+    await routers.start(*ROUTERS)
+    ready = FORKS.Event()
+    hung = FORKS.Process(target=be_writer, args=(sockets, ready), daemon=True)
+    hung.start()
+    assert await asyncio.to_thread(ready.wait, 20)
+    try:
+        async with client(sockets, "node") as writer, client(sockets) as reader:
+            writer.publish(topics.GOAL, topics.GOAL.at(), b"of one that works")
+            await asyncio.sleep(0.2)  # until the router knows that it can be asked
+            answers = ask(reader)
+            await eventually(lambda: set(answers) == {b"of one that hangs", b"of one that works"})
+            os.kill(hung.pid, signal.SIGSTOP)
+            later = ask(reader)
+            await eventually(lambda: later == [b"of one that works"], 0.5)
+    finally:
+        hung.kill()
+        hung.join()
+    async with client(sockets) as reader:
+        last = ask(reader)
+        await asyncio.sleep(0.2)
+        assert last == []
+
+
+async def test_a_newcomer_is_answered_after_all_routers_were_replaced(routers, sockets):
+    await routers.start(*ROUTERS)
+    async with client(sockets, "node") as writer:
+        writer.publish(topics.GOAL, topics.GOAL.at(), b"long ago")
+        for name in ROUTERS:
+            routers.send(name, signal.SIGKILL)
+            await asyncio.sleep(0.1)
+            await routers.start(name)
+        async with client(sockets) as reader:
+            answers: list[bytes] = []
+
+            def asked() -> bool:
+                reader.latest(topics.GOAL.at(),
+                              lambda _key, payload: answers.append(payload), lambda: None)
+                return bool(answers)
+
+            await eventually(asked, 5)
+            assert set(answers) == {b"long ago"}
+            assert ask(writer) == [], "nobody asks itself"
+
+
+async def test_a_flood_of_questions_is_answered_in_part(routers, sockets):
+    await routers.start("router_a")
+    async with client(sockets, "node") as writer, client(sockets) as reader:
+        writer.publish(topics.GOAL, topics.GOAL.at(), b"x")
+        await asyncio.sleep(0.2)
+        answers: list[bytes] = []
+        for _ in range(3 * zenoh_bus._ANSWERS_PER_S):
+            reader.latest(topics.GOAL.at(),
+                          lambda _key, payload: answers.append(payload), lambda: None)
+        await asyncio.sleep(0.5)
+        assert 0 < len(answers) <= 2 * zenoh_bus._ANSWERS_PER_S

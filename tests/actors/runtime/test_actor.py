@@ -287,6 +287,52 @@ async def test_a_newcomer_hears_the_states_of_its_partners_at_once(make_bus):
             assert newcomer.heard[0][1].stamp == 0.125
 
 
+class Former(Talker):
+    """Has said everything long before anybody came."""
+
+    outputs = (topics.POSE, topics.GOAL, ftm_topics.RESET)
+
+
+class Newcomer(Listener):
+    @on(topics.GOAL)
+    def goal(self, message: m.GoalOrder, header: Header) -> None:
+        self.heard.append((message, header))
+
+
+@pytest.mark.parametrize(("age_s", "number"), [(0.1, 2), (0.5, 1)])
+async def test_what_a_newcomer_hears_of_before_is_each_topics_last_if_that_is_no_silence(
+        make_bus, age_s, number):
+    order = m.GoalOrder("m1", 0, m.Goal(1.0, 2.0, m.Mode.TAXI), True)
+    async with running(Former, "talker", make_bus) as former:
+        now_s = former.clock.now()
+        former.publish(topics.GOAL, order, stamp=now_s - 100.0)
+        former.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0), stamp=now_s - age_s - 0.01)
+        former.publish(topics.POSE, m.Pose(2.0, 0.0, 0.0), stamp=now_s - age_s)
+        former.publish(ftm_topics.RESET, fm.Reset("RM1", "you"))
+        async with running(Newcomer, "listener", make_bus) as newcomer:
+            await eventually(lambda: len(newcomer.heard) >= number)
+            former.publish(ftm_topics.RESET, fm.Reset("RM2", "you"))
+            await eventually(lambda: len(newcomer.heard) > number)
+            said = [body for body, _ in newcomer.heard]
+            assert order in said
+            assert [body for body in said if isinstance(body, m.Pose)] == [
+                m.Pose(2.0, 0.0, 0.0)][:number - 1]
+            assert said[-1] == fm.Reset("RM2", "you"), "a command is given once, to those present"
+
+
+async def test_a_newcomer_hears_nothing_twice_and_nothing_of_the_dead(make_bus):
+    async with running(Talker, "talker", make_bus) as dead:
+        dead.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0))
+    async with (running(Talker, "talker", make_bus) as talker,
+                running(Listener, "listener", make_bus) as listener):
+        await eventually(lambda: bool(listener.peers))
+        for x in (2.0, 3.0, 4.0):
+            talker.publish(topics.POSE, m.Pose(x, 0.0, 0.0))
+            await asyncio.sleep(0.02)
+        await eventually(lambda: len(listener.heard) == 3)
+        assert [body.x_m for body, _ in listener.heard] == [2.0, 3.0, 4.0]
+
+
 async def test_what_a_node_has_no_use_for_in_this_life_does_not_reach_it(make_bus):
     class Deaf(Listener):
         def listens(self, topic) -> bool:

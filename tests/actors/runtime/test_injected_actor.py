@@ -172,7 +172,7 @@ def test_a_permanent_fault_dies_with_its_process():
         await scene.system.kill("talker")
         scene.system.start("talker", Talker)
         await wait(0.55)
-        assert scene.listener.poses == [1.0, 2.0, 3.0, 4.0, 5.0]
+        assert scene.listener.poses == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
 
     play(scenario)
 

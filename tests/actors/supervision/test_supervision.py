@@ -504,7 +504,8 @@ def test_what_fails_before_the_actors_of_a_process_start_is_told(tmp_path, monke
     monkeypatch.setattr(node_process, "set_title", broken)
     plan = stub_plan(write_stub_system(tmp_path))
     layout = Layout(plan, load_system(plan))
-    assert node_process.node_main(layout, ("supervisor",), 3, {}, -1) == node_process.EXIT_FAILED
+    role = node_process.Role(("supervisor",), 3)
+    assert node_process.node_main(layout, role, {}, -1) == node_process.EXIT_FAILED
     assert "supervisor #3 failed: RuntimeError: no title today" in capfd.readouterr().err
 
 

@@ -8,6 +8,7 @@ import errno
 import os
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from dataclasses import replace
 
 import msgspec
 import pytest
@@ -89,10 +90,22 @@ class Machine:
         self.starves_from_s = 0.0
         self.questions = 0
         self.searches = 0
+        self.ready: dict[str, tuple[int, str]] = {}
+        self.prepared: list[tuple[str, int, str]] = []
 
     def usage(self, process: Process) -> Usage:
         return Usage("S", 0.0, max(0.0, asyncio.get_running_loop().time() - self.starves_from_s)
                      if process.names[0] in self.starving else 0.0)
+
+    def prepare(self, names: tuple[str, ...], incarnation: int, kind: str) -> None:
+        self.ready[names[0]] = incarnation, kind
+        self.prepared.append((names[0], incarnation, kind))
+
+    def is_ready(self, names: tuple[str, ...]) -> bool:
+        return names[0] in self.ready
+
+    def forget(self, names: tuple[str, ...]) -> None:
+        self.ready.pop(names[0], None)
 
     def add(self, names: tuple[str, ...], incarnation: int, *, bound: bool = False) -> Process:
         self.issued |= dict.fromkeys(names, incarnation)
@@ -128,6 +141,7 @@ class Machine:
         if self.fork_error:
             raise self.fork_error
         self.forks.append((names[0], incarnation))
+        self.ready.pop(names[0], None)
         return self.add(names, incarnation).pid
 
     def hold(self, pid: int, ended: Callable[[], None]) -> Handle:
@@ -626,5 +640,47 @@ def test_of_two_lives_of_one_node_a_new_supervisor_adopts_the_higher_and_ends_th
             higher = max(two, key=lambda p: p.incarnation)
             assert world.row("DM2") == ("running", 7, higher.pid)
             assert world.machine.of("DM2") == [higher]
+
+    run(scenario)
+
+
+def test_a_process_is_made_ready_while_its_module_decides_and_forgotten_if_it_is_not_wanted():
+    async def scenario() -> None:
+        async with running() as world:
+            machine = world.machine
+            world.kill("DM1")  # the supervisor's own to bring back: nothing is to be waited for
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
+            assert machine.prepared == []
+            world.kill("osmosis_control")
+            await eventually(lambda: machine.prepared == [("osmosis_control", 2, "warm")])
+            await asyncio.sleep(0.5)
+            assert machine.ready
+            await asyncio.sleep(0.6)
+            assert machine.ready == {}
+            world.respawn("osmosis_control", 1)
+            await eventually(lambda: world.row("osmosis_control")[:2] == ("running", 2))
+            world.kill("osmosis_control")
+            await asyncio.sleep(0.1)
+            world.respawn("osmosis_control", 2)
+            await eventually(lambda: world.row("osmosis_control")[:2] == ("running", 3))
+            await asyncio.sleep(1.5)
+            assert machine.prepared[1:] == [("osmosis_control", 3, "warm")]
+
+    run(scenario)
+
+
+def test_a_hot_spare_is_there_before_anything_happens_and_replaced_when_it_is_gone():
+    async def scenario() -> None:
+        async with running() as world:
+            machine = world.machine
+            members = world.supervisor._layout.members
+            members["DM1"] = replace(members["DM1"], spare="hot")
+            await eventually(lambda: machine.ready == {"DM1": (2, "hot")}, 1.0)
+            machine.forget(("DM1",))  # it was killed, or did not answer
+            await eventually(lambda: machine.ready == {"DM1": (2, "hot")}, 1.0)
+            world.kill("DM1")
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
+            await eventually(lambda: machine.ready == {"DM1": (3, "hot")}, 1.0)
+            assert [kind for _, _, kind in machine.prepared] == 3 * ["hot"]
 
     run(scenario)
