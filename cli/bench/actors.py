@@ -67,7 +67,8 @@ class Tick(Message, frozen=True):
 
 
 INPUT = Topic("bench/input", Scan, Qos.SENSOR, INPUT_HZ, "", "What the node works on.")
-OUTPUT = Topic("bench/output", Mean, Qos.SENSOR, INPUT_HZ, "", "What the node says.")
+OUTPUT = Topic("bench/output", Mean, Qos.SENSOR, INPUT_HZ, "", "What the node says.",
+               several=True)
 PING = Topic("bench/ping", Ping, Qos.SENSOR, PING_HZ, "", "A question.")
 PONG = Topic("bench/pong", Pong, Qos.SENSOR, PING_HZ, "", "Its answer.")
 TICK = Topic("bench/tick/{name}", Tick, Qos.SENSOR, INPUT_HZ, "", "That a node is there.")

@@ -71,7 +71,7 @@ class Kill(msgspec.Struct, frozen=True):
     Attributes:
         detected: That the process is gone is told by whoever keeps it alive.
         decided: The manager of a system decides on a recovery.
-        begun: The replacement runs its first line.
+        begun: The replacement runs its first line; a hot spare has before.
         output: An independent process hears the replacement's first valid output.
     """
 

@@ -117,8 +117,12 @@ class Victim:
         except ProcessLookupError:
             raise BenchError(f"process {pid} of {self.name} has ended by itself") from None
         found = self._hear(start, BACK_S)
+        with contextlib.suppress(BenchError):  # the word of it may come after the output
+            self._teller.wait_for(lambda line: self._ended(line) or None, PAUSE_S, "", told)
         lines = self._teller.lines[told:]
         begun_s = found.body.get("begun_s") if isinstance(found.body, dict) else None
+        if begun_s is not None and begun_s < at_s:  # a hot spare
+            begun_s = None
         self.kills.append(Kill(*(None if then_s is None else round((then_s - at_s) * 1e3, 3) for
                                  then_s in (_first_s(lines, self._ended),
                                             _first_s(lines, self._decided),
@@ -140,6 +144,11 @@ def in_rounds(victims: Sequence[Victim], kills: int, show: Show,
             time.sleep(pause_s)
 
 
+def node_of(name: str) -> str:
+    """Return the node of `peers_system` that is killed for one of `OURS`."""
+    return name.removeprefix("rampart-")
+
+
 def _tells(detected: re.Pattern[str], line: Line) -> bool:
     return detected.search(line.text) is not None
 
@@ -159,7 +168,7 @@ def measure_peers(names: Sequence[str], kills: int, installed: Path, folder: Pat
     """Kill the same node under each keeper of processes.
 
     Args:
-        names: Of peers, `ACTOR` and `COMMAND`.
+        names: Of `KEEPERS`.
         kills: Of each.
         installed: Environment in which peers are installed.
         folder: For configurations and sockets.
@@ -176,7 +185,7 @@ def measure_peers(names: Sequence[str], kills: int, installed: Path, folder: Pat
 
         def victim(name: str, title: str, keeper: Program, ended: Callable[[Line], bool], *,
                    of: Program = ear, teller: Program | None = None) -> None:
-            source = "actor" if name == ACTOR else name
+            source = name if of is ear else node_of(name)
             victims[name] = Victim(
                 name, title, ear=of, keeper=keeper, teller=teller, ended=ended,
                 finds=lambda found: found.key == OUTPUT.key and found.source == source,
@@ -204,8 +213,7 @@ def measure_peers(names: Sequence[str], kills: int, installed: Path, folder: Pat
             for name in OURS:
                 if name in names:
                     victim(name, OURS[name], system.program, teller=system.ear,
-                           ended=crashed(name.removeprefix("rampart-")),
-                           of=system.ear if name == ACTOR else ear)
+                           ended=crashed(node_of(name)), of=ear if name == COMMAND else system.ear)
         for each in victims.values():
             show(f"waiting for {each.name}")
             each.wait()

@@ -16,6 +16,7 @@ from markupsafe import Markup
 from rampart.cli.bench.figures import Figures, Floor, Killed, Size, Spread
 from rampart.cli.bench.peers import ACTOR, OURS
 from rampart.cli.bench.size import TARGET as SIZE_TARGET
+from rampart.cli.bench.systems import BESIDES
 from rampart.cli.output import rendered
 from rampart.sim.runs.report import NONE
 
@@ -186,7 +187,8 @@ def _size(rows: Sequence[Size]) -> Section:
              for row in rows if row.output_ms]
     return Section(
         "size", "Cost against size",
-        "Systems of so many processes, of which all but six publish at 20 Hz and hear two others. "
+        f"Systems of so many processes, of which all but {BESIDES} publish at 20 Hz and hear two "
+        "others. "
         "From the command until all run; memory of a process at the mean (PSS: what is shared is "
         "divided; USS: its own); cores that all take at rest; SIGKILL of a node until its "
         f"replacement is heard, against the smallest (target at most {SIZE_TARGET:g}).",

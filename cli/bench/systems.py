@@ -43,13 +43,13 @@ intensity = 10000
 name = "none"
 '''
 
-BESIDES = 6
-"""Processes of a system that are none of its nodes: launcher, supervisor, two spawners, two
-routers."""
+BESIDES = 8
+"""Processes of a system that are none of its nodes: launcher, supervisor, and two each of spawners,
+routers and spares."""
 
 
 def peers_system(command: Sequence[str]) -> str:
-    """Return a system with the peers' node, as a command and as an actor."""
+    """Return a system with the peers' node: an actor, one with a hot spare, and a command."""
     return _HEAD.format(name="bench_peers", title="The peers' node") + f'''
 [[node]]
 name = "source"
@@ -60,6 +60,12 @@ kind = "non-control"
 name = "actor"
 actor = "rampart.cli.bench.actors:Worker"
 kind = "control"
+
+[[node]]
+name = "hot"
+actor = "rampart.cli.bench.actors:Worker"
+kind = "control"
+spare = "hot"
 
 [[node]]
 name = "command"
@@ -79,11 +85,12 @@ def talking_system() -> str:
 def sized_system(processes: int) -> str:
     """Return a system of so many processes, `BESIDES` included; each hears the two before it."""
     names = [f"n{i}" for i in range(processes - BESIDES)]
+    heard = [[f"bench/tick/{names[i - back]}" for back in (1, 2) if names[i - back] != name]
+             for i, name in enumerate(names)]
     return _HEAD.format(name="bench_size", title=f"{processes} processes") + "".join(
         f'\n[[node]]\nname = "{name}"\nactor = "rampart.cli.bench.actors:Ticker"\n'
-        'kind = "control"\nparameters = { hears = '
-        f'["bench/tick/{names[i - 1]}", "bench/tick/{names[i - 2]}"] }}\n'
-        for i, name in enumerate(names))
+        f'kind = "control"\nparameters = {{ hears = {json.dumps(keys)} }}\n'
+        for name, keys in zip(names, heard, strict=True))
 
 
 class System:

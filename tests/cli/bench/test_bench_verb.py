@@ -16,6 +16,7 @@ import pytest
 from rampart.actors.layout.layout import Layout
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.cli.bench.measuring import bench  # noqa: F401 imported once, before a test is timed
+from rampart.cli.bench.peers import HOT, OURS
 from rampart.cli.bench.processes.observer import Heard
 from rampart.cli.bench.restart import members_of, output_of, regular_topics, usual
 from rampart.cli.bench.systems import BESIDES, peers_system, sized_system, talking_system
@@ -27,14 +28,14 @@ from tests import CELL
 @pytest.mark.parametrize(("arguments", "told"), [
     (["--kills", "0"], "--kills 0: must be between 1 and 1000"),
     (["--peer", "docker"], "unknown peer 'docker'; known: dora, supervisord, circus, subprocess, "
-                           "rampart-actor, rampart-command"),
+                           "rampart-actor, rampart-hot, rampart-command"),
     (["--only", "floors", "--peer", "dora"], "--peer: only with the part peers; leave out --only, "
                                              "or say --only peers"),
     (["--only", "size", "--node", "x"], "--node: only with the part restart; leave out --only, or "
                                         "say --only restart"),
     (["--sizes", "10,many"], "--sizes 10,many: 'many' is no number of processes; whole numbers "
                              "with commas between are right, as 10,35,70,140"),
-    (["--sizes", "8"], "--sizes 8: must be between 9 and 500"),
+    (["--sizes", "9"], "--sizes 9: must be between 10 and 500"),
     (["--system", "nowhere.toml"], "nowhere.toml: No such file or directory; a spec is right, or "
                                    "the name of a shipped one: osmosis, paper"),
     (["--only", "restart", "--system", str(CELL), "--node", "grip"], "unknown node 'grip'; "),
@@ -52,9 +53,10 @@ def test_what_makes_no_sense_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize(("text", "nodes"), [
-    (peers_system(["/bin/true", "with \"quotes\""]), {"source", "actor", "command"}),
+    (peers_system(["/bin/true", "with \"quotes\""]), {"source", "actor", "hot", "command"}),
     (talking_system(), {"asker", "answerer"}),
-    (sized_system(9), {"n0", "n1", "n2"}),
+    (sized_system(10), {"n0", "n1"}),
+    (sized_system(11), {"n0", "n1", "n2"}),
     (sized_system(140), {f"n{i}" for i in range(140 - BESIDES)})])
 def test_the_systems_that_are_measured_are_sound(tmp_path, text, nodes):
     file = tmp_path / "system.toml"
@@ -105,9 +107,9 @@ def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
     broken.chmod(0o755)
     with subprocess.Popen(command(
             "--only", "peers", "--only", "restart", "--only", "size", "--kills", "2",
-            *(word for name in ("dora", "circus", "subprocess", "rampart-actor", "rampart-command")
-              for word in ("--peer", name)), "--peers-in", str(tmp_path / "peers"),
-            "--system", str(CELL), "--node", "gripper", "--sizes", "9", "--json",
+            *(word for name in ("dora", "circus", "subprocess", *OURS) for word in ("--peer", name)),
+            "--peers-in", str(tmp_path / "peers"),
+            "--system", str(CELL), "--node", "gripper", "--sizes", "10", "--json",
             "--out", str(out)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as done:
         stdout, stderr = done.communicate(timeout=110)
     assert (done.returncode, stderr) == (1, "")  # for two of the peers there is no figure
@@ -116,19 +118,22 @@ def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
     assert peers["dora"]["note"] == "not installed: make bench-peers"
     assert peers["circus"]["note"] == ("circus has ended before an output of circus came; "
                                        "the last line of circus: no licence")
-    for name in ("subprocess", "rampart-actor", "rampart-command"):
+    for name in ("subprocess", *OURS):
         row = peers[name]
         assert (row["note"], row["output_ms"]["n"]) == ("", 2)
         for kill in row["kills"]:
-            assert 0 < kill["detected"] < kill["output"]
-            assert 0 < kill["begun"] < kill["output"]
+            assert min(kill["detected"], kill["output"]) > 0
+            if name == HOT:
+                assert kill["begun"] is None
+            else:
+                assert 0 < kill["begun"] < kill["output"]
     assert peers["rampart-actor"]["times"]["median"] == 1
     [gripper] = found["restart"]
     assert (gripper["title"], len(gripper["kills"])) == ("heartbeat/gripper", 2)
-    [nine] = found["size"]
-    assert (nine["processes"], nine["note"], len(nine["samples_ms"])) == (9, "", 2)
-    assert 0 < nine["uss_mb"] < nine["total_mb"]
-    assert min(nine["start_s"], nine["cores"]) > 0
+    [ten] = found["size"]
+    assert (ten["processes"], ten["note"], len(ten["samples_ms"])) == (10, "", 2)
+    assert 0 < ten["uss_mb"] < ten["total_mb"]
+    assert min(ten["start_s"], ten["cores"]) > 0
     assert json.loads((out / "bench.json").read_text()) == found
     assert {file.name for file in out.iterdir()} == {
         "bench.html", "bench.json", "peers.svg", "restart.svg", "size.svg"}
@@ -140,7 +145,7 @@ def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
 def test_a_benchmark_that_is_interrupted_leaves_nothing(tmp_path, number):
     with subprocess.Popen(
             ["env", "--default-signal=HUP,INT", *command(
-                "--only", "size", "--sizes", "9", "--out", str(tmp_path))],
+                "--only", "size", "--sizes", "10", "--out", str(tmp_path))],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as done:
         wait_until(lambda: len(left_of(done.pid)) > 1, 30)
         os.kill(done.pid, number)
