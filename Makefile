@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow lint campaign bench bench-respawn chaos chaos-pairs fuzz setup clean requirements
+.PHONY: run test test-slow lint campaign bench bench-peers chaos chaos-pairs fuzz setup clean requirements
 
 run: setup
 	$(BIN)/python launch.py
@@ -33,9 +33,15 @@ campaign: setup
 	$(BIN)/rampart campaign --paper
 	$(BIN)/rampart campaign --paper --full
 
-# Kills each node 20 times during a mission and measures detection and recovery; five minutes.
-bench-respawn: setup
-	$(BIN)/python -m benchmarks.respawn
+# Kills the same node under dora-rs, supervisord, circus, a loop and Rampart; two minutes. The peers
+# are installed into an environment of their own. BENCH="--kills 30" says more.
+bench-peers: setup .venv-peers/installed
+	$(BIN)/rampart bench --only peers $(BENCH)
+
+.venv-peers/installed: benchmarks/peers.txt
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
 
 # Hits every process of the full system in every way, then 200 deaths in ten minutes with a count
 # of what leaks; half an hour. First the same for control nodes over many seeds in virtual time.
@@ -73,4 +79,4 @@ requirements: setup
 		--no-annotate --extra dev --output-file requirements.txt pyproject.toml
 
 clean:
-	rm -rf .venv build dist reports *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-peers build dist reports *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -19,6 +19,7 @@ Examples:
   rampart tree                                   see fault tree, FTMTree and orders
   rampart campaign --paper                       break it a hundred times, and count
   rampart verify                                 prove it, or show where it fails
+  rampart bench                                  how fast is it, beside its peers?
 `rampart VERB --help` shows more.
 """
 
@@ -37,6 +38,7 @@ from rampart.cli.analyse import (
     tree_verbs,
     verify_verb,
 )
+from rampart.cli.bench import verb as bench_verb
 from rampart.cli.look import serving_verbs, topic_verbs
 from rampart.cli.operate import adapt_verb, inject_verbs, node_verbs, operator_verbs
 from rampart.cli.output import NoEffectError, UsageError, warn
@@ -65,6 +67,7 @@ def build_parser() -> argparse.ArgumentParser:
     verbs.add_parser("campaign", add_help=False, help="run many missions with faults in them")
     for module in _OF_A_SYSTEM:
         module.add(verbs)
+    bench_verb.add(verbs)
     common = argparse.ArgumentParser(add_help=False)
     PORT(common)
     for found in sorted(entry_points(group="rampart.verbs"), key=lambda verb: verb.name):

@@ -27,8 +27,8 @@ ROOMS = (
     "actors.detection", "actors.recovery", "actors.foreign", "actors.layout", "manager.actor",
     "actors.supervision", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
-    "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.run", "cli.new",
-    "cli.main",
+    "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.bench",
+    "cli.run", "cli.new", "cli.main",
     "testing",
 )
 """The rooms of the engine, from the bottom to the top: each may import those before it."""
