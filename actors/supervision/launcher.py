@@ -145,7 +145,8 @@ class Launcher:
     def _fork(self, name: str) -> BinaryIO:
         """Fork a spawner, and return what it says when it can fork nodes."""
         output, said = os.pipe()
-        gc.collect()  # here, where the pages are: the fork's own would copy them
+        gc.collect()
+        gc.freeze()  # keeps both collectors from touching, and so copying, the shared pages
         if os.fork():
             os.close(said)
             return os.fdopen(output, "rb")
