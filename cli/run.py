@@ -92,10 +92,14 @@ class Run:
         with _kept(self._directory):
             if self._options.virtual:
                 return self._in_virtual_time()
-            return asyncio.run(self._on_processes())
+            run = ProcessRun(self._trial, self._scenario)
+            run.begin()
+            try:
+                return asyncio.run(self._on_processes(run))
+            finally:
+                run.launcher.abort()
 
-    async def _on_processes(self) -> int:
-        run = ProcessRun(self._trial, self._scenario)
+    async def _on_processes(self, run: ProcessRun) -> int:
         with _recorded(self._options):
             _interruptible(run)
             return self._conclude(await run.run(), run.failure)

@@ -71,6 +71,9 @@ class Bus(Protocol):
     def gone(self, node: str, incarnation: int) -> None:
         """Tell those who watch a node that a process of it has ended, before they see it."""
 
+    def after_burst(self, call: Callable[[], None]) -> None:
+        """Have `call` made when what has arrived together was delivered; soon if nothing has."""
+
     async def close(self) -> None:
         """Leave the bus. Closing twice is harmless."""
 
@@ -133,6 +136,10 @@ class SharedBus:
     def gone(self, node: str, incarnation: int) -> None:
         """Tell it over the owner's session."""
         self._owner.gone(node, incarnation)
+
+    def after_burst(self, call: Callable[[], None]) -> None:
+        """Have it made after what has arrived in the owner's session."""
+        self._owner.after_burst(call)
 
     async def close(self) -> None:
         """Hear and say nothing more; the session stays open."""

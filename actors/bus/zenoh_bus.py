@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import socket
 import time
 from collections import deque
@@ -57,6 +58,15 @@ _ANSWERS_PER_S = 500
 
 _ANSWER_S = 1.0
 """Real seconds that the newest message of a topic is waited for; nothing else waits meanwhile."""
+
+_RUNTIME = "ZENOH_RUNTIME"
+_THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "
+            "acc: (handover: app), net: (handover: app))")
+"""Of Zenoh in a client: one that reads and one that writes. By default a thread that waits for
+sockets wakes one of two others for each message that has come, which reads it. Reading and writing
+on one thread is no choice: they wait for each other, and no link comes to be. Routers keep a thread
+for each task: many links come and go there, and Zenoh holds locks while it waits for other tasks.
+"""
 
 _REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
 _LOOK_S = 0.002
@@ -129,6 +139,30 @@ def _answering(where: Sequence[str]) -> list[str]:
     return [one for _, one in sorted(found)]
 
 
+def _open_client(dial: Sequence[str]) -> zenoh.Session:
+    if _RUNTIME in os.environ:
+        return zenoh.open(session_config(None, dial))
+    os.environ[_RUNTIME] = _THREADS  # read when a process opens its first session
+    try:
+        return zenoh.open(session_config(None, dial))
+    finally:
+        del os.environ[_RUNTIME]  # commands that this process starts have their own
+
+
+class _Bell:
+    """What a Zenoh thread rings; closed with the last one that could, so never while one does.
+
+    Attributes:
+        number: of its descriptor.
+    """
+
+    def __init__(self) -> None:
+        self.number = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+
+    def __del__(self) -> None:
+        os.close(self.number)
+
+
 class ZenohBus:
     """One actor's Zenoh session.
 
@@ -153,6 +187,8 @@ class ZenohBus:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._arrived: deque[Callable[[], None]] = deque()
         self._woken = False
+        self._bell = _Bell()
+        self._after_burst: list[Callable[[], None]] | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._latest: dict[str, bytes] = {}
         self._answers = RateLimit(_ANSWERS_PER_S)
@@ -185,6 +221,7 @@ class ZenohBus:
             raise BusError(f"{self._listen} is in use by another process {node}"
                            if "acquire lock" in text
                            else f"cannot open {self._listen} {node}: {text}") from None
+        self._loop.add_reader(self._bell.number, self._drain)
 
     def announce(self) -> None:
         """Tell those who watch this node that it is there."""
@@ -200,7 +237,7 @@ class ZenohBus:
             try:
                 if found:
                     both = [*found, *(one for one in self._dial if one not in found)]
-                    return zenoh.open(session_config(None, both))
+                    return _open_client(both)
             except zenoh.ZError:  # it ended in this moment
                 pass
             if loop.time() > until_s:
@@ -319,6 +356,7 @@ class ZenohBus:
             self._recorder.close()
         if session is not None:
             await asyncio.to_thread(session.close)
+            asyncio.get_running_loop().remove_reader(self._bell.number)
 
     def _require(self) -> zenoh.Session:
         if self._session is None:
@@ -326,20 +364,35 @@ class ZenohBus:
         return self._session
 
     def _hand_over(self, call: Callable[[], None]) -> None:
+        if self._session is None:  # the actor is gone, so is its mail
+            return
         self._arrived.append(call)
-        if not self._woken and self._loop is not None:
+        if not self._woken:
             self._woken = True  # a race here costs one extra wake-up, never a message
-            try:
-                self._loop.call_soon_threadsafe(self._drain)
-            except RuntimeError:  # the loop has closed: the actor is gone, so is its mail
-                self._arrived.clear()
+            os.eventfd_write(self._bell.number, 1)  # costs less than `call_soon_threadsafe`
 
     def _drain(self) -> None:
-        self._woken = False
+        os.eventfd_read(self._bell.number)
+        self._woken = False  # after the reading: who finds it set still rings, or is drained below
+        after: list[Callable[[], None]] = []
+        self._after_burst = after
         while self._session is not None and self._arrived:
-            try:
-                self._arrived.popleft()()
-            except Exception as error:  # what else has arrived is not to wait for the next message
-                asyncio.get_running_loop().call_exception_handler({
-                    "message": f"{self._node or 'tool'}: a message could not be handed over",
-                    "exception": error})
+            self._try(self._arrived.popleft())
+        self._after_burst = None
+        for call in after:
+            self._try(call)
+
+    def _try(self, call: Callable[[], None]) -> None:
+        try:
+            call()
+        except Exception as error:  # what else has arrived is not to wait for the next message
+            asyncio.get_running_loop().call_exception_handler({
+                "message": f"{self._node or 'tool'}: a message could not be handed over",
+                "exception": error})
+
+    def after_burst(self, call: Callable[[], None]) -> None:
+        """Have `call` made when all that has arrived was delivered; soon if nothing has."""
+        if self._after_burst is not None:
+            self._after_burst.append(call)
+        else:
+            asyncio.get_running_loop().call_soon(call)

@@ -84,7 +84,8 @@ class Actor(Declared):
         self._keeper = Keeper(
             context.checkpoints, lambda line: self.report_diagnostic("checkpoint", line, self.name),
             context.clock.now, expected=context.incarnation > 1)
-        self._dispatcher = Dispatcher(context.bus.bursts, self._overflowed)
+        self._dispatcher = Dispatcher(
+            context.bus.bursts, self._overflowed, after_burst=context.bus.after_burst)
         self._timers = Timers(context.clock, self._dispatcher)
         self._waits = context.waits
         self._unsent: Remembered[tuple[str, int], tuple[Topic[Any], bytes]] = Remembered(_UNSENT)

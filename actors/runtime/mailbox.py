@@ -43,6 +43,7 @@ class Dispatcher:
     Args:
         bursts: Whether messages arrive in bursts, see `Bus`.
         on_overflow: Called with a message that is refused because too many wait.
+        after_burst: See `Bus`.
         capacity: Commands that may wait.
         slots: Keys of which a message may wait.
 
@@ -54,6 +55,7 @@ class Dispatcher:
     """
 
     def __init__(self, bursts: bool, on_overflow: Callable[[Any], None], *,
+                 after_burst: Callable[[Callable[[], None]], None] = lambda call: call(),
                  capacity: int = COMMAND_CAPACITY, slots: int = MESSAGE_SLOTS) -> None:
         self.stance = AWAKE
         self.progress = 0
@@ -66,6 +68,7 @@ class Dispatcher:
         self._latest: dict[str, Any] = {}
         self._commands = 0
         self._bursts = bursts
+        self._after_burst = after_burst
         self._held = False
         self._pace_s = 0.0
         self._at_rest = RESTING if bursts else IDLE
@@ -78,10 +81,10 @@ class Dispatcher:
 
     def put(self, slot: str, item: Callable[[], None]) -> None:
         """Handle an item of the actor's own; one that waits is replaced by the next of its slot."""
-        if self.stance == IDLE:
-            self.work(item)
-        else:
+        if self.stance == AWAKE or self._held:
             self._put_latest(slot, item)
+        else:
+            self.work(item)
 
     def put_message(self, slot: str | None, item: Any, *, reserved: bool = True) -> bool:
         """Have a message handled; False if too many others wait.
@@ -157,7 +160,7 @@ class Dispatcher:
         if self.stance != AWAKE and self._ended is not None:
             self.stance = AWAKE
             if self._bursts:
-                self._ended.get_loop().call_soon(self.work)
+                self._after_burst(self.work)
             else:
                 self.work()
 

@@ -18,7 +18,7 @@ from rampart.actors.bus.run_folder import issued
 from rampart.actors.bus.zenoh_bus import ROUTERS
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.supervision.patience import Patience, usage
-from rampart.actors.supervision.process_title import RunProcess, find_processes, kill
+from rampart.actors.supervision.process_title import RunProcess, find_process, find_processes, kill
 from rampart.actors.supervision.processes import OsHandle
 from rampart.actors.supervision.spawner import NAMES
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
@@ -37,6 +37,7 @@ LOAD_PATIENCE_S = 20.0
 
 _ASK_AGAIN_S = 0.01
 _SPAWNERS = {f"spawner_{name}": name for name in NAMES}
+_GUARDED = {SUPERVISOR, *ROUTERS, *_SPAWNERS}
 
 
 class Guard:
@@ -71,6 +72,7 @@ class Guard:
         self._hung: set[str] = set()
         self._supervisor_due_s: float | None = None
         self._no_routers = False
+        self._found: dict[str, RunProcess] = {}
         self._trouble = ""
 
     async def start_supervisor(self, within_s: float = PERIOD_S) -> None:
@@ -117,10 +119,7 @@ class Guard:
 
     async def look_after(self) -> bool:
         """Bring back whichever guard is missing; False if that was not possible."""
-        living: dict[str, RunProcess] = {}
-        for process in find_processes(self._plan.base_port, self._plan.launcher_pid):
-            for name in process.names:  # a child bears its spawner's name for a moment
-                living.setdefault(name, process)
+        living = self._living()
         all_there = True
         turning = {name: self._spawners.turns(short) for name, short in _SPAWNERS.items()}
         for name, turns in turning.items():
@@ -167,6 +166,23 @@ class Guard:
                 self._loaded.kill()
 
     # -- inside ---------------------------------------------------------------------------------
+
+    def _living(self) -> dict[str, RunProcess]:
+        """Return the processes that matter here, by name: where they were last, if all are."""
+        # Four times a second: to read all of /proc took half of the launcher's processor time.
+        living = {}
+        for name, before in self._found.items():
+            process = find_process(before.pid)
+            if process == before:
+                living[name] = process
+        if len(living) < len(_GUARDED):
+            living = {}
+            for process in find_processes(self._plan.base_port, self._plan.launcher_pid):
+                for name in process.names:  # a child bears its spawner's name for a moment
+                    if name in _GUARDED:
+                        living.setdefault(name, process)
+            self._found = living
+        return living
 
     def _is_hung(self, name: str, pid: int) -> bool:
         limit_s = (SUPERVISOR_PATIENCE_S / min(1.0, self._plan.rate) if name == SUPERVISOR

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ctypes
+import gc
 import os
 import resource
 import signal
@@ -18,6 +19,8 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
+from typing import BinaryIO
 
 import msgspec
 
@@ -28,8 +31,8 @@ from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.supervision.guard import Guard
-from rampart.actors.supervision.process_title import end_commands, kill, kill_leftovers
-from rampart.actors.supervision.spawner import NAMES, Loaded
+from rampart.actors.supervision.process_title import end_commands, kill, kill_leftovers, set_title
+from rampart.actors.supervision.spawner import NAMES, Loaded, load_and_serve
 from rampart.actors.supervision.spawner_client import (
     START_PATIENCE_S,
     SpawnerClient,
@@ -78,6 +81,7 @@ class Launcher:
         self._spawners = SpawnerClient("", plan.base_port, os.getpid())
         self._lifeline: tuple[int, int] = (-1, -1)
         self._first: subprocess.Popen[bytes] | None = None
+        self._loaded: BinaryIO | None = None
         self._begun_s = self._load_s = 0.0
         self._info: socket.socket | None = None
         self._descriptors = 0
@@ -86,8 +90,12 @@ class Launcher:
 
     # -- start ----------------------------------------------------------------------------------
 
-    def begin(self) -> None:
+    def begin(self, *, forks: bool = False) -> None:
         """Claim the base port and start the first spawner, which then loads in the background.
+
+        Args:
+            forks: as a fork of this process, which has loaded the system already. Not if there is
+                another thread here: what that one holds would be held for ever in the fork.
 
         Raises:
             LaunchError: another run has the base port, or there is no place for the run's sockets.
@@ -114,7 +122,13 @@ class Launcher:
         _, self._descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (self._descriptors, self._descriptors))
         self._begun_s = time.monotonic()
-        self._first = self._load(NAMES[0])
+        if forks and _has_one_thread():
+            self._begun_s -= _age_s()
+            self._loaded = self._fork(NAMES[0])
+        else:
+            self._first = self._load(NAMES[0])
+            assert self._first.stdout is not None  # noqa: S101 for the type checker
+            self._loaded = self._first.stdout  # type: ignore[assignment]
 
     def _load(self, name: str) -> subprocess.Popen[bytes]:
         spawner = subprocess.Popen(  # noqa: S603 our own interpreter and module
@@ -128,6 +142,29 @@ class Launcher:
             spawner.stdin.close()
         return spawner
 
+    def _fork(self, name: str) -> BinaryIO:
+        """Fork a spawner, and return what it says when it can fork nodes."""
+        output, said = os.pipe()
+        gc.collect()  # here, where the pages are: the fork's own would copy them
+        if os.fork():
+            os.close(said)
+            return os.fdopen(output, "rb")
+        code = 1
+        try:
+            os.setpgid(0, 0)  # see `node_process`
+            set_title(self.plan.base_port, self.plan.launcher_pid, (f"spawner_{name}",), 1)
+            os.close(output)
+            os.close(self._lifeline[1])
+            if self._info is not None:
+                self._info.close()
+            nothing = os.open(os.devnull, os.O_RDONLY)
+            os.dup2(nothing, 0)
+            os.close(nothing)
+            os.environ.update(working_folder.environment())
+            code = load_and_serve(name, self.plan, self._lifeline[0], said)
+        finally:
+            os._exit(code)
+
     async def load(self) -> None:
         """Wait until the first spawner has loaded the plan.
 
@@ -135,7 +172,7 @@ class Launcher:
             LaunchError: spec, airport or mission are unsound, or fewer files may be open than the
                 run needs.
         """
-        output = self._first.stdout if self._first else None
+        output = self._loaded
         assert output is not None  # noqa: S101 for the type checker
         try:
             line = await asyncio.wait_for(asyncio.to_thread(output.readline), LOAD_TIMEOUT_S)
@@ -235,6 +272,8 @@ class Launcher:
                 os.close(end)
         self._lifeline = (-1, -1)
         self.guard.end()
+        if self._loaded is not None:
+            self._loaded.close()
         if self._first is not None:
             with self._first:  # which closes its output and waits for it
                 self._first.kill()
@@ -244,6 +283,17 @@ class Launcher:
         end_commands(self.plan.folder)
         run_folder.remove(self.plan.folder)
         self._reap()
+
+
+def _has_one_thread() -> bool:
+    return len(list(Path("/proc/self/task").iterdir())) == 1
+
+
+def _age_s() -> float:
+    """Return for how long this process has existed, real seconds (proc(5), field 22 of stat)."""
+    stat = Path("/proc/self/stat").read_text(encoding="utf-8", errors="replace")
+    begun_s = int(stat.rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
+    return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - begun_s)
 
 
 def needed_descriptors(processes: int) -> int:

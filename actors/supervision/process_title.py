@@ -26,6 +26,10 @@ WAITING = "spare."
 
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 
+# It finds the room for titles from the environment's first variable, the first time it is called:
+# now, as long as none has been replaced.
+setproctitle.getproctitle()
+
 
 @dataclass(frozen=True, slots=True)
 class RunProcess:

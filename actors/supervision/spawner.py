@@ -366,16 +366,29 @@ def main() -> int:
     Prints one line on stdout: `Loaded` as JSON when it is ready to fork, or `error: …` if the plan
     cannot be run.
     """
-    name, lifeline = sys.argv[1], int(sys.argv[2])
     working_folder.admit()
     plan = msgspec.json.decode(sys.stdin.buffer.read(), type=RunPlan)
     working_folder.admit(Path(plan.system_file).parent)
+    output = os.dup(1)
+    os.set_inheritable(output, False)
+    return load_and_serve(sys.argv[1], plan, int(sys.argv[2]), output)
+
+
+def load_and_serve(name: str, plan: RunPlan, lifeline: int, output: int) -> int:
+    """Load a plan, say so, and serve; 2 if that is not possible.
+
+    Args:
+        name: `a` or `b`.
+        plan: of the run.
+        lifeline: read end of the pipe.
+        output: takes the line that `main` prints; closed then.
+    """
     try:
         spec = load_system(plan)
         run = load_run(plan, spec)
         layout = Layout(plan, spec, run.application)
     except (ValueError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), flush=True)
+        os.write(output, f"error: {' '.join(str(error).split())}\n".encode())
         return 2
     gc.collect()
     gc.freeze()  # keeps the collector from touching, and so copying, the shared pages
@@ -383,8 +396,9 @@ def main() -> int:
         spawner = Spawner(name, layout, run, lifeline)
         spawner.open()
         loaded = Loaded(tuple(layout.members), spec.supervision)
-        print(msgspec.json.encode(loaded).decode(), flush=True)
-        os.dup2(2, 1)  # the pipe is not read from here on
+        os.write(output, msgspec.json.encode(loaded) + b"\n")
+        os.close(output)  # it is not read from here on
+        os.dup2(2, 1)
         streams.secure()  # and stderr perhaps neither: that ends no node
         spawner.serve()
     except BrokenPipeError:  # the launcher ended while this was loading

@@ -19,7 +19,7 @@ from rampart.cli.verbs import (
     whole,
     word,
 )
-from rampart.sim.campaign.defaults import BACKENDS, PATIENCE_S
+from rampart.sim.campaign.defaults import BACKENDS, PATIENCE_S, SEEDS
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.virtual.network import NETWORKS
 
@@ -39,7 +39,8 @@ _CONDITIONS = (
     several("--strategy", "NAME", "of the manager; may be repeated (default: the system's)"),
     word("--network", "NAME", f"{', '.join(NETWORKS)} (default: measured)", "measured"),
     whole("--seed", "N", "default: 1", 1),
-    whole("--seeds", "N", "with --fault: so many runs of each, from --seed on (default: 1)", 1),
+    whole("--seeds", "N", "with --fault: so many runs of each, from --seed on (default: 1); with "
+          f"--runs: so many seeds among them (default: {SEEDS})"),
     number("--patience", "S", "simulated seconds without progress that end a run "
            f"(default: {PATIENCE_S:g})", PATIENCE_S),
     number("--duration", "S", "simulated seconds that a run of a system without a mission takes "
@@ -113,7 +114,8 @@ def run(options: argparse.Namespace) -> int:
     Examples:
       rampart campaign --paper                       the paper's tables, beside the paper's verdicts
       rampart campaign --paper --full                ... their rows on the full system
-      rampart campaign --runs 200                    200 random single faults
+      rampart campaign --runs 200                    200 random single faults, 20 seeds
+      rampart campaign --runs 200 --seeds 200        ... each with a seed of its own: slower
       rampart campaign --runs 200 --together 2       ... pairs of faults
       rampart campaign --fault 'kill:*' --seeds 5    every process killed, five seeds each
       rampart campaign --fault gps-bias@20+5 --obstacles 0,2 --ftm both

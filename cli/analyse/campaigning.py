@@ -35,6 +35,7 @@ from rampart.cli.output import (
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
+from rampart.sim.campaign.defaults import SEEDS
 from rampart.sim.campaign.execute import BackendError, JobError, execute
 from rampart.sim.campaign.job import (
     Job,
@@ -47,6 +48,7 @@ from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.campaign.plan import cross, fault_groups, sample
 from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_report
 from rampart.sim.campaign.search import Space, margin, search, shrink
+from rampart.sim.campaign.statistics import seeds_in_words
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.faults import faults_of
@@ -148,9 +150,10 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
         together = f"-{options.together}" if options.together > 1 else ""
         return f"sample{together}", sample(
             jobs, groups, options.runs, seed=options.seed, faults=faults_of(spec),
-            together=options.together, moments=_moments(spec, jobs[0]))
+            together=options.together, moments=_moments(spec, jobs[0]),
+            seeds=options.seeds or SEEDS)
     faults = list(_planned(options.fault, spec, all_groups(spec)))
-    return "faults", cross(jobs, faults, range(options.seed, options.seed + options.seeds))
+    return "faults", cross(jobs, faults, range(options.seed, options.seed + (options.seeds or 1)))
 
 
 def _moments(spec: SystemSpec, job: Job, *, searched: bool = False) -> tuple[float, float]:
@@ -207,6 +210,7 @@ def _execute(options: argparse.Namespace, jobs: Sequence[Job], store: Store) -> 
     unsafe = 0
     # On a terminal a bar; in a log a line now and then.
     watched = sys.stderr.isatty()
+    tqdm.monitor_interval = 0  # its thread would keep a single worker, this process, from forking
     with tqdm(total=len(unique), initial=done, unit="run", file=sys.stderr, smoothing=0.05,
               disable=not watched) as bar:
         log = ProgressLog(len(unique), done)
@@ -307,6 +311,7 @@ def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path
                   runs: Sequence[Run], named: NamedCampaign | None) -> Path:
     about = Campaign(
         title=named.title if named else "Fault-injection campaign", seed=options.seed,
+        note="" if named else seeds_in_words(runs),
         command=f"rampart {shlex.join(sys.argv[1:])}",
         section=named.section(spec, runs) if named else None)
     worst = {run.job.key: run_virtually(run.job) for run in worth_showing(runs)}

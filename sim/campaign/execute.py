@@ -9,8 +9,9 @@ from typing import Any
 
 import joblib
 
+from rampart.sim.campaign.branches import Attempt, attempt, attempt_together, together
 from rampart.sim.campaign.defaults import BACKENDS
-from rampart.sim.campaign.job import Job, RunResult, run_job
+from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import Store
 
 CONNECT_TIMEOUT_S = 10.0
@@ -47,33 +48,42 @@ def execute(jobs: Sequence[Job], store: Store, *, workers: int = 0, backend: str
 
     Raises:
         BackendError: The backend is not installed, or there is no cluster at the address.
-        JobError: A job makes no sense, or failed.
+        JobError: A job makes no sense, or failed; all others were run.
     """
     done = store.keys()
     waiting = {job.key: job for job in jobs if job.key not in done}
     if not waiting:
         return 0
     count = 0
+    failed = []
     with _connected(backend, address):
         for key, result, error in _attempts(list(waiting.values()), workers, backend):
             if result is None:
-                raise JobError(error)
+                failed.append(error)
+                continue
             store.add(waiting[key], result)
             count += 1
             progress(waiting[key], result)
+    if failed:
+        more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
+        raise JobError(f"{failed[0]}{more}")
     return count
 
 
-def _attempts(jobs: list[Job], workers: int, backend: str
-              ) -> Iterator[tuple[str, RunResult | None, str]]:
+def _attempts(jobs: list[Job], workers: int, backend: str) -> Iterator[Attempt]:
     """Yield what came of jobs, each as soon as it can be had."""
+    if backend == "loky":
+        count = min(workers or os.cpu_count() or 1, len(jobs))
+        groups = together(jobs, count)
+        for made in _parallel(count)(
+                joblib.delayed(attempt_together)(group, os.getpid()) for group in groups):
+            yield from made
+        return
+    # A cluster's workers have threads, and cannot fork: there each run is made from its start.
     count = workers or -1
-    if backend == "loky" and count < 0:
-        count = min(os.cpu_count() or 1, len(jobs))
-    attempts = [joblib.delayed(_attempt)(job) for job in jobs]
+    attempts = [joblib.delayed(attempt)(job) for job in jobs]
     if backend != "ray":
-        yield from joblib.Parallel(n_jobs=count, return_as="generator_unordered", batch_size=1,
-                                   pre_dispatch="2*n_jobs")(attempts)
+        yield from _parallel(count)(attempts)
         return
     # Ray's backend returns nothing before it has all, so it gets a handful at a time.
     some = _ROUNDS * joblib.effective_n_jobs(count)
@@ -81,13 +91,9 @@ def _attempts(jobs: list[Job], workers: int, backend: str
         yield from joblib.Parallel(n_jobs=count, batch_size=1)(attempts[start:start + some])
 
 
-def _attempt(job: Job) -> tuple[str, RunResult | None, str]:
-    """Run a job in a worker; errors travel as text, since not all of them can be pickled."""
-    try:
-        return job.key, run_job(job), ""
-    except Exception as error:
-        return job.key, None, (f"run {job.key} ({job.text()}): {type(error).__name__}: "
-                               f"{' '.join(str(error).split())}")
+def _parallel(count: int) -> joblib.Parallel:
+    return joblib.Parallel(n_jobs=count, return_as="generator_unordered", batch_size=1,
+                           pre_dispatch="2*n_jobs")
 
 
 @contextlib.contextmanager

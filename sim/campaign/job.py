@@ -124,7 +124,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
         outcomes: What became of the faults.
         failures: Actors that ended by an error.
         trace: Hash over every message.
-        wall_s: How long it took.
+        wall_s: How long it took; of a run that departed from others, since then.
         judged: Whether there was a judge; without one success and safety say nothing.
         restarts: Of all nodes.
     """
@@ -176,8 +176,12 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
 def run_job(job: Job) -> RunResult:
     """Run a job in virtual time and return what is kept of it."""
     begun_s = time.perf_counter()
-    result, injected_s = run_virtually(job), None
-    record, judged = result.record, result.judgement
+    return result_of(run_virtually(job), begun_s)
+
+
+def result_of(result: VirtualResult, begun_s: float) -> RunResult:
+    """Return what is kept of a run that began at a time of `time.perf_counter`."""
+    record, judged, injected_s = result.record, result.judgement, None
     effective = [o.injected_s for o in record.faults if o.effective and o.injected_s is not None]
     if effective:
         injected_s = min(effective)

@@ -12,6 +12,7 @@ import msgspec
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.layout.system_topics import published_keys, system_topics
 from rampart.manager.spec.schema import SystemSpec
+from rampart.sim.campaign.defaults import SEEDS
 from rampart.sim.campaign.job import Job
 from rampart.sim.faults.faults import PROCESS_FAULTS, Faults, faults_of
 from rampart.sim.faults.injector import can_be_hit
@@ -66,8 +67,8 @@ def cross(jobs: Sequence[Job], faults: Iterable[PlannedFault | None], seeds: Ite
 
 
 def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *, seed: int,
-           faults: Faults, together: int = 1, moments: tuple[float, float] = MOMENTS_S
-           ) -> list[Job]:
+           faults: Faults, together: int = 1, moments: tuple[float, float] = MOMENTS_S,
+           seeds: int = SEEDS) -> list[Job]:
     """Return random runs: kind, fault, moment, length and pattern are drawn.
 
     A kind is drawn first, then a fault of it, so that the few faults of the actuators weigh as
@@ -82,6 +83,7 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
         seed: Of the choice and of the runs; a longer sample begins with the shorter one.
         together: How many faults at once.
         moments: Between which simulated times they are injected.
+        seeds: How many: the first so many runs draw theirs, and the others take turns with them.
 
     Raises:
         ValueError: No jobs or faults to choose from.
@@ -89,12 +91,14 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
     kinds = [kind for kind, names in groups.items() if names]
     if not jobs or not kinds:
         raise ValueError("campaign: there is nothing to choose from")
-    chosen = []
+    chosen: list[Job] = []
     for number in range(runs):
         dice = random.Random(f"campaign {seed} {number}")  # noqa: S311 no secret
         wrong = tuple(_random_fault(dice, groups, kinds, faults, moments)
                       for _ in range(together))
-        chosen.append(_with(dice.choice(list(jobs)), wrong, dice.randrange(1, 2**31)))
+        job = dice.choice(list(jobs))
+        of_run = dice.randrange(1, 2**31) if number < seeds else chosen[number % seeds].seed
+        chosen.append(_with(job, wrong, of_run))
     return chosen
 
 

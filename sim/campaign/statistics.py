@@ -22,6 +22,9 @@ from rampart.sim.runs.report import NONE
 CONFIDENCE_Z = 1.959963984540054
 """Two-sided 95 %."""
 
+FEW_SEEDS = 10
+"""With fewer among many runs an interval says little of what depends on the seed."""
+
 NO_EFFECT = "no effect"
 """The verdict on a row of which no run counts."""
 
@@ -53,6 +56,7 @@ class Spread(msgspec.Struct, frozen=True):
 class Row(msgspec.Struct, frozen=True, kw_only=True):
     """All runs with one fault under one condition.
 
+    `seeds` is how many different ones the runs have.
     `ineffective` runs, in which the fault changed nothing, count for nothing else, unless they
     were unsafe or failed: see `RunResult.counts`.
     """
@@ -64,6 +68,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     retuned: dict[str, dict[str, Any]]
     judged: bool
     runs: int
+    seeds: int
     ineffective: int
     restarts: int
     success: Rate
@@ -143,6 +148,7 @@ def _row(condition: Job, runs: Sequence[Run]) -> Row:
     return Row(
         fault=condition.row, options=condition.options, ftm=condition.ftm,
         strategy=condition.strategy, retuned=condition.retuned, runs=len(runs),
+        seeds=len({run.job.seed for run in runs}),
         judged=all(run.result.judged for run in runs), ineffective=len(runs) - len(counted),
         restarts=sum(run.result.restarts for run in runs),
         success=rate(sum(r.success for r in results), len(results)),
@@ -168,6 +174,17 @@ def as_json(row: Row) -> dict[str, object]:
     return {**options, **margins, **more, "success": row.success.count, "safe": row.safe.count,
             "success_interval": [row.success.low, row.success.high],
             "safe_interval": [row.safe.low, row.safe.high]}
+
+
+def seeds_in_words(runs: Sequence[Run]) -> str:
+    """Return what runs that share their seeds lack in independence; "" if each has its own."""
+    seeds = len({run.job.seed for run in runs})
+    if seeds == len(runs):
+        return ""
+    return (f"{count(len(runs), 'run')}, {count(seeds, 'seed')}: runs of one seed have noise and "
+            "delays in common, and under the same conditions are one run until the first fault. "
+            "The intervals take all runs for independent"
+            + (", which so few seeds do not bear out." if seeds < FEW_SEEDS else "."))
 
 
 def percent(share: float) -> str:

@@ -7,8 +7,9 @@ robot whose faults are more than that has an injector of its own, derived from t
 
 from __future__ import annotations
 
+import asyncio
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar
 
 import msgspec
@@ -19,6 +20,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.fault_watch import FaultWatch
+from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import FaultOutcome, OnProcess, PlannedFault, action_of
@@ -37,6 +39,11 @@ or `slow` (each message takes so many seconds, the third argument; 0 ends that).
 """
 
 
+Branch = Callable[[int], bool]
+"""Asked, in the moment in which a scenario departs from others with the same beginning, whether
+this is the run that goes on with it: the number of the scenario, counted from 0."""
+
+
 def can_be_hit(spec: SystemSpec) -> tuple[str, ...]:
     """Return the nodes whose processes a fault may hit: all but the world, the supervisor too."""
     return (SUPERVISOR, *(node.name for node in spec.actors() if node.kind is not Kind.WORLD))
@@ -49,6 +56,8 @@ class PlannedAction(msgspec.Struct, eq=False):
         planned: what, and when.
         action: see `action_of`.
         watch: what is reported, if the action is a tuple of orders.
+        scenario: number of the scenario that it is of.
+        timer: until its moment.
         injected_s: simulated time, None until then.
         hit: 1 as soon as anything else was hit, a process for example.
         reason: why it has no effect, if it has none.
@@ -57,6 +66,8 @@ class PlannedAction(msgspec.Struct, eq=False):
     planned: PlannedFault
     action: object
     watch: FaultWatch
+    scenario: int = 0
+    timer: Timer | None = None
     injected_s: float | None = None
     hit: int = 0
     reason: str = ""
@@ -87,7 +98,8 @@ class Injector(Actor):
         ScenarioError: a planned fault makes no sense in this system.
 
     Attributes:
-        planned: all planned faults.
+        planned: all planned faults; none while it is open which of several scenarios this is.
+        open: the scenarios that the run may still turn out to be, by number.
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (bus_topics.INJECT,)
@@ -97,22 +109,66 @@ class Injector(Actor):
                  known: Sequence[Topic[Any]], faults: Faults) -> None:
         super().__init__(context)
         self._control = processes
-        self.planned: list[PlannedAction] = []
-        for i, planned in enumerate(scenario, start=1):
-            action = action_of(planned, f"f{i}", nodes, known, faults)
-            self.planned.append(PlannedAction(
-                planned, action, FaultWatch(action if isinstance(action, tuple) else ())))
-        self._may_publish.update(  # a robot orders its own faults on topics of its own
-            order.topic.key for fault in self.planned for order in fault.watch.orders)
+        self._nodes, self._known, self._faults = nodes, known, faults
+        self.open: dict[int, list[PlannedAction]] = {}
+        self._branch: Branch | None = None
         self._begun = 0
+        self.planned = self._plan(scenario)
+
+    def _plan(self, scenario: Sequence[PlannedFault], number: int = 0) -> list[PlannedAction]:
+        planned = []
+        for i, fault in enumerate(scenario, start=1):
+            action = action_of(fault, f"f{i}", self._nodes, self._known, self._faults)
+            planned.append(PlannedAction(
+                fault, action, FaultWatch(action if isinstance(action, tuple) else ()), number))
+        self._may_publish.update(  # a robot orders its own faults on topics of its own
+            order.topic.key for each in planned for order in each.watch.orders)
+        return planned
 
     def outcomes(self) -> tuple[FaultOutcome, ...]:
         """Return what became of the faults so far."""
         return tuple(fault.outcome() for fault in self.planned)
 
+    # -- one of several scenarios ---------------------------------------------------------------
+
+    def one_of(self, scenarios: Sequence[Sequence[PlannedFault]], branch: Branch) -> None:
+        """Leave open which of several scenarios this run is; to be called before it is started.
+
+        In the moment of a scenario's first fault `branch` is asked. If it returns true, this is
+        that scenario from then on, and has been from the beginning as far as a message can tell;
+        if not, it is one of the others.
+
+        Raises:
+            ScenarioError: a planned fault makes no sense in this system.
+        """
+        self.open = {i: self._plan(scenario, i) for i, scenario in enumerate(scenarios)}
+        self.planned = []
+        self._branch = branch
+
+    def decide(self, number: int) -> None:
+        """Have it decided whether this run is a scenario, unless that is known."""
+        if number not in self.open or self._branch is None:
+            return
+        faults = self.open.pop(number)
+        others = faults
+        if self._branch(number):
+            others = list(self._awaited())
+            self.planned = faults
+            self.open.clear()
+        for fault in others:
+            if fault.timer is not None:
+                fault.timer.cancel()
+
+    def _awaited(self) -> Iterable[PlannedAction]:
+        yield from self.planned
+        for faults in self.open.values():
+            yield from faults
+
+    # -- when -----------------------------------------------------------------------------------
+
     def on_start(self) -> None:
         """Wait for the times that are known."""
-        for fault in self.planned:
+        for fault in self._awaited():
             if not fault.planned.goal:
                 self._later(fault, fault.planned.at_s - self.clock.now())
 
@@ -120,7 +176,7 @@ class Injector(Actor):
         """Note that so many goals of the mission have begun; for the injector of a robot."""
         while self._begun < number:
             self._begun += 1
-            for fault in self.planned:
+            for fault in self._awaited():
                 if fault.planned.goal == self._begun:
                     self._later(fault, fault.planned.at_s)
 
@@ -138,7 +194,11 @@ class Injector(Actor):
     # -- acting ---------------------------------------------------------------------------------
 
     def _later(self, fault: PlannedAction, delay_s: float) -> None:
-        self.call_later(max(delay_s, 0.0), lambda: self._inject(fault))
+        delay_s = max(delay_s, 0.0)
+        if self.open:  # decided first, and outside of the mailbox, whose items are counted
+            asyncio.get_running_loop().call_at(
+                self.clock.source_time(self.clock.now() + delay_s), self.decide, fault.scenario)
+        fault.timer = self.call_later(delay_s, lambda: self._inject(fault))
 
     def _inject(self, fault: PlannedAction) -> None:
         fault.injected_s = self.clock.now()

@@ -50,7 +50,7 @@ def excused_s(late_s: float) -> float:
 
 
 class ProcessRun:
-    """One run on processes. Use: `run`, once.
+    """One run on processes. Use: `begin`, which may be left out, and `run`, once.
 
     Args:
         trial: What is run.
@@ -67,6 +67,16 @@ class ProcessRun:
         self.failure = ""
         self._trial = trial
         self._scenario = tuple(scenario)
+        self._begun = False
+
+    def begin(self) -> None:
+        """Claim what the run needs, and fork what starts processes; before there is a loop.
+
+        Raises:
+            LaunchError: The system cannot be started.
+        """
+        self.launcher.begin(forks=True)
+        self._begun = True
 
     async def run(self) -> RunRecord:
         """Start everything, run to the end, and return the record.
@@ -74,7 +84,8 @@ class ProcessRun:
         Raises:
             LaunchError: The system cannot be started.
         """
-        self.launcher.begin()
+        if not self._begun:
+            self.launcher.begin()
         try:
             await self.launcher.load()
             await self.launcher.start()

@@ -67,6 +67,7 @@ class Trial:
         title: of the run, for people.
         about: what is about to run, and how it ends.
         goals: how many there are, for faults at the beginning of one.
+        injects: the injector of its faults, if there are any, from `outside` on.
     """
 
     judges: ClassVar[bool] = False
@@ -90,7 +91,7 @@ class Trial:
         self.goals = 0
         self.console = self.tells(stream) if stream else None
         self.recorder = RunRecorder(run.plan, self.strategy)
-        self._injector: Injector | None = None
+        self.injects: Injector | None = None
         self._brought_back = 0
 
     def sinks(self, clock: Clock) -> list[Sink]:
@@ -120,15 +121,15 @@ class Trial:
         observers = replace(observers, parameters={"judged": list(judged)}, topics=judged)
         actors: list[Actor] = [kind(observers, [take, *self.sinks(observers.clock)])]
         if scenario:
-            self._injector = self.injector(
+            self.injects = self.injector(
                 context(INJECTOR), scenario, control, nodes=nodes, known=system_topics(spec),
                 faults=faults_of(spec))
-            actors.append(self._injector)
+            actors.append(self.injects)
         return actors
 
     def outcomes(self) -> tuple[FaultOutcome, ...]:
         """Return what has become of the faults so far."""
-        return self._injector.outcomes() if self._injector else ()
+        return self.injects.outcomes() if self.injects else ()
 
     def brought_back(self, name: str, now_s: float) -> None:
         """Note that the launcher has brought an actor back."""

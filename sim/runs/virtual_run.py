@@ -21,7 +21,7 @@ import msgspec
 from rampart.actors.layout.layout import Layout
 from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Context
-from rampart.sim.faults.injector import INJECTOR, can_be_hit
+from rampart.sim.faults.injector import INJECTOR, Branch, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.record import RunRecord
@@ -48,7 +48,7 @@ class VirtualResult(msgspec.Struct, frozen=True):
         why: Why it ended.
         trace: SHA-256 over everything that was sent, in hexadecimal.
         messages: How many were sent.
-        wall_s: How long it took, without loading.
+        wall_s: How long it took, without loading; of a branch, with what it has not made itself.
         failures: Actors that ended by an error, with the error's text.
         tracebacks: Of these, as text.
     """
@@ -102,7 +102,7 @@ def _tap(take: Callable[[float, str, bytes], None], zero_s: float) -> Tap:
 
 
 class VirtualRun:
-    """One trial in virtual time. Use: `run`, once.
+    """One trial in virtual time. Use: `run` or `branches`, once.
 
     Args:
         trial: What is run; id, rate and ports of its plan do not matter.
@@ -137,6 +137,28 @@ class VirtualRun:
 
     def run(self) -> VirtualResult:
         """Run to the end, on a loop of its own."""
+        result = self._on_loop()
+        if result is None:
+            raise RuntimeError("a run without branches has ended in none")
+        return result
+
+    def branches(self, scenarios: Sequence[Sequence[PlannedFault]], branch: Branch
+                 ) -> VirtualResult | None:
+        """Run as several scenarios with a common beginning, each of one fault at least.
+
+        Args:
+            scenarios: take the place of the one with which it was made.
+            branch: forks this process (`rampart.sim.virtual.virtual_loop.fork`) and returns true
+                in the child: what returns there is the result of that scenario.
+
+        Returns:
+            None in the process that has run the common beginning, when all have departed.
+        """
+        self._scenario = tuple(scenarios[0])
+        return self._on_loop(scenarios, branch)
+
+    def _on_loop(self, scenarios: Sequence[Sequence[PlannedFault]] = (),
+                 branch: Branch | None = None) -> VirtualResult | None:
         # What is loaded stays; what a run leaves behind goes without a collector, nearly all of it.
         gc.collect()
         gc.freeze()
@@ -144,12 +166,13 @@ class VirtualRun:
         gc.set_threshold(50_000, 20, 100)
         try:
             with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-                return runner.run(self._run())
+                return runner.run(self._run(scenarios, branch))
         finally:
             gc.set_threshold(*threshold)
             gc.unfreeze()
 
-    async def _run(self) -> VirtualResult:
+    async def _run(self, scenarios: Sequence[Sequence[PlannedFault]],
+                   branch: Branch | None) -> VirtualResult | None:
         begun_s = time.perf_counter()
         loop = asyncio.get_running_loop()
         if not isinstance(loop, VirtualLoop):
@@ -168,17 +191,27 @@ class VirtualRun:
 
         actors = self.trial.outside(
             context, machine.supervisor_heard, self._scenario, machine.hit, self._nodes)
+        injector = self.trial.injects
+        if branch is not None and injector is not None:
+            injector.one_of(scenarios, branch)
         watching = [asyncio.create_task(actor.run()) for actor in actors]
         machine.start()
         why = None
         while why is None and not any(task.done() for task in watching):
             await asyncio.sleep(_LOOK_S)
             why = self.interrupted or self.trial.over(clock.now())
+            if injector is not None and not (injector.planned or injector.open):
+                why = "all branches have departed"
+        if injector is not None:
+            for number in tuple(injector.open):  # their moments never came
+                injector.decide(number)
         now_s = clock.now()
         machine.shut_down()
         for actor in actors:
             actor.stop()
         await asyncio.gather(*watching)
+        if injector is not None and not injector.planned:
+            return None
         record = self.trial.conclude(now_s, why or "ended")
         return VirtualResult(
             record, self.trial.judgement(record), why or "ended", trace.digest(), trace.messages,

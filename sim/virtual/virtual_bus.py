@@ -210,6 +210,10 @@ class VirtualBus:
         for incarnation in sorted(self._hub.alive.get(node, ())):
             self.soon(lambda i=incarnation: changed(node, i, True))  # type: ignore[misc]
 
+    def after_burst(self, call: Callable[[], None]) -> None:
+        """Make a call: each message arrives by itself."""
+        call()
+
     def gone(self, node: str, incarnation: int) -> None:
         """Nothing to do: watchers are told when it is cut off."""
 

@@ -12,7 +12,9 @@ they are posted, with two arguments, and stand in the heap as they are.
 from __future__ import annotations
 
 import asyncio
+import os
 import selectors
+import warnings
 from collections.abc import Callable, Iterable
 from contextvars import Context
 from heapq import heapify, heappop, heappush
@@ -47,6 +49,28 @@ class _Call:
         return self._when
 
 
+class _Files(selectors.PollSelector):
+    """What the loop watches besides its timers; of its own after a fork, as an epoll is not.
+
+    Attributes:
+        count: how many files; asked after each timer, for which its map is too slow.
+    """
+
+    count = 0
+
+    def register(self, *args: Any, **more: Any) -> selectors.SelectorKey:
+        """Watch a file."""
+        key = super().register(*args, **more)
+        self.count = len(self.get_map())
+        return key
+
+    def unregister(self, *args: Any) -> selectors.SelectorKey:
+        """Watch it no more."""
+        key = super().unregister(*args)
+        self.count = len(self.get_map())
+        return key
+
+
 class VirtualLoop(asyncio.SelectorEventLoop):
     """A loop whose time stands still while it works, and jumps when it would wait.
 
@@ -57,9 +81,8 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(self) -> None:
-        self._files = selectors.DefaultSelector()
+        self._files = _Files()
         super().__init__(self._files)
-        self._watched = self._files.get_map()  # one is the loop's own wake-up pipe
         self.now_s = 0.0
         self._count = 0
         # When, count, a posted callback and its arguments; or instead of these None, a `_Call`.
@@ -114,7 +137,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _run_once(self) -> None:
         # asyncio's own step, called by `run_forever`, with the waiting left out.
         ready, files = self._ready, self._files  # type: ignore[attr-defined]
-        if len(self._watched) > 1:
+        if files.count > 1:  # one is the loop's own wake-up pipe
             self._process_events(files.select(0))  # type: ignore[attr-defined]
         if ready:
             for _ in range(len(ready)):
@@ -127,7 +150,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
     def _let_time_pass(self) -> None:
         """Move the clock from timer to timer and make all calls due, while nothing else is."""
-        timers, ready, watched = self._timers, self._ready, self._watched  # type: ignore[attr-defined]
+        timers, ready, files = self._timers, self._ready, self._files  # type: ignore[attr-defined]
         while timers:
             when, _, callback, first, second = heappop(timers)
             if callback is None and first._cancelled:
@@ -147,7 +170,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
                 if not timers or timers[0][0] > now_s or timers[0][1] > last:
                     break
                 _, _, callback, first, second = heappop(timers)
-            if ready or self._stopping or len(watched) > 1:  # type: ignore[attr-defined]
+            if ready or self._stopping or files.count > 1:  # type: ignore[attr-defined]
                 return
 
     def _make(self, call: _Call) -> None:
@@ -166,6 +189,23 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _report(self, callback: Any, error: BaseException) -> None:
         self.call_exception_handler({
             "message": f"Exception in callback {callback!r}", "exception": error})
+
+
+def fork() -> int:
+    """Fork this process within a call of its virtual loop, which goes on in parent and child.
+
+    All that a virtual run consists of is memory: both have it, and it is the same run up to here.
+
+    Returns:
+        The child's process id; 0 in the child.
+    """
+    loop = asyncio.get_running_loop()
+    with warnings.catch_warnings():  # of numpy's idle threads, which are prepared for a fork
+        warnings.simplefilter("ignore", DeprecationWarning)
+        pid = os.fork()
+    if pid == 0:
+        asyncio._set_running_loop(loop)  # which asyncio takes away from a child
+    return pid
 
 
 class VirtualClock(Clock):

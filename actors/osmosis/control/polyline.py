@@ -94,6 +94,8 @@ def _rays(count: int, angle_min_rad: float, angle_increment_rad: float) -> Array
 
 def to_map(points: Array, x_m: float, y_m: float, yaw_rad: float) -> Array:
     """Move points from `base_link` at the given pose into `map`."""
+    if not len(points):  # as most of the time
+        return points
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(points @ np.array(((cos, sin), (-sin, cos))) + (x_m, y_m))
 
@@ -190,6 +192,8 @@ class Polyline:
             s_from_m: start of the stretch of route looked at.
             s_to_m: end of that stretch; it is cut to the route.
         """
+        if not len(points):
+            return NO_POINTS
         low, high = self._stretch(s_from_m, s_to_m)
         along_x, along_y = self._directions[low:high].T
         x, y = (points[:, None, :] - self._starts[low:high]).transpose(2, 0, 1)

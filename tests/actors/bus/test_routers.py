@@ -12,6 +12,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -306,3 +307,30 @@ async def test_a_flood_of_questions_is_answered_in_part(routers, sockets):
                           lambda _key, payload: answers.append(payload), lambda: None)
         await asyncio.sleep(0.5)
         assert 0 < len(answers) <= 2 * zenoh_bus._ANSWERS_PER_S
+
+
+def tell_threads(folder: str, told) -> None:
+    """Open a client and tell of its threads."""
+
+    async def main() -> None:
+        async with client(folder):
+            tasks = Path("/proc/self/task").iterdir()
+            told.put(({(task / "comm").read_text().split("-")[0].strip() for task in tasks},
+                      "ZENOH_RUNTIME" in os.environ))
+
+    asyncio.run(main())
+
+
+async def test_a_client_reads_on_one_thread_and_writes_on_another_and_no_command_inherits_that(
+        routers):
+    await routers.start("router_a")
+    told = FORKS.SimpleQueue()
+    process = FORKS.Process(target=tell_threads, args=(routers.folder, told), daemon=True)
+    process.start()
+
+    threads, is_inherited = await asyncio.to_thread(told.get)
+    await asyncio.to_thread(process.join, 20)
+
+    assert {"app", "tx"} <= threads
+    assert threads.isdisjoint({"rx", "net", "acc"})
+    assert not is_inherited

@@ -28,6 +28,7 @@ from rampart.actors.run.run_info import find_runs
 from rampart.actors.run.run_plan import load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision import guard as guard_module
 from rampart.actors.supervision import node_process
 from rampart.actors.supervision.kill_node import main as kill_node
 from rampart.actors.supervision.launcher import Launcher, LaunchError
@@ -567,6 +568,56 @@ async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path, sto
         child.wait()
     await eventually(lambda: find_processes(plan.base_port) == [], 2.0)
     assert not [r for r in find_runs() if r.base_port == plan.base_port]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+async def test_a_launcher_that_has_one_thread_forks_its_first_spawner(tmp_path, threads):
+    plan = stub_plan(write_stub_system(tmp_path))
+    script = (
+        "import asyncio, threading, time; from tests.stub_actors import *\n"
+        f"for _ in range({threads} - 1):\n"
+        "    threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
+        f"plan = stub_plan({plan.system_file!r}, base_port={plan.base_port})\n"
+        "launcher = Launcher(plan, 'test')\n"
+        "launcher.begin(forks=True)\n"
+        "async def main():\n"
+        "    await launcher.load()\n"
+        "    await launcher.start()\n"
+        "    print('program' if launcher._first else 'fork', flush=True)\n"
+        "    await asyncio.sleep(60)\n"
+        "asyncio.run(main())\n")
+    child = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", script, stdout=subprocess.PIPE, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"})
+    try:
+        kind = await asyncio.wait_for(child.stdout.readline(), 20)
+        await eventually(lambda: len(find_processes(plan.base_port)) == 26, 20)
+    finally:
+        child.kill()
+        await child.wait()
+
+    assert kind.strip() == (b"fork" if threads == 1 else b"program")
+    await eventually(lambda: find_processes(plan.base_port) == [], 2.0)
+
+
+async def test_the_guard_reads_all_of_proc_only_when_somebody_is_missing(tmp_path, monkeypatch):
+    searches = []
+
+    def searched(*which):
+        searches.append(which)
+        return find_processes(*which)
+
+    monkeypatch.setattr(guard_module, "find_processes", searched)
+    async with running(tmp_path) as (launcher, _):
+        assert await launcher.guard.look_after()
+        searches.clear()
+        assert await launcher.guard.look_after()
+        assert not searches
+
+        os.kill(process(launcher.plan.base_port, "spawner_b"), signal.SIGKILL)
+        await eventually(lambda: searches)
+        await eventually(lambda: len(
+            [p for p in find_processes(launcher.plan.base_port) if p.names == ("spawner_b",)]) == 1)
 
 
 def test_the_number_of_another_run_is_refused_before_anything_starts(tmp_path):

@@ -27,11 +27,20 @@ from rampart.cli.analyse.campaigning import ProgressLog
 from rampart.cli.main import main as rampart
 from rampart.sim.campaign import execute as execution
 from rampart.sim.campaign.content import with_content
+from rampart.sim.campaign.defaults import SEEDS
 from rampart.sim.campaign.execute import BackendError, JobError, execute
 from rampart.sim.campaign.job import Job, RunResult, run_job
 from rampart.sim.campaign.plan import cross, fault_groups, sample
 from rampart.sim.campaign.search import Space, margin, search, shrink
-from rampart.sim.campaign.statistics import badness, rate, spread, table, total, worst
+from rampart.sim.campaign.statistics import (
+    badness,
+    rate,
+    seeds_in_words,
+    spread,
+    table,
+    total,
+    worst,
+)
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
@@ -90,7 +99,7 @@ def test_a_longer_sample_begins_with_the_shorter_one_and_another_seed_is_another
 
 
 def test_a_sample_draws_all_kinds_patterns_and_conditions_alike():
-    jobs = sample(BASES, GROUPS, 3000, seed=1)
+    jobs = sample(BASES, GROUPS, 3000, seed=1, seeds=3000)
     kind_of = {name: kind for kind, names in GROUPS.items() for name in names}
     kinds = Counter(kind_of[job.faults[0].fault] for job in jobs)
     assert set(kinds) == set(GROUPS)
@@ -104,6 +113,27 @@ def test_a_sample_draws_all_kinds_patterns_and_conditions_alike():
     assert intermittent / len(messages) == pytest.approx(1 / 3, abs=0.05)
     assert {len(job.faults) for job in jobs} == {1}
     assert len({job.seed for job in jobs}) > 2990
+
+
+def test_a_sample_has_few_seeds_that_take_turns_and_one_for_each_run_if_asked_for():
+    own = sample(BASES, GROUPS, 50, seed=1, seeds=50)
+    few = sample(BASES, GROUPS, 50, seed=1, seeds=8)
+    assert [job.seed for job in few] == [own[i % 8].seed for i in range(50)]
+    assert [msgspec.structs.replace(job, seed=0) for job in few] == [
+        msgspec.structs.replace(job, seed=0) for job in own]
+    assert len({job.seed for job in sample(BASES, GROUPS, 50, seed=1)}) == SEEDS
+
+
+def test_how_many_seeds_a_sample_has_is_told_with_what_that_means_for_its_intervals():
+    def told(seeds: int) -> str:
+        return seeds_in_words([Run(job, result()) for job in
+                               sample(BASES, GROUPS, 40, seed=1, seeds=seeds)])
+
+    assert told(40) == ""
+    assert told(20).startswith("40 runs, 20 seeds: ")
+    assert told(20).endswith("The intervals take all runs for independent.")
+    assert told(1).startswith("40 runs, 1 seed: ")
+    assert told(1).endswith(", which so few seeds do not bear out.")
 
 
 def test_faults_come_in_pairs_and_triples_when_asked_for():

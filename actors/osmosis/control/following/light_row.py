@@ -217,6 +217,8 @@ class LightRow(Follower):
 
     def _free(self, x_m: float, y_m: float, yaw_rad: float, points: Array, s_m: float) -> float:
         """Free distance ahead of the hull in the lane along the row; infinite if all is free."""
+        if not len(points):
+            return math.inf
         reach_m = 2.0 * self._limits.stop_distance_m + 4.0
         echoes = self.line.coordinates(to_map(points, x_m, y_m, yaw_rad), s_m - 1.0, s_m + reach_m)
         half_m = self._hull.half_width_m + self._limits.lane_margin_m

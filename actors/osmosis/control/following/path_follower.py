@@ -259,7 +259,7 @@ class PathFollower(Follower):
             top * math.cos(bearing) ** 2,
             top * max(math.cos(min(curve, math.pi) / 2) ** 2, 0.35),
             max(limits.braking_speed(direct_m - limits.arrival_radius_m / 2), 0.2)]
-        ahead = points[points[:, 0] > -self._hull.half_length_m]
+        ahead = points[points[:, 0] > -self._hull.half_length_m] if len(points) else points
         if len(ahead):
             nearest_m = float(self._hull.distance(ahead).min())
             free_m = free_ahead(points, self._hull, 0.08)
