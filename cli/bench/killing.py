@@ -61,20 +61,28 @@ class Victim:
         pid_of: Returns the process to be killed, when this was heard of it.
 
     Attributes:
-        note: Why it is killed no more; "" as long as it is.
+        failure: Why it is killed no more; "" as long as it is.
+        besides: How often it was replaced without being killed.
     """
 
     def __init__(self, name: str, title: str, *, ear: Program, finds: Callable[[Heard], bool],
                  keeper: Program, ended: Callable[[Line], bool], pid_of: Callable[[Heard], int],
                  teller: Program | None = None,
                  decided: Callable[[Line], bool] = lambda _: False) -> None:
-        self.name, self.title, self.note = name, title, ""
+        self.name, self.title, self.failure, self.besides = name, title, "", 0
         self.kills: list[Kill] = []
         self._ear, self._finds = ear, finds
         self._keeper, self._teller = keeper, teller or keeper
         self._ended, self._decided = ended, decided
         self._pid_of = pid_of
         self._newest: Heard | None = None
+        self._looked = 0
+
+    @property
+    def note(self) -> str:
+        """What a reader of its row has to know, "" for nothing."""
+        besides = f"replaced without a kill: {self.besides}" if self.besides else ""
+        return "; ".join(filter(None, (self.failure, besides)))
 
     def wait(self) -> None:
         """Wait until it is heard for the first time."""
@@ -85,13 +93,13 @@ class Victim:
         self._attempt(self._kill)
 
     def _attempt(self, what: Callable[[], object]) -> None:
-        if self.note:
+        if self.failure:
             return
         try:
             what()
         except BenchError as error:
             done = f"after {len(self.kills)} kills: " if self.kills else ""
-            self.note = f"{done}{error}"
+            self.failure = f"{done}{error}"
 
     def _hear(self, start: int, within_s: float) -> Heard:
         before = self._newest
@@ -103,19 +111,34 @@ class Victim:
 
         self._newest = self._ear.wait_for(new, within_s, f"an output of {self.name}", start,
                                           self._keeper)
+        self._looked = len(self._ear.lines)
         return self._newest
 
+    def _catch_up(self) -> None:
+        """Know who is there now: a keeper may have taken a process for hung and replaced it."""
+        for line in self._ear.lines[self._looked:]:
+            found = heard(line)
+            if found is not None and self._finds(found) and (
+                    self._newest is None or found.number != self._newest.number):
+                self._newest = found
+                self.besides += 1
+        self._looked = len(self._ear.lines)
+
     def _kill(self) -> None:
+        time.sleep(random.uniform(0, _PHASE_S))  # noqa: S311
+        self._catch_up()
         if self._newest is None:
             raise RuntimeError(f"{self.name} was not waited for")
         pid = self._pid_of(self._newest)
         start, told = len(self._ear.lines), len(self._teller.lines)
-        time.sleep(random.uniform(0, _PHASE_S))  # noqa: S311
         at_s = time.monotonic()
         try:
             os.kill(pid, signal.SIGKILL)
-        except ProcessLookupError:
-            raise BenchError(f"process {pid} of {self.name} has ended by itself") from None
+        except ProcessLookupError:  # the replacement is on its way, and the next round finds it
+            self._hear(start, BACK_S)
+            self.besides += 1
+            self.kills.append(Kill())  # so that rounds stay side by side
+            return
         found = self._hear(start, BACK_S)
         with contextlib.suppress(BenchError):  # the word of it may come after the output
             self._teller.wait_for(lambda line: self._ended(line) or None, PAUSE_S, "", told)

@@ -123,7 +123,7 @@ def _range(of: Spread | None) -> str:
 
 
 def _kills(row: Killed) -> str:
-    return f"{len(row.kills)}" + (f"; {row.note}" if row.note else "")
+    return f"{row.output_ms.n if row.output_ms else 0}" + (f"; {row.note}" if row.note else "")
 
 
 def _outputs(rows: Sequence[Killed], ours: Sequence[str] = ()) -> list[Lane]:
