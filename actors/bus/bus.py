@@ -61,6 +61,12 @@ class Bus(Protocol):
     def gone(self, node: str, incarnation: int) -> None:
         """Tell those who watch a node that a process of it has ended, before they see it."""
 
+    def moved(self) -> bool:
+        """Whether, since this was last asked, messages were lost because a router has died.
+
+        Also as long as there is none.
+        """
+
     async def close(self) -> None:
         """Leave the bus. Closing twice is harmless."""
 
@@ -114,6 +120,10 @@ class SharedBus:
     def gone(self, node: str, incarnation: int) -> None:
         """Tell it over the owner's session."""
         self._owner.gone(node, incarnation)
+
+    def moved(self) -> bool:
+        """Whether the owner's session has gone over to another router."""
+        return self._owner.moved()
 
     async def close(self) -> None:
         """Hear and say nothing more; the session stays open."""

@@ -148,6 +148,7 @@ class ZenohBus:
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._held: list[Any] = []
         self._leaving: dict[tuple[str, int, PeerChange], asyncio.TimerHandle] = {}
+        self._routers: list[str] = []
 
     async def open(self) -> None:
         """Open the session, and announce this node.
@@ -165,6 +166,7 @@ class ZenohBus:
             raise BusError(f"{self._listen} is in use by another process {node}"
                            if "acquire lock" in text
                            else f"cannot open {self._listen} {node}: {text}") from None
+        self._routers = self._linked()
         if self._node:
             self._held.append(self._session.liveliness().declare_token(
                 f"{_ALIVE}/{self._node}/{self._incarnation}"))
@@ -254,6 +256,14 @@ class ZenohBus:
         self._require().put(
             f"{_GONE}/{node}/{incarnation}", b"", priority=zenoh.Priority.INTERACTIVE_HIGH,
             congestion_control=zenoh.CongestionControl.BLOCK, express=True)
+
+    def moved(self) -> bool:
+        """Whether it has lost its router since this was last asked; less than a microsecond."""
+        before, self._routers = self._routers, self._linked()
+        return not self._routers or self._routers != before
+
+    def _linked(self) -> list[str]:
+        return [str(router) for router in self._require().info.routers_zid()]
 
     async def close(self) -> None:
         """Close the session."""
