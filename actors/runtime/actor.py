@@ -23,7 +23,7 @@ from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from rampart.actors.bus.fields import Field
 from rampart.actors.bus.limits import RateLimit, ReportLimit
-from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
+from rampart.actors.bus.messages import ON_TIME, Diagnostic, Heartbeat, Hello, Injection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
 from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
@@ -39,6 +39,9 @@ __all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every",
 
 _REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
+
+_LATE_DIGITS = 3
+"""Of the lateness of timers: milliseconds."""
 
 _HELLOS_PER_S = 100
 """More newcomers in a simulated second than a system has nodes are no newcomers."""
@@ -349,9 +352,10 @@ class Actor(Declared):
         if not self.is_well():
             return
         context = self.context
+        late_s = round(self._timers.lateness_s(), _LATE_DIGITS) or ON_TIME
         self.publish(HEARTBEAT, Heartbeat(
             context.pid, self._dispatcher.progress, context.heartbeat_period_s, self._rejected,
-            self._dispatcher.overflowed))
+            self._dispatcher.overflowed, late_s))
         left_out = self._reports.left_out(self.clock.now())
         if left_out:
             self.report_diagnostic(
