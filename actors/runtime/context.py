@@ -12,6 +12,8 @@ import msgspec
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm.patience import Usage
+from rampart.actors.ftm.patience import usage as read_usage
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.clock import Clock
@@ -37,6 +39,7 @@ class Context:
         members: names of all nodes of the system; what others make it remember is bounded.
         topics: those that parameters of the system's nodes name, by key.
         usage: returns what a process has used of the machine.
+        scheduled: returns what the main thread of a process has run, and waited for a processor.
     """
 
     name: str
@@ -53,3 +56,4 @@ class Context:
     members: frozenset[str] = frozenset()
     topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
     usage: Callable[[int], ProcessCount | None] = read_count
+    scheduled: Callable[[int], Usage] = read_usage
