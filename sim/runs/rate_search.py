@@ -18,7 +18,7 @@ from rampart.sim.runs.keeping_up import KeptUp
 from rampart.sim.runs.process_run import ProcessRun
 from rampart.sim.runs.trial import Trial
 
-LEAST, MOST = 0.1, 20.0
+LEAST, MOST = 0.1, 20
 """Rates that can be asked for."""
 
 PROBE_S = 6.0
