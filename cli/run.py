@@ -14,7 +14,9 @@ import time
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import TextIO
 
 import msgspec
 
@@ -27,7 +29,7 @@ from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_document
 from rampart.actors.supervision.launcher import LaunchError
 from rampart.cli.output import FORMAT, UsageError
-from rampart.cli.run_options import ERROR_LOG, parse, plan_of, refuse
+from rampart.cli.run_options import ERROR_LOG, MAX_RATE, parse, plan_of, refuse
 from rampart.files import streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec
@@ -35,9 +37,10 @@ from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import action_of, parse_fault
 from rampart.sim.runs.process_run import ProcessRun
+from rampart.sim.runs.rate_search import find_rate, first_rate, probe_run
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import in_words
-from rampart.sim.runs.trial import trial_class
+from rampart.sim.runs.trial import Trial, trial_class
 from rampart.sim.runs.virtual_run import LEAD_S, VirtualRun
 from rampart.sim.virtual.network import find_network
 
@@ -72,8 +75,8 @@ class Run:
         kept = self._directory.resolve()
         plan = msgspec.structs.replace(
             plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"))
-        self._trial = kind(replace(run, plan=plan),
-                           options.patience if kind.patient else options.duration, sys.stderr)
+        self._kind, self._context = kind, replace(run, plan=plan)
+        self._trial = self._made(plan)
         self._plan = plan
         self._scenario = [parse_fault(text) for text in options.fault]
         known = system_topics(spec) if self._scenario else ()
@@ -92,12 +95,31 @@ class Run:
         with _kept(self._directory):
             if self._options.virtual:
                 return self._in_virtual_time()
+            if self._options.rate == MAX_RATE:
+                asyncio.run(self._find_rate())
             run = ProcessRun(self._trial, self._scenario)
             run.begin()
             try:
                 return asyncio.run(self._on_processes(run))
             finally:
                 run.launcher.abort()
+
+    def _made(self, plan: RunPlan, stream: TextIO | None = sys.stderr) -> Trial:
+        options, kind = self._options, self._kind
+        return kind(replace(self._context, plan=plan),
+                    options.patience if kind.patient else options.duration, stream)
+
+    async def _find_rate(self) -> None:
+        """Take the rate with which this machine keeps up."""
+        def trial(rate: float, run_id: str) -> Trial:
+            plan = msgspec.structs.replace(
+                self._plan, rate=rate, run_id=run_id, checkpoints="", hmi_port=0, waits=False)
+            return self._made(plan, None)
+
+        rate = await find_rate(partial(probe_run, trial), _say, first_rate())
+        _say(f"--rate max: {rate:g} is taken")
+        self._plan = msgspec.structs.replace(self._plan, rate=rate)
+        self._trial = self._made(self._plan)
 
     async def _on_processes(self, run: ProcessRun) -> int:
         with _recorded(self._options):

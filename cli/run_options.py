@@ -51,12 +51,24 @@ from rampart.files import working_folder
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.faults.faults import faults_of
+from rampart.sim.runs.rate_search import LEAST, MOST
 from rampart.sim.virtual.network import NETWORKS
 
 ERROR_LOG = "errors.log"
 LAST_PORT = 32_000
 TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
 HMI = "rampart.actors.operator.hmi:Hmi"
+
+MAX_RATE = "max"
+
+
+def _rate(text: str) -> float | str:
+    try:
+        return MAX_RATE if text == MAX_RATE else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: a number from {LEAST:g} to {MOST:g} is right, or {MAX_RATE}") from None
+
 
 _EXAMPLES = (
     ("", "the shipped system, as its spec says"),
@@ -79,7 +91,9 @@ _OPTIONS = (
          "says so (default: the system's)", ""),
     flag("--no-ftm", "run the paper's unprotected baseline: last command kept, no dead man, no "
          "respawn"),
-    number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
+    option("--rate", type=_rate, metavar="R", default=1.0, help="simulated seconds per second, or "
+           f"{MAX_RATE}: as many as this machine keeps up with, which short runs find out before "
+           "(default: 1)"),
     whole("--seed", "N", "for sensor noise (default: 1)", 1),
     flag("--no-hmi", "no operator's page (its node still runs)"),
     whole("--hmi-port", "PORT", "port of the operator's page (default: 8080)", 8080),
@@ -178,7 +192,8 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
     system_file = _system_file(options.system)
     token, token_is_new = _token(options)
     plan = RunPlan(
-        run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
+        run_id=uuid.uuid4().hex[:12], base_port=options.port,
+        rate=1.0 if options.rate == MAX_RATE else options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
@@ -207,7 +222,11 @@ def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    between("--rate", options.rate, 0.1, 20)
+    if options.rate != MAX_RATE:
+        between("--rate", options.rate, LEAST, MOST)
+    elif options.virtual:
+        raise UsageError(f"--rate {MAX_RATE}: only on real processes; virtual time has no rate, it "
+                         "is always as fast as it can be")
     positive("--duration", options.duration, below=1e9)
     positive("--patience", options.patience)
     if options.record:

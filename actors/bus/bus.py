@@ -74,6 +74,12 @@ class Bus(Protocol):
     def after_burst(self, call: Callable[[], None]) -> None:
         """Have `call` made when what has arrived together was delivered; soon if nothing has."""
 
+    def moved(self) -> bool:
+        """Whether, since this was last asked, messages were lost because a router has died.
+
+        Also as long as there is none.
+        """
+
     async def close(self) -> None:
         """Leave the bus. Closing twice is harmless."""
 
@@ -140,6 +146,10 @@ class SharedBus:
     def after_burst(self, call: Callable[[], None]) -> None:
         """Have it made after what has arrived in the owner's session."""
         self._owner.after_burst(call)
+
+    def moved(self) -> bool:
+        """Whether the owner's session has gone over to another router."""
+        return self._owner.moved()
 
     async def close(self) -> None:
         """Hear and say nothing more; the session stays open."""

@@ -28,18 +28,28 @@ _VALUES_BYTES = 300_000
 _VALUES_DEPTH = 6
 
 
+ON_TIME = 0.0
+"""Of what is never late in virtual time. A field of this very object is not encoded: msgspec
+compares a default by identity."""
+
+
 class Message(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True):
     """Base of all messages: immutable, and an unknown field makes the payload invalid."""
 
 
-class Heartbeat(Message, frozen=True):
-    """Sent from the actor's own loop; `progress` counts what the mailbox has handled."""
+class Heartbeat(Message, frozen=True, omit_defaults=True):
+    """Sent from the actor's own loop; `progress` counts what the mailbox has handled.
+
+    `late_s` is how late a timer of that loop was at most since the heartbeat before, simulated
+    seconds; it is left out if none was.
+    """
 
     pid: Pid
     progress: Count
     period_s: Duration
     rejected_payloads: Count
     overflowed: Count
+    late_s: Seconds = ON_TIME
 
 
 class Diagnostic(Message, frozen=True):

@@ -194,6 +194,7 @@ class ZenohBus:
         self._answers = RateLimit(_ANSWERS_PER_S)
         self._held: list[Any] = []
         self._leaving: dict[tuple[str, int, PeerChange], asyncio.TimerHandle] = {}
+        self._routers: list[str] = []
 
     def take_name(self, node: str, incarnation: int, recorder: RecorderConnection | None) -> None:
         """Be the bus of this node from now on; the session may be open already."""
@@ -221,6 +222,7 @@ class ZenohBus:
             raise BusError(f"{self._listen} is in use by another process {node}"
                            if "acquire lock" in text
                            else f"cannot open {self._listen} {node}: {text}") from None
+        self._routers = self._linked()
         self._loop.add_reader(self._bell.number, self._drain)
 
     def announce(self) -> None:
@@ -344,6 +346,14 @@ class ZenohBus:
         self._require().put(
             f"{_GONE}/{node}/{incarnation}", b"", priority=zenoh.Priority.INTERACTIVE_HIGH,
             congestion_control=zenoh.CongestionControl.BLOCK, express=True)
+
+    def moved(self) -> bool:
+        """Whether it has lost its router since this was last asked; less than a microsecond."""
+        before, self._routers = self._routers, self._linked()
+        return not self._routers or self._routers != before
+
+    def _linked(self) -> list[str]:
+        return [str(router) for router in self._require().info.routers_zid()]
 
     async def close(self) -> None:
         """Close the session."""

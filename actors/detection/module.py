@@ -4,7 +4,14 @@ A detection module is a pure monitor (what it heard, and by when it must have he
 actor round it. The actor hands events to the monitor, wakes it when its next deadline is due,
 and says on `detection/NAME` what the monitor found: at once when it changes, and at 5 Hz.
 
-Two subtleties, both about a module that was not there for a while:
+What is not heard is no fault of those who say it, if the module could not have heard it:
+
+* A timer that is late shows that the module, too, waits for a processor. It reads its mail for as
+  long as it was late, and then judges.
+* When its router dies a module hears nothing from anybody, and so blames nobody, until the bus has
+  gone over to the other one (`FAILOVER_S`).
+
+Neither counts again within a second. Two more subtleties, about a module that was away for longer:
 
 * A module that was itself stopped and goes on, or a machine that hung, finds every deadline
   passed while the proof to the contrary still waits unread. A module that finds that it has not
@@ -25,7 +32,10 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.runtime.actor import Actor, Context, Header, every
-from rampart.manager.spec.tables import NonNegative
+from rampart.manager.spec.tables import FAILOVER_S, NonNegative
+
+LATE_S = 0.02
+"""A timer that is so late, simulated seconds, shows a lack of processor time."""
 
 ABSENCE_S = 0.3
 """A module that has not run for so long, though it repeats its report each 0.2 s, was stopped."""
@@ -158,6 +168,7 @@ class DetectionModule(Actor):
     def repeat(self) -> None:
         """Say it again, for nodes that have joined since."""
         self._note_absence()
+        self._note_move()
         if self._told or self.first_life:
             self.publish(topics.DETECTION, self._report)
 
@@ -214,9 +225,12 @@ class DetectionModule(Actor):
         monitor = self._monitor
         if monitor is None:
             return
-        self._wake_s = math.inf
+        due_s, self._wake_s = self._wake_s, math.inf
         self._note_absence()
         now_s = self.clock.now()
+        if monitor.due_s <= now_s:
+            self._note_move()
+            self._note_lateness(now_s - due_s)
         if now_s < self._judges_from_s:
             self._sleep_until(self._judges_from_s)
         else:
@@ -225,6 +239,18 @@ class DetectionModule(Actor):
 
     def _note_absence(self) -> None:
         now_s = self.clock.now()
-        if now_s - self._ran_s > ABSENCE_S and now_s > self._judges_from_s + NEXT_EXCUSE_S:
-            self._judges_from_s = now_s + EXCUSE_S
+        if now_s - self._ran_s > ABSENCE_S:
+            self._read_mail_until(now_s + EXCUSE_S)
         self._ran_s = now_s
+
+    def _note_lateness(self, late_s: float) -> None:
+        if late_s > LATE_S:
+            self._read_mail_until(self.clock.now() + min(late_s, EXCUSE_S))
+
+    def _note_move(self) -> None:
+        if self._bus.moved():
+            self._read_mail_until(self.clock.now() + FAILOVER_S * self.clock.rate)
+
+    def _read_mail_until(self, until_s: float) -> None:
+        if self.clock.now() > self._judges_from_s + NEXT_EXCUSE_S:
+            self._judges_from_s = until_s

@@ -7,13 +7,20 @@ Processes of a node are told apart by their incarnation. The end of one may be r
 next is already at work, and a heartbeat of the old one may arrive after the news of its end;
 neither may be believed of the new one. Being back is proved by a heartbeat, not by a token: a
 process that exists does not work yet.
+
+A heartbeat that is overdue is a failure if the process could have sent it: time in which it waited
+for a processor does not count (`rampart.actors.ftm.patience`). If others are late as well it is the
+machine, or the bus, and a process is blamed only if it stands still. Both up to twice the timeout.
+What a node publishes often anyway is a sign of life as well, and much sooner missed: three periods
+of it are enough to find a loop that hangs (`rampart.actors.detection.loop_watch`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -21,18 +28,33 @@ from rampart.actors.bus import messages as m
 from rampart.actors.bus import topics
 from rampart.actors.bus.plausible import is_possible
 from rampart.actors.bus.topic import Members, Topic
+from rampart.actors.detection.loop_watch import LoopWatch
 from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.ftm.patience import AT_LEISURE, Patience, Standstill, Usage
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import HeartbeatTimeout, NodeNames
+from rampart.actors.runtime.parameters import HeartbeatTimeout, NodeNames, SignsOfLife
+from rampart.manager.spec.budget import PERIODS_TO_MISS
 
+LEAST_PERIOD_S = 0.02
+"""Real seconds; by what comes more often a loop is judged as by what comes 50 times a second."""
+
+_MOST_EXCUSED = 2
+"""After so many timeouts a heartbeat has failed to come, whatever the process waited for."""
+
+_ROUNDING_S = 1e-6
 
 @dataclass(slots=True)
 class _Watched:
     """What is known of a watched node: its newest incarnation and how that one is."""
 
     due_s: float
+    loop: LoopWatch
+    patience: Patience
+    standstill: Standstill
     incarnation: int = 0
+    pid: int = -1
     heard: bool = False
+    heard_s: float = -math.inf
     gone_s: float | None = None
     failure: str = ""
 
@@ -49,13 +71,19 @@ class WatchdogCore:
         start_s: now.
         grace_s: how long the first heartbeat of a node may take, s.
         known: whether idle may be claimed before all nodes were heard.
+        used: returns what a process has used; its times are in seconds of the same clock.
+        least_period_s: see `LoopWatch`.
     """
 
     def __init__(self, nodes: Iterable[str], timeout_s: float, start_s: float, grace_s: float,
-                 *, known: bool = True) -> None:
+                 *, known: bool = True, used: Callable[[int], Usage] = lambda _pid: AT_LEISURE,
+                 least_period_s: float = LEAST_PERIOD_S) -> None:
         self.timeout_s = timeout_s
         self._known = known
-        self._watched = {node: _Watched(due_s=start_s + grace_s) for node in nodes}
+        self._used = used
+        self._watched = {node: _Watched(start_s + grace_s, LoopWatch(least_period_s),
+                                        Patience(timeout_s), Standstill())
+                         for node in nodes}
 
     @property
     def active(self) -> bool:
@@ -80,15 +108,16 @@ class WatchdogCore:
 
     @property
     def due_s(self) -> float:
-        """When the next heartbeat is overdue."""
+        """When a heartbeat is overdue, or a silent process is to be looked at."""
         due_s = math.inf
         for one in self._watched.values():
-            if one.due_s < due_s and not one.failure:
-                due_s = one.due_s
+            if not one.failure:
+                due_s = min(due_s, one.due_s, one.loop.look_s)
         return due_s
 
-    def beat(self, node: str, incarnation: int, stamp_s: float, now_s: float) -> None:
-        """Take note of a heartbeat that was sent at `stamp_s`."""
+    def beat(self, node: str, incarnation: int, stamp_s: float, now_s: float, pid: int = -1
+             ) -> None:
+        """Take note of a heartbeat that a process sent at `stamp_s`."""
         one = self._watched.get(node)
         if one is None or incarnation < one.incarnation:
             return
@@ -98,9 +127,17 @@ class WatchdogCore:
                 stamp_s <= one.gone_s or not is_possible(stamp_s, now_s)):
             return  # sent before it died, and under way since; or at an impossible time
         one.gone_s = None
-        one.heard = True
+        one.heard, one.heard_s, one.pid = True, now_s, pid
         one.failure = ""
-        one.due_s = now_s + self.timeout_s
+        one.patience.answered()
+        one.standstill.begin()
+        one.due_s = now_s + self.timeout_s / 2  # it is not worth a look before
+
+    def sign(self, node: str, incarnation: int, period_s: float, now_s: float) -> None:
+        """Take note of what a node that works publishes with a period."""
+        one = self._watched.get(node)
+        if one is not None and one.heard and incarnation == one.incarnation and not one.failure:
+            one.loop.sign(period_s, now_s)
 
     def peer(self, node: str, incarnation: int, alive: bool, now_s: float) -> None:
         """Take note of a liveliness token that appears or vanishes."""
@@ -121,11 +158,42 @@ class WatchdogCore:
         one.failure = f"process of incarnation {incarnation} is gone"
 
     def expire(self, now_s: float) -> None:
-        """Conclude from the time that has passed without a heartbeat."""
+        """Conclude from the time that has passed without a heartbeat or a sign of life."""
         for one in self._watched.values():
-            if not one.failure and now_s >= one.due_s:
-                one.failure = f"no heartbeat for {self.timeout_s:g} s" if one.heard \
-                    else "never heard"
+            if one.failure:
+                continue
+            if now_s >= one.loop.look_s:
+                self._look(one, now_s)
+            if now_s >= one.due_s and not one.failure:
+                self._miss(one, now_s)
+
+    def _look(self, one: _Watched, now_s: float) -> None:
+        """Look whether the loop of a process turns that gives no sign of life."""
+        silent_s = now_s - one.loop.sign_s
+        if silent_s > self.timeout_s:  # then it is up to the heartbeats
+            one.loop.give_up()
+        elif how := one.loop.look(now_s, self._used(one.pid)):
+            one.failure = f"its loop hangs, {how}"
+            one.gone_s = one.loop.sign_s  # a heartbeat from before may still be under way
+
+    def _miss(self, one: _Watched, now_s: float) -> None:
+        """Look whether a process could have sent the heartbeat that has not come."""
+        if not one.heard:
+            one.failure = "never heard"
+            return
+        used, half_s = self._used(one.pid), self.timeout_s / 2
+        left_s = self.timeout_s - one.patience.look(now_s, one.pid, used, one.heard_s)
+        stands = one.standstill.look(now_s, used, self.timeout_s / PERIODS_TO_MISS)
+        if left_s <= _ROUNDING_S and not stands and self._others_late(one, now_s):
+            left_s = half_s
+        left_s = min(left_s, half_s, one.heard_s + _MOST_EXCUSED * self.timeout_s - now_s)
+        if left_s <= _ROUNDING_S:
+            one.failure = f"no heartbeat for {self.timeout_s:g} s"
+        one.due_s = now_s + left_s
+
+    def _others_late(self, one: _Watched, now_s: float) -> bool:
+        return any(other.heard and not other.failure and now_s - other.heard_s > self.timeout_s / 2
+                   for other in self._watched.values() if other is not one)
 
     @staticmethod
     def _succeed(one: _Watched, incarnation: int) -> None:
@@ -133,6 +201,9 @@ class WatchdogCore:
         one.incarnation = incarnation
         one.gone_s = None
         one.heard = False
+        one.loop.forget()
+        one.patience.answered()
+        one.standstill.begin()
 
 
 class Watchdog(DetectionModule):
@@ -144,10 +215,14 @@ class Watchdog(DetectionModule):
         Attributes:
             watch: names of the nodes.
             timeout_s: a node without a heartbeat for so long has failed, s.
+            signs: topics that they publish by a timer, ten times a second or more often, as long
+                as their loops turn: three periods without show that one hangs. One for a node is
+                enough.
         """
 
         watch: NodeNames
         timeout_s: HeartbeatTimeout = 0.5
+        signs: SignsOfLife = ()
 
     parameters: Parameters
 
@@ -156,7 +231,20 @@ class Watchdog(DetectionModule):
         timeout_s = self.parameters.timeout_s
         self.monitor = self.judged_by(WatchdogCore(
             self.parameters.watch, timeout_s, self.clock.now(),
-            self.grace_s(timeout_s), known=self.first_life))
+            self.grace_s(timeout_s), known=self.first_life, used=self._used,
+            least_period_s=LEAST_PERIOD_S * self.clock.rate))
+        for key in self.parameters.signs:
+            topic = self.chosen_topic(key)
+            self.hear_topic(key, partial(self._sign, 1.0 / topic.rate_hz))
+
+    def _used(self, pid: int) -> Usage:
+        """Return what a process has used, in simulated seconds."""
+        used, rate = self.context.scheduled(pid), self.clock.rate
+        return Usage(used.state, used.ran_s * rate, used.waited_s * rate)
+
+    def _sign(self, period_s: float, _message: Any, header: Header) -> None:
+        # The timer that is pending finds out what is due then; it need not be asked for each.
+        self.monitor.sign(header.source, header.incarnation, period_s, self.clock.now())
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
@@ -174,8 +262,8 @@ class Watchdog(DetectionModule):
         self.follow()
 
     @on(topics.HEARTBEAT)
-    def heartbeat(self, _message: m.Heartbeat, header: Header) -> None:
+    def heartbeat(self, message: m.Heartbeat, header: Header) -> None:
         """Hear that a loop turns."""
         self.monitor.beat(header.source, header.incarnation, header.stamp,
-                          self.clock.now())
+                          self.clock.now(), message.pid)
         self.follow()

@@ -27,7 +27,7 @@ from rampart.actors.bus.bounds import (
     Text,
     Texts,
 )
-from rampart.actors.bus.messages import Injection, Message
+from rampart.actors.bus.messages import ON_TIME, Injection, Message
 from rampart.manager.model.mechanisms import RecoveryPhase
 
 
@@ -184,8 +184,12 @@ class NodeState(StrEnum):
     GIVEN_UP = "given up"
 
 
-class NodeInfo(Message, frozen=True):
-    """One row of the supervisor's table."""
+class NodeInfo(Message, frozen=True, omit_defaults=True):
+    """One row of the supervisor's table.
+
+    `late_s` is how late a timer of its loop was at most in the last half or whole second, simulated
+    seconds; left out if none was.
+    """
 
     name: Name
     kind: Name
@@ -193,6 +197,7 @@ class NodeInfo(Message, frozen=True):
     state: NodeState
     incarnation: Incarnation
     restarts: Count
+    late_s: Seconds = ON_TIME
 
 
 class NodeTable(Message, frozen=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
@@ -13,11 +14,17 @@ import msgspec
 from rampart.actors.bus.fields import Field, Steered
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
-from rampart.actors.layout.wiring import Member, panels_of, shows_panels
+from rampart.actors.layout.wiring import Member, panels_of, published, shows_panels
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import Named, messages_said, topics_named
 from rampart.manager.spec.panels import NUMBER, Panel
 from rampart.manager.spec.schema import SystemSpec
+
+LEAST_SIGN_HZ = 10.0
+"""What is published less often is no better a sign of life than heartbeats."""
+
+_LATEST_SIGN = 1.5
+"""Periods of such a topic within which a loop that turns has had a timer to handle."""
 
 MOST_PLOTS = 8
 """Panels of a page that declares none."""
@@ -54,6 +61,8 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
                     raise ValueError(f"{where}: {member.actor.__name__} hears {key!r} anyway")
                 if one.field:
                     _check_field(topic, one, where)
+                if one.signs_of:
+                    _check_sign(topic, one, everyone, where)
                 name = topic.member(key)
                 there = ways[way].get(topic.key, ())
                 ways[way][topic.key] = (*(there or ()), name) if name else None
@@ -161,6 +170,26 @@ def steered(panel: Panel, topic: Topic[Any]) -> Steered:
     names = [shown.field.partition(":")[2] for shown in panel.fields()]
     count = len(panel.stick or ())
     return Steered(topic.type, names[:count], "".join(names[count:]), panel.scale)
+
+
+def _check_sign(topic: Topic[Any], named: Named, members: Iterable[Member], where: str) -> None:
+    """Refuse what is no sign of life of a watched node, or too rare to be a better one."""
+    if topic.rate_hz < LEAST_SIGN_HZ:
+        comes = f"comes {topic.rate_hz:g} times a second" if topic.rate_hz else "comes on event"
+        raise ValueError(f"{where} = {named.key!r}: {comes}, heartbeats show as much; a topic with "
+                         f"a rate of {LEAST_SIGN_HZ:g} Hz or more is right")
+    publishers = [m for m in members if topic.key in published(m)]
+    watched = [m for m in publishers if m.name in named.signs_of]
+    if not watched:
+        names = ", ".join(m.name for m in publishers) or "none"
+        raise ValueError(f"{where} = {named.key!r}: published by {names}, a topic of "
+                         f"{' or '.join(named.signs_of)} is right")
+    longest_s = _LATEST_SIGN / topic.rate_hz
+    for member in watched:
+        if min(member.actor.periods_s(), default=math.inf) > longest_s:
+            raise ValueError(f"{where} = {named.key!r}: {member.name} has no timer of "
+                             f"{1 / topic.rate_hz:g} s, so it is silent when others are; what is "
+                             "published by a timer (@every) is right")
 
 
 def _check_field(topic: Topic[Any], named: Named, where: str) -> None:

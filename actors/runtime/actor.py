@@ -23,7 +23,7 @@ from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from rampart.actors.bus.fields import Field
 from rampart.actors.bus.limits import Remembered, ReportLimit
-from rampart.actors.bus.messages import Diagnostic, Heartbeat, Injection
+from rampart.actors.bus.messages import ON_TIME, Diagnostic, Heartbeat, Injection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, INJECT
 from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
@@ -44,6 +44,9 @@ its publisher is silent, and only the next message shows that it is not."""
 
 _UNSENT = 256
 """So many messages one that waits to be the node keeps: the newest of each topic, all commands."""
+
+_LATE_DIGITS = 3
+"""Of the lateness of timers: milliseconds."""
 
 _PATIENCE_S = 0.02
 """So long one that replaces another waits at most for what was published before it came."""
@@ -405,9 +408,10 @@ class Actor(Declared):
         if not self.is_well():
             return
         context = self.context
+        late_s = round(self._timers.lateness_s(), _LATE_DIGITS) or ON_TIME
         self.publish(HEARTBEAT, Heartbeat(
             context.pid, self._dispatcher.progress, context.heartbeat_period_s, self._rejected,
-            self._dispatcher.overflowed))
+            self._dispatcher.overflowed, late_s))
         left_out = self._reports.left_out(self.clock.now())
         if left_out:
             self.report_diagnostic(

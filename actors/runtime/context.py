@@ -12,6 +12,8 @@ import msgspec
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm.patience import Usage
+from rampart.actors.ftm.patience import usage as read_usage
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.clock import Clock
@@ -38,6 +40,7 @@ class Context:
         topics: those that parameters of the system's nodes name, by key.
         waits: "warm" or "hot" if it is set up as that, to be silent until `promote`.
         usage: returns what a process has used of the machine.
+        scheduled: returns what the main thread of a process has run, and waited for a processor.
     """
 
     name: str
@@ -55,3 +58,4 @@ class Context:
     topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
     waits: str = ""
     usage: Callable[[int], ProcessCount | None] = read_count
+    scheduled: Callable[[int], Usage] = read_usage

@@ -107,6 +107,11 @@ class Handlers:
         """Topics it has handlers for, of an actor those that every actor hears included."""
         return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
 
+    @classmethod
+    def periods_s(cls) -> tuple[float, ...]:
+        """Periods of what it does by `every`, simulated seconds."""
+        return tuple(period_s for period_s, _ in cls._periodic)
+
 
 _OF_HANDLER = {1: "(self)", 3: "(self, message, header)"}
 

@@ -30,6 +30,9 @@ RecoveryNames = Annotated[tuple[Name, ...], msgspec.Meta(extra={"names": "recove
 TopicHeard = Annotated[str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "heard"})]
 """Key of a topic, below `rampart/`, that the node hears because its parameters say so."""
 TopicsHeard = Annotated[tuple[str, ...], msgspec.Meta(extra={"names": "topic", "way": "heard"})]
+SignsOfLife = Annotated[tuple[str, ...], msgspec.Meta(
+    extra={"names": "topic", "way": "heard", "signs_of": "watch"})]
+"""Keys of topics by which the nodes that the parameter `watch` names show that they work."""
 TopicPublished = Annotated[
     str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "published"})]
 """Key of a topic that the node publishes because its parameters say so."""
@@ -97,6 +100,7 @@ class Named(NamedTuple):
         field: of its messages, or "".
         kinds: of which the field may be.
         shown_by: "panel TITLE: " if a panel shows or says it.
+        signs_of: nodes of which it is a sign of life, if it is.
     """
 
     name: str
@@ -104,6 +108,7 @@ class Named(NamedTuple):
     field: str
     kinds: tuple[str, ...] = ANYTHING
     shown_by: str = ""
+    signs_of: tuple[str, ...] = ()
 
 
 def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
@@ -117,7 +122,8 @@ def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
                     found["published" if shown.is_said else "heard"].append(Named(
                         shown.key, *_parts(shown.field), shown.kinds, f"panel {panel.title!r}: "))
         elif "way" in marks and said:
-            found[marks["way"]] += [Named(name, *_parts(text))
+            nodes = getattr(parameters, marks["signs_of"]) if "signs_of" in marks else ()
+            found[marks["way"]] += [Named(name, *_parts(text), signs_of=nodes)
                                     for text in ([said] if isinstance(said, str) else said)]
     return found
 

@@ -50,6 +50,7 @@ class Timers:
         self._count = 0
         self._pending: set[Timer] = set()
         self._ended = False
+        self._late_s = 0.0
 
     def __len__(self) -> int:
         return len(self._pending)
@@ -83,11 +84,17 @@ class Timers:
             nonlocal due_s
             if not self._ended:
                 now_s, next_s = clock.now(), due_s + period_s
+                self._late_s = max(self._late_s, now_s - due_s)
                 due_s = next_s if next_s > now_s else now_s + period_s
                 post_at(clock.source_time(due_s), tick, None, None)
                 self._dispatcher.put(slot, call)
 
         post_at(clock.source_time(due_s), tick, None, None)
+
+    def lateness_s(self) -> float:
+        """Return how late a periodic call came at most since this was asked last."""
+        late_s, self._late_s = self._late_s, 0.0
+        return late_s
 
     def cancel(self) -> None:
         """Make none of the calls any more."""

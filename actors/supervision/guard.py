@@ -16,8 +16,8 @@ from collections.abc import Callable, Mapping
 
 from rampart.actors.bus.run_folder import issued
 from rampart.actors.bus.zenoh_bus import ROUTERS
+from rampart.actors.ftm.patience import Patience, usage
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
-from rampart.actors.supervision.patience import Patience, usage
 from rampart.actors.supervision.process_title import RunProcess, find_process, find_processes, kill
 from rampart.actors.supervision.processes import OsHandle
 from rampart.actors.supervision.spawner import NAMES

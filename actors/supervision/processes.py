@@ -18,7 +18,7 @@ from typing import Literal, Protocol
 
 from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.supervision.patience import AT_LEISURE, Usage, usage
+from rampart.actors.ftm.patience import AT_LEISURE, Usage, usage
 from rampart.actors.supervision.process_title import RunProcess, find_processes
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 

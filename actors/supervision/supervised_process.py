@@ -21,12 +21,19 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from rampart.actors.ftm.messages import NodeState
+from rampart.actors.ftm.patience import Patience, Standstill, Usage
 from rampart.actors.layout.layout import Unit
-from rampart.actors.supervision.patience import Patience, Usage
+from rampart.manager.spec.budget import PERIODS_TO_MISS
 from rampart.manager.spec.tables import Supervision
 
 START_TIMEOUT_S = 3.0
 """Wall seconds in which a new process must have sent its first heartbeat."""
+
+MANY = 2
+"""When so many heartbeats are missing it is the machine, or the bus."""
+
+MOST_EXCUSED_S = 3.0
+"""Wall seconds that a process could have run after which it is blamed though many are silent."""
 
 STATUS = "fresh status of the manager"
 """Stands among the names of a process' nodes for what the Safety Pilot depends on."""
@@ -219,6 +226,7 @@ class SupervisedProcess:
     started_s: float = 0.0
     searched_s: float = -math.inf
     heard_s: dict[str, float] = field(default_factory=dict)
+    standstill: Standstill = field(default_factory=Standstill)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -264,13 +272,20 @@ class SupervisedProcess:
         self.pid, self.incarnation, self.heard_s = pid, incarnation, {}
         self.highest = max(self.highest, incarnation)
 
-    def silence(self, now_s: float, timeout_s: float, used: Callable[[], Usage]) -> str:
+    def is_late(self, now_s: float, timeout_s: float) -> bool:
+        """Whether a heartbeat of it is missing."""
+        return self.state is State.RUNNING and (
+            now_s - min(self.heard_s.values(), default=now_s) > timeout_s / 2)
+
+    def silence(self, now_s: float, timeout_s: float, used: Callable[[], Usage], *,
+                many: bool = False) -> str:
         """Return in words what was not heard of it for too long although it could; "" if nothing.
 
         Args:
             now_s: Now.
             timeout_s: Of a heartbeat.
             used: Returns what the process has used; asked only if that matters.
+            many: Whether many are late: then it has to be proved that it stands still.
         """
         if self.state is State.STARTING:
             is_silent = self._could_have_been_heard(now_s, self.started_s, START_TIMEOUT_S, used)
@@ -279,17 +294,22 @@ class SupervisedProcess:
             return ""
         since_s = min(self.heard_s.values(), default=now_s)
         late = [name for name, at_s in self.heard_s.items() if now_s - at_s > timeout_s]
-        if not self._could_have_been_heard(now_s, since_s, timeout_s, used) or not late:
+        could = self._could_have_been_heard(now_s, since_s, timeout_s, used, many=many)
+        if not could or not late:
             return ""
         nodes = ", ".join(name for name in late if name != STATUS)
         return f"no heartbeat from {nodes}" if nodes else f"no {STATUS}"
 
     def _could_have_been_heard(self, now_s: float, since_s: float, limit_s: float,
-                               used: Callable[[], Usage]) -> bool:
+                               used: Callable[[], Usage], *, many: bool = False) -> bool:
         if now_s - since_s <= limit_s / 2:  # not worth a look into /proc
             self.patience.answered()
+            self.standstill.begin()
             return False
-        return self.patience.look(now_s, self.pid, used(), since_s) > limit_s
+        usage = used()
+        stands = self.standstill.look(now_s, usage, limit_s / PERIODS_TO_MISS)
+        could_s = self.patience.look(now_s, self.pid, usage, since_s)
+        return could_s > limit_s and (bool(stands) or not many or could_s > MOST_EXCUSED_S)
 
     def excuse(self, now_s: float, stall_s: float) -> None:
         """Do not count as silence what the supervisor could not have heard."""

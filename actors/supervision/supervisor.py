@@ -29,17 +29,18 @@ from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
-from rampart.actors.bus.messages import Heartbeat
+from rampart.actors.bus.messages import ON_TIME, Heartbeat
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
+from rampart.actors.ftm.patience import Patience
 from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.supervision.held_process import HeldProcess
-from rampart.actors.supervision.patience import Patience
 from rampart.actors.supervision.processes import OsProcesses, Processes, ProcessHandle, RunProcess
 from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import (
+    MANY,
     STATUS,
     Action,
     Event,
@@ -48,12 +49,16 @@ from rampart.actors.supervision.supervised_process import (
 )
 from rampart.manager.spec.adaptation import changed_actors
 from rampart.manager.spec.schema import Kind
+from rampart.manager.spec.tables import FAILOVER_S
 
 STOP_GRACE_S = 0.5
 """Wall seconds between SIGTERM and SIGKILL at the end of a run."""
 
 _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
+
+_LATE_S = 0.02
+"""Wall seconds by which this look is late when its own process lacks processor time."""
 
 _ROUTERS_S = 0.03
 """Wall seconds between two looks whether a router is stopped."""
@@ -103,6 +108,8 @@ class Supervisor(Actor):
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
         self._checked_s = self._loop.time()
+        self._late_s: dict[str, float] = {}
+        self._late_before_s: dict[str, float] = {}
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
@@ -157,6 +164,8 @@ class Supervisor(Actor):
                 header.incarnation, message.pid) != (process.incarnation, process.pid):
             return  # said before it was killed, or by another one
         process.heard_s[header.source] = self._loop.time()
+        if message.late_s > self._late_s.get(header.source, 0.0):
+            self._late_s[header.source] = message.late_s
         process.requested_by = ""
         self._on(process, Event.HEARD)
 
@@ -216,14 +225,19 @@ class Supervisor(Actor):
     def check(self) -> None:
         """Look for processes whose loops are silent."""
         # A supervisor that was stopped, starved or waiting for a hung spawner heard no node. What
-        # was said is still on its way here, and silence counts only while this loop turned.
+        # was said is still on its way here, and silence counts only while this loop turned. Nor
+        # does it count when the router has died over which it hears them.
         now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
         stall_s = now - self._checked_s - period_s
         self._checked_s = now
+        missed_s = FAILOVER_S if self._bus.moved() else stall_s if stall_s > _LATE_S else 0.0
+        if missed_s:
+            for process in self._processes.values():
+                process.excuse(now, missed_s)
+        late = sum(process.is_late(now, self._timeout_s) for process in self._processes.values())
         for process in self._processes.values():
-            if stall_s > period_s:
-                process.excuse(now, stall_s)
-            silence = process.silence(now, self._timeout_s, process.handle.usage)
+            silence = process.silence(
+                now, self._timeout_s, process.handle.usage, many=late >= MANY)
             if silence:
                 stopped = process.state is State.RUNNING and process.handle.stopped()
                 self._on(process, Event.SILENT_STOPPED if stopped else Event.SILENT,
@@ -242,6 +256,7 @@ class Supervisor(Actor):
         """Repeat the node table for those who joined late, and see to the spares."""
         self._publish_table()
         self._look_at_spares()
+        self._late_before_s, self._late_s = self._late_s, {}
 
     def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
         if process.pid == pid:  # else it was replaced while the news waited in the mailbox
@@ -397,8 +412,13 @@ class Supervisor(Actor):
 
     def _publish_table(self) -> None:
         own = fm.NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid,
-                          fm.NodeState.RUNNING, self._incarnation, self._incarnation - 1)
+                          fm.NodeState.RUNNING, self._incarnation, self._incarnation - 1,
+                          self._lateness_s(self.name))
         rows = (fm.NodeInfo(node.name, node.kind.value, p.pid, p.shown, p.incarnation,
-                            max(0, p.incarnation - 1))
+                            max(0, p.incarnation - 1), self._lateness_s(node.name))
                 for p in self._processes.values() for node in p.unit.nodes)
         self.publish(topics.NODES, fm.NodeTable((own, *rows)))
+
+    def _lateness_s(self, node: str) -> float:
+        late_s = max(self._late_s.get(node, 0.0), self._late_before_s.get(node, 0.0))
+        return late_s or ON_TIME

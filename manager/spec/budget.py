@@ -28,7 +28,7 @@ from rampart.manager.spec.mobile_robot import (
     time_to_obstacle_s,
 )
 from rampart.manager.spec.schema import Kind, SystemSpec, Within
-from rampart.manager.spec.tables import PERIODS, Finding, Timing, numbered
+from rampart.manager.spec.tables import FAILOVER_S, GUARDED, PERIODS, Finding, Timing, numbered
 
 PERIODS_TO_MISS = 3
 """A timeout shorter than so many periods would take a late message for a lost one."""
@@ -149,6 +149,9 @@ def find_false_alarms(timing: Timing) -> Iterator[Finding]:
     for field, period_field in PERIODS.items():
         value = getattr(timing, field)
         problem = find_false_alarm(timing, value, period_field)
+        if not problem and field not in GUARDED and value < FAILOVER_S - 1e-9:
+            problem = (f"would stop the robot whenever a router of the bus dies; at least "
+                       f"{FAILOVER_S:.3f} s, for which nothing may be heard then, is right")
         if problem:
             yield Finding(f"$.timing.{field}", problem, (value,))
 

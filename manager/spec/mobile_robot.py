@@ -26,7 +26,16 @@ from enum import StrEnum
 
 import msgspec
 
-from rampart.manager.spec.tables import PERIODS, Finding, NonNegative, Positive, Table, Timing
+from rampart.manager.spec.tables import (
+    FAILOVER_S,
+    GUARDED,
+    PERIODS,
+    Finding,
+    NonNegative,
+    Positive,
+    Table,
+    Timing,
+)
 
 SHARE = 0.9
 """Of the time that is left, a derived timeout takes this much."""
@@ -147,7 +156,7 @@ def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
 
     Args:
         robot: Speeds and distances; without one a timeout is `PERIODS_WAITED` periods of what it
-            waits for.
+            waits for, and what stops the robot outlasts the death of a router (`FAILOVER_S`).
         timing: With NaN where a value is to be derived; values that are given are kept, and
             those derived follow from them.
 
@@ -157,8 +166,9 @@ def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
     """
     if robot is None:
         return msgspec.structs.replace(timing, **{
-            field: PERIODS_WAITED * getattr(timing, period) for field, period in PERIODS.items()
-            if math.isnan(getattr(timing, field))})
+            field: max(PERIODS_WAITED * getattr(timing, period),
+                       0.0 if field in GUARDED else FAILOVER_S)
+            for field, period in PERIODS.items() if math.isnan(getattr(timing, field))})
     drift = time_to_drift_s(robot)
     noticed_s = SHARE * (drift - timing.arbitration_s - timing.actuation_s)
     cycle_s, obstacle = timing.control_period_s, time_to_obstacle_s(robot)

@@ -18,6 +18,7 @@ from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.topics import INJECT
+from rampart.actors.ftm.patience import AT_LEISURE
 from rampart.actors.layout.layout import Layout, load_run
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
@@ -138,7 +139,7 @@ class VirtualSystem:
         return Context(name, incarnation, self.clock, VirtualBus(self.hub, name, incarnation),
                        parameters, self.run, checkpoints=kept, members=self.members,
                        register=self.register, topics=self._named(parameters),
-                       usage=lambda _pid: None)
+                       usage=lambda _pid: None, scheduled=lambda _pid: AT_LEISURE)
 
     def _named(self, parameters: dict[str, Any]) -> dict[str, Topic[Any]]:
         """Return the topics that parameters may name, by their keys there."""

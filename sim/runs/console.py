@@ -115,6 +115,8 @@ class Console:
         """Say how it ended, and where the report is, if there is one."""
         for reason in record.reasons:
             self.say(f"  {reason}")
+        if (kept_up := record.keeping_up) and kept_up.behind_s:
+            self.say(f"  for {kept_up.behind_s:.0f} s of {record.duration_s:.0f} s {kept_up}")
         if report is not None:
             self.say(f"Report: {report}")
 

@@ -18,6 +18,7 @@ from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.manager.strategies.registry import decision_in_words
 from rampart.sim.faults.scenario import FaultOutcome
+from rampart.sim.runs.keeping_up import KeptUp
 
 KEPT = 10_000
 """Most events, intervals, decisions or names of a kind that are kept of a run."""
@@ -89,6 +90,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         seed: of everything random.
         rate: simulated seconds per second.
         faults: that were planned, and what became of them.
+        keeping_up: whether the machine kept up with the rate; None in virtual time.
     """
 
     run_id: str
@@ -106,6 +108,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     rate: float
     faults: tuple[FaultOutcome, ...] = ()
+    keeping_up: KeptUp | None = None
 
 
 _SOON_S = 1.0

@@ -27,12 +27,13 @@ from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.parameters import read_parameters
-from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import INJECTOR, Injector, ProcessControl
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.console import Console
 from rampart.sim.runs.judge import Judge, Verdict
+from rampart.sim.runs.keeping_up import KeepingUp, KeptUp
 from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord, RunRecorder, Safety
 from rampart.sim.runs.report import Written, margin_text, render, try_report
@@ -93,6 +94,9 @@ class Trial:
         self.recorder = RunRecorder(run.plan, self.strategy)
         self.injects: Injector | None = None
         self._brought_back = 0
+        self._keeping_up = None if run.plan.virtual else KeepingUp(
+            run.system.timing, [n.name for n in run.system.nodes if n.kind is Kind.WORLD],
+            run.plan.rate)
 
     def sinks(self, clock: Clock) -> list[Sink]:
         """Return what wants to hear the run's messages."""
@@ -111,9 +115,10 @@ class Trial:
             control: by which processes are hit.
             nodes: names that may be hit.
         """
-        def take(_topic: Topic[Any], message: Any, _header: Header) -> None:
+        def take(_topic: Topic[Any], message: Any, header: Header) -> None:
             if isinstance(message, NodeTable):
                 heard(message)
+                self._note_lateness(message, header.stamp)
 
         spec, observers = self.run.system, context(OBSERVER)
         kind = observer_class(spec)
@@ -126,6 +131,12 @@ class Trial:
                 faults=faults_of(spec))
             actors.append(self.injects)
         return actors
+
+    def _note_lateness(self, table: NodeTable, now_s: float) -> None:
+        if self._keeping_up is not None:
+            line = self._keeping_up.take(table, now_s)
+            if line and self.console:
+                self.console.line(now_s, line)
 
     def outcomes(self) -> tuple[FaultOutcome, ...]:
         """Return what has become of the faults so far."""
@@ -156,12 +167,16 @@ class Trial:
             why: it is over.
         """
         del why
-        return self.recorder.record(now_s, faults=self.outcomes())
+        return self.recorder.record(now_s, faults=self.outcomes(), keeping_up=self._kept_up(now_s))
+
+    def _kept_up(self, now_s: float) -> KeptUp | None:
+        return self._keeping_up.result(now_s) if self._keeping_up else None
 
     def concluded(self, verdict: Verdict, now_s: float, why: str) -> RunRecord:
         """Return the record of a run that has ended for a reason, and was judged."""
         return self.recorder.record(
-            now_s, faults=self.outcomes(), mission="success" if verdict.success else "fail",
+            now_s, faults=self.outcomes(), keeping_up=self._kept_up(now_s),
+            mission="success" if verdict.success else "fail",
             safety=_SAFETY[verdict.safe],
             reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
 
@@ -171,6 +186,7 @@ class Trial:
             "mission": record.mission, "safety": record.safety, "reasons": record.reasons,
             "duration_s": round(record.duration_s, 2), "restarts": record.restarts,
             "given_up": record.given_up, "failing": record.failing,
+            "keeping_up": msgspec.to_builtins(record.keeping_up),
             "decisions": msgspec.to_builtins(record.decisions),
             "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
                        for fault in record.faults]}

@@ -217,6 +217,10 @@ class VirtualBus:
     def gone(self, node: str, incarnation: int) -> None:
         """Nothing to do: watchers are told when it is cut off."""
 
+    def moved(self) -> bool:
+        """Never: there are no routers."""
+        return False
+
     def cut(self) -> None:
         """Send and receive nothing any more, as when the process is killed; none is told yet."""
         self._open = False

@@ -8,6 +8,7 @@ for it, and brings the supervisor back. The actors, the supervisor included, are
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.ftm.messages import AdaptedSystem, NodeTable
+from rampart.actors.ftm.patience import Usage
 from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import SUPERVISOR
@@ -66,6 +68,7 @@ class VirtualProcess(msgspec.Struct, eq=False):
     actors: list[tuple[Actor, VirtualBus, asyncio.Task[None]]] = []
     holders: list[Callable[[], None]] = []
     gone: bool = False
+    held_s: float = math.inf
 
 
 @dataclass(eq=False, slots=True)
@@ -221,6 +224,14 @@ class VirtualMachine:
         """Start processes by a changed system from now on."""
         self._layout, self._run = adapted_system(self._layout, self._run, adapted)
 
+    def scheduled(self, pid: int) -> Usage:
+        """Return what a process has run: always a little, unless it is stopped or hangs."""
+        process = self._processes.get(pid)
+        if process is None:
+            return Usage("X", 0.0, 0.0)
+        stopped = process.condition is Condition.STOPPED
+        return Usage("T" if stopped else "S", min(self._loop.time(), process.held_s), 0.0)
+
     def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:  # noqa: ARG002
         """End processes."""
         for handle in handles:
@@ -252,6 +263,7 @@ class VirtualMachine:
             if process.condition is not before:
                 return False
             process.condition = after
+            process.held_s = math.inf if after is Condition.RUNNING else self._loop.time()
             for actor, _, _ in process.actors:
                 actor.hold(after is not Condition.RUNNING)
         return True
@@ -281,7 +293,7 @@ class VirtualMachine:
                 process.pid, self._store(name, process.incarnation),
                 self._layout.spec.timing.heartbeat_period_s, register=self._known.get,
                 members=frozenset(self._layout.members), topics=self._layout.topics,
-                usage=lambda _pid: None)
+                usage=lambda _pid: None, scheduled=self.scheduled)
             try:
                 actor = Supervisor(context, self) if name == SUPERVISOR else member.actor(context)
             except Exception as error:

@@ -31,6 +31,41 @@ def test_messages_and_help_say_what_was_typed(capsys, start, name):
     assert f"  {name} --mission A --obstacles 2 " in told
 
 
+def test_a_rate_that_is_none_and_one_without_a_meaning_are_refused_in_one_line(capsys):
+    assert launch.main(["--rate", "max", "--virtual"]) == 2
+    assert capsys.readouterr().err == (
+        "launch.py: --rate max: only on real processes; virtual time has no rate, it is always as "
+        "fast as it can be\n")
+    with pytest.raises(SystemExit) as ended:
+        launch.main(["--rate", "fast"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.splitlines()[-1].endswith(
+        "argument --rate: 'fast': a number from 0.1 to 20 is right, or max")
+
+
+@pytest.mark.parametrize(("signs", "problem"), [
+    ("plan/route", "comes 5 times a second, heartbeats show as much; a topic with a rate of 10 Hz "
+     "or more is right"),
+    ("mission/order", "comes on event, heartbeats show as much; a topic with a rate of 10 Hz or "
+     "more is right"),
+    ("summit_xl/odom", "published by simulator, a topic of mission_manager or graph_planner or "
+     "osmosis_control is right"),
+    ("localization/pose", "localization has no timer of 0.05 s, so it is silent when others are; "
+     "what is published by a timer (@every) is right")])
+def test_what_is_no_sign_of_life_is_refused_in_one_line(tmp_path, capsys, signs, problem):
+    text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
+    if signs == "localization/pose":
+        watch = 'watch = ["localization"],'
+        text = text.replace(watch, f'{watch} signs = ["{signs}"],')
+    else:
+        text = text.replace('signs = ["control/command"]', f'signs = ["{signs}"]')
+    (tmp_path / "own.toml").write_text(text, encoding="utf-8")
+    assert launch.main(["--virtual", "--system", str(tmp_path / "own.toml")]) == 2
+    told = capsys.readouterr().err
+    module = "DM7" if signs == "localization/pose" else "DM4"
+    assert told.endswith(f"own.toml: {module}: parameters.signs = '{signs}': {problem}\n")
+
+
 def test_a_system_without_an_application_offers_no_options_or_examples_of_a_robot(capsys):
     with pytest.raises(SystemExit):
         launch.main(["--system", str(CELL), "--help"])

@@ -31,6 +31,7 @@ from msgspec import inspect
 
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.ftm.patience import AT_LEISURE, Usage
 from rampart.actors.layout.layout import Layout, load_run
 from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.osmosis.application import Osmosis
@@ -40,7 +41,6 @@ from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
 from rampart.actors.runtime.parameters import topics_named
-from rampart.actors.supervision.patience import AT_LEISURE, Usage
 from rampart.cli import systems
 from rampart.cli.look import top_view
 from rampart.cli.look.metrics_families import families

@@ -164,6 +164,25 @@ async def test_when_a_router_dies_all_go_over_to_the_other_and_none_counts_as_go
         assert set(changes) == {("node", 1, True)}
 
 
+async def test_who_has_gone_over_to_another_router_knows_it_once(routers, sockets):
+    await routers.start(*ROUTERS)
+    async with client(sockets, "node") as writer, client(sockets) as reader:
+        heard = hear(reader)
+        await send_until(writer, lambda: heard)
+        assert not reader.moved()
+        routers.send("router_a", signal.SIGKILL)
+        await eventually(reader.moved)
+        heard.clear()
+        await send_until(writer, lambda: heard)
+        reader.moved()
+        assert not reader.moved()
+        assert not SharedBus(reader).moved()
+        routers.send("router_b", signal.SIGKILL)
+        await eventually(reader.moved)
+        await asyncio.sleep(0.1)
+        assert reader.moved()  # as long as there is none
+
+
 async def test_when_both_die_all_come_back_to_the_next_ones(routers, sockets):
     await routers.start(*ROUTERS)
     changes = []

@@ -19,13 +19,14 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem, ManagerStatus, NodeState, RespawnRequest
+from rampart.actors.ftm.patience import Usage
 from rampart.actors.layout.layout import Layout
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan, load_document, load_system
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
-from rampart.actors.supervision.patience import Usage
 from rampart.actors.supervision.processes import RunProcess, SpawnerUnavailableError
+from rampart.actors.supervision.supervised_process import MOST_EXCUSED_S
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.manager.spec.tables import Supervision
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
@@ -88,13 +89,15 @@ class Machine:
         self.ended: list[str] = []
         self.starving: set[str] = set()
         self.starves_from_s = 0.0
+        self.turning = False
         self.questions = 0
         self.searches = 0
         self.ready: dict[str, tuple[int, str]] = {}
         self.prepared: list[tuple[str, int, str]] = []
 
     def usage(self, process: Process) -> Usage:
-        return Usage("S", 0.0, max(0.0, asyncio.get_running_loop().time() - self.starves_from_s)
+        ran_s = 1.0 + (asyncio.get_running_loop().time() / 100 if self.turning else 0.0)
+        return Usage("S", ran_s, max(0.0, asyncio.get_running_loop().time() - self.starves_from_s)
                      if process.names[0] in self.starving else 0.0)
 
     def prepare(self, names: tuple[str, ...], incarnation: int, kind: str) -> None:
@@ -339,6 +342,57 @@ def test_who_waits_for_a_processor_is_not_taken_for_wedged_and_who_waits_for_not
             assert world.row("DM1") == ("running", 1, starved.pid)
             world.machine.starving.clear()  # it has a processor, and says nothing all the same
             await eventually(lambda: starved.killed, 0.8)
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(("silent", "killed"), [(("DM1",), True),
+                                                (("DM1", "DM2", "DM3", "DM4"), False)])
+def test_where_many_are_silent_at_once_who_runs_is_blamed_for_nothing(silent, killed):
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.turning = True
+            processes = [world.machine.of(name)[0] for name in silent]
+            world.silent |= {process.pid for process in processes}
+            await asyncio.sleep(1.5)
+            assert [process.killed for process in processes] == [killed] * len(silent)
+            world.silent.clear()
+
+    run(scenario)
+
+
+def test_where_many_stand_still_all_are_replaced_in_time():
+    async def scenario() -> None:
+        async with running() as world:
+            processes = [world.machine.of(f"DM{i}")[0] for i in range(1, 6)]
+            world.silent |= {process.pid for process in processes}
+            await eventually(lambda: all(p.killed for p in processes), 1.2)
+
+    run(scenario)
+
+
+def test_where_many_are_silent_for_long_all_are_replaced_whatever_they_do():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.turning = True
+            processes = [world.machine.of(f"DM{i}")[0] for i in range(1, 6)]
+            world.silent |= {process.pid for process in processes}
+            await eventually(lambda: all(p.killed for p in processes), MOST_EXCUSED_S + 1.0)
+
+    run(scenario)
+
+
+def test_what_is_not_heard_because_a_router_died_is_no_fault_of_any_process():
+    async def scenario() -> None:
+        async with running() as world:
+            answers = iter([False, True])
+            world.supervisor._bus.moved = lambda: next(answers, False)
+            process = world.machine.of("DM1")[0]
+            world.silent.add(process.pid)
+            timeout_s = world.spec.timing.heartbeat_timeout_s
+            await asyncio.sleep(timeout_s + 0.1)
+            assert not process.killed
+            await eventually(lambda: process.killed, 0.3 + 0.2)
 
     run(scenario)
 

@@ -14,7 +14,7 @@ from rampart.manager.spec.mobile_robot import (
     time_to_runaway_s,
 )
 from rampart.manager.spec.schema import Within
-from rampart.manager.spec.tables import Timing
+from rampart.manager.spec.tables import FAILOVER_S, GUARDED, PERIODS, Timing
 from tests.manager.bench import full_system, paper
 
 SPEC = paper()
@@ -163,10 +163,20 @@ def test_a_budget_explains_itself():
         "0.400) of 0.990 s before DM2 of FTM2 detects the consequence")
 
 
+@pytest.mark.parametrize("field", sorted(PERIODS.keys() - GUARDED))
+def test_what_stops_the_robot_outlasts_the_death_of_a_router(field):
+    slow = with_timing(control_period_s=0.01, manager_period_s=0.01, detection_period_s=0.01).timing
+    assert not list(find_false_alarms(msgspec.structs.replace(slow, **{field: FAILOVER_S})))
+    found = list(find_false_alarms(msgspec.structs.replace(slow, **{field: 0.29})))
+    assert found == [(f"$.timing.{field}", "would stop the robot whenever a router of the bus "
+                      "dies; at least 0.300 s, for which nothing may be heard then, is right",
+                      (0.29,))]
+
+
 def test_all_timeouts_are_guarded_against_false_alarms():
     for field, least in {"heartbeat_timeout_s": 0.42, "command_timeout_s": 0.15,
-                         "localization_timeout_s": 0.15, "scan_timeout_s": 0.15,
-                         "dead_man_timeout_s": 0.15,
+                         "localization_timeout_s": 0.15, "scan_timeout_s": 0.3,
+                         "dead_man_timeout_s": 0.3,
                          "manager_timeout_s": 0.3, "detection_silence_timeout_s": 0.6}.items():
         assert not list(find_false_alarms(with_timing(**{field: least}).timing))
         alarm = next(find_false_alarms(with_timing(**{field: least - 0.01}).timing))

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from rampart.actors.supervision.patience import AT_LEISURE, Patience, Usage, usage
+from rampart.actors.ftm.patience import AT_LEISURE, Patience, Usage, usage
 from rampart.testing import wait_until
 
 
@@ -52,6 +52,27 @@ def test_whoever_stood_still_himself_blames_no_other_for_it():
 def test_what_it_owes_for_longer_counts_from_then():
     patience = Patience(0.5)
     assert [patience.look(at, 7, AT_LEISURE, 8.0) for at in (10.0, 10.25)] == [2.0, 2.25]
+
+
+@pytest.mark.parametrize(("ran_s", "counted_s"), [(0.2, 2.2), (0.0, 0.0), (0.1, 0.1)])
+def test_whether_the_time_before_the_first_look_counts_shows_at_the_second(ran_s, counted_s):
+    patience = Patience(0.5)
+    assert patience.look(10.0, 7, Usage("R", 5.0, 5.0), 8.0) == 0.0
+    assert patience.look(10.21, 7, Usage("R", 5.0 + ran_s, 5.0)) == pytest.approx(counted_s)
+
+
+def test_a_thread_that_is_on_the_run_queue_makes_its_process_one_that_is():
+    code = ("import threading, sys, time\n"
+            "def spin():\n    while True: hash('x' * 9)\n"
+            "threading.Thread(target=spin, daemon=True).start()\n"
+            "sys.setswitchinterval(1000)\ntime.sleep(1000)")
+    with subprocess.Popen([sys.executable, "-c", code]) as process:
+        try:
+            wait_until(lambda: usage(process.pid).state == "R", 20, lambda: "it never spins")
+            seen = {usage(process.pid).state for _ in range(20)}
+            assert seen == {"R"}
+        finally:
+            process.kill()
 
 
 def test_an_answer_and_another_process_begin_anew():

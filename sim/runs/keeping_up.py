@@ -1,0 +1,138 @@
+"""Does the machine keep up with the rate that was asked for? From how late its event loops were.
+
+Each node says with its heartbeat how late one of its timers was at the most, and the supervisor's
+table passes that on; so does the simulated world, whose timer steps the physics. With too little
+processor time timers are late, and so are messages, and a timeout that waits for them runs out.
+
+The measure of too late is the shortest slack of the system's timeouts, that is, of each the time
+beyond the period of what it waits for (`[timing]`): a message may be late twice, at its sender and
+at its reader, so either may use up half of it. Lateness is a matter of real seconds, which at a
+lower rate are fewer simulated ones. From that follows the rate with which the machine would have
+kept up: `rate * allowed / late`. It is an estimate on the safe side, for at a lower rate there is
+less to do, and loops are not as late.
+
+Pure; times are simulated seconds. In virtual time nothing is ever late.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Collection
+
+import msgspec
+
+from rampart.actors.ftm.messages import NodeTable
+from rampart.manager.spec.tables import PERIODS, Timing
+
+WINDOW_S = 2.0
+"""Real seconds over which the largest lateness is taken."""
+
+LINE_S = 5.0
+"""Real seconds from one line about it to the next."""
+
+_SHARE = 0.9
+"""Of the windows, by whose lateness a rate is judged: a single hiccup does not count."""
+
+_MOST = 10_000
+
+
+def allowed_s(timing: Timing) -> float:
+    """Return how late a loop may be, simulated seconds: half the shortest slack of a timeout."""
+    slacks_s: list[float] = [getattr(timing, field) - getattr(timing, period)
+                             for field, period in PERIODS.items()]
+    return min(slacks_s) / 2
+
+
+class KeptUp(msgspec.Struct, frozen=True):
+    """Whether the machine kept up with the rate of a run, and with which one it would have.
+
+    Attributes:
+        rate: Simulated seconds per second that were asked for.
+        with_rate: With which the machine keeps up, by what was measured; `rate` if it did.
+        late_s: By how much a loop was too late at the most.
+        node: Whose loop that was; "" if none was late.
+        world_late_s: By how much the simulated world was.
+        allowed_s: By how much either may be.
+        behind_s: For how long one was later than that.
+    """
+
+    rate: float
+    with_rate: float
+    late_s: float
+    node: str
+    world_late_s: float
+    allowed_s: float
+    behind_s: float
+
+    def __str__(self) -> str:
+        world = f", the world {1e3 * self.world_late_s:.0f} ms behind" if self.world_late_s else ""
+        return (f"this machine keeps up with rate {self.with_rate:.2g}, not {self.rate:g}: loops "
+                f"are up to {1e3 * self.late_s:.0f} ms late ({self.node}){world}; simulated time, "
+                f"{1e3 * self.allowed_s:.0f} ms are in order")
+
+
+class KeepingUp:
+    """Measures it over a run.
+
+    Args:
+        timing: Of the system.
+        world: Names of the nodes that simulate the world.
+        rate: Simulated seconds per second.
+    """
+
+    def __init__(self, timing: Timing, world: Collection[str], rate: float) -> None:
+        self._allowed_s = allowed_s(timing)
+        self._world = world
+        self._rate = rate
+        self._until_s = self._said_s = -math.inf
+        self._window = (0.0, "", 0.0)
+        self._worst = (0.0, "", 0.0)
+        self._late_s: deque[float] = deque(maxlen=_MOST)
+        self._behind_s = 0.0
+
+    def take(self, table: NodeTable, now_s: float) -> str:
+        """Take a table of the nodes; return a line for people, "" if there is nothing to say."""
+        if now_s < 0:  # the system is starting
+            return ""
+        late_s, node = max(((row.late_s, row.name) for row in table.nodes), default=(0.0, ""))
+        world_s = max((row.late_s for row in table.nodes if row.name in self._world), default=0.0)
+        self._window = _worse(self._window, (late_s, node, world_s))
+        if now_s < self._until_s:
+            return ""
+        line = self._close(now_s) if self._until_s > -math.inf else ""
+        self._until_s = now_s + WINDOW_S * self._rate
+        return line
+
+    def _close(self, now_s: float) -> str:
+        late_s, node, world_s = self._window
+        self._worst = _worse(self._worst, self._window)
+        self._late_s.append(late_s)
+        self._window = (0.0, "", 0.0)
+        if late_s <= self._allowed_s:
+            return ""
+        self._behind_s += now_s - self._until_s + WINDOW_S * self._rate
+        if now_s < self._said_s + LINE_S * self._rate:
+            return ""
+        self._said_s = now_s
+        return str(KeptUp(self._rate, self._with_rate(late_s), late_s, node, world_s,
+                          self._allowed_s, 0.0))
+
+    def _with_rate(self, late_s: float) -> float:
+        return self._rate * min(1.0, self._allowed_s / late_s) if late_s > 0 else self._rate
+
+    def result(self, now_s: float) -> KeptUp:
+        """Return what was measured in a run that is over now."""
+        if self._until_s > -math.inf:
+            self._close(now_s)
+        found = sorted(self._late_s)
+        usual_s = found[math.ceil(_SHARE * len(found)) - 1] if found else 0.0
+        late_s, node, world_s = self._worst
+        return KeptUp(self._rate, self._with_rate(usual_s), late_s, node if late_s else "",
+                      world_s, self._allowed_s, self._behind_s)
+
+
+def _worse(one: tuple[float, str, float], other: tuple[float, str, float]
+           ) -> tuple[float, str, float]:
+    late_s, node, _ = max(one, other)
+    return late_s, node, max(one[2], other[2])
