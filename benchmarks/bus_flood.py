@@ -52,7 +52,7 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm, topics as ftm_topics
 from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.bus.messages import Injection
-from rampart.actors.bus.zenoh_bus import session_config
+from rampart.actors.bus.zenoh_session import session_config
 kind, per_s, seconds, dial = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), sys.argv[4:]
 order = Injection("i", "no/topic", "drop", 1.0)
 report = fm.DetectionReport(fm.DetectionState.IDLE, "", (), 0.0)

@@ -7,7 +7,8 @@ import os
 import pytest
 
 from rampart.actors.bus import run_folder
-from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import endpoint
 from tests.actors.operator.browser import CHROMIUM
 
 HOW_TO_GET_CHROMIUM = "no Chromium: `apt-get install chromium` brings it"

@@ -19,13 +19,10 @@ per burst, or answers with what was published last; everything else happens on t
 from __future__ import annotations
 
 import asyncio
-import json
 import os
-import socket
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -34,14 +31,8 @@ from zenoh.handlers import Callback
 from rampart.actors.bus.bus import BusError, Deliver, PeerChange
 from rampart.actors.bus.limits import RateLimit
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.run_folder import socket_path
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.bus.unix_peer import peer, process_state
-
-ROUTERS = ("router_a", "router_b")
-
-LEASE_MS = 2000
-"""A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
+from rampart.actors.bus.zenoh_session import answering, open_client, session_config
 
 PATIENCE_S = 10.0
 """Real seconds that a client looks for a router when it starts."""
@@ -49,29 +40,14 @@ PATIENCE_S = 10.0
 SETTLE_S = 0.2
 """Real seconds within which the tokens of nodes are back whose router has died."""
 
-HANDSHAKE_MS = 300
-"""A handshake that takes longer is given up on either side: what connects and says nothing holds
-one of the hundred places that Zenoh has for handshakes no longer than this."""
-
 _ANSWERS_PER_S = 500
 """To newcomers, which ask once for each topic that they hear. Who asks more often floods."""
 
 _ANSWER_S = 1.0
 """Real seconds that the newest message of a topic is waited for; nothing else waits meanwhile."""
 
-_RUNTIME = "ZENOH_RUNTIME"
-_THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "
-            "acc: (handover: app), net: (handover: app))")
-"""Of Zenoh in a client: one that reads and one that writes. By default a thread that waits for
-sockets wakes one of two others for each message that has come, which reads it. Reading and writing
-on one thread is no choice: they wait for each other, and no link comes to be. Routers keep a thread
-for each task: many links come and go there, and Zenoh holds locks while it waits for other tasks.
-"""
-
-_REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
 _LOOK_S = 0.002
 
-_PROTOCOL = "unixsock-stream"
 _ALIVE, _GONE = f"{ROOT}/alive", f"{ROOT}/gone"
 _DELIVERY = {
     Qos.SENSOR: (zenoh.Priority.DATA, zenoh.CongestionControl.DROP),
@@ -79,74 +55,9 @@ _DELIVERY = {
     Qos.COMMAND: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK)}
 
 
-def endpoint(folder: str, name: str) -> str:
-    """Return the Zenoh endpoint of a node in the folder of a run."""
-    return f"{_PROTOCOL}/{socket_path(folder, name)}"
-
-
-def endpoints(folder: str) -> list[str]:
-    """Return the endpoints of the routers in the folder of a run."""
-    return [endpoint(folder, name) for name in ROUTERS]
-
-
 def _direct(call: Callable[[Any], None], end: Callable[[], None] = lambda: None) -> Callback[Any]:
     """Return a handler that is called on the thread that reads; `end` when no more will come."""
     return Callback(call, end, indirect=False)
-
-
-def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
-    """Return the configuration of a session that finds others only where it is told.
-
-    Args:
-        listen: where a router listens; None for a client.
-        dial: a client goes to the first of these that answers, a router to all, again and again.
-    """
-    config = zenoh.Config()
-    settings: dict[str, Any] = {
-        "mode": "router" if listen else "client",
-        "listen/endpoints": [listen] if listen else [],
-        "listen/exit_on_failure": True,
-        "connect/endpoints": list(dial),
-        "connect/timeout_ms": -1 if listen else 0,  # in the background, or each once
-        "connect/retry": _REDIAL_MS,
-        "connect/exit_on_failure": False,
-        "open/return_conditions": {"connect_scouted": False, "declares": False},
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,
-        "transport/shared_memory/enabled": False,  # a SIGKILL would leave its segment behind
-        "transport/unicast/open_timeout": HANDSHAKE_MS,
-        "transport/unicast/accept_timeout": HANDSHAKE_MS,
-        "transport/link/tx/lease": LEASE_MS}
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
-
-
-def _answering(where: Sequence[str]) -> list[str]:
-    """Return the endpoints at which there is a process that is not stopped, the oldest first."""
-    found = []
-    for one in where:
-        path = one.removeprefix(f"{_PROTOCOL}/")
-        with socket.socket(socket.AF_UNIX) as probe:
-            probe.setblocking(False)
-            try:
-                probe.connect(path)
-                if process_state(peer(probe)[0]) not in "TtX":
-                    found.append((Path(path).stat().st_mtime_ns, one))
-            except OSError:  # none, or so many wait to be let in that none is
-                continue
-    return [one for _, one in sorted(found)]
-
-
-def _open_client(dial: Sequence[str]) -> zenoh.Session:
-    if _RUNTIME in os.environ:
-        return zenoh.open(session_config(None, dial))
-    os.environ[_RUNTIME] = _THREADS  # read when a process opens its first session
-    try:
-        return zenoh.open(session_config(None, dial))
-    finally:
-        del os.environ[_RUNTIME]  # commands that this process starts have their own
 
 
 class _Bell:
@@ -235,11 +146,11 @@ class ZenohBus:
         """Return the session of a client, as soon as there is a router."""
         until_s = loop.time() + PATIENCE_S
         while True:
-            found = _answering(self._dial)
+            found = answering(self._dial)
             try:
                 if found:
                     both = [*found, *(one for one in self._dial if one not in found)]
-                    return _open_client(both)
+                    return open_client(both)
             except zenoh.ZError:  # it ended in this moment
                 pass
             if loop.time() > until_s:

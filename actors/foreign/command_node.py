@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.bus.zenoh_bus import endpoints
+from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.foreign import strays
 from rampart.actors.foreign.channel import Channel
 from rampart.actors.foreign.child import Child, CommandError, environment

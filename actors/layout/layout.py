@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.topic import Topic
-from rampart.actors.bus.zenoh_bus import ROUTERS
+from rampart.actors.bus.zenoh_session import ROUTERS
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem

@@ -16,7 +16,7 @@ import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.unix_peer import is_same_user
-from rampart.actors.bus.zenoh_bus import endpoint, endpoints
+from rampart.actors.bus.zenoh_session import endpoint, endpoints
 
 REPLAY = "replay"
 """Name of the one socket in the folder of a replay: it plays all nodes."""

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from rampart.actors.bus.run_folder import issued
-from rampart.actors.bus.zenoh_bus import ROUTERS
+from rampart.actors.bus.zenoh_session import ROUTERS
 from rampart.actors.ftm.patience import Patience, usage
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.supervision.process_title import RunProcess, find_process, find_processes, kill

@@ -26,7 +26,8 @@ import msgspec
 
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.zenoh_bus import ROUTERS, ZenohBus, endpoints
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import ROUTERS, endpoints
 from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import OBSERVER, RunPlan

@@ -36,7 +36,8 @@ from typing import Any
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import register_of
-from rampart.actors.bus.zenoh_bus import ROUTERS, ZenohBus, endpoint, endpoints
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import ROUTERS, endpoint, endpoints
 from rampart.actors.layout.layout import Layout, router
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Actor, Context

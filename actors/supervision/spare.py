@@ -21,7 +21,8 @@ from typing import Any
 
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.unix_peer import process_state
-from rampart.actors.bus.zenoh_bus import ZenohBus, endpoints
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.supervision.process_title import kill
 
 _TAKE_MS = 10

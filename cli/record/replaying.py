@@ -27,7 +27,8 @@ from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import Qos, Topic
-from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import endpoint
 from rampart.actors.layout.layout import application_class
 from rampart.actors.layout.wiring import load_class
 from rampart.actors.operator.hmi import Hmi

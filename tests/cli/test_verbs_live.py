@@ -12,7 +12,8 @@ import pytest
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.bus.zenoh_bus import ZenohBus, endpoints
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m

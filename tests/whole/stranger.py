@@ -16,7 +16,7 @@ from typing import Any
 
 import zenoh
 
-from rampart.actors.bus.zenoh_bus import session_config
+from rampart.actors.bus.zenoh_session import session_config
 from rampart.actors.osmosis import topics
 
 NOBODY = 65534

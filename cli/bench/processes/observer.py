@@ -22,7 +22,8 @@ import zenoh
 
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.topic import ROOT
-from rampart.actors.bus.zenoh_bus import PATIENCE_S, endpoints, session_config
+from rampart.actors.bus.zenoh_bus import PATIENCE_S
+from rampart.actors.bus.zenoh_session import endpoints, session_config
 from rampart.cli.bench.actors import INPUT_HZ, OUTPUT, is_mean, scan
 
 _LOOK_S = 0.05

@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from rampart.actors.bus.zenoh_bus import session_config
+from rampart.actors.bus.zenoh_session import session_config
 from rampart.cli.bench.actors import PING_HZ
 from rampart.cli.bench.processes.observer import joined
 

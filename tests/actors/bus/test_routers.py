@@ -19,7 +19,8 @@ import pytest
 from rampart.actors.bus import zenoh_bus
 from rampart.actors.bus.bus import BusError, SharedBus
 from rampart.actors.bus.run_folder import socket_path
-from rampart.actors.bus.zenoh_bus import ROUTERS, ZenohBus, endpoint, endpoints
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import ROUTERS, endpoint, endpoints
 from rampart.actors.osmosis import topics
 from rampart.testing import eventually
 

@@ -9,7 +9,8 @@ import json
 import msgspec
 import pytest
 
-from rampart.actors.bus.zenoh_bus import ZenohBus, endpoints
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m

@@ -1,0 +1,107 @@
+"""How Zenoh sessions are configured and opened, and where the routers of a run listen."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from rampart.actors.bus.run_folder import socket_path
+from rampart.actors.bus.unix_peer import peer, process_state
+
+ROUTERS = ("router_a", "router_b")
+
+LEASE_MS = 2000
+"""A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
+
+HANDSHAKE_MS = 300
+"""A handshake that takes longer is given up on either side: what connects and says nothing holds
+one of the hundred places that Zenoh has for handshakes no longer than this."""
+
+_RUNTIME = "ZENOH_RUNTIME"
+_THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "
+            "acc: (handover: app), net: (handover: app))")
+"""Of Zenoh in a client: one that reads and one that writes. By default a thread that waits for
+sockets wakes one of two others for each message that has come, which reads it. Reading and writing
+on one thread is no choice: they wait for each other, and no link comes to be. Routers keep a thread
+for each task: many links come and go there, and Zenoh holds locks while it waits for other tasks.
+"""
+
+_REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
+
+_PROTOCOL = "unixsock-stream"
+
+
+def endpoint(folder: str, name: str) -> str:
+    """Return the Zenoh endpoint of a node in the folder of a run."""
+    return f"{_PROTOCOL}/{socket_path(folder, name)}"
+
+
+def endpoints(folder: str) -> list[str]:
+    """Return the endpoints of the routers in the folder of a run."""
+    return [endpoint(folder, name) for name in ROUTERS]
+
+
+def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
+    """Return the configuration of a session that finds others only where it is told.
+
+    Args:
+        listen: where a router listens; None for a client.
+        dial: a client goes to the first of these that answers, a router to all, again and again.
+    """
+    config = zenoh.Config()
+    settings: dict[str, Any] = {
+        "mode": "router" if listen else "client",
+        "listen/endpoints": [listen] if listen else [],
+        "listen/exit_on_failure": True,
+        "connect/endpoints": list(dial),
+        "connect/timeout_ms": -1 if listen else 0,  # in the background, or each once
+        "connect/retry": _REDIAL_MS,
+        "connect/exit_on_failure": False,
+        "open/return_conditions": {"connect_scouted": False, "declares": False},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        "transport/shared_memory/enabled": False,  # a SIGKILL would leave its segment behind
+        "transport/unicast/open_timeout": HANDSHAKE_MS,
+        "transport/unicast/accept_timeout": HANDSHAKE_MS,
+        "transport/link/tx/lease": LEASE_MS}
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def answering(where: Sequence[str]) -> list[str]:
+    """Return the endpoints at which there is a process that is not stopped, the oldest first."""
+    found = []
+    for one in where:
+        path = one.removeprefix(f"{_PROTOCOL}/")
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.setblocking(False)
+            try:
+                probe.connect(path)
+                if process_state(peer(probe)[0]) not in "TtX":
+                    found.append((Path(path).stat().st_mtime_ns, one))
+            except OSError:  # none, or so many wait to be let in that none is
+                continue
+    return [one for _, one in sorted(found)]
+
+
+def open_client(dial: Sequence[str]) -> zenoh.Session:
+    """Open the session of a client of the first router that answers.
+
+    Raises:
+        ZError: none does.
+    """
+    if _RUNTIME in os.environ:
+        return zenoh.open(session_config(None, dial))
+    os.environ[_RUNTIME] = _THREADS  # read when a process opens its first session
+    try:
+        return zenoh.open(session_config(None, dial))
+    finally:
+        del os.environ[_RUNTIME]  # commands that this process starts have their own
