@@ -22,8 +22,9 @@ import msgspec
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from rampart.actors.bus.fields import Field
-from rampart.actors.bus.limits import Remembered, ReportLimit
+from rampart.actors.bus.limits import ReportLimit
 from rampart.actors.bus.messages import ON_TIME, Diagnostic, Heartbeat, Injection
+from rampart.actors.bus.newcomer import PATIENCE_S, HeldBack, Questions, unless_silent
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, INJECT
 from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
@@ -37,19 +38,8 @@ from rampart.actors.runtime.timer import Timer, Timers
 
 __all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
 
-_OFTEN_HZ = 7.0
-_PERIODS = 3
-"""What is published so often at least is of no use to a newcomer when it is so many periods old:
-its publisher is silent, and only the next message shows that it is not."""
-
-_UNSENT = 256
-"""So many messages one that waits to be the node keeps: the newest of each topic, all commands."""
-
 _LATE_DIGITS = 3
 """Of the lateness of timers: milliseconds."""
-
-_PATIENCE_S = 0.02
-"""So long one that replaces another waits at most for what was published before it came."""
 
 
 def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any, Header], None]:
@@ -90,10 +80,9 @@ class Actor(Declared):
         self._dispatcher = Dispatcher(
             context.bus.bursts, self._overflowed, after_burst=context.bus.after_burst)
         self._timers = Timers(context.clock, self._dispatcher)
-        self._waits = context.waits
-        self._unsent: Remembered[tuple[str, int], tuple[Topic[Any], bytes]] = Remembered(_UNSENT)
-        self._unkept: Callable[[], None] = lambda: None
-        self._questions = 0
+        self._held_back = HeldBack(context.waits) if context.waits else None
+        self._questions = Questions(
+            context.bus, lambda: self._dispatcher.put("go to work", self._go_to_work))
         self._is_at_work = False
         self._sequence = 0
         self._rejected = 0
@@ -210,7 +199,7 @@ class Actor(Declared):
         Raises:
             RuntimeError: it is a hot spare, and the state still belongs to another process.
         """
-        if self._waits == "hot":
+        if self._held_back is not None and self.context.waits == "hot":
             raise RuntimeError(f"{type(self).__name__} keeps checkpoints: its class has to say "
                                "most_spare = 'warm'")
         return self._keeper.kept(form)
@@ -221,8 +210,8 @@ class Actor(Declared):
         On return it survives this process. What goes wrong is reported and does not raise: the
         node goes on without.
         """
-        if self._waits:
-            self._unkept = partial(self._keeper.keep, form, state)
+        if self._held_back is not None:
+            self._held_back.keep = partial(self._keeper.keep, form, state)
         else:
             self._keeper.keep(form, state)
 
@@ -241,14 +230,9 @@ class Actor(Declared):
 
     def promote(self) -> None:
         """Be the node from now on, if it waits for that: keep and send what was held back."""
-        if self._waits:
-            self._waits = ""
-            self._unkept()
-            if self._bus.is_open:  # else it announces itself when that is so
-                self._bus.announce()
-            for (key, _), (topic, payload) in self._unsent.items():
-                self._bus.publish(topic, key, payload)
-            self._unsent.clear()
+        held_back, self._held_back = self._held_back, None
+        if held_back is not None:
+            held_back.let_go(self._bus)
 
     def abandon(self) -> None:
         """Have nothing more run when its task is cancelled: what SIGKILL does."""
@@ -272,7 +256,7 @@ class Actor(Declared):
             BusError: the bus could not be opened.
             Exception: whatever a handler raised.
         """
-        await self._bus.open(announce=not self._waits)
+        await self._bus.open(announce=self._held_back is None)
         try:
             self._set_up()
             await self._dispatcher.run()
@@ -302,16 +286,10 @@ class Actor(Declared):
         self.on_start()
         self._beat()
         self._timers.every(self.context.heartbeat_period_s, "_beat", self._beat)
-        if self._incarnation == 1 or not self._questions:  # there is nothing to be heard yet
+        if self._incarnation == 1 or not self._questions.open:  # there is nothing to be heard yet
             self._go_to_work()
         else:
-            self.call_later(_PATIENCE_S, self._go_to_work)
-
-    def _question_answered(self) -> None:
-        """Begin as soon as all that was published before is known."""
-        self._questions -= 1
-        if self._questions == 0:
-            self._dispatcher.put("go to work", self._go_to_work)
+            self.call_later(PATIENCE_S, self._go_to_work)
 
     def _go_to_work(self) -> None:
         """Start the periodic work: of one that replaces another, at once."""
@@ -346,16 +324,9 @@ class Actor(Declared):
     def _hear(self, topic: Topic[Any], where: str, handler: Callable[[Any, Header], None]) -> None:
         """Hear what is published from now on, and what was published last if it is no command."""
         self._bus.subscribe(topic, where, self._receiver(topic, handler))
-        now = self.clock.now
-
-        def take(message: Any, header: Header) -> None:
-            if topic.rate_hz < _OFTEN_HZ or now() - header.stamp <= _PERIODS / topic.rate_hz:
-                handler(message, header)
-
-        if topic.qos is Qos.COMMAND:
-            return
-        self._questions += 1
-        self._bus.latest(where, self._receiver(topic, take), self._question_answered)
+        if topic.qos is not Qos.COMMAND:
+            self._questions.ask(where, self._receiver(
+                topic, unless_silent(topic, self.clock.now, handler)))
 
     def _receiver(self, topic: Topic[Any],
                   handler: Callable[[Any, Header], None]) -> Callable[[str, bytes], None]:
@@ -396,10 +367,8 @@ class Actor(Declared):
         if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
             self.report_diagnostic("not sent", too_long(payload), key)
             return
-        if self._waits:
-            is_command = topic.qos is Qos.COMMAND
-            if not (is_command and self._waits == "hot"):  # that is given once, by who speaks
-                self._unsent[key, sequence if is_command else 0] = topic, payload
+        if self._held_back is not None:
+            self._held_back.send(topic, key, sequence, payload)
             return
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
@@ -421,7 +390,7 @@ class Actor(Declared):
 
     @on(INJECT)
     def _on_injection(self, order: Injection, _header: Header) -> None:
-        if self._waits:  # it is meant for the process that was there
+        if self._held_back is not None:  # it is meant for the process that was there
             return
         topic = self.published(order.topic, self.name, self.parameters) or (
             next((self.context.topics[named.key] for named in

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Literal
 
+from rampart.actors.ftm.messages import NodeInfo
 from rampart.actors.runtime.timer import Timer
-from rampart.actors.supervision.processes import ProcessHandle
+from rampart.actors.supervision.processes import Processes, ProcessHandle
 from rampart.actors.supervision.supervised_process import SupervisedProcess
 
 
@@ -20,6 +23,24 @@ class HeldProcess(SupervisedProcess):
 
     handle: ProcessHandle = field(default_factory=ProcessHandle)
     next_step: Timer | None = None
+
+    def rows(self, late_s: Callable[[str], float]) -> Iterator[NodeInfo]:
+        """Return the rows of its nodes in the table of all; `late_s` says how late one was."""
+        for node in self.unit.nodes:
+            yield NodeInfo(node.name, node.kind.value, self.pid, self.shown, self.incarnation,
+                           max(0, self.incarnation - 1), late_s(node.name))
+
+    def prepare(self, machine: Processes, kind: Literal["warm", "hot"]
+                ) -> Callable[[], None] | None:
+        """Have its next process made ready; return what ends that if it has not been needed.
+
+        None if one is ready.
+        """
+        if machine.is_ready(self.names):
+            return None
+        names, incarnation = self.names, self.highest + 1
+        machine.prepare(names, incarnation, kind)
+        return lambda: machine.forget(names) if self.highest < incarnation else None
 
     def take(self, pid: int, incarnation: int) -> None:
         """Note that another process is the present one, and let go of the one before."""

@@ -15,9 +15,11 @@ from __future__ import annotations
 import asyncio
 import os
 import select
+import selectors
 import socket
+import time
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import Any, NoReturn
 
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.unix_peer import process_state
@@ -27,6 +29,15 @@ from rampart.actors.supervision.process_title import kill
 
 _TAKE_MS = 10
 """A spare that could take a request does so in a fraction of a millisecond."""
+
+_PAUSE_S = 0.25
+"""A spare is forked when for so long no other process was; longer, up to ..."""
+
+_PAUSE_MAX_S = 8.0
+"""... this, if the one before ended by itself."""
+
+_LOOK_S = 1.0
+"""Seconds between two looks whether a spare is stopped."""
 
 _READY, _TAKEN = b"r", b"t"
 _REQUEST_BYTES = 160_000
@@ -86,6 +97,81 @@ class Spare:
         """End it."""
         self.control.close()
         kill(self.pid)
+
+
+class Spares:
+    """The spares of one spawner.
+
+    Args:
+        number: of them.
+        selector: tells when one says something.
+        be_spare: what a child does that is forked to be one, with its end of the connection.
+    """
+
+    def __init__(self, number: int, selector: selectors.BaseSelector,
+                 be_spare: Callable[[socket.socket], NoReturn]) -> None:
+        self._number = number
+        self._selector = selector
+        self._be_spare = be_spare
+        self._there: list[Spare] = []
+        self._pause_s = _PAUSE_S
+        self._since_s = time.monotonic()
+
+    def wait_a_moment(self) -> None:
+        """Fork none while processes are being started."""
+        self._since_s = time.monotonic()
+
+    def look_after(self) -> float | None:
+        """Fork one if one is missing; return in how many seconds to look again, None for never."""
+        if self._number == 0:
+            return None
+        for spare in [one for one in self._there if not one.is_fit()]:
+            self._forget(spare)
+            spare.end()
+        is_missing = len(self._there) < self._number
+        wait_s = self._since_s + self._pause_s - time.monotonic()
+        if is_missing and wait_s <= 0:
+            self.wait_a_moment()
+            self._fork()
+        return max(_PAUSE_S, wait_s) if is_missing else _LOOK_S
+
+    def take(self, request: bytes, connection: socket.socket) -> bool:
+        """Hand a request over to one with its connection; False if there is none that takes it."""
+        self.wait_a_moment()
+        while ready := [spare for spare in self._there if spare.is_ready]:
+            self._forget(ready[0])
+            if ready[0].take(request, connection):
+                return True
+        return False
+
+    def end(self) -> None:
+        """End them; others follow."""
+        for spare in self._there:
+            self._forget(spare)
+            spare.end()
+
+    def _fork(self) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        pid = os.fork()
+        if pid == 0:
+            ours.close()
+            self._be_spare(theirs)
+        theirs.close()
+        spare = Spare(pid, ours)
+        self._there.append(spare)
+        self._selector.register(ours, selectors.EVENT_READ, lambda _: self._hear(spare))
+
+    def _hear(self, spare: Spare) -> None:
+        if spare.heard():
+            self._pause_s = _PAUSE_S
+        else:
+            self._pause_s = min(2 * self._pause_s, _PAUSE_MAX_S)
+            self._forget(spare)
+            spare.control.close()
+
+    def _forget(self, spare: Spare) -> None:
+        self._selector.unregister(spare.control)
+        self._there = [one for one in self._there if one is not spare]
 
 
 def _read(token: int) -> bool:

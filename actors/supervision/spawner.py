@@ -20,7 +20,6 @@ import selectors
 import signal
 import socket
 import sys
-import time
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -36,22 +35,13 @@ from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.supervision.node_process import Role, live, node_main, wedge
 from rampart.actors.supervision.process_title import end_run, set_title
-from rampart.actors.supervision.spare import Spare, wait
+from rampart.actors.supervision.spare import Spares, wait
 from rampart.files import streams, working_folder
 from rampart.manager.spec.tables import Supervision
 
 NAMES = ("a", "b")
 MAX_DATAGRAM = 160_000
 """A changed system spec has to fit; unix sockets take 200 kB by default."""
-
-_PAUSE_S = 0.25
-"""A spare is forked when for so long no other process was; longer, up to ..."""
-
-_PAUSE_MAX_S = 8.0
-"""... this, if the one before ended by itself."""
-
-_LOOK_S = 1.0
-"""Seconds between two looks whether a spare is stopped."""
 
 _BACKLOG = 64
 """So many may wait to be accepted: all processes of a run, each asked for on a connection."""
@@ -122,10 +112,7 @@ class Spawner:
         self._run = run
         self._lifeline = lifeline
         self._selector = selectors.DefaultSelector()
-        self._kept = layout.spec.supervision.spares
-        self._spares: list[Spare] = []
-        self._forked_s = time.monotonic()
-        self._pause_s = _PAUSE_S
+        self._spares = Spares(layout.spec.supervision.spares, self._selector, self._be_spare)
 
     def open(self) -> None:
         """Take the title and the address.
@@ -156,7 +143,7 @@ class Spawner:
         signal.signal(signal.SIGUSR2, wedge)
         self._selector.register(self._lifeline, selectors.EVENT_READ, self._launcher_gone)
         while True:
-            for key, _ in self._selector.select(self._look_after_spares()):
+            for key, _ in self._selector.select(self._spares.look_after()):
                 key.data(key.fileobj)
 
     def _accept(self, listener: socket.socket) -> None:
@@ -200,18 +187,18 @@ class Spawner:
         elif isinstance(request, Adapt):
             self._layout, self._run = adapted_system(self._layout, self._run, request.adapted)
         if not isinstance(request, Ping):
-            for spare in self._spares:  # they know the system as it was
-                self._forget(spare)
-                spare.end()
+            self._spares.end()  # they know the system as it was
 
     def _fork(self, request: ForkRequest, connection: socket.socket) -> None:
         for name in request.names:
             if name not in {*self._layout.members, *self._layout.routers,
                             *(f"spawner_{n}" for n in NAMES)}:
                 raise ValueError(f"unknown node {name!r}")
-        self._forked_s = time.monotonic()
-        if not self._hand_over(request, connection) and os.fork() == 0:
-            self._become(request, connection)
+        may_be_spare = self._layout.spare_of(request.names) != "none"
+        if not (may_be_spare and self._spares.take(msgspec.json.encode(request), connection)):
+            self._spares.wait_a_moment()
+            if os.fork() == 0:
+                self._become(request, connection)
         self._let_go(connection)  # the child answers; if it cannot, its end is the answer
 
     def _become(self, request: ForkRequest, connection: socket.socket) -> NoReturn:
@@ -272,58 +259,6 @@ class Spawner:
             _answer(connection, Reply())
         return Role(names, request.incarnation, born, request.waits, told,
                     connection if request.waits else None)
-
-    # -- spares ---------------------------------------------------------------------------------
-
-    def _hand_over(self, request: ForkRequest, connection: socket.socket) -> bool:
-        """Give a request to a spare; False if there is none for it."""
-        if self._layout.spare_of(request.names) == "none":
-            return False
-        while ready := [spare for spare in self._spares if spare.is_ready]:
-            self._forget(ready[0])
-            if ready[0].take(msgspec.json.encode(request), connection):
-                return True
-        return False
-
-    def _look_after_spares(self) -> float | None:
-        """Fork a spare if one is missing; return in how many seconds to look again, if at all.
-
-        Not while processes are being started, and the later the more often spares have ended.
-        """
-        if self._kept == 0:
-            return None
-        for spare in [one for one in self._spares if not one.is_fit()]:
-            self._forget(spare)
-            spare.end()
-        missing = self._kept - len(self._spares)
-        wait_s = self._forked_s + self._pause_s - time.monotonic()
-        if missing and wait_s <= 0:
-            self._forked_s = time.monotonic()
-            self._fork_spare()
-        return max(_PAUSE_S, wait_s) if missing else _LOOK_S
-
-    def _fork_spare(self) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        pid = os.fork()
-        if pid == 0:
-            ours.close()
-            self._be_spare(theirs)
-        theirs.close()
-        spare = Spare(pid, ours)
-        self._spares.append(spare)
-        self._selector.register(ours, selectors.EVENT_READ, lambda _: self._hear(spare))
-
-    def _hear(self, spare: Spare) -> None:
-        if spare.heard():
-            self._pause_s = _PAUSE_S
-        else:
-            self._pause_s = min(2 * self._pause_s, _PAUSE_MAX_S)
-            self._forget(spare)
-            spare.control.close()
-
-    def _forget(self, spare: Spare) -> None:
-        self._selector.unregister(spare.control)
-        self._spares = [one for one in self._spares if one is not spare]
 
     def _be_spare(self, control: socket.socket) -> NoReturn:
         code = 1

@@ -29,7 +29,7 @@ from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
-from rampart.actors.bus.messages import ON_TIME, Heartbeat
+from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
@@ -37,6 +37,7 @@ from rampart.actors.ftm.patience import Patience
 from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.supervision.held_process import HeldProcess
+from rampart.actors.supervision.lateness import Lateness
 from rampart.actors.supervision.processes import OsProcesses, Processes, ProcessHandle, RunProcess
 from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import (
@@ -108,8 +109,7 @@ class Supervisor(Actor):
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
         self._checked_s = self._loop.time()
-        self._late_s: dict[str, float] = {}
-        self._late_before_s: dict[str, float] = {}
+        self._lateness = Lateness()
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
@@ -164,8 +164,7 @@ class Supervisor(Actor):
                 header.incarnation, message.pid) != (process.incarnation, process.pid):
             return  # said before it was killed, or by another one
         process.heard_s[header.source] = self._loop.time()
-        if message.late_s > self._late_s.get(header.source, 0.0):
-            self._late_s[header.source] = message.late_s
+        self._lateness.note(header.source, message.late_s)
         process.requested_by = ""
         self._on(process, Event.HEARD)
 
@@ -255,8 +254,10 @@ class Supervisor(Actor):
     def repeat(self) -> None:
         """Repeat the node table for those who joined late, and see to the spares."""
         self._publish_table()
-        self._look_at_spares()
-        self._late_before_s, self._late_s = self._late_s, {}
+        self._lateness.turn()
+        for process in self._processes.values():
+            if process.state is State.RUNNING and self._layout.spare_of(process.names) == "hot":
+                process.prepare(self._machine, "hot")
 
     def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
         if process.pid == pid:  # else it was replaced while the news waited in the mailbox
@@ -269,23 +270,10 @@ class Supervisor(Actor):
 
     def _prepare(self, process: HeldProcess) -> None:
         """Have the next process made ready while it is decided whether there is to be one."""
-        if self._layout.spare_of(process.names) == "none" or self._machine.is_ready(process.names):
-            return
-        incarnation = process.highest + 1
-        self._machine.prepare(process.names, incarnation, "warm")
-
-        def forget() -> None:
-            if process.highest < incarnation:
-                self._machine.forget(process.names)
-
-        self.call_later(_WANTED_S * self.clock.rate, forget)
-
-    def _look_at_spares(self) -> None:
-        """Have hot spares made, and those replaced that are gone or hang, not too often."""
-        for process in self._processes.values():
-            if (process.state is State.RUNNING and self._layout.spare_of(process.names) == "hot"
-                    and not self._machine.is_ready(process.names)):
-                self._machine.prepare(process.names, process.highest + 1, "hot")
+        if self._layout.spare_of(process.names) != "none":
+            forget = process.prepare(self._machine, "warm")
+            if forget is not None:
+                self.call_later(_WANTED_S * self.clock.rate, forget)
 
     def _owns(self, process: HeldProcess) -> bool:
         """Whether the supervisor itself brings the process back."""
@@ -413,12 +401,6 @@ class Supervisor(Actor):
     def _publish_table(self) -> None:
         own = fm.NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid,
                           fm.NodeState.RUNNING, self._incarnation, self._incarnation - 1,
-                          self._lateness_s(self.name))
-        rows = (fm.NodeInfo(node.name, node.kind.value, p.pid, p.shown, p.incarnation,
-                            max(0, p.incarnation - 1), self._lateness_s(node.name))
-                for p in self._processes.values() for node in p.unit.nodes)
+                          self._lateness.of(self.name))
+        rows = (row for p in self._processes.values() for row in p.rows(self._lateness.of))
         self.publish(topics.NODES, fm.NodeTable((own, *rows)))
-
-    def _lateness_s(self, node: str) -> float:
-        late_s = max(self._late_s.get(node, 0.0), self._late_before_s.get(node, 0.0))
-        return late_s or ON_TIME

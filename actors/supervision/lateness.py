@@ -1,0 +1,26 @@
+"""How late the loops of the nodes were, as their heartbeats say."""
+
+from __future__ import annotations
+
+from rampart.actors.bus.messages import ON_TIME
+
+
+class Lateness:
+    """The greatest lateness of each node in the last one or two periods; `turn` begins another."""
+
+    def __init__(self) -> None:
+        self._now: dict[str, float] = {}
+        self._before: dict[str, float] = {}
+
+    def note(self, node: str, late_s: float) -> None:
+        """Note what a heartbeat says."""
+        if late_s > self._now.get(node, 0.0):
+            self._now[node] = late_s
+
+    def turn(self) -> None:
+        """Forget what is older than a period."""
+        self._before, self._now = self._now, {}
+
+    def of(self, node: str) -> float:
+        """Return by how many simulated seconds a node was late at most."""
+        return max(self._now.get(node, 0.0), self._before.get(node, 0.0)) or ON_TIME
