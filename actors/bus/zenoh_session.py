@@ -28,8 +28,8 @@ _THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: 
             "acc: (handover: app), net: (handover: app))")
 """Of Zenoh in a client: one that reads and one that writes. By default a thread that waits for
 sockets wakes one of two others for each message that has come, which reads it. Reading and writing
-on one thread is no choice: they wait for each other, and no link comes to be. Routers keep a thread
-for each task: many links come and go there, and Zenoh holds locks while it waits for other tasks.
+on one thread is no choice: most nodes were never heard then. Routers keep a thread for each
+task: many links come and go there, and Zenoh holds locks while it waits for other tasks.
 """
 
 _REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
