@@ -57,6 +57,7 @@ class _Watched:
     heard_s: float = -math.inf
     gone_s: float | None = None
     failure: str = ""
+    hangs: bool = False
 
 
 _failure = attrgetter("failure")
@@ -92,8 +93,9 @@ class WatchdogCore:
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """The failed nodes."""
-        return tuple(node for node, one in self._watched.items() if one.failure)
+        """The failed nodes; one whose last heartbeat is young with the incarnation that hangs."""
+        return tuple(f"{node}#{one.incarnation}" if one.hangs else node
+                     for node, one in self._watched.items() if one.failure)
 
     @property
     def reason(self) -> str:
@@ -128,7 +130,7 @@ class WatchdogCore:
             return  # sent before it died, and under way since; or at an impossible time
         one.gone_s = None
         one.heard, one.heard_s, one.pid = True, now_s, pid
-        one.failure = ""
+        one.failure, one.hangs = "", False
         one.patience.answered()
         one.standstill.begin()
         one.due_s = now_s + self.timeout_s / 2  # it is not worth a look before
@@ -155,7 +157,7 @@ class WatchdogCore:
             return
         one.incarnation = incarnation
         one.gone_s = now_s
-        one.failure = f"process of incarnation {incarnation} is gone"
+        one.failure, one.hangs = f"process of incarnation {incarnation} is gone", False
 
     def expire(self, now_s: float) -> None:
         """Conclude from the time that has passed without a heartbeat or a sign of life."""
@@ -173,7 +175,7 @@ class WatchdogCore:
         if silent_s > self.timeout_s:  # then it is up to the heartbeats
             one.loop.give_up()
         elif how := one.loop.look(now_s, self._used(one.pid)):
-            one.failure = f"its loop hangs, {how}"
+            one.failure, one.hangs = f"its loop hangs, {how}", True
             one.gone_s = one.loop.sign_s  # a heartbeat from before may still be under way
 
     def _miss(self, one: _Watched, now_s: float) -> None:

@@ -176,6 +176,13 @@ def test_a_stopped_or_wedged_process_is_detected_by_its_silence(what):
     assert 0.3 < result.detected_after_s < 0.6
 
 
+def test_a_node_that_works_all_the_time_is_found_to_hang_sooner_and_replaced_at_once():
+    result = run_job(job("wedge:osmosis_control@12", SHORT.text().replace("@6", "@20")))
+    assert decisions(result)[0] == (("FTM4",), ("RM3",))
+    assert 0.1 < result.detected_after_s < 0.25
+    assert result.recovered_after_s < result.detected_after_s + 0.1
+
+
 def test_a_slow_process_is_slow():
     usual = run_job(job(SHORT.text()))
     slow = run_job(job(SHORT.text(), "slow:osmosis_control:0.3@2"))

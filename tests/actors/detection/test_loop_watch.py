@@ -189,8 +189,10 @@ def test_a_heartbeat_from_before_the_hang_does_not_end_it():
     core.sign("a", 1, PERIOD_S, 1.02)
     machine.how = "sleeps"
     wake(core, 1.2)
-    assert core.active
+    assert core.nodes == ("a#1",), "who respawns it heard it a moment ago, and is to believe this"
     core.beat("a", 1, 1.01, 1.21, 77)
     assert core.active
     core.beat("a", 1, 1.22, 1.22, 77)
     assert not core.active
+    core.peer("a", 1, False, 1.3)
+    assert core.nodes == ("a",)
