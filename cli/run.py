@@ -76,7 +76,7 @@ class Run:
         plan = msgspec.structs.replace(
             plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"))
         self._kind, self._context = kind, replace(run, plan=plan)
-        self._trial = self._made(plan)
+        self._trial = self._made(plan, sys.stderr)
         self._plan = plan
         self._scenario = [parse_fault(text) for text in options.fault]
         known = system_topics(spec) if self._scenario else ()
@@ -104,7 +104,7 @@ class Run:
             finally:
                 run.launcher.abort()
 
-    def _made(self, plan: RunPlan, stream: TextIO | None = sys.stderr) -> Trial:
+    def _made(self, plan: RunPlan, stream: TextIO | None) -> Trial:
         options, kind = self._options, self._kind
         return kind(replace(self._context, plan=plan),
                     options.patience if kind.patient else options.duration, stream)
@@ -119,7 +119,7 @@ class Run:
         rate = await find_rate(partial(probe_run, trial), _say, first_rate())
         _say(f"--rate max: {rate:g} is taken")
         self._plan = msgspec.structs.replace(self._plan, rate=rate)
-        self._trial = self._made(self._plan)
+        self._trial = self._made(self._plan, sys.stderr)
 
     async def _on_processes(self, run: ProcessRun) -> int:
         with _recorded(self._options):

@@ -218,8 +218,9 @@ class DetectionModule(Actor):
         # A deadline that has moved on does not cancel the timer: that one wakes, finds nothing
         # due, and sleeps again. One timer per timeout, instead of one per message.
         if due_s < self._wake_s:
-            self._wake_s = due_s
-            self.call_later(max(due_s - self.clock.now(), _SHORTEST_SLEEP_S), self._woken)
+            now_s = self.clock.now()
+            self._wake_s = max(due_s, now_s + _SHORTEST_SLEEP_S)  # it may be over already
+            self.call_later(self._wake_s - now_s, self._woken)
 
     def _woken(self) -> None:
         monitor = self._monitor

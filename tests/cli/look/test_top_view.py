@@ -37,7 +37,8 @@ NODES = fm.NodeTable((
 MANAGER = fm.ManagerStatus(("FTM4",), (), ("RM3",), ("RM1",), "safety-first", 4)
 TRUTH = m.GroundTruth(m.Pose(0, 0, 0), m.Twist(0, 0), 0, 0.0, 2.5, 1.25, 1.0)
 USAGE = {"mission_manager": {"cpu": 1.0, "mb": 60.0, "age_s": 75.0},
-         "localization": {"cpu": 2.0, "mb": 61.0, "age_s": 3700.0},
+         "localization": {"cpu": 2.0, "mb": 61.0, "age_s": 3700.0,
+        "late_s": 0.0},
          "hmi": {"cpu": 9.0, "mb": 62.0, "age_s": 4.0}}
 
 
@@ -185,7 +186,8 @@ def test_the_same_can_be_had_as_data():
     assert data["decisions"][0]["words"].startswith("FTM4 is active: run RM3")
     assert data["processes"][0] == {
         "name": "localization", "kind": "control", "pid": 12, "state": "crashed",
-        "incarnation": 3, "restarts": 2, "cpu": 2.0, "mb": 61.0, "age_s": 3700.0}
+        "incarnation": 3, "restarts": 2, "cpu": 2.0, "mb": 61.0, "age_s": 3700.0,
+        "late_s": 0.0}
 
 
 @pytest.mark.parametrize("state", [s for s in fm.NodeState if s is not fm.NodeState.RUNNING])
