@@ -83,7 +83,7 @@ class HeldBack:
     def let_go(self, bus: Bus) -> None:
         """Keep the state, and send everything."""
         self.keep()
-        if bus.is_open:  # else it announces itself when that is so
+        if bus.is_open:  # else it announces itself when that is so, or has ended already
             bus.announce()
-        for (key, _), (topic, payload) in self._unsent.items():
-            bus.publish(topic, key, payload)
+            for (key, _), (topic, payload) in self._unsent.items():
+                bus.publish(topic, key, payload)

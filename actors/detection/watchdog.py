@@ -57,7 +57,7 @@ class _Watched:
     heard_s: float = -math.inf
     gone_s: float | None = None
     failure: str = ""
-    hangs: bool = False
+    hangs: str = ""
 
 
 _failure = attrgetter("failure")
@@ -94,8 +94,7 @@ class WatchdogCore:
     @property
     def nodes(self) -> tuple[str, ...]:
         """The failed nodes; one whose last heartbeat is young with the incarnation that hangs."""
-        return tuple(f"{node}#{one.incarnation}" if one.hangs else node
-                     for node, one in self._watched.items() if one.failure)
+        return tuple(node + one.hangs for node, one in self._watched.items() if one.failure)
 
     @property
     def reason(self) -> str:
@@ -130,7 +129,7 @@ class WatchdogCore:
             return  # sent before it died, and under way since; or at an impossible time
         one.gone_s = None
         one.heard, one.heard_s, one.pid = True, now_s, pid
-        one.failure, one.hangs = "", False
+        one.failure, one.hangs = "", ""
         one.patience.answered()
         one.standstill.begin()
         one.due_s = now_s + self.timeout_s / 2  # it is not worth a look before
@@ -155,9 +154,11 @@ class WatchdogCore:
             else:
                 one.gone_s = None
             return
+        if one.hangs != f"#{incarnation}":
+            one.hangs = ""
         one.incarnation = incarnation
         one.gone_s = now_s
-        one.failure, one.hangs = f"process of incarnation {incarnation} is gone", False
+        one.failure = f"process of incarnation {incarnation} is gone"
 
     def expire(self, now_s: float) -> None:
         """Conclude from the time that has passed without a heartbeat or a sign of life."""
@@ -175,7 +176,7 @@ class WatchdogCore:
         if silent_s > self.timeout_s:  # then it is up to the heartbeats
             one.loop.give_up()
         elif how := one.loop.look(now_s, self._used(one.pid)):
-            one.failure, one.hangs = f"its loop hangs, {how}", True
+            one.failure, one.hangs = f"its loop hangs, {how}", f"#{one.incarnation}"
             one.gone_s = one.loop.sign_s  # a heartbeat from before may still be under way
 
     def _miss(self, one: _Watched, now_s: float) -> None:

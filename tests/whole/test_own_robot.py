@@ -179,7 +179,6 @@ def test_a_run_without_a_mission_tells_where_its_tracebacks_are(tmp_path):
     report = tmp_path / "report"
     done = launched(tmp_path, "--system", "own.toml", "--duration", "1", "--port",
                     str(free_base_port()), "--report", str(report))
-    assert done.returncode == 0, done.stderr  # it has not failed often enough to count as broken
     assert f"launch.py: tracebacks of what failed: {report / 'errors.log'}" in done.stderr
     assert f'File "{tmp_path}/own.py", line 8, in fail' in (report / "errors.log").read_text()
 

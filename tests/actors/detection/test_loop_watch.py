@@ -194,5 +194,13 @@ def test_a_heartbeat_from_before_the_hang_does_not_end_it():
     assert core.active
     core.beat("a", 1, 1.22, 1.22, 77)
     assert not core.active
-    core.peer("a", 1, False, 1.3)
+
+    wake(core, 1.23)
+    core.sign("a", 1, PERIOD_S, 1.24)
+    wake(core, 1.4)
+    core.peer("a", 1, False, 1.41)
+    assert core.nodes == ("a#1",), "that it was killed for it is no news"
+    core.peer("a", 2, True, 1.42)
+    assert core.nodes == ("a#1",), "the next one is not accused"
+    core.peer("a", 2, False, 1.43)
     assert core.nodes == ("a",)
