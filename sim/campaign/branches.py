@@ -109,8 +109,10 @@ class _Beginning:
     def attempts(self) -> dict[int, Attempt]:
         """Return what came of those that have departed, by number; in a child it does not return.
 
-        The loop runs on in the child as well, so all that is above it on the stack does, too.
+        The loop runs on in the child as well, so all that is above it on the stack does, too. An
+        interrupt may come in the very moment of the fork: whoever is another process ends here.
         """
+        worker = os.getpid()
         try:
             result = virtual_run(self._jobs[0]).branches(
                 [job.faults for job in self._jobs], self._depart)
@@ -120,7 +122,7 @@ class _Beginning:
             if self._job is not None:
                 self._send(_failed(self._job, error))
         finally:
-            if self._job is not None:
+            if os.getpid() != worker:
                 os._exit(0 if self._sent else 1)
         return self._made
 
