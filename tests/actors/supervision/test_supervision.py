@@ -557,7 +557,7 @@ async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path, sto
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         start_new_session=True)  # as a terminal's; this process adopts what is left of others
     try:
-        await eventually(lambda: len(find_processes(plan.base_port)) == 26, 20)
+        await eventually(lambda: len(find_processes(plan.base_port)) >= 26, 20)
         await asyncio.sleep(0.5)
         os.kill(process(plan.base_port, "DM6"), signal.SIGUSR2)
         for one in find_processes(plan.base_port):  # who is stopped cannot read its lifeline
@@ -591,7 +591,7 @@ async def test_a_launcher_that_has_one_thread_forks_its_first_spawner(tmp_path, 
         env={**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"})
     try:
         kind = await asyncio.wait_for(child.stdout.readline(), 20)
-        await eventually(lambda: len(find_processes(plan.base_port)) == 26, 20)
+        await eventually(lambda: len(find_processes(plan.base_port)) >= 26, 20)
     finally:
         child.kill()
         await child.wait()
