@@ -119,7 +119,8 @@ title = "Crash"
 
 
 @pytest.mark.parametrize(("how", "found"), [
-    ("sleeps", "it sleeps"), ("spins", "it spins"), ("holds the lock", "it sleeps")])
+    ("sleeps", "it sleeps"), pytest.param("spins", "it spins", marks=pytest.mark.slow),
+    pytest.param("holds the lock", "it sleeps", marks=pytest.mark.slow)])
 def test_a_loop_that_hangs_is_found_by_its_missing_signs_of_life(tmp_path: Path, how, found):
     (tmp_path / "loops_nodes.py").write_text(NODES)
     (tmp_path / "loops.toml").write_text(SYSTEM.format(how=how))

@@ -168,6 +168,7 @@ def test_an_emergency_stop_stays_until_it_is_reset_and_then_the_mission_goes_on(
         run.wait_for("goal 2/3", 60)
 
 
+@pytest.mark.slow
 def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
     script = (
         "import sys, zenoh, time\n"
@@ -340,6 +341,7 @@ def test_the_paper_s_strategy_leaves_a_dead_node_dead_where_repair_under_guard_r
     assert "in shadow safety-first would run RM2" in stories["guarded-repair"]
 
 
+@pytest.mark.slow
 def test_an_adapted_system_outlives_whatever_runs_it(tmp_path):
     def strategy() -> str:
         return str(json.loads(run.tool("status", "--json").stdout)["manager"]["strategy"])
