@@ -8,7 +8,9 @@ How often it may be restarted is OTP's restart intensity, with backoff; the numb
 once; beyond that each waits longer, doubling from `backoff_s`; one more than `intensity` and the
 policy gives up. What has crashed so often may yet be well again later, when a disk has room or a
 device is plugged in. So giving up is no end: single attempts follow, further and further apart, and
-only if one of them lasts for a whole period is the process as good as any other again.
+only if one of them lasts for a whole period is the process as good as any other again. Until then
+it is not hidden: a silent detection module counts as active, a silent manager stops the Safety
+Pilot, a silent Safety Pilot trips the dead man.
 """
 
 from __future__ import annotations

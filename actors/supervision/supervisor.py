@@ -7,16 +7,14 @@
   whose silence stops the robot, the status counts as much as the heartbeat.
 
 Who waits for a processor is neither (see `patience`): on a machine that stands still for half a
-second all are silent, and replacing them all would keep it busy for longer. What follows from what
-is in `supervised_process`.
+second all are silent, and replacing them all would keep it busy for longer. What follows from what,
+and what becomes of a process that ends too often, is in `supervised_process`.
 
 What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
 Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order,
-stop in reverse, SIGTERM before SIGKILL, a bounded restart intensity. What is given up on is not
-hidden: a silent detection module counts as active, a silent manager stops the Safety Pilot, a
-silent Safety Pilot trips the dead man. Nor is that the end: the supervisor goes on with single
-attempts until one of them lasts. A request is carried out when the new process was heard: until
-then the supervisor repeats it by itself, for the module that asked may have missed its deadline.
+stop in reverse, SIGTERM before SIGKILL, a bounded restart intensity. A request is carried out when
+the new process was heard: until then the supervisor repeats it by itself, for the module that asked
+may have missed its deadline.
 """
 
 from __future__ import annotations
@@ -223,24 +221,21 @@ class Supervisor(Actor):
     @every(_CHECK_S)
     def check(self) -> None:
         """Look for processes whose loops are silent."""
-        # A supervisor that was stopped, starved or waiting for a hung spawner heard no node. What
-        # was said is still on its way here, and silence counts only while this loop turned. Nor
-        # does it count when the router has died over which it hears them.
+        # Silence counts only while this loop turned (one that was stopped, starved or waiting for a
+        # hung spawner has mail to read first), and not if the router died over which it hears all.
         now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
-        stall_s = now - self._checked_s - period_s
-        self._checked_s = now
+        stall_s, self._checked_s = now - self._checked_s - period_s, now
         missed_s = FAILOVER_S if self._bus.moved() else stall_s if stall_s > _LATE_S else 0.0
-        if missed_s:
-            for process in self._processes.values():
-                process.excuse(now, missed_s)
+        for process in self._processes.values() if missed_s else ():
+            process.excuse(now, missed_s)
         late = sum(process.is_late(now, self._timeout_s) for process in self._processes.values())
+        many = late >= MANY
         for process in self._processes.values():
-            silence = process.silence(
-                now, self._timeout_s, process.handle.usage, many=late >= MANY)
+            silence = process.silence(now, self._timeout_s, process.handle.usage, many=many)
             if silence:
                 stopped = process.state is State.RUNNING and process.handle.stopped()
-                self._on(process, Event.SILENT_STOPPED if stopped else Event.SILENT,
-                         detail=silence)
+                event = Event.SILENT_STOPPED if stopped else Event.SILENT
+                self._on(process, event, detail=silence)
 
     def _look_at_routers(self) -> None:
         """Find routers that are stopped at once: who is linked to one hears and says nothing."""
@@ -270,10 +265,9 @@ class Supervisor(Actor):
 
     def _prepare(self, process: HeldProcess) -> None:
         """Have the next process made ready while it is decided whether there is to be one."""
-        if self._layout.spare_of(process.names) != "none":
-            forget = process.prepare(self._machine, "warm")
-            if forget is not None:
-                self.call_later(_WANTED_S * self.clock.rate, forget)
+        if (self._layout.spare_of(process.names) != "none"
+                and (forget := process.prepare(self._machine, "warm"))):
+            self.call_later(_WANTED_S * self.clock.rate, forget)
 
     def _owns(self, process: HeldProcess) -> bool:
         """Whether the supervisor itself brings the process back."""
