@@ -65,7 +65,7 @@ class Hub:
             if bus is not reader:
                 route = self._link(bus.node, reader.node), deliver, reader.arrive
                 for key in filter(pattern.fullmatch, bus.latest_sent):
-                    bus.send([route], key, bus.latest_sent[key])
+                    bus.answer(route, key)
 
     def watch(self, node: str, changed: PeerChange, bus: VirtualBus) -> None:
         """Have the coming and going of a node told to a bus."""
@@ -156,16 +156,8 @@ class VirtualBus:
         for tap in hub.taps:
             tap(now_s, self.node, key, payload)
         routes = self._routes.get(key)
-        self.send(hub.route(self.node, key) if routes is None else routes, key, payload)
-        if topic.qos is not Qos.COMMAND:
-            self.latest_sent[key] = payload
-
-    def send(self, routes: Sequence[Route], key: str, payload: bytes) -> None:
-        """Send a message by some routes only, and past the taps."""
-        loop, virtual = self._loop, self._virtual
-        if loop is None:
-            return
-        now_s = loop.time() if virtual is None else virtual.now_s
+        if routes is None:
+            routes = hub.route(self.node, key)
         for link, deliver, arrive in routes:
             if virtual is None:
                 loop.call_soon(arrive, deliver, key, payload)
@@ -174,6 +166,18 @@ class VirtualBus:
             else:
                 for at_s in link(now_s):
                     virtual.post_at(at_s, deliver, key, payload)
+        if topic.qos is not Qos.COMMAND:
+            self.latest_sent[key] = payload
+
+    def answer(self, route: Route, key: str) -> None:
+        """Send what was published last on a key by one route, past the taps."""
+        link, deliver, arrive = route
+        payload, virtual = self.latest_sent[key], self._virtual
+        if virtual is None:
+            asyncio.get_running_loop().call_soon(arrive, deliver, key, payload)
+        else:
+            for at_s in (virtual.now_s,) if link is None else link(virtual.now_s):
+                virtual.post_at(at_s, deliver, key, payload)
 
     def arrive(self, deliver: Deliver, key: str, payload: bytes) -> None:
         """Hand a message over, if this bus is still open.
