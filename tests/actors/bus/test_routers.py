@@ -329,14 +329,19 @@ async def test_a_flood_of_questions_is_answered_in_part(routers, sockets):
         assert 0 < len(answers) <= 2 * zenoh_bus._ANSWERS_PER_S
 
 
+def names_of_threads() -> set[str]:
+    return {(task / "comm").read_text().split("-")[0].strip()
+            for task in Path("/proc/self/task").iterdir()}
+
+
 def tell_threads(folder: str, told) -> None:
-    """Open a client and tell of its threads."""
+    """Open a client and tell of its threads, which name themselves a moment after they began."""
 
     async def main() -> None:
         async with client(folder):
-            tasks = Path("/proc/self/task").iterdir()
-            told.put(({(task / "comm").read_text().split("-")[0].strip() for task in tasks},
-                      "ZENOH_RUNTIME" in os.environ))
+            with contextlib.suppress(AssertionError):
+                await eventually(lambda: {"app", "tx"} <= names_of_threads())
+            told.put((names_of_threads(), "ZENOH_RUNTIME" in os.environ))
 
     asyncio.run(main())
 
