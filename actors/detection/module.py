@@ -32,6 +32,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.runtime.actor import Actor, Context, Header, every
+from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import FAILOVER_S, NonNegative
 
 LATE_S = 0.02
@@ -115,6 +116,7 @@ class DetectionModule(Actor):
         self._told = False
         self._monitor: Monitor | None = None
         self._wake_s = math.inf
+        self._alarm: Timer | None = None
         self._senders: dict[str, int] = Remembered(MANY)
         self._ran_s = self.clock.now()
         self._judges_from_s = 0.0  # before that the system is starting, see `Launcher.start`
@@ -220,13 +222,15 @@ class DetectionModule(Actor):
         if due_s < self._wake_s:
             now_s = self.clock.now()
             self._wake_s = max(due_s, now_s + _SHORTEST_SLEEP_S)  # it may be over already
-            self.call_later(self._wake_s - now_s, self._woken)
+            if self._alarm is not None:
+                self._alarm.cancel()  # or it would wake, sleep again, and so wake for ever
+            self._alarm = self.call_later(self._wake_s - now_s, self._woken)
 
     def _woken(self) -> None:
         monitor = self._monitor
         if monitor is None:
             return
-        due_s, self._wake_s = self._wake_s, math.inf
+        due_s, self._wake_s, self._alarm = self._wake_s, math.inf, None
         self._note_absence()
         now_s = self.clock.now()
         if monitor.due_s <= now_s:
