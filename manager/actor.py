@@ -54,6 +54,9 @@ MANAGER_STATE = StateFormat(Memory, version=1, objection=objection)
 DECISIONS_PER_INCARNATION = 10_000
 """Each incarnation numbers its decisions from a multiple of this."""
 
+_CALM_REPEATS = 5
+"""While nothing is active or activated, each so many-th time is what is wanted repeated."""
+
 ABSENCE_S = 0.3
 """Three ticks missed: the manager itself was stopped, or the machine hung."""
 
@@ -79,6 +82,7 @@ class FtmManager(Actor):
         self._remembered: tuple[int, tuple[str, ...]] | None = None
         self._replaced: dict[str, int] = {}
         self._request = 0
+        self._repeats = 0
 
     @classmethod
     def output_names(cls, topic: Topic[Any], name: str, parameters: Any) -> tuple[str, ...] | None:
@@ -151,8 +155,11 @@ class FtmManager(Actor):
 
     @every(0.2)
     def repeat(self) -> None:
-        """Repeat what is wanted, for recovery modules that were respawned."""
+        """Repeat what is wanted, in case it was lost; once a second while nothing is wanted."""
         state = self.arbiter_state
+        self._repeats += 1
+        if self._repeats % _CALM_REPEATS and self._shown is not None and _is_calm(self._shown):
+            return
         for command in state.desired.values():
             # One that has just started does not know yet what is in force: it releases nothing.
             if command.activate or state.oriented:

@@ -14,10 +14,11 @@ HOLDS = Topic("holds/{name}", m.Holds, Qos.STATE, 5, "",
               "are none. `rampart reset` lets go in their place.")
 DETECTION = Topic("detection/{name}", m.DetectionReport, Qos.STATE, 5, "",
                   "State of detection module {name}.")
-RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 5, "",
-                         "What the manager orders recovery module {name} to do.")
-RECOVERY = Topic("recovery/{name}/state", m.RecoveryReport, Qos.STATE, 5, "",
-                 "State of recovery module {name}.")
+RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 1, "",
+                         "What the manager orders recovery module {name} to do; 5 Hz while any is "
+                         "activated.")
+RECOVERY = Topic("recovery/{name}/state", m.RecoveryReport, Qos.STATE, 1, "",
+                 "State of recovery module {name}; 5 Hz while it is activated.")
 DECISION = Topic("manager/decision", m.DecisionRecord, Qos.COMMAND, 0, "",
                  "Each decision of the FTM Manager with its certificate.")
 SHADOW = Topic("manager/shadow", m.ShadowRecord, Qos.COMMAND, 0, "",
