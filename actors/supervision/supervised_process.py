@@ -295,9 +295,10 @@ class SupervisedProcess:
         if self.state is not State.RUNNING:
             return ""
         since_s = min(self.heard_s.values(), default=now_s)
+        if not self._could_have_been_heard(now_s, since_s, timeout_s, used, many=many):
+            return ""
         late = [name for name, at_s in self.heard_s.items() if now_s - at_s > timeout_s]
-        could = self._could_have_been_heard(now_s, since_s, timeout_s, used, many=many)
-        if not could or not late:
+        if not late:
             return ""
         nodes = ", ".join(name for name in late if name != STATUS)
         return f"no heartbeat from {nodes}" if nodes else f"no {STATUS}"
