@@ -26,6 +26,7 @@ from typing import Literal, NoReturn
 import msgspec
 from msgspec.structs import replace
 
+from rampart.actors.bus.envelope import decoder
 from rampart.actors.bus.run_folder import issue, issued, register_of, socket_path
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus
@@ -325,6 +326,9 @@ def load_and_serve(name: str, plan: RunPlan, lifeline: int, output: int) -> int:
     except (ValueError, OSError) as error:
         os.write(output, f"error: {' '.join(str(error).split())}\n".encode())
         return 2
+    for member in layout.members.values():
+        for topic in (*member.actor.inputs(), *layout.topics.values()):
+            decoder(topic.type)  # now, and not in each process when it starts: 2 ms
     gc.collect()
     gc.freeze()  # keeps the collector from touching, and so copying, the shared pages
     try:
