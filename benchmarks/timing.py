@@ -19,7 +19,7 @@ from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import NodeTable, ProcessEvent
+from rampart.actors.ftm.messages import NodeTable, RespawnRequest
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
@@ -39,7 +39,7 @@ class Ear(Actor):
         self._launcher = launcher
         self.messages: list[float] = []
         self.deaths: dict[tuple[str, int], float] = {}
-        self.forks: dict[tuple[str, int], float] = {}
+        self.asked: dict[str, float] = {}
         self.words: dict[tuple[str, int], float] = {}
 
     @classmethod
@@ -58,16 +58,27 @@ class Ear(Actor):
         self.messages.append(self.clock.now() - header.stamp)
         self.words.setdefault((header.source, header.incarnation), header.stamp)
 
-    @on(topics.PROCESS_EVENT)
-    def event(self, event: ProcessEvent, header: Header) -> None:
-        """Note when a process was forked."""
-        if event.event == "respawned":
-            self.forks[event.node, event.incarnation] = header.stamp
+    @on(topics.RESPAWN)
+    def respawn(self, request: RespawnRequest, header: Header) -> None:
+        """Note when a recovery module asked for a process."""
+        self.asked[request.node] = header.stamp
 
     def on_peer(self, node: str, incarnation: int, alive: bool) -> None:
-        """Note when a token vanished."""
+        """Note when a process was known to be gone, by the supervisor or by its token."""
         if not alive:
-            self.deaths[node, incarnation] = time.monotonic()
+            self.deaths.setdefault((node, incarnation), time.monotonic())
+
+    def start_s(self, node: str, incarnation: int, exited_s: float) -> float | None:
+        """Return how long a successor took to its first word, from when it was to be started.
+
+        That is when it was asked for, or when the supervisor saw the end of its predecessor.
+        """
+        said_s = [at_s for (name, number), at_s in self.words.items()
+                  if name == node and number > incarnation]
+        if not said_s:
+            return None
+        begun_s = max(exited_s, self.asked.get(node, exited_s))
+        return max(0.0, min(said_s) - begun_s)  # the supervisor may see an end before this does
 
 
 async def measure(port: int, kills: int) -> dict[str, list[float]]:
@@ -97,6 +108,9 @@ async def measure(port: int, kills: int) -> dict[str, list[float]]:
                 await asyncio.sleep(0.35 + random.uniform(0, 0.05))
                 if (node, incarnation) in ear.deaths:
                     found["death_ms"].append(ear.deaths[node, incarnation] - killed_s)
+                start_s = ear.start_s(node, incarnation, exited_s - launcher.plan.origin_s)
+                if start_s is not None:
+                    found["start_ms"].append(start_s)
         for _ in range(2 * kills):
             back.clear()
             killed_s, _, _ = await _kill(port, SUPERVISOR)
@@ -104,8 +118,6 @@ async def measure(port: int, kills: int) -> dict[str, list[float]]:
                 await asyncio.sleep(0.001)
             found["supervisor_back_ms"].append(back[0] - killed_s)
             await asyncio.sleep(1.0)
-        found["start_ms"] = [ear.words[key] - at for key, at in ear.forks.items()
-                             if key in ear.words]
         ear.stop()
         await task
     finally:
@@ -144,7 +156,8 @@ def main() -> int:
     options = parser.parse_args()
     found = asyncio.run(measure(options.port, options.kills))
     print("# Measured on real processes by `python -m benchmarks.timing`; milliseconds, evenly\n"
-          "# spaced quantiles from minimum to maximum. See timing.py beside it for what each is.")
+          "# spaced quantiles from minimum to maximum. See sim/virtual/network.py for what each "
+          "one is.")
     for name, samples in found.items():
         print(f"\n# {len(samples)} samples\n{name} = {quantiles_ms(samples)}")
     return 0

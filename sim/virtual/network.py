@@ -154,9 +154,9 @@ class Timing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         message_ms: From sending to the reader's mailbox.
-        death_ms: From SIGKILL to the readers of the liveliness token.
+        death_ms: From SIGKILL to those who watch the node: what the supervisor says, or the token.
         exit_ms: From SIGKILL to the supervisor, by pidfd.
-        start_ms: From fork to the new process's first message.
+        start_ms: From when a process is to be started to its first message: the fork, or the spare.
         supervisor_back_ms: From the supervisor's SIGKILL to its successor's fork.
     """
 
