@@ -39,6 +39,7 @@ from rampart.testing import RealRun
 
 WAYS = ("KILL", "STOP", "SEGV", "WEDGE")
 SPAWNERS = tuple(f"spawner_{name}" for name in NAMES)
+SPARES = tuple(f"spare_{name}" for name in NAMES)
 
 BACK_WITHIN_S = 10.0
 """Wall seconds after which a victim counts as not having come back; a loaded machine is slow."""
@@ -75,7 +76,7 @@ def targets(spec: SystemSpec) -> Targets:
     nodes = {unit: members[0] for unit, members in spec.processes().items()}
     world = tuple(n.name for n in nodes.values() if n.kind is Kind.WORLD)
     mortal = tuple(n.name for n in nodes.values() if n.kind is not Kind.WORLD)
-    return Targets((*mortal, SUPERVISOR, *SPAWNERS, *ROUTERS), world)
+    return Targets((*mortal, SUPERVISOR, *SPAWNERS, *ROUTERS, *SPARES), world)
 
 
 def each_in_every_way(of: Targets, seed: int, pause_s: tuple[float, float]) -> list[Hit]:
