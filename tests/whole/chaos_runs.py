@@ -1,8 +1,8 @@
-"""The long chaos test, `make chaos`: every process in every way, then 200 deaths in ten minutes.
+"""The long chaos test, `make chaos`: every process in every way, 50 routers, 200 deaths.
 
-`python -m tests.whole.chaos_runs [--seed N] [--rate R] [--only ways|leaks] [--kills N]`, about half
-an hour. One line for each hit, one for each count, a summary; exit code 1 if anything was not as
-it has to be. Other load on the machine is part of what is tested, so keep it moderate.
+`python -m tests.whole.chaos_runs [--seed N] [--rate R] [--only ways|routers|leaks] [--kills N]`,
+about half an hour. One line for each hit, one for each count, a summary; exit code 1 if anything
+was not as it has to be. Other load on the machine is part of what is tested, so keep it moderate.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from rampart.actors.bus.zenoh_session import ROUTERS
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.manager.spec.specification import SystemSpec, check_document, read_document
@@ -22,6 +23,7 @@ from tests import ROOT
 from tests.whole.chaos import (
     SPAWNERS,
     Chaos,
+    Hit,
     Struck,
     complaints,
     each_in_every_way,
@@ -34,6 +36,7 @@ SYSTEM = ROOT / "systems" / "osmosis.toml"
 SETTLE_S = 8.0
 """Wall seconds of quiet before a count that others are compared with."""
 
+ROUTER_HITS = 50
 COUNT_EVERY = 40
 LAPS = 3
 MINUTES = 10.0
@@ -61,9 +64,20 @@ def everybody_in_every_way(root: Path, seed: int, rate: float) -> list[str]:
     """Hit every process in every way during one mission; return what was wrong."""
     everybody = targets(load())
     hits = each_in_every_way(everybody, seed, (2.0 / rate, 5.0 / rate))
-    with start(root / "ways", str(write_laps(root)), rate) as run:
+    return _in_one_mission("ways", root, rate, hits, everybody.world)
+
+
+def routers_in_turn(root: Path, seed: int, rate: float) -> list[str]:
+    """Hit the two routers in turn during one mission; return what was wrong."""
+    hits = so_many(ROUTERS, ROUTER_HITS, seed, (1.0 / rate, 4.0 / rate))
+    return _in_one_mission("routers", root, rate, hits)
+
+
+def _in_one_mission(where: str, root: Path, rate: float, hits: Sequence[Hit],
+                    world: Sequence[str] = ()) -> list[str]:
+    with start(root / where, str(write_laps(root)), rate) as run:
         run.wait_for("goal 1/")
-        chaos = Chaos(run, everybody.world, say)
+        chaos = Chaos(run, world, say)
         left = chaos.carry_out(hits)
         code, result = run.result(1200)
     wrong = complaints(run, code, result, "AB", chaos.struck)
@@ -71,7 +85,7 @@ def everybody_in_every_way(root: Path, seed: int, rate: float) -> list[str]:
         wrong.append(f"{len(left)} hits of {len(hits)} were left when the mission ended")
     say(f"{len(chaos.struck)} hits: {result['mission']}, {result['safety']}, "
         f"{result['duration_s']} s simulated")
-    return _judged("ways", run, chaos.struck, wrong)
+    return _judged(where, run, chaos.struck, wrong)
 
 
 def write_laps(directory: Path, laps: int = LAPS) -> Path:
@@ -134,15 +148,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rate", type=float, default=1.0, help="simulated seconds per second")
-    parser.add_argument("--only", choices=("ways", "leaks"))
+    parser.add_argument("--only", choices=("ways", "routers", "leaks"))
     parser.add_argument("--kills", type=int, default=200, help="in ten minutes (default: 200)")
     options = parser.parse_args()
     wrong: list[str] = []
     with tempfile.TemporaryDirectory() as directory:
         root = Path(directory)
-        if options.only != "leaks":
+        if options.only in {None, "ways"}:
             wrong += everybody_in_every_way(root, options.seed, options.rate)
-        if options.only != "ways":
+        if options.only in {None, "routers"}:
+            wrong += routers_in_turn(root, options.seed, options.rate)
+        if options.only in {None, "leaks"}:
             wrong += many_deaths(root, options.seed, options.rate, options.kills)
     for line in wrong:
         say(f"WRONG {line}")
