@@ -7,8 +7,8 @@ second from one member of the bus, of each of these kinds:
 
 * `garbage`: bytes that are no message, on DM1's own key, which the manager hears;
 * `reports`: well-formed reports of a detection module that does not exist;
-* `hello`: well-formed hellos of one unknown node, which every node hears;
-* `names`: hellos of 26,000 unknown nodes in turn.
+* `questions`: for the newest report of every detection module, as a newcomer asks once;
+* `names`: orders to inject of 26,000 unknown nodes in turn, which every node hears.
 
 The bound is the spec's `arbitration_s`. Example: `python -m benchmarks.bus_flood --brakes 40`.
 """
