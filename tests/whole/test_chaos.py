@@ -15,7 +15,7 @@ from tests.whole.chaos import WAYS, Chaos, Targets, complaints, each_in_every_wa
 from tests.whole.leak_counts import Counts, leaks
 
 SHIPPED = ROOT / "systems" / "osmosis.toml"
-PAUSE_S = (0.8, 2.0)
+PAUSE_S = (0.3, 1.0)
 ALL_FOUR = ("mission_manager", "router_a", "safety_pilot", "ftm_manager", "supervisor")
 
 

@@ -385,6 +385,7 @@ def noise(file: Path) -> None:
     file.write_bytes(random.Random(16).randbytes(4000))
 
 
+@pytest.mark.slow
 @pytest.mark.processes
 @pytest.mark.timeout(180)
 def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path):

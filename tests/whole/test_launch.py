@@ -76,6 +76,7 @@ def nodes_of(port: int) -> list[str]:
             if not name.startswith("spare")]
 
 
+@pytest.mark.slow
 def test_stopped_and_wedged_control_nodes_are_replaced_and_the_mission_goes_on(tmp_path):
     with RealRun(tmp_path, "paper", "--mission", near(tmp_path), "--rate", "2") as run:
         run.wait_for("goal 1/2")

@@ -244,6 +244,7 @@ def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listen
     assert "Traceback" not in run.story
 
 
+@pytest.mark.slow
 @pytest.mark.processes
 @pytest.mark.timeout(180)
 def test_a_real_mission_succeeds_though_its_folder_goes_and_its_recording_stops(tmp_path):
