@@ -2,8 +2,9 @@
 
 A spawner keeps some (`[supervision] spares`), and hands a request to fork over to one instead of
 forking: that saves the fork and the opening of the session, two thirds of what a new process takes.
-It is a process like others. One that was killed is seen at once; one that is stopped or hangs does
-not take the request within `_TAKE_MS`, is ended, and the spawner forks as if there were none. Which
+It is a process like others. One that was killed is seen at once. It is asked each second whether it
+turns, so one that is stopped or hangs is found out though nobody needs it; if somebody does before,
+it does not take the request within `_TAKE_MS`, and the spawner forks as if there were none. Which
 of the two has a request is decided by a pipe with one byte in it: who reads that has it. So no
 request leads to two processes, however late a spare wakes up.
 
@@ -13,6 +14,7 @@ The spare that has a request goes on as any new process does (`node_process`), w
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import select
 import selectors
@@ -25,6 +27,7 @@ from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
+from rampart.actors.ftm.patience import Patience, usage
 from rampart.actors.supervision.process_title import kill
 
 _TAKE_MS = 10
@@ -37,9 +40,12 @@ _PAUSE_MAX_S = 8.0
 """... this, if the one before ended by itself."""
 
 _LOOK_S = 1.0
-"""Seconds between two looks whether a spare is stopped."""
+"""Seconds between two looks whether a spare turns."""
 
-_READY, _TAKEN = b"r", b"t"
+_HUNG_S = 0.9
+"""A spare that could have answered for so long hangs."""
+
+_READY, _TAKEN, _ASKED = b"r", b"t", b"?"
 _REQUEST_BYTES = 160_000
 
 Begin = Callable[[bytes, socket.socket, ZenohBus], Coroutine[Any, Any, int]]
@@ -58,6 +64,8 @@ class Spare:
         self.pid = pid
         self.control = control
         self.is_ready = False
+        self._patience = Patience(2 * _LOOK_S)
+        self._owes = False
 
     def heard(self) -> bool:
         """Read what it said; False if it has ended."""
@@ -66,11 +74,20 @@ class Spare:
         except OSError:
             said = b""
         self.is_ready = said == _READY
+        self._owes = False
+        self._patience.answered()
         return self.is_ready
 
     def is_fit(self) -> bool:
-        """Whether it is neither stopped nor gone, as the kernel sees it."""
-        return process_state(self.pid) not in "TtXZ"
+        """Whether it is neither stopped nor gone, as the kernel sees it, and answers; ask again."""
+        if process_state(self.pid) in "TtXZ":
+            return False
+        if self.is_ready and not self._owes:
+            self._owes = True
+            with contextlib.suppress(OSError):  # it has just ended, which is seen at once
+                self.control.send(_ASKED)
+        return not self._owes or self._patience.look(
+            time.monotonic(), self.pid, usage(self.pid)) < _HUNG_S
 
     def take(self, request: bytes, connection: socket.socket) -> bool:
         """Hand a request over with its connection; False if it did not take it, and is ended."""
@@ -82,8 +99,10 @@ class Spare:
             socket.send_fds(self.control, [request], [connection.fileno(), token])
             poll = select.poll()
             poll.register(self.control, select.POLLIN)
-            taken = bool(poll.poll(_TAKE_MS)) and self.control.recv(1) == _TAKEN
-            taken = taken or not _read(token)
+            said = _READY  # the answer to a question may come first
+            while said == _READY and poll.poll(_TAKE_MS):
+                said = self.control.recv(1)
+            taken = said == _TAKEN or not _read(token)
         except OSError:  # it has just ended
             taken = not _read(token)
         finally:
@@ -174,6 +193,14 @@ class Spares:
         self._there = [one for one in self._there if one is not spare]
 
 
+async def _next(control: socket.socket, woken: asyncio.Event) -> tuple[bytes, list[int]]:
+    while True:
+        await woken.wait()
+        woken.clear()
+        with contextlib.suppress(BlockingIOError):  # it was read already
+            return socket.recv_fds(control, _REQUEST_BYTES, 2)[:2]
+
+
 def _read(token: int) -> bool:
     try:
         return os.read(token, 1) != b""
@@ -196,13 +223,14 @@ async def wait(control: socket.socket, folder: str, begin: Begin) -> int:
     except BusError:  # without routers nobody needs it
         return 0
     control.setblocking(False)
-    control.send(_READY)
     woken = asyncio.Event()
     loop.add_reader(control, woken.set)
-    await woken.wait()
-    loop.remove_reader(control)
+    request, descriptors = _ASKED, list[int]()
     try:
-        request, descriptors, _flags, _address = socket.recv_fds(control, _REQUEST_BYTES, 2)
+        while request == _ASKED:
+            control.send(_READY)
+            request, descriptors = await _next(control, woken)
+        loop.remove_reader(control)
         if not request or len(descriptors) < 2 or not _read(descriptors[1]):
             return 0
         control.send(_TAKEN)

@@ -104,9 +104,12 @@ async def test_a_spare_becomes_the_node_and_one_that_cannot_costs_nothing_but_it
             assert witness.pid("DM1") not in there.values()
             await eventually(lambda t=there: not Path(f"/proc/{t['spare_a']}").exists())
         there = await spares(port, *both, other_than={"used": there["spare_a"]})
-        for pid in there.values():  # one that is stopped is found out though nobody needs it
-            os.kill(pid, signal.SIGSTOP)
-        await spares(port, *both, other_than=there)
+        for hurt in HURTS:  # it is found out though nobody needs it
+            for pid in there.values():
+                os.kill(pid, hurt)
+            there = await spares(port, *both, other_than=there)
+        await asyncio.sleep(2.5)
+        assert pids(port, *both) == there, "one that is well is left alone"
 
 
 @pytest.mark.processes
