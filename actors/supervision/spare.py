@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 import select
 import selectors
@@ -65,7 +66,7 @@ class Spare:
         self.control = control
         self.is_ready = False
         self._patience = Patience(2 * _LOOK_S)
-        self._owes = False
+        self._owes, self._asked_s = False, -math.inf
 
     def heard(self) -> bool:
         """Read what it said; False if it has ended."""
@@ -74,20 +75,21 @@ class Spare:
         except OSError:
             said = b""
         self.is_ready = said == _READY
-        self._owes = False
         self._patience.answered()
+        self._owes = False
         return self.is_ready
 
     def is_fit(self) -> bool:
-        """Whether it is neither stopped nor gone, as the kernel sees it, and answers; ask again."""
+        """Whether it is neither stopped nor gone, as the kernel sees it, and answers; ask it."""
+        now_s = time.monotonic()
         if process_state(self.pid) in "TtXZ":
             return False
-        if self.is_ready and not self._owes:
-            self._owes = True
+        if self.is_ready and not self._owes and now_s >= self._asked_s + _LOOK_S:
+            self._owes, self._asked_s = True, now_s
             with contextlib.suppress(OSError):  # it has just ended, which is seen at once
                 self.control.send(_ASKED)
-        return not self._owes or self._patience.look(
-            time.monotonic(), self.pid, usage(self.pid)) < _HUNG_S
+        return not self._owes or (
+            self._patience.look(now_s, self.pid, usage(self.pid)) < _HUNG_S)
 
     def take(self, request: bytes, connection: socket.socket) -> bool:
         """Hand a request over with its connection; False if it did not take it, and is ended."""

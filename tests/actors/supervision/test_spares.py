@@ -6,6 +6,7 @@ import asyncio
 import os
 import re
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ import pytest
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import RespawnRequest
+from rampart.actors.ftm.patience import usage
 from rampart.actors.layout.layout import Layout
 from rampart.actors.osmosis import topics as robot
 from rampart.actors.run.run_plan import load_system
@@ -108,8 +110,11 @@ async def test_a_spare_becomes_the_node_and_one_that_cannot_costs_nothing_but_it
             for pid in there.values():
                 os.kill(pid, hurt)
             there = await spares(port, *both, other_than=there)
+        spawner = pids(port, "spawner_a")["spawner_a"]
+        ran_s, begun_s = usage(spawner).ran_s, time.monotonic()
         await asyncio.sleep(2.5)
         assert pids(port, *both) == there, "one that is well is left alone"
+        assert usage(spawner).ran_s - ran_s < (time.monotonic() - begun_s) / 4, "it asks too often"
 
 
 @pytest.mark.processes
