@@ -119,9 +119,10 @@ def many_deaths(root: Path, seed: int, rate: float, kills: int) -> list[str]:
                 break
             say(f"after {done + COUNT_EVERY}: {count(run, counted)}")
         took_s = chaos.elapsed_s
-        time.sleep(SETTLE_S)
-        counts.append(count(run, counted))
-        say(f"after: {counts[-1]}")
+        if run.process.poll() is None:
+            time.sleep(SETTLE_S)
+            counts.append(count(run, counted))
+            say(f"after: {counts[-1]}")
         code, result = run.result(900)
     wrong = complaints(run, code, result, "AB", chaos.struck) + leaks(counts[0], counts[-1])
     if len(chaos.struck) < kills or took_s > 60 * MINUTES:
