@@ -64,18 +64,18 @@ def everybody_in_every_way(root: Path, seed: int, rate: float) -> list[str]:
     """Hit every process in every way during one mission; return what was wrong."""
     everybody = targets(load())
     hits = each_in_every_way(everybody, seed, (2.0 / rate, 5.0 / rate))
-    return _in_one_mission("ways", root, rate, hits, everybody.world)
+    return _in_one_mission("ways", root, rate, hits, LAPS, everybody.world)
 
 
 def routers_in_turn(root: Path, seed: int, rate: float) -> list[str]:
     """Hit the two routers in turn during one mission; return what was wrong."""
     hits = so_many(ROUTERS, ROUTER_HITS, seed, (1.0 / rate, 4.0 / rate))
-    return _in_one_mission("routers", root, rate, hits)
+    return _in_one_mission("routers", root, rate, hits, 0)
 
 
-def _in_one_mission(where: str, root: Path, rate: float, hits: Sequence[Hit],
-                    world: Sequence[str] = ()) -> list[str]:
-    with start(root / where, str(write_laps(root)), rate) as run:
+def _in_one_mission(where: str, root: Path, rate: float, hits: Sequence[Hit],  # noqa: PLR0917
+                    laps: int, world: Sequence[str] = ()) -> list[str]:
+    with start(root / where, str(write_laps(root, laps)), rate) as run:
         run.wait_for("goal 1/")
         chaos = Chaos(run, world, say)
         left = chaos.carry_out(hits)
