@@ -152,6 +152,7 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
     assert "wheels #1 ended: signal SIGKILL" in (tmp_path / "report/logs/wheels.log").read_text()
 
 
+@pytest.mark.slow
 def test_a_flood_and_one_that_ends_at_once_harm_nobody_and_a_killed_launcher_ends_all(tmp_path):
     system_of(tmp_path, MORE)
     with RealRun(tmp_path, "tug.toml") as tug:

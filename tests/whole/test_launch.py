@@ -154,6 +154,7 @@ def test_without_ftm_a_killed_node_stays_dead_and_the_run_is_unsafe(tmp_path, no
     assert result["restarts"] == {}
 
 
+@pytest.mark.slow
 def test_an_emergency_stop_stays_until_it_is_reset_and_then_the_mission_goes_on(tmp_path):
     with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2") as run:
         run.wait_for("goal 1/3")
@@ -214,6 +215,7 @@ def test_nothing_is_left_two_seconds_after_any_end(tmp_path, number):
     assert (set(Path("/dev/shm").glob("*.zenoh")), set(Path("/tmp").glob("*rampart*"))) == before
 
 
+@pytest.mark.slow
 def test_a_launcher_that_was_stopped_goes_on_and_its_nodes_came_back_meanwhile(tmp_path):
     with RealRun(tmp_path, "osmosis", "--mission", "A") as run:
         run.wait_for("goal 1/3")
