@@ -44,7 +44,8 @@ bench-peers: setup .venv-peers/installed
 	@touch $@
 
 # Hits every process of the full system in every way, 50 routers in one mission, then 200 deaths in
-# ten minutes with a count of what leaks; half an hour. First the same for control nodes over many seeds in virtual time.
+# ten minutes with a count of what leaks; half an hour. First the same for control nodes over many
+# seeds in virtual time.
 chaos: setup
 	$(BIN)/python -m tests.whole.checkpoint_runs 0 10 6
 	$(BIN)/python -m tests.whole.chaos_runs

@@ -20,6 +20,7 @@ import selectors
 import signal
 import socket
 import sys
+from itertools import chain
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -326,9 +327,9 @@ def load_and_serve(name: str, plan: RunPlan, lifeline: int, output: int) -> int:
     except (ValueError, OSError) as error:
         os.write(output, f"error: {' '.join(str(error).split())}\n".encode())
         return 2
-    for member in layout.members.values():
-        for topic in (*member.actor.inputs(), *layout.topics.values()):
-            decoder(topic.type)  # now, and not in each process when it starts: 2 ms
+    heard = chain(layout.topics.values(), *(m.actor.inputs() for m in layout.members.values()))
+    for topic in heard:
+        decoder(topic.type)  # now, and not in each process when it starts: 2 ms
     gc.collect()
     gc.freeze()  # keeps the collector from touching, and so copying, the shared pages
     try:

@@ -109,6 +109,26 @@ class Obedient(Actor):
         self.heard.append(message)
 
 
+class Counter(Actor):
+    """Counts what is said to RM1, and by it."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.commands = self.reports = 0
+
+    @classmethod
+    def names(cls, topic, name, parameters):
+        return ("RM1",)
+
+    @on(ftm_topics.RECOVERY_COMMAND)
+    def command(self, _message: fm.RecoveryCommand, _header: Header) -> None:
+        self.commands += 1
+
+    @on(ftm_topics.RECOVERY)
+    def report(self, _message: fm.RecoveryReport, _header: Header) -> None:
+        self.reports += 1
+
+
 class Tool(Actor):
     """Injects faults."""
 
@@ -508,6 +528,25 @@ def test_it_repeats_what_is_wanted_and_shows_that_it_lives():
         system.recorder.statuses.clear()
         await asyncio.sleep(2.0)
         assert len(system.recorder.statuses) == pytest.approx(20, abs=1)
+
+    in_whole_system(scenario)
+
+
+def test_what_is_wanted_is_repeated_once_a_second_and_five_times_while_anything_is_activated():
+    async def scenario(system: Whole) -> None:
+        counter = system.start("counter", Counter)
+        await asyncio.sleep(3.0)
+        counter.commands, counter.reports = 0, 0
+        await asyncio.sleep(5.0)
+        idle = counter.commands, counter.reports
+        system.robot.y_m = 2.2
+        await asyncio.sleep(1.0)
+        assert system.base.engaged
+        counter.commands, counter.reports = 0, 0
+        await asyncio.sleep(5.0)
+        assert idle == (pytest.approx(5, abs=1), pytest.approx(5, abs=1))
+        assert (counter.commands, counter.reports) == (
+            pytest.approx(25, abs=1), pytest.approx(25, abs=1))
 
     in_whole_system(scenario)
 

@@ -57,6 +57,30 @@ def test_silence_counts_as_soon_as_it_lasts():
     assert found(lambda _: None) == pytest.approx(TIMEOUT_S, abs=1e-3)
 
 
+class Earlier(Freshness):
+    """Has a deadline that comes to lie earlier, as a watchdog's may; counts its timers."""
+
+    waiting = 0
+
+    def follow(self) -> None:
+        super().follow()
+        self._sleep_until(self.clock.now() + 0.02)
+        type(self).waiting = max(self.waiting, len(self._timers))
+
+
+def test_a_deadline_that_comes_to_lie_earlier_leaves_no_timer_behind():
+    async def scenario() -> None:
+        async with System() as system:
+            source = system.start("localization", Source)
+            system.start("DM6", Earlier, **POSE, timeout_s=TIMEOUT_S)
+            for _ in range(40):
+                source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+                await asyncio.sleep(0.05)
+
+    run(scenario)
+    assert Earlier.waiting == 1
+
+
 @pytest.mark.parametrize("late_s", [0.04, 0.08])
 def test_a_module_that_was_late_reads_its_mail_for_as_long_before_it_judges(late_s):
     end_s = TIMEOUT_S - 0.05 + late_s
