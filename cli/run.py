@@ -28,6 +28,7 @@ from rampart.actors.recording.virtual import VirtualRecording
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_document
 from rampart.actors.supervision.launcher import LaunchError
+from rampart.cli.host_run import HostRun
 from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.run_options import ERROR_LOG, MAX_RATE, parse, plan_of, refuse
 from rampart.files import streams, working_folder
@@ -269,6 +270,13 @@ def _interruptible_between_bytecodes(run: VirtualRun) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def _on_another_host(options: argparse.Namespace, plan: RunPlan, reports: Path) -> int:
+    directory = Path(options.report) if options.report else (
+        reports / f"{time.strftime('%Y%m%d-%H%M%S')}-{plan.host}")
+    with _kept(directory):
+        return asyncio.run(HostRun(options, plan, directory).run())
+
+
 def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
          reports: Path = Path("reports")) -> int:
     """Parse the command line, run, and return the exit code.
@@ -283,7 +291,10 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
         options, kind = parse(arguments, program)
-        return Run(options, *plan_of(options, kind), reports).run()
+        plan, spec = plan_of(options, kind)
+        if plan.host:
+            return _on_another_host(options, plan, reports)
+        return Run(options, plan, spec, reports).run()
     except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
         _say(str(error))
         return EXIT_USAGE

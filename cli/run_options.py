@@ -114,6 +114,8 @@ _OPTIONS = (
     word("--record", "FILE", "keep everything that is sent in an MCAP file, for `rampart bag "
          "info`, `rampart replay` and Foxglove-compatible viewers"),
     flag("--overwrite", "--record may replace an existing file"),
+    word("--host", "NAME", "which of the system's [[host]]s this machine is; each runs its own part, "
+         "and all start when all are there (default: the first)"),
     word("--report", "DIR", f"where the report goes, checkpoints, and in {ERROR_LOG} the "
          "tracebacks of nodes that failed (default: reports/TIME-MISSION, without a mission "
          "reports/TIME-SYSTEM)"),
@@ -190,6 +192,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
     """
     _check(options)
     system_file = _system_file(options.system)
+    host = _host(options, load_system(RunPlan(system_file=str(system_file))))
     token, token_is_new = _token(options)
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port,
@@ -198,16 +201,32 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
         hmi_host=options.hmi_host, hmi_token=token, hmi_token_is_new=token_is_new,
-        waits=options.wait, virtual=options.virtual)
+        waits=options.wait, virtual=options.virtual, host=host)
     spec = load_system(plan)
     layout = Layout(plan, spec)
     if not options.no_hmi:
         plan = msgspec.structs.replace(plan, faults=faults_of(spec).offered())
-    if not any(issubclass(member.actor, load_class(HMI)) for member in layout.members.values()):
+    if not any(issubclass(member.actor, load_class(HMI)) and layout.hosts.home_of[name] == host
+               for name, member in layout.members.items()):
+        where = f" on host {host or 'the first'}" if layout.hosts.several else ""
         refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token_file"),
-               f"no node of {spec.name} serves an operator's page")
+               f"no node of {spec.name}{where} serves an operator's page")
         plan = msgspec.structs.replace(plan, hmi_port=0)
     return plan, spec
+
+
+def _host(options: argparse.Namespace, spec: SystemSpec) -> str:
+    """Return which host this is, "" for the first."""
+    if options.host is None:
+        return ""
+    names = [host.name for host in spec.hosts]
+    if options.host not in names:
+        raise UsageError(f"--host {options.host}: " + (
+            f"unknown; known: {', '.join(names)}" if names else
+            f"{spec.name} has no [[host]]; it runs on one machine"))
+    if options.virtual:
+        raise UsageError(f"--host {options.host}: virtual time is on one machine")
+    return "" if options.host == names[0] else str(options.host)
 
 
 def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:

@@ -25,10 +25,10 @@ ROOMS = (
     "manager.analysis", "manager.drawing",
     "actors.bus", "actors.ftm", "actors.web", "actors.run", "actors.runtime",
     "actors.detection", "actors.recovery", "actors.foreign", "actors.layout", "manager.actor",
-    "actors.supervision", "actors.recording", "actors.operator",
+    "actors.supervision", "actors.hosts", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
     "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.bench",
-    "cli.run", "cli.new", "cli.main",
+    "cli.host_run", "cli.run", "cli.new", "cli.main",
     "testing",
 )
 """The rooms of the engine, from the bottom to the top: each may import those before it."""

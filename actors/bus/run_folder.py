@@ -24,6 +24,9 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+ROUTERS = ("router_a", "router_b")
+"""Names of the sockets of the two routers."""
+
 MAX_SOCKET_BYTES = 107
 """Longest path that the address of a unix socket can hold (unix(7))."""
 

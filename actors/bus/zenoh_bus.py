@@ -81,14 +81,14 @@ class ZenohBus:
         node: name under which this session announces itself; "" announces nothing (a tool).
         incarnation: of the node.
         dial: endpoints of the routers; to a router, of the other one.
-        listen: endpoint of a router; None for a client.
+        listen: endpoints of a router, that in the folder first; none for a client.
         recorder: connection to a recorder of the run; None for none.
     """
 
     bursts = True
 
     def __init__(self, node: str, incarnation: int, dial: Sequence[str],
-                 listen: str | None = None, recorder: RecorderConnection | None = None) -> None:
+                 listen: Sequence[str] = (), recorder: RecorderConnection | None = None) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
@@ -125,14 +125,15 @@ class ZenohBus:
     async def _open(self) -> None:
         self._loop = asyncio.get_running_loop()
         try:
-            self._session = (await self._joined(self._loop) if self._listen is None
+            self._session = (await self._joined(self._loop) if not self._listen
                              else zenoh.open(session_config(self._listen, self._dial)))
         except zenoh.ZError as error:
             text = " ".join(str(error).split())
             node = f"(node {self._node})"
-            raise BusError(f"{self._listen} is in use by another process {node}"
+            where = self._listen[0]
+            raise BusError(f"{where} is in use by another process {node}"
                            if "acquire lock" in text
-                           else f"cannot open {self._listen} {node}: {text}") from None
+                           else f"cannot open {where} {node}: {text}") from None
         self._routers = self._linked()
         self._loop.add_reader(self._bell.number, self._drain)
 

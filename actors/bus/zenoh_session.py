@@ -11,10 +11,8 @@ from typing import Any
 
 import zenoh
 
-from rampart.actors.bus.run_folder import socket_path
+from rampart.actors.bus.run_folder import ROUTERS, socket_path
 from rampart.actors.bus.unix_peer import peer, process_state
-
-ROUTERS = ("router_a", "router_b")
 
 LEASE_MS = 2000
 """A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
@@ -22,6 +20,11 @@ LEASE_MS = 2000
 HANDSHAKE_MS = 300
 """A handshake that takes longer is given up on either side: what connects and says nothing holds
 one of the hundred places that Zenoh has for handshakes no longer than this."""
+
+FAR_HANDSHAKE_MS = 2000
+"""Of a router that other hosts are linked to: four messages, some of which may be lost."""
+
+_NOT_FATAL = "exit_on_failure=false"
 
 _RUNTIME = "ZENOH_RUNTIME"
 _THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "
@@ -47,17 +50,20 @@ def endpoints(folder: str) -> list[str]:
     return [endpoint(folder, name) for name in ROUTERS]
 
 
-def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
+def session_config(listen: Sequence[str], dial: Sequence[str]) -> zenoh.Config:
     """Return the configuration of a session that finds others only where it is told.
 
     Args:
-        listen: where a router listens; None for a client.
+        listen: where a router listens, in the folder first; none for a client. It goes on
+            without the others: an address that is not there now may come.
         dial: a client goes to the first of these that answers, a router to all, again and again.
     """
     config = zenoh.Config()
+    is_far = any(not one.startswith(_PROTOCOL) for one in (*listen, *dial))
+    handshake_ms = FAR_HANDSHAKE_MS if is_far else HANDSHAKE_MS
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",
-        "listen/endpoints": [listen] if listen else [],
+        "listen/endpoints": [*listen[:1], *(f"{far}#{_NOT_FATAL}" for far in listen[1:])],
         "listen/exit_on_failure": True,
         "connect/endpoints": list(dial),
         "connect/timeout_ms": -1 if listen else 0,  # in the background, or each once
@@ -68,8 +74,8 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
         "transport/shared_memory/enabled": False,  # a SIGKILL would leave its segment behind
-        "transport/unicast/open_timeout": HANDSHAKE_MS,
-        "transport/unicast/accept_timeout": HANDSHAKE_MS,
+        "transport/unicast/open_timeout": handshake_ms,
+        "transport/unicast/accept_timeout": handshake_ms,
         "transport/link/tx/lease": LEASE_MS}
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -99,9 +105,9 @@ def open_client(dial: Sequence[str]) -> zenoh.Session:
         ZError: none does.
     """
     if _RUNTIME in os.environ:
-        return zenoh.open(session_config(None, dial))
+        return zenoh.open(session_config((), dial))
     os.environ[_RUNTIME] = _THREADS  # read when a process opens its first session
     try:
-        return zenoh.open(session_config(None, dial))
+        return zenoh.open(session_config((), dial))
     finally:
         del os.environ[_RUNTIME]  # commands that this process starts have their own

@@ -182,13 +182,14 @@ class NodeState(StrEnum):
     STOPPED = "stopped"
     WEDGED = "wedged"
     GIVEN_UP = "given up"
+    UNREACHABLE = "unreachable"
 
 
 class NodeInfo(Message, frozen=True, omit_defaults=True):
     """One row of the supervisor's table.
 
     `late_s` is how late a timer of its loop was at most in the last half or whole second, simulated
-    seconds; left out if none was.
+    seconds; left out if none was. `host` is where it runs; "" is the first.
     """
 
     name: Name
@@ -198,6 +199,7 @@ class NodeInfo(Message, frozen=True, omit_defaults=True):
     incarnation: Incarnation
     restarts: Count
     late_s: Seconds = ON_TIME
+    host: Name = ""
 
 
 class NodeTable(Message, frozen=True):

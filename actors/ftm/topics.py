@@ -36,6 +36,8 @@ RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched r
 
 # Runtime and supervision.
 NODES = Topic("supervisor/nodes", m.NodeTable, Qos.STATE, 2, "", "The supervisor's node table.")
+HOST_NODES = Topic("supervisor/{name}/nodes", m.NodeTable, Qos.STATE, 2, "",
+                   "What supervisor {name} runs, of a system of several hosts; for the others.")
 RESPAWN = Topic("supervisor/respawn", m.RespawnRequest, Qos.COMMAND, 0, "",
                 "Ask for a node to be respawned.")
 PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",

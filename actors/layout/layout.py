@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.topic import Topic
-from rampart.actors.bus.zenoh_session import ROUTERS
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.chosen_topics import choose_topics, with_pages
 from rampart.actors.layout.connections import check_connections, check_heard, publishers_of
+from rampart.actors.layout.hosts import Hosts
 from rampart.actors.layout.wiring import (
     SPARES,
     Member,
@@ -25,7 +25,7 @@ from rampart.actors.layout.wiring import (
 )
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan, load_document, tailor
+from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_document, on_host, tailor
 from rampart.actors.runtime.declaration import Handlers
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
@@ -33,6 +33,9 @@ from rampart.manager.spec.specification import check_document, check_modules
 from rampart.manager.spec.tables import Layers
 
 SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"
+FIRST_SUPERVISOR_CLASS = "rampart.actors.hosts.host_supervisor:FirstSupervisor"
+HOST_SUPERVISOR_CLASS = "rampart.actors.hosts.host_supervisor:HostSupervisor"
+HOST_OBSERVER_CLASS = "rampart.actors.hosts.host_observer:HostObserver"
 ROUTER_CLASS = "rampart.actors.supervision.router:Router"
 
 
@@ -76,9 +79,12 @@ class Layout:
         self.unit_of: dict[str, str] = {
             node.name: unit.name for unit in self.units.values() for node in unit.nodes}
         self.routers: dict[str, Unit] = {
-            name: Unit(name, (NodeSpec(name, Kind.SUPERVISION, ROUTER_CLASS),)) for name in ROUTERS}
+            name: Unit(name, (NodeSpec(name, Kind.SUPERVISION, ROUTER_CLASS),))
+            for name in plan.routers}
+        self.hosts = Hosts(spec, plan.host)
+        self.here = {name: unit for name, unit in self.units.items()
+                     if self.hosts.home_of[unit.nodes[0].name] == plan.host}
         file = plan.system_file
-        supervisor = load_class(SUPERVISOR_CLASS)
         try:
             kind = application_class(spec)
             observer = load_class(kind.observer)
@@ -86,10 +92,13 @@ class Layout:
             judged = judged_topics(spec, observer)
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
-        heard = msgspec.convert({"nodes": (*ROUTERS, *self.unit_of)}, supervisor.Parameters)
-        own = [Member(SUPERVISOR, supervisor, heard),
+        own = [*self._supervisors(),
                Member(OBSERVER, observer, msgspec.convert(
                    {"judged": [topic.key for topic in judged]}, observer.Parameters))]
+        own += [Member(on_host(OBSERVER, host), watcher, msgspec.convert(
+                    {"supervisor": name}, watcher.Parameters))
+                for host, name in self.hosts.supervisors.items() if host
+                for watcher in [load_class(HOST_OBSERVER_CLASS)]]
         world = {"seed": plan.seed, **(application or Application()).world_parameters(),
                  "dead_man": spec.layers.dead_man,
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
@@ -100,6 +109,16 @@ class Layout:
         self.members, self.topics = choose_topics(
             with_pages(own, spec, ordered, file), (*known, *judged), file)
         self._check(judge, (*ftm_topics.ALL, *known), file)
+
+    def _supervisors(self) -> Iterator[Member]:
+        for host, name in self.hosts.supervisors.items():
+            kind = load_class(SUPERVISOR_CLASS if len(self.hosts.supervisors) == 1 else
+                              HOST_SUPERVISOR_CLASS if host else FIRST_SUPERVISOR_CLASS)
+            yield Member(name, kind, msgspec.convert(
+                {"nodes": self.hosts.heard_by(host, self.unit_of), "host": host,
+                 "others": tuple(one for one in self.hosts.supervisors if one != host)}
+                if self.hosts.several else {"nodes": self.hosts.heard_by(host, self.unit_of)},
+                kind.Parameters))
 
     def spare_of(self, names: Collection[str]) -> str:
         """Return which spare the process of these actors is to have; the least that one allows."""

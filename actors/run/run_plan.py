@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.ftm.messages import NamedFault
 from rampart.actors.web.access import page_url
 from rampart.files import toml
@@ -22,6 +23,11 @@ from rampart.manager.spec.tables import Layers, SpecificationError
 SUPERVISOR = "supervisor"
 OBSERVER = "observer"
 DEFAULT_PORT = 7450
+
+
+def on_host(name: str, host: str) -> str:
+    """Return what is called `name` on the first host as it is called on another one."""
+    return f"{name}_{host}" if host else name
 
 
 class RunPlan(msgspec.Struct, frozen=True):
@@ -49,6 +55,8 @@ class RunPlan(msgspec.Struct, frozen=True):
         waits: True has the mission wait until the operator starts it from the page.
         virtual: whether time is virtual: nothing outside of the process is used.
         options: of the system's application, in place of what the spec says.
+        host: name of the machine that this is the plan of; "" on the first, and on the only one.
+        incarnations: of the supervisor and the routers of this host begin above this number.
     """
 
     run_id: str = "run"
@@ -72,6 +80,18 @@ class RunPlan(msgspec.Struct, frozen=True):
     waits: bool = False
     virtual: bool = False
     options: dict[str, Any] = {}
+    host: str = ""
+    incarnations: int = 0
+
+    @property
+    def supervisor(self) -> str:
+        """Name of this host's supervisor."""
+        return on_host(SUPERVISOR, self.host)
+
+    @property
+    def routers(self) -> dict[str, str]:
+        """Names of this host's routers, each with that of its socket."""
+        return {on_host(name, self.host): name for name in ROUTERS}
 
     @property
     def description(self) -> dict[str, Any]:
@@ -131,7 +151,7 @@ def tailor(plan: RunPlan, spec: SystemSpec) -> SystemSpec:
                     plan.system_file, f"{node.name}: command", "there are no processes in virtual "
                     "time; name with stand_in = 'module:Class' the actor that plays it there",
                     list(node.command))
-        spec = msgspec.structs.replace(spec, nodes=nodes)
+        spec = msgspec.structs.replace(spec, nodes=nodes, hosts=())
     return spec if plan.ftm else msgspec.structs.replace(spec, layers=Layers(
         dead_man=False, safety_pilot_checks=False, manager_watch=False,
         supervisor_respawn=False, ftm=False, checkpoints=False))

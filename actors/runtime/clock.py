@@ -7,8 +7,14 @@ the simulated time (origin 0, rate 1) and the same class serves.
 
 from __future__ import annotations
 
+import mmap
+import os
+import struct
 import time
 from collections.abc import Callable
+from pathlib import Path
+
+from rampart.actors.run.run_plan import RunPlan
 
 
 class Clock:
@@ -43,3 +49,67 @@ class Clock:
     def source_time(self, simulated_s: float) -> float:
         """Return the reading of the time source at a simulated time."""
         return self._origin_s + simulated_s / self.rate
+
+
+class FollowedClock(Clock):
+    """The clock of a host that follows another one's: its origin is kept in a file, and changes.
+
+    Args:
+        file: holds the origin.
+        rate: as of a `Clock`.
+        source: likewise.
+
+    Raises:
+        OSError: there is no such file.
+    """
+
+    __slots__ = ("_shared",)
+
+    def __init__(self, file: Path, rate: float = 1.0,
+                 source: Callable[[], float] = time.monotonic) -> None:
+        descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            self._shared = mmap.mmap(descriptor, _ORIGIN.size, prot=mmap.PROT_READ)
+        finally:
+            os.close(descriptor)
+        super().__init__(self._read(), rate, source)
+
+    def _read(self) -> float:
+        origin_s: float = _ORIGIN.unpack_from(self._shared)[0]
+        return origin_s
+
+    def now(self) -> float:
+        self._origin_s = self._read()
+        return super().now()
+
+    def source_time(self, simulated_s: float) -> float:
+        self._origin_s = self._read()
+        return super().source_time(simulated_s)
+
+
+_ORIGIN = struct.Struct("d")
+
+
+def keep_origin(file: Path, origin_s: float) -> None:
+    """Have all clocks that follow a file go by another origin.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        os.pwrite(descriptor, _ORIGIN.pack(origin_s), 0)  # of eight bytes a reader sees all or none
+    finally:
+        os.close(descriptor)
+
+
+def origin_file(folder: str) -> Path:
+    """Return where the origin is kept in the folder of a run, on a host that follows another."""
+    return Path(folder, "origin")
+
+
+def clock_of(plan: RunPlan, source: Callable[[], float] = time.monotonic) -> Clock:
+    """Return the clock of a run as this host has it."""
+    if plan.host:
+        return FollowedClock(origin_file(plan.folder), plan.rate, source)
+    return Clock(plan.origin_s, plan.rate, source)

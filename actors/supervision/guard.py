@@ -15,9 +15,8 @@ import time
 from collections.abc import Callable, Mapping
 
 from rampart.actors.bus.run_folder import issued
-from rampart.actors.bus.zenoh_session import ROUTERS
 from rampart.actors.ftm.patience import Patience, usage
-from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
+from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.supervision.process_title import RunProcess, find_process, find_processes, kill
 from rampart.actors.supervision.processes import OsHandle
 from rampart.actors.supervision.spawner import NAMES
@@ -37,7 +36,6 @@ LOAD_PATIENCE_S = 20.0
 
 _ASK_AGAIN_S = 0.01
 _SPAWNERS = {f"spawner_{name}": name for name in NAMES}
-_GUARDED = {SUPERVISOR, *ROUTERS, *_SPAWNERS}
 
 
 class Guard:
@@ -59,15 +57,17 @@ class Guard:
     def __init__(self, plan: RunPlan, spawners: SpawnerClient,
                  load: Callable[[str], subprocess.Popen[bytes]]) -> None:
         self.supervisor_pid = 0
-        self.supervisor_incarnation = 0
+        self.supervisor_incarnation = plan.incarnations
         self.policy = RestartPolicy()
         self.on_restart: Callable[[str], None] = lambda _name: None
         self.report: Callable[[str], None] = complain
         self._plan = plan
+        self._supervisor = plan.supervisor
+        self._guarded = {self._supervisor, *plan.routers, *_SPAWNERS}
         self._spawners = spawners
         self._load = load
         self._loaded: subprocess.Popen[bytes] | None = None
-        self._patience = {name: Patience(2 * PERIOD_S) for name in (SUPERVISOR, *_SPAWNERS)}
+        self._patience = {name: Patience(2 * PERIOD_S) for name in (self._supervisor, *_SPAWNERS)}
         self._load_patience = Patience(2 * PERIOD_S)
         self._hung: set[str] = set()
         self._supervisor_due_s: float | None = None
@@ -82,9 +82,9 @@ class Guard:
             SpawnerUnavailableError: no spawner answers within so many seconds.
         """
         incarnation = self.supervisor_incarnation + 1
-        self.supervisor_pid = await self.fork(SUPERVISOR, incarnation, within_s)
+        self.supervisor_pid = await self.fork(self._supervisor, incarnation, within_s)
         self.supervisor_incarnation = incarnation
-        self._patience[SUPERVISOR].answered()
+        self._patience[self._supervisor].answered()
 
     async def fork(self, name: str, incarnation: int, within_s: float = PERIOD_S) -> int:
         """Fork a supervisor or spawner and return its pid, as `SpawnerClient.fork`."""
@@ -99,7 +99,7 @@ class Guard:
 
     def supervisor_heard(self) -> None:
         """Note that the supervisor is heard."""
-        self._patience[SUPERVISOR].answered()
+        self._patience[self._supervisor].answered()
 
     async def keep(self) -> None:
         """Look after them until this is cancelled; whatever goes wrong, there is a next time."""
@@ -132,12 +132,12 @@ class Guard:
             else:
                 all_there &= self._judge(name, living[name].pid, turning)
         await self._bring_routers_back(living)
-        supervisor = living.get(SUPERVISOR)
+        supervisor = living.get(self._supervisor)
         if supervisor is not None:  # it may be a child of a spawner that died before it answered
             self.supervisor_pid = supervisor.pid
             self.supervisor_incarnation = max(self.supervisor_incarnation, supervisor.incarnation)
-            if self._is_hung(SUPERVISOR, supervisor.pid):
-                self._patience[SUPERVISOR].answered()
+            if self._is_hung(self._supervisor, supervisor.pid):
+                self._patience[self._supervisor].answered()
                 kill(supervisor.pid)
                 await self.supervisor_gone(PERIOD_S)  # its port is free only then
                 supervisor = None
@@ -175,17 +175,17 @@ class Guard:
             process = find_process(before.pid)
             if process == before:
                 living[name] = process
-        if len(living) < len(_GUARDED):
+        if len(living) < len(self._guarded):
             living = {}
             for process in find_processes(self._plan.base_port, self._plan.launcher_pid):
                 for name in process.names:  # a child bears its spawner's name for a moment
-                    if name in _GUARDED:
+                    if name in self._guarded:
                         living.setdefault(name, process)
             self._found = living
         return living
 
     def _is_hung(self, name: str, pid: int) -> bool:
-        limit_s = (SUPERVISOR_PATIENCE_S / min(1.0, self._plan.rate) if name == SUPERVISOR
+        limit_s = (SUPERVISOR_PATIENCE_S / min(1.0, self._plan.rate) if name == self._supervisor
                    else SPAWNER_PATIENCE_S)
         return self._patience[name].look(time.monotonic(), pid, usage(pid)) >= limit_s
 
@@ -202,9 +202,9 @@ class Guard:
 
     async def _bring_routers_back(self, living: Mapping[str, RunProcess]) -> None:
         """Without any the supervisor, which looks after them, might not even start."""
-        missing = living.keys().isdisjoint(ROUTERS)
+        missing = living.keys().isdisjoint(self._plan.routers)
         if missing and self._no_routers:
-            for name in ROUTERS:
+            for name in self._plan.routers:
                 await self.fork(name, issued(self._spawners.folder).get(name, 0) + 1)
         self._no_routers = missing
 
@@ -263,7 +263,7 @@ class Guard:
             return False
         self._supervisor_due_s = None
         policy.restarted(time.monotonic())
-        self.on_restart(SUPERVISOR)
+        self.on_restart(self._supervisor)
         return True
 
     def _tell(self, trouble: str) -> None:

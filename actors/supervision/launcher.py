@@ -27,10 +27,10 @@ import msgspec
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.bus.zenoh_session import ROUTERS, endpoints
+from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
-from rampart.actors.run.run_plan import OBSERVER, RunPlan
+from rampart.actors.run.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.supervision.guard import Guard
 from rampart.actors.supervision.process_title import end_commands, kill, kill_leftovers, set_title
 from rampart.actors.supervision.spawner import NAMES, Loaded, load_and_serve
@@ -204,12 +204,11 @@ class Launcher:
         loop = asyncio.get_running_loop()
         tell_of_callbacks(loop, self._tell)
         loop.add_signal_handler(signal.SIGCHLD, self._reap)
-        startup_s = min(max(STARTUP_S[0], _LOADS * self._load_s), STARTUP_S[1])
-        self.plan = msgspec.structs.replace(self.plan, origin_s=time.monotonic() + startup_s)
+        self.plan = msgspec.structs.replace(self.plan, origin_s=self.origin_s())
         try:
             self._spawners.set_origin(self.plan.origin_s)
-            for name in (*ROUTERS, f"spawner_{NAMES[1]}"):
-                await self.guard.fork(name, 1, START_PATIENCE_S)
+            for name in (*self.plan.routers, f"spawner_{NAMES[1]}"):
+                await self.guard.fork(name, self.plan.incarnations + 1, START_PATIENCE_S)
             await self.guard.start_supervisor(START_PATIENCE_S)
         except SpawnerUnavailableError as error:
             raise LaunchError(str(error)) from None
@@ -219,6 +218,10 @@ class Launcher:
             loop.add_reader(self._info, lambda info: run_info.answer(info, self.info()), self._info)
         self._keeping = asyncio.create_task(self.guard.keep())
         watch(self._keeping, "the guard of supervisor and spawners", self.failed)
+
+    def origin_s(self) -> float:
+        """Return the reading of the monotonic clock at simulated time 0, all being loaded now."""
+        return time.monotonic() + min(max(STARTUP_S[0], _LOADS * self._load_s), STARTUP_S[1])
 
     def failed(self, why: str) -> None:
         """Note that the run has to end, for a part of the launcher's process has failed."""
@@ -238,7 +241,7 @@ class Launcher:
 
     def observers_bus(self) -> ZenohBus:
         """Return the bus of an observer in this process, which hears all nodes; not yet open."""
-        return ZenohBus(OBSERVER, 1, endpoints(self.plan.folder),
+        return ZenohBus(on_host(OBSERVER, self.plan.host), 1, endpoints(self.plan.folder),
                         recorder=RecorderConnection(self.plan.base_port))
 
     # -- tools ----------------------------------------------------------------------------------

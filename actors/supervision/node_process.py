@@ -35,15 +35,15 @@ from typing import Any
 
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.run_folder import register_of
+from rampart.actors.bus.run_folder import ROUTERS, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.bus.zenoh_session import ROUTERS, endpoint, endpoints
+from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.layout.layout import Layout, router
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
-from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.clock import clock_of
 from rampart.actors.supervision.process_title import WAITING, end_run, kill, set_title
 from rampart.actors.supervision.unseen import tell_of_callbacks
 from rampart.files.streams import complain
@@ -86,13 +86,10 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         waits: "warm" or "hot" if it is to be silent until it is promoted.
     """
     member = layout.members.get(name) or router(name)
-    clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
-    folder = layout.plan.folder
+    clock = clock_of(layout.plan, loop.time)
     recorder = RecorderConnection(layout.plan.base_port)
     if bus is None:
-        own = endpoint(folder, name) if name in ROUTERS else None
-        bus = ZenohBus(name, incarnation, [one for one in endpoints(folder) if one != own], own,
-                       recorder)
+        bus = ZenohBus(name, incarnation, *_ends(layout, name), recorder)
     else:
         bus.take_name(name, incarnation, recorder)
     return member.actor(Context(
@@ -101,6 +98,16 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
         members=frozenset((*layout.members, *layout.routers)), topics=layout.topics, waits=waits))
+
+
+def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:
+    """Return what an actor's session dials, and where it listens, which a router's does."""
+    folder, place = layout.plan.folder, layout.plan.routers.get(name)
+    if place is None:
+        return endpoints(folder), []
+    own, hosts = endpoint(folder, place), layout.hosts
+    beside = [one for one in endpoints(folder) if one != own]
+    return [*beside, *hosts.dials()], [own, *hosts.listens(ROUTERS.index(place))]
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:

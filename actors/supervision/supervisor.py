@@ -33,6 +33,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.patience import Patience
 from rampart.actors.layout.layout import Layout, adapted_system
+from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.supervision.held_process import HeldProcess
 from rampart.actors.supervision.lateness import Lateness
@@ -94,10 +95,8 @@ class Supervisor(Actor):
         self._machine: Processes = processes or OsProcesses(
             self._plan.folder, self._plan.base_port, self._plan.launcher_pid)
         self._routers = self._layout.routers if self._machine.has_routers else {}
-        self._processes = {
-            name: HeldProcess(unit, RestartPolicy(self._spec.supervision),
-                           Patience(2 * _CHECK_S / self._plan.rate))
-            for name, unit in {**self._routers, **self._layout.units}.items()}
+        self._processes = {name: HeldProcess(unit, *self._means())
+                           for name, unit in {**self._routers, **self._layout.here}.items()}
         for node, incarnation in run.known_incarnations.items():
             if (process := self._process_of(node)) is not None:
                 process.incarnation = process.highest = incarnation
@@ -114,6 +113,9 @@ class Supervisor(Actor):
         """Hear the heartbeats of the nodes that it starts."""
         return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
+    def _means(self) -> tuple[RestartPolicy, Patience]:
+        return RestartPolicy(self._spec.supervision), Patience(2 * _CHECK_S / self._plan.rate)
+
     def _process_of(self, node: str) -> HeldProcess | None:
         return self._processes.get(
             node if node in self._routers else self._layout.unit_of.get(node, ""))
@@ -125,7 +127,7 @@ class Supervisor(Actor):
         living = self._machine.living()
         for process in self._processes.values():
             if not self._adopt_living(process, living) and (
-                    self._incarnation == 1 or self._owns(process)):
+                    self._incarnation == self._plan.incarnations + 1 or self._owns(process)):
                 self._on(process, Event.START)
         self._publish_table()
         if self._routers:
@@ -192,7 +194,7 @@ class Supervisor(Actor):
         self._machine.adapt(message)
         changed = changed_actors(self._spec, layout.spec)
         self._layout, self._spec = layout, layout.spec
-        for unit in {self._layout.unit_of[name] for name in changed}:
+        for unit in {self._layout.unit_of[name] for name in changed} & self._processes.keys():
             process = self._processes[unit]
             process.unit = self._layout.units[unit]
             if process.step(Event.ADAPTED):  # it was given up: it may do better now
@@ -206,9 +208,10 @@ class Supervisor(Actor):
         """Kill what is left of a node and start it anew, once per failed incarnation."""
         process = self._process_of(request.node)
         if process is None:
-            self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
-                request.node, "refused", 0, 0, request.by,
-                clip(f"no such node: {request.node!r}")))
+            if request.node not in self._layout.unit_of:
+                self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
+                    request.node, "refused", 0, 0, request.by,
+                    clip(f"no such node: {request.node!r}")))
         elif (process.state in (State.STARTING, State.RUNNING)
               and process.incarnation > request.failed_incarnation):
             self._tell(process, "respawned", request.by, "already")
@@ -273,7 +276,7 @@ class Supervisor(Actor):
         """Whether the supervisor itself brings the process back."""
         return process.unit.name in self._routers or (
             self._spec.layers.supervisor_respawn
-            and process.unit.respawn == self.name
+            and process.unit.respawn == SUPERVISOR
             and process.unit.kind != Kind.WORLD.value)
 
     # -- acting ---------------------------------------------------------------------------------
@@ -392,9 +395,12 @@ class Supervisor(Actor):
             self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
                 node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
-    def _publish_table(self) -> None:
+    def _rows(self) -> tuple[fm.NodeInfo, ...]:
         own = fm.NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid,
                           fm.NodeState.RUNNING, self._incarnation, self._incarnation - 1,
                           self._lateness.of(self.name))
         rows = (row for p in self._processes.values() for row in p.rows(self._lateness.of))
-        self.publish(topics.NODES, fm.NodeTable((own, *rows)))
+        return own, *rows
+
+    def _publish_table(self) -> None:
+        self.publish(topics.NODES, fm.NodeTable(self._rows()))

@@ -89,6 +89,7 @@ def _of_mechanisms(spec: SystemSpec) -> Iterator[Budget]:
     repairs = {recovery.name for recovery in spec.recoveries if recovery.kind.repairs}
     mechanisms = {mechanism.name: mechanism for mechanism in spec.mechanisms}
     parents = spec.build_ftm_tree().parents if mechanisms else {}
+    manager = next((node.name for node in spec.nodes if node.kind is Kind.MANAGER), "")
     for mechanism in spec.mechanisms:
         listens_to = [detections[name] for name in mechanism.detections]
         if isinstance(mechanism.against, Within):
@@ -101,9 +102,10 @@ def _of_mechanisms(spec: SystemSpec) -> Iterator[Budget]:
             left_s = min(detections[name].soonest_s for name in parent.detections)
             hazard = f"{parent.detect} of {parent.name} detects the consequence"
         # Which input of a gate opens it is not known: count on the slowest.
-        detection_s = max(detection.latency_s for detection in listens_to)
-        yield Budget(mechanism.name, hazard, left_s, detection_s, timing.arbitration_s,
-                     timing.actuation_s,
+        detection_s = max(detection.latency_s for detection in listens_to) + (
+            spec.link_s(manager, mechanism.detections))
+        arbitration_s = timing.arbitration_s + spec.link_s(manager, mechanism.recoveries)
+        yield Budget(mechanism.name, hazard, left_s, detection_s, arbitration_s, timing.actuation_s,
                      0.0 if repairs.isdisjoint(mechanism.recoveries) else timing.respawn_s)
 
 

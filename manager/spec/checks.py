@@ -15,6 +15,7 @@ from rampart.manager.model.fault_tree import FaultTreeError
 from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
 from rampart.manager.model.order import CycleError, find_cycle
 from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
+from rampart.manager.spec.hosts import find_wrong_hosts
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
 from rampart.manager.spec.panels import problem_of
 from rampart.manager.spec.schema import SystemSpec
@@ -63,6 +64,7 @@ def modules(spec: SystemSpec) -> Iterator[tuple[str, str, str, str]]:
 
 def _names(spec: SystemSpec) -> Iterator[Finding]:
     taken = dict.fromkeys(RESERVED, "reserved")
+    taken |= {f"{name}_{host.name}": "reserved" for name in RESERVED for host in spec.hosts}
     named = [(path, name, process) for path, name, process, _ in modules(spec)]
     named += [(path, m.name, "") for path, m in numbered("mechanism", spec.mechanisms)]
     for path, name, process in named:
@@ -367,6 +369,7 @@ def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
 
 
 VALIDATORS: tuple[Validator, ...] = (
-    find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, _mechanisms,
+    find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, find_wrong_hosts,
+    _mechanisms,
     _reachability, _faults, _panels, _wrong_tree, _wrong_policy, _wrong_orders, _contradictions,
     _wrong_compounds, _wrong_precedence, find_wrong_budget)

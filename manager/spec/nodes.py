@@ -80,6 +80,7 @@ class NodeSpec(Table, frozen=True):
         kind: What it is.
         actor: Its class, `module:Class`; "" of one that has a command.
         process: Name of the OS process it runs in; "" for one of its own name.
+        host: Name of the machine on which it runs; "" for the first.
         respawn: Who brings it back: a recovery module, or "supervisor".
         spare: What its next process is made of. "none": a new one. "warm": one that is connected
             and waits for a role. "hot": one that hears everything in this role, in silence. "" is
@@ -100,6 +101,7 @@ class NodeSpec(Table, frozen=True):
     kind: Kind
     actor: OptionalClassPath = ""
     process: OptionalName = ""
+    host: OptionalName = ""
     respawn: Name = "supervisor"
     spare: Literal["", "none", "warm", "hot"] = ""
     parameters: dict[str, Any] = {}

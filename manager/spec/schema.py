@@ -9,7 +9,7 @@ is checked by type alone: unknown fields, wrong types, names that are no names, 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args
 
@@ -19,6 +19,7 @@ from rampart.manager.model.fault_tree import Event, FaultTree
 from rampart.manager.model.gates import detection_gate, recovery_gate
 from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
 from rampart.manager.model.order import PartialOrder, Tree, refine
+from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.mobile_robot import Hazard, Robot
 from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits, ClassPath, Kind, NodeSpec
 from rampart.manager.spec.panels import Panel
@@ -49,6 +50,7 @@ class DetectionSpec(Table, frozen=True):
         title: For people.
         actor: Its class, `module:Class`.
         process: OS process it runs in; "" for one of its own name.
+        host: On which it runs; "" for the first.
         enabled: False leaves out every mechanism that listens to it.
     """
 
@@ -57,6 +59,7 @@ class DetectionSpec(Table, frozen=True):
     actor: ClassPath
     within_s: Positive | Name = DERIVED
     process: OptionalName = ""
+    host: OptionalName = ""
     parameters: dict[str, Any] = {}
     enabled: bool = True
 
@@ -103,6 +106,7 @@ class RecoverySpec(Table, frozen=True):
     deadline_s: Positive = 2.0
     escalate_to: OptionalName = ""
     process: OptionalName = ""
+    host: OptionalName = ""
     parameters: dict[str, Any] = {}
     enabled: bool = True
 
@@ -212,6 +216,8 @@ class SystemSpec(Table, frozen=True):
         application: What the system adds to the engine: `class`, and that class's options.
         judge: Who says what a run was worth: `class`, and that class's parameters.
         end: When a run is over.
+        hosts: Its machines, the robot's first; none for a system of one machine.
+        link: What is assumed of the network between them.
         mobile: Speeds and distances of a mobile robot, `[robot]` in the file.
         strategy: By which the arbiter decides; `rampart.manager.strategies.registry` has them.
         shadow: A strategy that is asked as well, and whose differing decisions are recorded;
@@ -226,6 +232,8 @@ class SystemSpec(Table, frozen=True):
     application: dict[str, Any] = {}
     judge: dict[str, Any] = {}
     end: End = End()
+    hosts: tuple[HostSpec, ...] = msgspec.field(name="host", default=())
+    link: Link = Link()
     mobile: Robot | None = msgspec.field(name="robot", default=None)
     strategy: str = "safety-first"
     shadow: str = ""
@@ -260,13 +268,26 @@ class SystemSpec(Table, frozen=True):
         detection modules, the recovery modules, the FTM Manager) are left out.
         """
         actors = list(self.nodes)
-        actors += [NodeSpec(m.name, Kind.DETECTION, m.actor, m.process, parameters=m.parameters)
-                   for m in self.detections]
-        actors += [NodeSpec(m.name, Kind.RECOVERY, m.actor, m.process, parameters=m.parameters)
-                   for m in self.recoveries]
+        actors += [NodeSpec(m.name, Kind.DETECTION, m.actor, m.process, m.host,
+                            parameters=m.parameters) for m in self.detections]
+        actors += [NodeSpec(m.name, Kind.RECOVERY, m.actor, m.process, m.host,
+                            parameters=m.parameters) for m in self.recoveries]
         tolerance = {Kind.DETECTION, Kind.RECOVERY, Kind.MANAGER}
         return tuple(msgspec.structs.replace(node, process=node.process or node.name)
                      for node in actors if self.layers.ftm or node.kind not in tolerance)
+
+    @property
+    def host_of(self) -> dict[str, str]:
+        """Names of all nodes, detection and recovery modules with that of their host."""
+        first = self.hosts[0].name if self.hosts else ""
+        return {one.name: one.host if first and one.host else first
+                for rows in (self.nodes, self.detections, self.recoveries) for one in rows}
+
+    def link_s(self, node: str, others: Iterable[str]) -> float:
+        """Return how long a message between a node and any of others is under way on a network."""
+        host_of = self.host_of if self.hosts else {}
+        return self.link.delay_s if any(
+            host_of.get(other) != host_of.get(node) for other in others) else 0.0
 
     def processes(self) -> dict[str, tuple[NodeSpec, ...]]:
         """Return the actors of each OS process, by the name of the process."""

@@ -155,7 +155,7 @@ class Finding(NamedTuple):
 
 
 _NAME = re.compile(r"[A-Za-z][\w-]{0,63}\Z", re.ASCII)
-_IN_A_ROW = re.compile(r"\$\.(node|detection|recovery|mechanism|event|fault)\[(\d+)\](\.|\Z)")
+_IN_A_ROW = re.compile(r"\$\.(node|detection|recovery|mechanism|event|fault|host)\[(\d+)\](\.|\Z)")
 
 
 def by_name(path: str, document: Mapping[str, Any]) -> str:

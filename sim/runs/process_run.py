@@ -8,6 +8,7 @@ from functools import partial
 
 from rampart.actors.bus.bus import SharedBus
 from rampart.actors.bus.run_folder import register_of
+from rampart.actors.hosts.launchers import FirstLauncher
 from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
@@ -62,7 +63,8 @@ class ProcessRun:
     """
 
     def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = ()) -> None:
-        self.launcher = Launcher(trial.run.plan, trial.title)
+        self.launcher = (FirstLauncher(trial.run, trial.title) if trial.run.system.hosts
+                         else Launcher(trial.run.plan, trial.title))
         self.interrupted = ""
         self.failure = ""
         self._trial = trial
@@ -88,6 +90,8 @@ class ProcessRun:
             self.launcher.begin()
         try:
             await self.launcher.load()
+            if isinstance(self.launcher, FirstLauncher) and self._trial.console:
+                self.launcher.say = self._trial.console.say
             await self.launcher.start()
             return await self._observe()
         finally:

@@ -1,0 +1,214 @@
+"""The launchers of a run on several hosts: the first waits for the others, which ask it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+
+import msgspec
+
+from rampart.actors.bus import run_folder
+from rampart.actors.hosts.clock_sync import ClockSync
+from rampart.actors.hosts.meeting import (
+    PERIOD_S,
+    Attendance,
+    Meeting,
+    MeetingError,
+    Told,
+    contents_of,
+    joined,
+)
+from rampart.actors.hosts.placement import EPOCH
+from rampart.actors.layout.hosts import Hosts
+from rampart.actors.layout.layout import load_application
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.clock import keep_origin, origin_file
+from rampart.actors.supervision.launcher import Launcher, LaunchError
+
+_RETRY_S = 0.2
+
+
+class FirstLauncher(Launcher):
+    """The first host's: as any launcher, but it starts when all hosts are ready.
+
+    Attributes:
+        say: is told for whom it waits.
+    """
+
+    def __init__(self, run: RunContext, title: str) -> None:
+        super().__init__(run.plan, title)
+        self.say: Callable[[str], None] = lambda _line: None
+        self._run = run
+        self._meeting: Meeting | None = None
+
+    async def start(self) -> None:
+        """Wait for the others, and start; raises LaunchError as any launcher."""
+        hosts = Hosts(self._run.system)
+        try:
+            contents = contents_of(self.plan, self._run.application)
+            self._meeting = Meeting(
+                self.plan, tuple(host for host in hosts.supervisors if host), contents,
+                lambda: run_folder.issued(self.plan.folder))
+            await self._meeting.open(*hosts.meeting_place())
+        except (MeetingError, OSError) as error:
+            raise LaunchError(str(error)) from None
+        await self._meeting.all_ready(self.say)
+        await super().start()
+        self._meeting.begin(self.plan.origin_s)
+
+    async def end(self) -> None:
+        """End this host's processes, and have the others end theirs."""
+        if self._meeting is not None:
+            await self._meeting.close()
+        await super().end()
+
+
+class OtherHost:
+    """One of the other hosts, from the first question to the end of the run.
+
+    Args:
+        own: what of the plan is this host's own.
+        say: is told what happens, in a line.
+
+    Attributes:
+        launcher: of this host's processes, from `join` on.
+        interrupted: set to end before the run does.
+    """
+
+    def __init__(self, own: RunPlan, say: Callable[[str], None]) -> None:
+        self.launcher: OtherLauncher | None = None
+        self.interrupted = asyncio.Event()
+        self._own = own
+        self._say = say
+        self._spec = load_system(own)
+        hosts = Hosts(self._spec, own.host)
+        self._where = hosts.meeting_place()
+        self._link = hosts.link
+        self._attendance = Attendance(own.host, self._where, contents_of(own))
+        self._clocks = ClockSync()
+        self._said = ""
+        self._is_trusted = True
+
+    async def join(self) -> RunPlan:
+        """Wait for the first host, and return the plan of the run as it is for this one.
+
+        Raises:
+            MeetingError: this host may not take part.
+        """
+        told = await self._answer()
+        plan = joined(told.plan, self._own)
+        application = load_application(plan, self._spec)
+        self._attendance.ready(contents_of(plan, application))
+        plan = msgspec.structs.replace(plan, incarnations=(told.starts - 1) * EPOCH)
+        self.launcher = OtherLauncher(plan, self._spec.title, told.incarnations)
+        return plan
+
+    async def start(self) -> None:
+        """Start this host's processes when the first host says so.
+
+        Raises:
+            LaunchError: They cannot be started.
+            MeetingError: this host may not take part, or the run is over already.
+        """
+        launcher = self.launcher
+        assert launcher is not None  # noqa: S101 for the type checker
+        await launcher.load()
+        while not self.interrupted.is_set():
+            told = await self._answer()
+            if told.over:
+                raise MeetingError(f"the run is over: {told.over}")
+            if told.origin_s is not None:
+                launcher.begins_s = told.origin_s - self._clocks.offset_s
+                await launcher.start()
+                return
+            self._tell(f"waiting for {', '.join(told.waits_for) or 'the first host'}")
+            await asyncio.sleep(PERIOD_S)
+
+    async def stay(self) -> str:
+        """Follow the first host's clock until the run is over; return why it is.
+
+        "" if this host has ended its part before.
+
+        Raises:
+            MeetingError: the first host runs something else by now.
+        """
+        launcher = self.launcher
+        assert launcher is not None  # noqa: S101 for the type checker
+        while not (launcher.failure or self.interrupted.is_set()):
+            told = await self._answer()
+            if told.over:
+                return told.over
+            if told.origin_s is not None:
+                launcher.follow(told.origin_s - self._clocks.offset_s)
+            self._judge_clock()
+            await asyncio.sleep(PERIOD_S)
+        return ""
+
+    def close(self) -> None:
+        """Ask no more."""
+        self._attendance.close()
+
+    async def _answer(self) -> Told:
+        """Ask until there is an answer; what the clocks show of it is noted."""
+        while True:
+            try:
+                told, asked_s, heard_s = await self._attendance.ask()
+            except OSError as error:
+                self._tell(f"the first host cannot be reached at {self._where[0]} port "
+                           f"{self._where[1]} ({error.strerror or error}); trying on")
+                await asyncio.sleep(_RETRY_S)
+                if self.interrupted.is_set() or (self.launcher and self.launcher.failure):
+                    return Told(self._own, over="it was interrupted")
+                continue
+            if self._said.startswith("the first host cannot"):
+                self._tell("the first host answers")
+            if told.now_s:
+                self._clocks.exchanged(asked_s, told.now_s, heard_s)
+            return told
+
+    def _judge_clock(self) -> None:
+        bound_s = self._clocks.bound_at(time.monotonic())
+        is_trusted = bound_s <= self._link.clock_s
+        if is_trusted != self._is_trusted:
+            self._is_trusted = is_trusted
+            self._tell(f"this host's clock is known within {bound_s * 1e3:.0f} ms of the first "
+                       f"host's; [link] clock_s = {self._link.clock_s:g} "
+                       + ("holds again" if is_trusted else "does not hold"))
+
+    def _tell(self, line: str) -> None:
+        if line != self._said:
+            self._said = line
+            self._say(line)
+
+
+class OtherLauncher(Launcher):
+    """Another host's launcher.
+
+    Args:
+        incarnations: of the nodes, those that were issued already.
+
+    Attributes:
+        begins_s: reading of this host's monotonic clock at simulated time 0.
+    """
+
+    def __init__(self, plan: RunPlan, title: str, incarnations: dict[str, int]) -> None:
+        super().__init__(plan, title)
+        self.begins_s = 0.0
+        self._incarnations = incarnations
+
+    def begin(self, *, forks: bool = False) -> None:
+        """Claim what the run needs and start to load, as any launcher."""
+        super().begin(forks=forks)
+        for name, incarnation in self._incarnations.items():
+            run_folder.issue(self.plan.folder, [name], incarnation)
+
+    def origin_s(self) -> float:
+        """Return when simulated time began, or will, as the first host has it."""
+        self.follow(self.begins_s)
+        return self.begins_s
+
+    def follow(self, origin_s: float) -> None:
+        """Have all processes of this host go by this origin."""
+        keep_origin(origin_file(self.plan.folder), origin_s)

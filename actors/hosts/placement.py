@@ -1,0 +1,206 @@
+"""Which of a system's processes a supervisor runs, when there are several hosts. Pure.
+
+Each process has a home. While a host is lost, nothing being heard of its supervisor and its
+routers, the first host, the robot's, runs what has its home there; when it has been back for a
+while, the first host lets go of that, and the home starts it anew. No agreement is needed for it,
+for two rules hold at any time:
+
+* **The highest incarnation counts.** What the first host starts in another one's place has an
+  incarnation that its home cannot have reached meanwhile (`EPOCH`). Every reader refuses the lower
+  one as soon as its host knows, and whoever learns of a higher one lets go of its own.
+* **Only the first host takes over.** A home that hears nothing of the first goes on with what it
+  has, which then only those can hear who are cut off with it.
+
+So a recovery module obeys one manager at any time: that of the highest incarnation it can hear of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+
+from rampart.actors.ftm.messages import NodeInfo
+from rampart.manager.spec.hosts import Link
+
+EPOCH = 1_000_000
+"""More than the restarts of one process in any run: 50 in a minute are a thousand hours' worth."""
+
+FIRST = ""
+"""Name of the first host."""
+
+_GRACE_S = 10.0
+"""A host that was not heard yet since this supervisor began is not lost for so long: it starts."""
+
+_TABLE_S = 1.5
+"""A table of the first host is repeated each half second; older, it says nothing any more."""
+
+
+@dataclass(slots=True)
+class _Other:
+    """What is known of another host. Times are real seconds.
+
+    Attributes:
+        heard_s: When any of its guards was heard.
+        since_s: Since when they have been heard without a break.
+        told_s: When its supervisor said what it runs.
+        runs: That, each node with its incarnation.
+    """
+
+    heard_s: float
+    since_s: float
+    told_s: float = -1e12
+    is_lost: bool = False
+    runs: dict[str, NodeInfo] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What follows from a look at the others.
+
+    Attributes:
+        lost: Hosts that are lost since the last look.
+        back: Hosts that are back.
+        take: Units to be started here, each with the number that its incarnation has to exceed.
+        drop: Units to be let go.
+    """
+
+    lost: tuple[str, ...] = ()
+    back: tuple[str, ...] = ()
+    take: tuple[tuple[str, int], ...] = ()
+    drop: tuple[str, ...] = ()
+
+
+class Placement:
+    """What one supervisor runs.
+
+    Args:
+        own: Name of its host.
+        others: Of the other hosts.
+        homes: Each unit with the name of its host and those of its nodes.
+        fixed: Units that run at home or nowhere.
+        link: When a host is lost, and when it is back.
+        now_s: Now.
+
+    Attributes:
+        held: Units that it runs.
+    """
+
+    def __init__(self, own: str, others: Iterable[str],
+                 homes: Mapping[str, tuple[str, tuple[str, ...]]], fixed: Collection[str],
+                 link: Link, now_s: float) -> None:
+        self.held = {unit for unit, (home, _) in homes.items() if home == own}
+        self._own = own
+        self._homes = homes
+        self._unit_of = {node: unit for unit, (_, nodes) in homes.items() for node in nodes}
+        self._fixed = frozenset(fixed)
+        self._link = link
+        self._others = {name: _Other(now_s + _GRACE_S - link.lost_after_s, now_s)
+                        for name in others}
+        self._highest: dict[str, int] = {}
+
+    def is_lost(self, host: str) -> bool:
+        """Whether a host is lost."""
+        return host != self._own and self._others[host].is_lost
+
+    def adopted(self, unit: str) -> None:
+        """Note that a unit of another host runs here already: so that is lost."""
+        self.held.add(unit)
+        self._others[self._homes[unit][0]].is_lost = True
+
+    def heard(self, host: str, now_s: float) -> None:
+        """Note that a guard of another host was heard."""
+        other = self._others[host]
+        if now_s - other.heard_s > self._link.lost_after_s:
+            other.since_s = now_s
+        other.heard_s = now_s
+
+    def told(self, host: str, rows: Iterable[NodeInfo], mine: Mapping[str, int], now_s: float
+             ) -> tuple[list[NodeInfo], list[str]]:
+        """Take what the supervisor of another host runs.
+
+        Args:
+            host: Its name.
+            rows: What it says; of nodes that are not its own to run, nothing is believed.
+            mine: Incarnation of each node that is run here.
+            now_s: Now.
+
+        Returns:
+            What is news of which incarnation was issued there, and the units to be let go.
+        """
+        other = self._others[host]
+        other.told_s = now_s
+        believed = {row.name: row for row in rows if self._may_run(host, row.name)}
+        other.runs = believed
+        news, drop = [], dict[str, None]()
+        for name, row in believed.items():
+            if row.incarnation > self._highest.get(name, 0):
+                self._highest[name] = row.incarnation
+                if row.incarnation > mine.get(name, 0):
+                    news.append(row)
+            unit = self._unit_of.get(name, "")
+            if unit in self.held and row.incarnation > mine.get(name, 0):
+                drop[unit] = None
+        self.held.difference_update(drop)
+        return news, list(drop)
+
+    def look(self, now_s: float, mine: Mapping[str, int]) -> Changes:
+        """Return what is to be done.
+
+        Args:
+            now_s: Now.
+            mine: Incarnation of each node that was ever issued on this host.
+        """
+        lost, back, drop = list[str](), list[str](), list[str]()
+        take: list[tuple[str, int]] = []
+        for host, other in self._others.items():
+            is_silent = now_s - other.heard_s > self._link.lost_after_s
+            if not other.is_lost and is_silent:
+                other.is_lost = True
+                lost.append(host)
+            elif (other.is_lost and not is_silent
+                  and now_s - other.since_s >= self._link.return_after_s):
+                other.is_lost = False
+                back.append(host)
+                if self._own == FIRST:
+                    drop += [unit for unit in self._homed(host) if unit in self.held]
+            if other.is_lost and self._own == FIRST:
+                take += [(unit, self._next_epoch(unit, mine)) for unit in self._homed(host)
+                         if unit not in self.held and unit not in self._fixed]
+        if self._own != FIRST:
+            take += self._given_back(now_s, mine)
+        self.held.update(unit for unit, _ in take)
+        self.held.difference_update(drop)
+        return Changes(tuple(lost), tuple(back), tuple(take), tuple(drop))
+
+    def rows(self) -> list[NodeInfo]:
+        """Return what the others run, and no one here does."""
+        return [row for other in self._others.values() for row in other.runs.values()
+                if self._unit_of.get(row.name, "") not in self.held]
+
+    def lost_hosts(self) -> list[str]:
+        """Return the names of the hosts that are lost."""
+        return [host for host, other in self._others.items() if other.is_lost]
+
+    def _may_run(self, host: str, node: str) -> bool:
+        """Whether a host may speak of a node: the first of those of all, another of its own."""
+        unit = self._unit_of.get(node)
+        return unit is None or host == FIRST or self._homes[unit][0] == host
+
+    def _homed(self, host: str) -> list[str]:
+        return [unit for unit, (home, _) in self._homes.items() if home == host]
+
+    def _known(self, unit: str, mine: Mapping[str, int]) -> int:
+        _, nodes = self._homes[unit]
+        return max(max(self._highest.get(name, 0), mine.get(name, 0)) for name in nodes)
+
+    def _next_epoch(self, unit: str, mine: Mapping[str, int]) -> int:
+        return (self._known(unit, mine) // EPOCH + 1) * EPOCH
+
+    def _given_back(self, now_s: float, mine: Mapping[str, int]) -> list[tuple[str, int]]:
+        """Return what has its home here and is not run: the first host does not list it (more)."""
+        first = self._others[FIRST]
+        if now_s - first.told_s > _TABLE_S:
+            return []
+        return [(unit, self._known(unit, mine)) for unit in self._homed(self._own)
+                if unit not in self.held
+                and first.runs.keys().isdisjoint(self._homes[unit][1])]

@@ -1,0 +1,83 @@
+"""Which machine runs what, and what the supervisors and routers of each are called.
+
+Hosts are known by name here, the first one, which is the only one as a rule, by "".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rampart.actors.bus.run_folder import ROUTERS
+from rampart.actors.run.run_plan import SUPERVISOR, on_host
+from rampart.manager.spec.hosts import HostSpec
+from rampart.manager.spec.schema import SystemSpec
+
+
+class Hosts:
+    """The machines of a system, as one of them sees it.
+
+    Args:
+        spec: of the system.
+        own: name of the one; "" of the first.
+
+    Attributes:
+        several: whether there is more than one.
+        supervisors: name of the supervisor of each host.
+        link: what is assumed of the network between them.
+        home_of: name of each node with that of the host on which it runs, unless that is lost.
+
+    Raises:
+        ValueError: there is no such host.
+    """
+
+    def __init__(self, spec: SystemSpec, own: str = "") -> None:
+        first = spec.hosts[0].name if spec.hosts else ""
+        names = tuple("" if host.name == first else host.name for host in spec.hosts) or ("",)
+        if own not in names:
+            raise ValueError(f"no host {own!r}")
+        self.several = len(names) > 1
+        self.supervisors = {name: on_host(SUPERVISOR, name) for name in names}
+        self.home_of = {node: "" if host == first else host
+                        for node, host in spec.host_of.items()}
+        self.link = spec.link
+        self._specs: dict[str, HostSpec] = dict(zip(names, spec.hosts, strict=False))
+        self._own = own
+
+    def guards_of(self, host: str) -> tuple[str, ...]:
+        """Return the names of a host's supervisor and routers, by which it is known to be there."""
+        return (self.supervisors[host], *(on_host(name, host) for name in ROUTERS))
+
+    def heard_by(self, host: str, nodes: Iterable[str]) -> tuple[str, ...]:
+        """Return whose heartbeats the supervisor of a host hears.
+
+        Of its own routers and nodes, on the first host of all nodes, for it may have to run them,
+        and of the guards of the others.
+        """
+        return (*(name for name in self.guards_of(host) if name != self.supervisors[host]),
+                *(node for node in nodes if host in {"", self.home_of[node]}),
+                *(name for other in self.supervisors if other != host
+                  for name in self.guards_of(other)))
+
+    def listens(self, place: int) -> list[str]:
+        """Return where a router of this host listens for those of the others.
+
+        Args:
+            place: of the router, 0 or 1.
+        """
+        return [_endpoint(self._specs[self._own], place)] if self.several else []
+
+    def dials(self) -> list[str]:
+        """Return where the routers are that those of this host dial: of the hosts before it."""
+        before = list(self._specs)[:list(self._specs).index(self._own)] if self.several else []
+        return [_endpoint(self._specs[host], place) for host in before
+                for place in range(len(ROUTERS))]
+
+    def meeting_place(self) -> tuple[str, int]:
+        """Return address and port at which the first host's launcher is asked."""
+        first = self._specs[""]
+        return first.address, first.port + len(ROUTERS)
+
+
+def _endpoint(host: HostSpec, place: int) -> str:
+    address = f"[{host.address}]" if ":" in host.address else host.address
+    return f"tcp/{address}:{host.port + place}"

@@ -1,0 +1,118 @@
+"""A run as the other hosts have it: `launch.py --host NAME`, where NAME is not the first host.
+
+It waits for the first host, runs what belongs here, and ends when the run does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import signal
+import sys
+from pathlib import Path
+
+import msgspec
+
+from rampart.actors.bus.run_folder import register_of
+from rampart.actors.ftm.messages import ProcessEvent
+from rampart.actors.hosts.host_observer import HostObserver
+from rampart.actors.hosts.launchers import OtherHost, OtherLauncher
+from rampart.actors.hosts.meeting import MeetingError
+from rampart.actors.run.run_plan import OBSERVER, RunPlan, on_host
+from rampart.actors.runtime.actor import Context
+from rampart.actors.runtime.clock import clock_of
+from rampart.actors.supervision.unseen import watch
+from rampart.cli.output import FORMAT, UsageError
+from rampart.cli.run_options import ERROR_LOG, refuse
+from rampart.files.plain_text import one_line
+
+_LEFT_TO_THE_FIRST = ("wait", "strategy", "shadow", "no_ftm", "rate", "seed", "patience", "duration",
+                      "record", "overwrite", "virtual", "network", "fault")
+
+EXIT_OVER, EXIT_FAILED = 0, 1
+
+
+class HostRun:
+    """One host's part in a run.
+
+    Args:
+        options: of the command line.
+        plan: what of the plan is this host's own.
+        directory: for checkpoints and tracebacks.
+
+    Raises:
+        UsageError: an option is the first host's to say.
+    """
+
+    def __init__(self, options: argparse.Namespace, plan: RunPlan, directory: Path) -> None:
+        refuse(options, _LEFT_TO_THE_FIRST,
+               f"on host {plan.host} the first host's command line decides that")
+        kept = directory.resolve()
+        self._json = options.json
+        self._failure = ""
+        self._plan = msgspec.structs.replace(
+            plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"))
+
+    async def run(self) -> int:
+        """Take part until the run is over, and return the exit code.
+
+        Raises:
+            UsageError: this host may not take part.
+            LaunchError: its processes cannot be started.
+        """
+        host = OtherHost(self._plan, _say)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, host.interrupted.set)
+        try:
+            plan = await host.join()
+            launcher = host.launcher
+            if launcher is None or host.interrupted.is_set():
+                return EXIT_FAILED
+            launcher.begin()
+            await host.start()
+            why = await self._stay(host, launcher, plan) if not host.interrupted.is_set() else ""
+        except MeetingError as error:
+            raise UsageError(f"--host {self._plan.host}: {error}") from None
+        finally:
+            host.close()
+            if host.launcher is not None:
+                await host.launcher.end()
+        _say(f"the run is over: {why or self._failure or 'interrupted'}")
+        if self._json:
+            print(json.dumps({"format": FORMAT, "host": self._plan.host, "over": why}), flush=True)
+        return EXIT_OVER if why else EXIT_FAILED
+
+    async def _stay(self, host: OtherHost, launcher: OtherLauncher, plan: RunPlan) -> str:
+        plan = launcher.plan
+        clock = clock_of(plan)
+
+        def event(event: ProcessEvent, stamp_s: float) -> None:
+            if event.event not in {"started", "running"}:
+                _say(f"{stamp_s:8.2f} s  {event.node} {event.event} "
+                     f"{one_line(event.detail)}".rstrip())
+
+        launcher.guard.report = _say
+        launcher.guard.on_restart = lambda name: _say(f"{clock.now():8.2f} s  {name} brought back")
+        name = on_host(OBSERVER, plan.host)
+        observer = HostObserver(Context(
+            name, 1, clock, launcher.observers_bus(), {"supervisor": plan.supervisor},
+            register=register_of(plan.folder), members=frozenset(launcher.names)),
+            launcher.supervisor_heard, event)
+        task = asyncio.create_task(observer.run())
+        watch(task, f"the launcher's {name}", launcher.failed)
+        _say(f"host {plan.host} takes part in run {plan.run_id}; ctrl-C ends it here")
+        try:
+            why = await host.stay()
+            self._failure = launcher.failure
+            return why
+        finally:
+            observer.stop()
+            with contextlib.suppress(Exception):
+                await task
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
