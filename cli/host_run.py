@@ -28,8 +28,8 @@ from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.run_options import ERROR_LOG, refuse
 from rampart.files.plain_text import one_line
 
-_LEFT_TO_THE_FIRST = ("wait", "strategy", "shadow", "no_ftm", "rate", "seed", "patience", "duration",
-                      "record", "overwrite", "virtual", "network", "fault")
+_LEFT_TO_THE_FIRST = ("wait", "strategy", "shadow", "no_ftm", "rate", "seed", "patience",
+                      "duration", "record", "overwrite", "virtual", "network", "fault")
 
 EXIT_OVER, EXIT_FAILED = 0, 1
 

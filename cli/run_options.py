@@ -114,8 +114,8 @@ _OPTIONS = (
     word("--record", "FILE", "keep everything that is sent in an MCAP file, for `rampart bag "
          "info`, `rampart replay` and Foxglove-compatible viewers"),
     flag("--overwrite", "--record may replace an existing file"),
-    word("--host", "NAME", "which of the system's [[host]]s this machine is; each runs its own part, "
-         "and all start when all are there (default: the first)"),
+    word("--host", "NAME", "which of the system's [[host]]s this machine is; each runs its own "
+         "part, and all start when all are there (default: the first)"),
     word("--report", "DIR", f"where the report goes, checkpoints, and in {ERROR_LOG} the "
          "tracebacks of nodes that failed (default: reports/TIME-MISSION, without a mission "
          "reports/TIME-SYSTEM)"),

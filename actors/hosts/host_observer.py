@@ -20,7 +20,8 @@ class HostObserver(Actor):
 
     parameters: Parameters
 
-    def __init__(self, context: Context, table: Callable[[fm.NodeTable], None] = lambda _table: None,
+    def __init__(self, context: Context,
+                 table: Callable[[fm.NodeTable], None] = lambda _table: None,
                  event: Callable[[fm.ProcessEvent, float], None] = lambda _event, _stamp: None
                  ) -> None:
         super().__init__(context)

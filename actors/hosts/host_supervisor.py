@@ -8,7 +8,7 @@ first host's publishes the table of all.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Heartbeat
@@ -16,9 +16,8 @@ from rampart.actors.bus.run_folder import issue
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
-from rampart.actors.hosts.placement import Changes, Placement
-from rampart.actors.runtime.actor import Context, Header, every, on
-from rampart.actors.supervision.held_process import HeldProcess
+from rampart.actors.hosts.placement import Changes, Home, Placement
+from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.supervision.processes import Processes
 from rampart.actors.supervision.supervised_process import Event
 from rampart.actors.supervision.supervisor import Supervisor
@@ -43,7 +42,7 @@ class HostSupervisor(Supervisor):
         others: tuple[str, ...] = ()
 
     parameters: Parameters
-    outputs = (topics.HOST_NODES, topics.PROCESS_EVENT)
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.HOST_NODES, topics.PROCESS_EVENT)
 
     def __init__(self, context: Context, processes: Processes | None = None) -> None:
         super().__init__(context, processes)
@@ -53,10 +52,9 @@ class HostSupervisor(Supervisor):
         self._guard_of = {name: host for host in others for name in hosts.guards_of(host)}
         self._placement = Placement(
             own, others,
-            {name: (hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes))
+            {name: Home(hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes),
+                        any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
              for name, unit in units.items()},
-            [name for name, unit in units.items() if any(
-                node.command or node.kind is Kind.WORLD for node in unit.nodes)],
             hosts.link, self._loop.time())
 
     @classmethod
@@ -82,7 +80,7 @@ class HostSupervisor(Supervisor):
             unit = self._layout.unit_of.get(process.names[0], "")
             if unit and unit not in self._processes:
                 self._placement.adopted(unit)
-                self._processes[unit] = self._made(unit)
+                self._processes[unit] = self._held(self._layout.units[unit])
         super().on_start()
         self._look_at_hosts()
 
@@ -142,11 +140,8 @@ class HostSupervisor(Supervisor):
 
     # -- what follows ---------------------------------------------------------------------------
 
-    def _made(self, unit: str) -> HeldProcess:
-        return HeldProcess(self._layout.units[unit], *self._means())
-
     def _take(self, unit: str, above: int) -> None:
-        process = self._processes[unit] = self._made(unit)
+        process = self._processes[unit] = self._held(self._layout.units[unit])
         process.incarnation = process.highest = above
         self._on(process, Event.START)
 
@@ -176,7 +171,7 @@ class HostSupervisor(Supervisor):
 class FirstSupervisor(HostSupervisor):
     """The first host's, which tells what runs on all of them."""
 
-    outputs = (*HostSupervisor.outputs, topics.NODES)
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (*HostSupervisor.outputs, topics.NODES)
 
     def _rows(self) -> tuple[fm.NodeInfo, ...]:
         others = tuple(

@@ -156,8 +156,9 @@ class OtherHost:
             try:
                 told, asked_s, heard_s = await self._attendance.ask()
             except OSError as error:
+                why = error.strerror or str(error) or "no answer"
                 self._tell(f"the first host cannot be reached at {self._where[0]} port "
-                           f"{self._where[1]} ({error.strerror or error}); trying on")
+                           f"{self._where[1]} ({why}); trying on")
                 await asyncio.sleep(_RETRY_S)
                 if self.interrupted.is_set() or (self.launcher and self.launcher.failure):
                     return Told(self._own, over="it was interrupted")

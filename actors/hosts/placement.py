@@ -16,8 +16,9 @@ So a recovery module obeys one manager at any time: that of the highest incarnat
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from rampart.actors.ftm.messages import NodeInfo
 from rampart.manager.spec.hosts import Link
@@ -33,6 +34,20 @@ _GRACE_S = 10.0
 
 _TABLE_S = 1.5
 """A table of the first host is repeated each half second; older, it says nothing any more."""
+
+
+class Home(NamedTuple):
+    """Where a unit belongs.
+
+    Attributes:
+        host: Name of the host.
+        nodes: Of the unit.
+        is_fixed: Whether it runs there or nowhere.
+    """
+
+    host: str
+    nodes: tuple[str, ...]
+    is_fixed: bool = False
 
 
 @dataclass(slots=True)
@@ -76,8 +91,7 @@ class Placement:
     Args:
         own: Name of its host.
         others: Of the other hosts.
-        homes: Each unit with the name of its host and those of its nodes.
-        fixed: Units that run at home or nowhere.
+        homes: Where each unit belongs.
         link: When a host is lost, and when it is back.
         now_s: Now.
 
@@ -85,14 +99,12 @@ class Placement:
         held: Units that it runs.
     """
 
-    def __init__(self, own: str, others: Iterable[str],
-                 homes: Mapping[str, tuple[str, tuple[str, ...]]], fixed: Collection[str],
+    def __init__(self, own: str, others: Iterable[str], homes: Mapping[str, Home],
                  link: Link, now_s: float) -> None:
-        self.held = {unit for unit, (home, _) in homes.items() if home == own}
+        self.held = {unit for unit, home in homes.items() if home.host == own}
         self._own = own
         self._homes = homes
-        self._unit_of = {node: unit for unit, (_, nodes) in homes.items() for node in nodes}
-        self._fixed = frozenset(fixed)
+        self._unit_of = {node: unit for unit, home in homes.items() for node in home.nodes}
         self._link = link
         self._others = {name: _Other(now_s + _GRACE_S - link.lost_after_s, now_s)
                         for name in others}
@@ -105,7 +117,7 @@ class Placement:
     def adopted(self, unit: str) -> None:
         """Note that a unit of another host runs here already: so that is lost."""
         self.held.add(unit)
-        self._others[self._homes[unit][0]].is_lost = True
+        self._others[self._homes[unit].host].is_lost = True
 
     def heard(self, host: str, now_s: float) -> None:
         """Note that a guard of another host was heard."""
@@ -165,7 +177,7 @@ class Placement:
                     drop += [unit for unit in self._homed(host) if unit in self.held]
             if other.is_lost and self._own == FIRST:
                 take += [(unit, self._next_epoch(unit, mine)) for unit in self._homed(host)
-                         if unit not in self.held and unit not in self._fixed]
+                         if unit not in self.held and not self._homes[unit].is_fixed]
         if self._own != FIRST:
             take += self._given_back(now_s, mine)
         self.held.update(unit for unit, _ in take)
@@ -184,14 +196,14 @@ class Placement:
     def _may_run(self, host: str, node: str) -> bool:
         """Whether a host may speak of a node: the first of those of all, another of its own."""
         unit = self._unit_of.get(node)
-        return unit is None or host == FIRST or self._homes[unit][0] == host
+        return unit is None or host == FIRST or self._homes[unit].host == host
 
     def _homed(self, host: str) -> list[str]:
-        return [unit for unit, (home, _) in self._homes.items() if home == host]
+        return [unit for unit, home in self._homes.items() if home.host == host]
 
     def _known(self, unit: str, mine: Mapping[str, int]) -> int:
-        _, nodes = self._homes[unit]
-        return max(max(self._highest.get(name, 0), mine.get(name, 0)) for name in nodes)
+        return max(max(self._highest.get(name, 0), mine.get(name, 0))
+                   for name in self._homes[unit].nodes)
 
     def _next_epoch(self, unit: str, mine: Mapping[str, int]) -> int:
         return (self._known(unit, mine) // EPOCH + 1) * EPOCH
@@ -203,4 +215,4 @@ class Placement:
             return []
         return [(unit, self._known(unit, mine)) for unit in self._homed(self._own)
                 if unit not in self.held
-                and first.runs.keys().isdisjoint(self._homes[unit][1])]
+                and first.runs.keys().isdisjoint(self._homes[unit].nodes)]

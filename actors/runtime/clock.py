@@ -79,10 +79,12 @@ class FollowedClock(Clock):
         return origin_s
 
     def now(self) -> float:
+        """Return simulated seconds since the start of the run."""
         self._origin_s = self._read()
         return super().now()
 
     def source_time(self, simulated_s: float) -> float:
+        """Return the reading of the time source at a simulated time."""
         self._origin_s = self._read()
         return super().source_time(simulated_s)
 

@@ -207,8 +207,9 @@ class Launcher:
         self.plan = msgspec.structs.replace(self.plan, origin_s=self.origin_s())
         try:
             self._spawners.set_origin(self.plan.origin_s)
-            for name in (*self.plan.routers, f"spawner_{NAMES[1]}"):
+            for name in self.plan.routers:
                 await self.guard.fork(name, self.plan.incarnations + 1, START_PATIENCE_S)
+            await self.guard.fork(f"spawner_{NAMES[1]}", 1, START_PATIENCE_S)
             await self.guard.start_supervisor(START_PATIENCE_S)
         except SpawnerUnavailableError as error:
             raise LaunchError(str(error)) from None

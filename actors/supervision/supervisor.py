@@ -6,15 +6,13 @@
 * *Wedged*: no heartbeat although the process runs: its event loop turns no more. Of the manager,
   whose silence stops the robot, the status counts as much as the heartbeat.
 
-Who waits for a processor is neither (see `patience`): on a machine that stands still for half a
-second all are silent, and replacing them all would keep it busy for longer. What follows from what,
-and what becomes of a process that ends too often, is in `supervised_process`.
+Who waits for a processor is neither (see `patience`). What follows from what, and what becomes of
+one that ends too often, is in `supervised_process`.
 
 What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
-Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order,
-stop in reverse, SIGTERM before SIGKILL, a bounded restart intensity. A request is carried out when
-the new process was heard: until then the supervisor repeats it by itself, for the module that asked
-may have missed its deadline.
+Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order, stop
+in reverse, SIGTERM before SIGKILL, a bounded restart intensity. A request is carried out when the
+new process was heard: until then it is repeated, for who asked may have missed its deadline.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
@@ -32,7 +30,7 @@ from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.patience import Patience
-from rampart.actors.layout.layout import Layout, adapted_system
+from rampart.actors.layout.layout import Layout, Unit, adapted_system
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.supervision.held_process import HeldProcess
@@ -63,17 +61,13 @@ _LATE_S = 0.02
 _ROUTERS_S = 0.03
 """Wall seconds between two looks whether a router is stopped."""
 
-_SEARCH_S = 0.05
-"""Wall seconds between two looks into /proc on account of one node's messages."""
-
-_GONE_S = 0.002
-"""Wall seconds between two looks whether a process that was killed is gone."""
+_SEARCH_S, _GONE_S = 0.05, 0.002
+"""Wall seconds between two looks into /proc for one node, and at whether a killed one is gone."""
 
 _WANTED_S = 1.0
 """Wall seconds that a process which was made ready waits for the decision that it is wanted."""
 
-_RETRY_S = 0.05
-_ASK_AGAIN_S = 0.01
+_RETRY_S, _ASK_AGAIN_S = 0.05, 0.01
 
 
 class Supervisor(Actor):
@@ -85,7 +79,7 @@ class Supervisor(Actor):
         nodes: tuple[str, ...] = ()
 
     parameters: Parameters
-    outputs = (topics.NODES, topics.PROCESS_EVENT)
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.NODES, topics.PROCESS_EVENT)
 
     def __init__(self, context: Context, processes: Processes | None = None) -> None:
         super().__init__(context)
@@ -95,8 +89,8 @@ class Supervisor(Actor):
         self._machine: Processes = processes or OsProcesses(
             self._plan.folder, self._plan.base_port, self._plan.launcher_pid)
         self._routers = self._layout.routers if self._machine.has_routers else {}
-        self._processes = {name: HeldProcess(unit, *self._means())
-                           for name, unit in {**self._routers, **self._layout.here}.items()}
+        self._processes = {
+            name: self._held(unit) for name, unit in {**self._routers, **self._layout.here}.items()}
         for node, incarnation in run.known_incarnations.items():
             if (process := self._process_of(node)) is not None:
                 process.incarnation = process.highest = incarnation
@@ -113,8 +107,9 @@ class Supervisor(Actor):
         """Hear the heartbeats of the nodes that it starts."""
         return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
-    def _means(self) -> tuple[RestartPolicy, Patience]:
-        return RestartPolicy(self._spec.supervision), Patience(2 * _CHECK_S / self._plan.rate)
+    def _held(self, unit: Unit) -> HeldProcess:
+        return HeldProcess(unit, RestartPolicy(self._spec.supervision),
+                           Patience(2 * _CHECK_S / self._plan.rate))
 
     def _process_of(self, node: str) -> HeldProcess | None:
         return self._processes.get(
@@ -208,10 +203,9 @@ class Supervisor(Actor):
         """Kill what is left of a node and start it anew, once per failed incarnation."""
         process = self._process_of(request.node)
         if process is None:
-            if request.node not in self._layout.unit_of:
+            if request.node not in self._layout.unit_of:  # else another host's supervisor answers
                 self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
-                    request.node, "refused", 0, 0, request.by,
-                    clip(f"no such node: {request.node!r}")))
+                    request.node, "refused", 0, 0, request.by, clip(f"no node {request.node!r}")))
         elif (process.state in (State.STARTING, State.RUNNING)
               and process.incarnation > request.failed_incarnation):
             self._tell(process, "respawned", request.by, "already")

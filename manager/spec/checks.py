@@ -15,7 +15,7 @@ from rampart.manager.model.fault_tree import FaultTreeError
 from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
 from rampart.manager.model.order import CycleError, find_cycle
 from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
-from rampart.manager.spec.hosts import find_wrong_hosts
+from rampart.manager.spec.host_checks import find_wrong_hosts
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
 from rampart.manager.spec.panels import problem_of
 from rampart.manager.spec.schema import SystemSpec

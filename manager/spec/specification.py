@@ -51,8 +51,8 @@ limits of a float, and a thousand million seconds are thirty years.
 LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
 
-MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000, "host": 16,
-            "fault": 500, "orders": 16, "panel": MAX_PANELS}
+MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
+            "host": 16, "fault": 500, "orders": 16, "panel": MAX_PANELS}
 """Of each table; the shipped systems have 31 actors, and checks compare many with many."""
 
 

@@ -136,7 +136,7 @@ def joined(dial: Sequence[str]) -> zenoh.Session:
     until_s = time.monotonic() + PATIENCE_S
     while True:
         try:
-            return zenoh.open(session_config(None, dial))
+            return zenoh.open(session_config((), dial))
         except zenoh.ZError:
             if time.monotonic() > until_s:
                 raise
