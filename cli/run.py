@@ -28,7 +28,7 @@ from rampart.actors.recording.virtual import VirtualRecording
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_document
 from rampart.actors.supervision.launcher import LaunchError
-from rampart.cli.host_run import HostRun
+from rampart.cli.host import HostRun
 from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.run_options import ERROR_LOG, MAX_RATE, parse, plan_of, refuse
 from rampart.files import streams, working_folder

@@ -26,6 +26,11 @@ FAR_HANDSHAKE_MS = 2000
 
 _NOT_FATAL = "exit_on_failure=false"
 
+FULL_US = 20_000
+"""A link that takes nothing for so long is closed, microseconds: its reader is stopped, or cut off.
+By default a session waits for 5 s when it has something to send that may not be left out, and while
+a router waits for one reader, no other hears anything."""
+
 _RUNTIME = "ZENOH_RUNTIME"
 _THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "
             "acc: (handover: app), net: (handover: app))")
@@ -76,7 +81,8 @@ def session_config(listen: Sequence[str], dial: Sequence[str]) -> zenoh.Config:
         "transport/shared_memory/enabled": False,  # a SIGKILL would leave its segment behind
         "transport/unicast/open_timeout": handshake_ms,
         "transport/unicast/accept_timeout": handshake_ms,
-        "transport/link/tx/lease": LEASE_MS}
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": FULL_US}
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config

@@ -16,6 +16,7 @@ from rampart.actors.ftm.messages import DetectionState
 from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.layout.wiring import load_class
 from rampart.manager.model.gates import GateError, detection_gate
+from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.schema import (
     DetectionSpec,
     EventSpec,
@@ -46,7 +47,8 @@ EXAMPLE = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 MODULES = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 
 
-@pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, Supervision, End, NodeSpec,
+@pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, Supervision, End, HostSpec,
+                                   Link, NodeSpec,
                                    DetectionSpec, RecoverySpec, MechanismSpec, EventSpec, FaultSpec,
                                    Within])
 def test_every_field_is_described(table):
@@ -70,7 +72,7 @@ def toml(value: object) -> str:
     ("Top level", SystemSpec, set()), ("`[robot]`", Robot, set()),
     ("`[timing]`", Timing, set()), ("`[end]`", End, set()),
     ("`[layers]`", Layers, set()), ("`[supervision]`", Supervision, set()),
-    ("`[[node]]`", NodeSpec, set()),
+    ("`[[host]]`", HostSpec, set()), ("`[link]`", Link, set()), ("`[[node]]`", NodeSpec, set()),
     ("`[[detection]]`", DetectionSpec, {"within_s"}), ("`[[recovery]]`", RecoverySpec, set()),
     ("`[[mechanism]]`", MechanismSpec, set()), ("`[[event]]`", EventSpec, {"gate"}),
     ("`[[fault]]`", FaultSpec, set())])

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rampart.actors.bus.zenoh_session import ROUTERS
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
 from rampart.actors.run.run_plan import SUPERVISOR

@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rampart.actors.bus.zenoh_session import ROUTERS
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.manager.spec.specification import SystemSpec, check_document, read_document

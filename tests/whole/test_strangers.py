@@ -10,7 +10,7 @@ import sys
 import psutil
 import pytest
 
-from rampart.actors.bus.zenoh_session import ROUTERS
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
 from tests import ROOT

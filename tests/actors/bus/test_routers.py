@@ -18,9 +18,9 @@ import pytest
 
 from rampart.actors.bus import zenoh_bus
 from rampart.actors.bus.bus import BusError, SharedBus
-from rampart.actors.bus.run_folder import socket_path
+from rampart.actors.bus.run_folder import ROUTERS, socket_path
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.bus.zenoh_session import ROUTERS, endpoint, endpoints
+from rampart.actors.bus.zenoh_session import LEASE_MS, endpoint, endpoints
 from rampart.actors.osmosis import topics
 from rampart.testing import eventually
 
@@ -33,7 +33,7 @@ def be_router(folder: str, name: str, ready) -> None:
 
     async def main() -> None:
         own = endpoint(folder, name)
-        bus = ZenohBus(name, 1, [one for one in endpoints(folder) if one != own], own)
+        bus = ZenohBus(name, 1, [one for one in endpoints(folder) if one != own], [own])
         await bus.open()
         ready.set()
         await asyncio.sleep(1000)
@@ -143,7 +143,7 @@ async def test_who_connects_and_says_nothing_holds_no_place_for_long(routers, so
 async def test_a_second_router_of_a_name_is_refused_in_one_line(routers, sockets):
     await routers.start("router_a")
     with pytest.raises(BusError, match=r"^\S+/router_a is in use by another process \(node "):
-        await ZenohBus("router_a", 2, [], endpoint(sockets, "router_a")).open()
+        await ZenohBus("router_a", 2, [], [endpoint(sockets, "router_a")]).open()
 
 
 async def test_when_a_router_dies_all_go_over_to_the_other_and_none_counts_as_gone(
@@ -293,6 +293,44 @@ async def test_who_hangs_tells_what_it_said_last_and_who_is_stopped_is_not_waite
         last = ask(reader)
         await asyncio.sleep(0.2)
         assert last == []
+
+
+def be_reader(folder: str, ready) -> None:
+    """Hear everything."""
+
+    async def main() -> None:
+        async with client(folder) as bus:
+            for topic in (topics.POSE, topics.MISSION_ORDER):
+                bus.subscribe(topic, topic.at(), lambda _key, _payload: None)
+            ready.set()
+            await asyncio.sleep(1000)
+
+    asyncio.run(main())
+
+
+async def test_who_is_stopped_and_reads_no_more_keeps_nobody_else_waiting(routers, sockets):
+    await routers.start(*ROUTERS)
+    ready = FORKS.Event()
+    stopped = FORKS.Process(target=be_reader, args=(sockets, ready), daemon=True)
+    stopped.start()
+    assert await asyncio.to_thread(ready.wait, 20)
+    try:
+        async with client(sockets, "node") as writer, client(sockets) as reader:
+            heard, order = list[float](), topics.MISSION_ORDER
+            reader.subscribe(topics.POSE, topics.POSE.at(), lambda *_: heard.append(
+                time.monotonic()))
+            os.kill(stopped.pid, signal.SIGSTOP)
+            for _ in range(600):  # 6 MB: more than all sockets and queues between them hold
+                writer.publish(topics.POSE, topics.POSE.at(), b"x" * 10_000)
+                writer.publish(order, order.at(), b"may not be left out")
+                await asyncio.sleep(0.005)
+            await asyncio.sleep(0.2)
+            pauses = [later - earlier for earlier, later in pairwise(heard)]
+            assert len(heard) > 500
+            assert max(pauses) < LEASE_MS / 1e3  # it does not take that long to let go of it
+    finally:
+        stopped.kill()
+        stopped.join()
 
 
 async def test_a_newcomer_is_answered_after_all_routers_were_replaced(routers, sockets):

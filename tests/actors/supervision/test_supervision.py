@@ -19,7 +19,7 @@ import pytest
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Diagnostic
-from rampart.actors.bus.zenoh_session import ROUTERS
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeTable, ProcessEvent, RespawnRequest
 from rampart.actors.layout.layout import Layout
