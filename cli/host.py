@@ -77,7 +77,7 @@ class HostRun:
         except MeetingError as error:
             raise UsageError(f"--host {self._plan.host}: {error}") from None
         finally:
-            host.close()
+            await host.close()
             if host.launcher is not None:
                 await host.launcher.end()
         _say(f"the run is over: {why or self._failure or 'interrupted'}")

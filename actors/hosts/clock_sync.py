@@ -45,7 +45,8 @@ class ClockSync:
             heard_s: This clock, when the answer came.
         """
         is_first = not self._kept
-        self._kept.append((heard_s, told_s - heard_s, told_s - asked_s))
+        drift_s = DRIFT * (heard_s - asked_s)  # it was told at some time in between
+        self._kept.append((heard_s, told_s - heard_s - drift_s, told_s - asked_s + drift_s))
         low_s, high_s = self._overlap(heard_s)
         if low_s > high_s:
             self.jumps += 1

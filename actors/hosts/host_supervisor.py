@@ -50,6 +50,7 @@ class HostSupervisor(Supervisor):
         own, others = self.parameters.host, self.parameters.others
         self._supervisors = {hosts.supervisors[host]: host for host in others}
         self._guard_of = {name: host for host in others for name in hosts.guards_of(host)}
+        self._issued = dict(context.run.known_incarnations)
         self._placement = Placement(
             own, others,
             {name: Home(hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes),
@@ -133,10 +134,9 @@ class HostSupervisor(Supervisor):
         self.call_later(_LOOK_S * self.clock.rate, self._look_at_hosts)
 
     def _mine(self) -> dict[str, int]:
-        """Return the incarnations that were issued here, as far as they matter."""
-        return {**self.context.run.known_incarnations, **{
-            name: process.highest for process in self._processes.values()
-            for name in process.names}}
+        """Return the incarnations that were issued here."""
+        return {**self._issued, **{name: process.highest for process in self._processes.values()
+                                   for name in process.names}}
 
     # -- what follows ---------------------------------------------------------------------------
 
@@ -152,6 +152,7 @@ class HostSupervisor(Supervisor):
             process.forget_step()
             process.kill()
             self._tell(process, "handed over", self.name)
+            self._issued.update(dict.fromkeys(process.names, process.highest))
             process.let_go()
 
     def _tell_of(self, host: str, event: str) -> None:

@@ -146,9 +146,9 @@ class OtherHost:
             await asyncio.sleep(PERIOD_S)
         return ""
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Ask no more."""
-        self._attendance.close()
+        await self._attendance.close()
 
     async def _answer(self) -> Told:
         """Ask until there is an answer; what the clocks show of it is noted."""

@@ -89,6 +89,7 @@ class Meeting:
         self._over = ""
         self._server: asyncio.Server | None = None
         self._told: dict[str, asyncio.Event] = {}
+        self._writers: set[asyncio.StreamWriter] = set()
 
     async def open(self, address: str, port: int) -> None:
         """Listen.
@@ -126,12 +127,15 @@ class Meeting:
             await asyncio.wait_for(asyncio.gather(*waiting), 2 * PERIOD_S)
         if self._server is not None:
             self._server.close()
+        for writer in list(self._writers):
+            await _closed(writer)
 
     def _missing(self) -> tuple[str, ...]:
         return tuple(host for host, ready in self._ready.items() if not ready)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         told_of_end, host = asyncio.Event(), ""
+        self._writers.add(writer)
         try:
             while True:
                 line = await asyncio.wait_for(reader.readuntil(), _PATIENCE_S)
@@ -153,7 +157,8 @@ class Meeting:
                 if host in self._ready and self._origin_s is None:
                     self._ready[host] = False
                     self._changed.set()
-            writer.close()
+            self._writers.discard(writer)
+            await _closed(writer)
 
     def _answer(self, ask: Ask) -> Told:
         if ask.host not in self._ready:
@@ -212,21 +217,21 @@ class Attendance:
                 heard_s = time.monotonic()
                 told = msgspec.json.decode(line, type=Told)
         except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, *UNREADABLE) as error:
-            self.close()
+            await self.close()
             raise OSError(f"no answer ({error})") from None
         except (OSError, TimeoutError):
-            self.close()
+            await self.close()
             raise
         if told.refused:
-            self.close()
+            await self.close()
             raise MeetingError(plain_line(told.refused))
         return told, asked_s, heard_s
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Close the connection; the next question makes another one."""
-        if self._ends is not None:
-            self._ends[1].close()
-            self._ends = None
+        ends, self._ends = self._ends, None
+        if ends is not None:
+            await _closed(ends[1])
 
 
 _OWN = ("base_port", "hmi_port", "hmi_host", "hmi_token", "hmi_token_is_new", "launcher_pid",
@@ -272,6 +277,12 @@ def _difference(ours: Mapping[str, str], ask: Ask) -> str:
     return (f"{', '.join(different)}: not the same as on the first host "
             f"({theirs.get(different[0], 'none')[:12]} here, "
             f"{ours.get(different[0], 'none')[:12]} there); copy it from there")
+
+
+async def _closed(writer: asyncio.StreamWriter) -> None:
+    writer.close()
+    with contextlib.suppress(OSError):
+        await writer.wait_closed()
 
 
 def _program() -> str:

@@ -1,10 +1,10 @@
-"""The full system on two machines: the robot's, and a ground station with the page and modules."""
+"""Systems on two machines: the robot's, and a ground station with a page and some modules."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-from rampart.systems import DEFAULT
+from tests import system_file
 
 ON_GROUND = ("hmi", "teleoperation", "DM5", "DM10", "DM11", "DM13")
 
@@ -12,18 +12,22 @@ _PATIENT = """event = "non_control_node_crash"
 against = { within_s = 5.0, hazard = "the operator has neither page nor stick" }"""
 
 
-def two_hosts(addresses: Mapping[str, str], on_ground: Collection[str] = ON_GROUND) -> str:
-    """Return the specification of the full system, some of it on the second host.
+def two_hosts(addresses: Mapping[str, str], on_ground: Collection[str] = ON_GROUND,
+              system: str = "osmosis", delay_s: float = 0.3) -> str:
+    """Return the specification of a system, some of it on the second host.
 
     Args:
         addresses: Of the hosts, the robot's first.
         on_ground: Names of what runs on the second.
+        system: Which.
+        delay_s: Of a message between them, at most.
     """
-    text = DEFAULT.read_text(encoding="utf-8")
+    text = system_file(system).read_text(encoding="utf-8")
     _, second = addresses
     hosts = "".join(f'[[host]]\nname = "{name}"\naddress = "{address}"\n\n'
                     for name, address in addresses.items())
     for name in on_ground:
         text = text.replace(f'\nname = "{name}"\n', f'\nname = "{name}"\nhost = "{second}"\n', 1)
     text = text.replace('event = "non_control_node_crash"\nagainst = "parent"', _PATIENT, 1)
-    return text.replace("[[node]]\n", f"{hosts}[[node]]\n", 1)
+    link = f"[link]\ndelay_s = {delay_s}\n\n"
+    return text.replace("[[node]]\n", f"{link}{hosts}[[node]]\n", 1)

@@ -1,0 +1,68 @@
+"""What time it is elsewhere: the bound holds whatever the network does, and a jump is noticed."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rampart.actors.hosts.clock_sync import DRIFT, ClockSync
+
+
+def exchange(sync: ClockSync, at_s: float, ahead_s: float, there_s: float, back_s: float) -> None:
+    sync.exchanged(at_s, at_s + there_s + ahead_s, at_s + there_s + back_s)
+
+
+@given(st.floats(-1e6, 1e6), st.lists(
+    st.tuples(st.floats(1e-5, 5.0), st.floats(1e-5, 5.0)), min_size=1, max_size=80),
+    st.floats(-DRIFT / 2, DRIFT / 2))
+def test_the_true_offset_lies_within_the_bound(ahead_s, ways, drift):
+    sync, now_s = ClockSync(), 0.0
+    for there_s, back_s in ways:
+        told_s = now_s + there_s
+        sync.exchanged(now_s, told_s + ahead_s + drift * told_s, told_s + back_s)
+        now_s = told_s + back_s
+        true_s = ahead_s + drift * now_s
+        assert abs(sync.offset_s - true_s) <= sync.bound_s + 1e-6
+        now_s += 0.25
+    assert sync.jumps == 0
+
+
+def test_the_quickest_way_there_and_the_quickest_way_back_count_together():
+    sync = ClockSync()
+    exchange(sync, 0.0, 100.0, 0.001, 0.4)
+    exchange(sync, 1.0, 100.0, 0.4, 0.001)
+    for second in range(2, 300):
+        exchange(sync, float(second), 100.0, 0.3, 0.3)
+        if second == 50:
+            assert sync.bound_s < 0.25  # on its way: it never jumps
+    assert sync.offset_s == pytest.approx(100.0, abs=0.2)
+
+
+def test_it_moves_by_no_more_than_a_step_at_a_time():
+    sync, noise = ClockSync(), random.Random(1)
+    exchange(sync, 0.0, 5.0, 0.001, 0.2)
+    before_s = sync.offset_s
+    for turn in range(1, 200):
+        exchange(sync, turn / 4, 5.0, noise.uniform(0.01, 0.1), noise.uniform(0.01, 0.1))
+        if turn > 1:
+            assert abs(sync.offset_s - before_s) <= 0.002 + 1e-9
+        before_s = sync.offset_s
+
+
+def test_a_clock_that_jumps_is_noticed_and_it_begins_anew():
+    sync = ClockSync()
+    for turn in range(20):
+        exchange(sync, turn / 4, 5.0, 0.01, 0.01)
+    exchange(sync, 6.0, 7.0, 0.01, 0.01)
+    assert sync.jumps == 1
+    assert sync.offset_s == pytest.approx(7.0, abs=0.01)
+
+
+def test_the_bound_grows_while_nothing_is_heard():
+    sync = ClockSync()
+    assert sync.bound_at(0.0) == float("inf")
+    exchange(sync, 0.0, 5.0, 0.01, 0.01)
+    assert sync.bound_at(100.02) == pytest.approx(0.01 + 100.02 * DRIFT)

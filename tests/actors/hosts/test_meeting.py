@@ -1,0 +1,188 @@
+"""The launchers come together: who waits for whom, what has to be the same, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from contextlib import asynccontextmanager
+
+import msgspec
+import pytest
+
+from rampart.actors.hosts.meeting import Attendance, Meeting, MeetingError, contents_of, joined
+from rampart.actors.run.run_plan import RunPlan
+from rampart.systems import DEFAULT
+from rampart.testing import eventually
+from rampart.testing.ports import free_port
+
+PLAN = RunPlan("r1", 7450, seed=7, system_file="/there/x.toml", hmi_token="secret", folder="/f")
+CONTENTS = {"rampart": "aa", "specification": "bb", "airport": "cc"}
+FIRST = {"rampart": "aa", "specification": "bb"}
+
+
+@asynccontextmanager
+async def meeting(*hosts: str):
+    port = free_port()
+    made = Meeting(PLAN, hosts or ("ground",), CONTENTS, lambda: {"hmi": 3})
+    await made.open("127.0.0.1", port)
+    try:
+        yield made, ("127.0.0.1", port)
+    finally:
+        await made.close()
+
+
+async def test_the_first_waits_until_the_others_are_ready_and_all_begin():
+    async with meeting() as (made, where):
+        said: list[str] = []
+        waiting = asyncio.create_task(made.all_ready(said.append))
+        ground = Attendance("ground", where, FIRST)
+        told, asked_s, heard_s = await ground.ask()
+        assert (told.plan.seed, told.origin_s, told.waits_for) == (7, None, ("ground",))
+        assert told.incarnations == {"hmi": 3}
+        assert asked_s <= told.now_s <= heard_s
+        assert not waiting.done()
+        ground.ready(CONTENTS)
+        await ground.ask()
+        await waiting
+        made.begin(12.5)
+        assert (await ground.ask())[0].origin_s == 12.5
+        assert said == ["waiting for ground: rampart run --host ground there"]
+        await ground.close()
+
+
+async def test_what_is_a_host_s_own_stays_there_and_no_secret_travels():
+    async with meeting() as (_, where):
+        ground = Attendance("ground", where, FIRST)
+        plan = (await ground.ask())[0].plan
+        assert b"secret" not in msgspec.json.encode(plan)
+        own = RunPlan(base_port=7451, system_file="/here/x.toml", host="ground")
+        assert joined(plan, own) == msgspec.structs.replace(own, run_id="r1", seed=7)
+        await ground.close()
+
+
+@pytest.mark.parametrize(("host", "contents", "words"), [
+    ("moon", FIRST, "no host 'moon' waits to take part; known: ground"),
+    ("ground", FIRST | {"specification": "xx"},
+     "specification: not the same as on the first host (xx here, bb there); copy it from there"),
+    ("ground", FIRST | {"rampart": "older"}, "rampart: not the same as on the first host"),
+])
+async def test_who_may_not_take_part_is_told_why(host, contents, words):
+    async with meeting() as (_, where):
+        with pytest.raises(MeetingError, match=words.replace("(", r"\(").replace(")", r"\)")):
+            await Attendance(host, where, contents).ask()
+
+
+async def test_files_that_the_plan_names_are_compared_when_they_are_known():
+    async with meeting() as (_, where):
+        ground = Attendance("ground", where, FIRST)
+        await ground.ask()
+        ground.ready(FIRST)
+        with pytest.raises(MeetingError, match="airport: not the same"):
+            await ground.ask()
+
+
+async def test_who_is_there_already_is_not_taken_for_another():
+    async with meeting("ground", "moon") as (_, where):
+        ground = Attendance("ground", where, FIRST)
+        ground.ready(CONTENTS)
+        await ground.ask()
+        with pytest.raises(MeetingError, match="host ground takes part already"):
+            await Attendance("ground", where, FIRST).ask()
+        await ground.close()
+
+
+async def test_a_host_that_is_started_anew_is_counted_and_the_old_one_is_sent_away():
+    async with meeting() as (made, where):
+        old = Attendance("ground", where, FIRST)
+        old.ready(CONTENTS)
+        await old.ask()
+        made.begin(1.0)
+        new = Attendance("ground", where, FIRST)
+        told, _, _ = await new.ask()
+        assert (told.starts, told.origin_s) == (2, 1.0)
+        with pytest.raises(MeetingError, match="host ground was started anew"):
+            await old.ask()
+        await new.close()
+
+
+async def test_one_that_goes_before_the_start_is_waited_for_again():
+    async with meeting("ground", "moon") as (made, where):
+        said: list[str] = []
+        waiting = asyncio.create_task(made.all_ready(said.append))
+        ground = Attendance("ground", where, FIRST)
+        ground.ready(CONTENTS)
+        await ground.ask()
+        await eventually(lambda: len(said) == 2)
+        await ground.close()
+        await eventually(lambda: len(said) == 3)
+        assert [line.partition(":")[0] for line in said] == [
+            "waiting for ground, moon", "waiting for moon", "waiting for ground, moon"]
+        waiting.cancel()
+
+
+async def test_the_end_is_told():
+    async with meeting() as (made, where):
+        ground = Attendance("ground", where, FIRST)
+        await ground.ask()
+        closing = asyncio.create_task(made.close())
+        await asyncio.sleep(0.05)
+        assert (await ground.ask())[0].over == "the first host has ended it"
+        await closing
+        await ground.close()
+
+
+async def test_nobody_there_is_an_error_that_may_pass():
+    ground = Attendance("ground", ("127.0.0.1", free_port()), FIRST)
+    with pytest.raises(OSError, match="Connect call failed"):
+        await ground.ask()
+
+
+@pytest.mark.parametrize("said", [b"", b"\n", b"garbage\n", b'{"type":"ask"}\n', b"x" * 2_000_000,
+                                  b'{"type":"ask","host":"ground","serial":"1","contents":5}\n'])
+async def test_a_stranger_is_let_go_and_disturbs_nobody(said):
+    async with meeting() as (_, where):
+        reader, writer = await asyncio.open_connection(*where)
+        writer.write(said)
+        writer.write_eof()
+        with contextlib.suppress(ConnectionResetError):  # there was more that nobody wanted to read
+            assert await asyncio.wait_for(reader.read(), 10) == b""
+        writer.close()
+        with contextlib.suppress(ConnectionResetError):
+            await writer.wait_closed()
+        ground = Attendance("ground", where, FIRST)
+        assert (await ground.ask())[0].plan.run_id == "r1"
+        await ground.close()
+
+
+async def test_an_answer_that_makes_no_sense_is_an_error_that_may_pass():
+    async def serve(reader, writer):
+        await reader.readuntil()
+        writer.write(b"nonsense\n")
+        await writer.drain()
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    async with server:
+        ground = Attendance("ground", server.sockets[0].getsockname(), FIRST)
+        with pytest.raises(OSError, match="no answer"):
+            await ground.ask()
+
+
+async def test_an_address_that_is_not_this_machine_s_is_told_in_a_line():
+    made = Meeting(PLAN, ("ground",), CONTENTS, dict)
+    with pytest.raises(MeetingError, match=r"cannot listen at 192\.0\.2\.1 port 7462"):
+        await made.open("192.0.2.1", 7462)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        with pytest.raises(MeetingError, match="for the other hosts"):
+            await made.open(*taken.getsockname())
+
+
+def test_contents_do_not_depend_on_where_the_files_are(tmp_path):
+    text = DEFAULT.read_text(encoding="utf-8")
+    here, changed = tmp_path / "a.toml", tmp_path / "b.toml"
+    here.write_text(f"# a remark\n{text}", encoding="utf-8")
+    changed.write_text(text.replace("intensity = 50", "intensity = 51"), encoding="utf-8")
+    hashes = [contents_of(RunPlan(system_file=str(file))) for file in (DEFAULT, here, changed)]
+    assert hashes[0] == hashes[1]
+    assert {name for name in hashes[0] if hashes[0][name] != hashes[2][name]} == {"specification"}

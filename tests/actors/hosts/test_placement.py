@@ -1,0 +1,157 @@
+"""Who runs what, as the hosts come and go: two supervisors' decisions, and never two of a node."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.ftm.messages import NodeInfo, NodeState
+from rampart.actors.hosts.placement import EPOCH, Changes, Home, Placement
+from rampart.manager.spec.hosts import Link
+
+LINK = Link()
+HOMES = {"pilot": Home("", ("pilot",)), "page": Home("ground", ("hmi",)),
+         "modules": Home("ground", ("DM1", "DM2")), "world": Home("ground", ("world",), True)}
+LOST_S = LINK.lost_after_s + 0.01
+
+
+def row(name: str, incarnation: int, host: str = "ground") -> NodeInfo:
+    return NodeInfo(name, "detection", 1, NodeState.RUNNING, incarnation, 0, host=host)
+
+
+def robot() -> Placement:
+    made = Placement("", ["ground"], HOMES, LINK, 0.0)
+    made.heard("ground", 0.0)
+    return made
+
+
+def test_each_begins_with_what_has_its_home_there():
+    assert robot().held == {"pilot"}
+    assert Placement("ground", [""], HOMES, LINK, 0.0).held == {"page", "modules", "world"}
+
+
+def test_a_host_that_starts_is_waited_for():
+    made = Placement("", ["ground"], HOMES, LINK, 0.0)
+    assert made.look(9.9, {}) == Changes()
+    assert made.look(10.1, {}).lost == ("ground",)
+
+
+def test_what_a_lost_host_ran_is_taken_over_with_incarnations_that_it_cannot_have_reached():
+    made = robot()
+    made.told("ground", [row("hmi", 3), row("DM1", 1), row("DM2", 1)], {}, 0.1)
+    assert made.look(LINK.lost_after_s, {}) == Changes()
+    assert made.look(LOST_S, {}) == Changes(
+        lost=("ground",), take=(("page", EPOCH), ("modules", EPOCH)))
+    assert made.held == {"pilot", "page", "modules"}
+    assert made.look(LOST_S + 1, {}) == Changes()
+
+
+def test_a_second_time_they_are_higher_again():
+    made = robot()
+    made.told("ground", [row("hmi", EPOCH + 4)], {}, 0.1)
+    assert dict(made.look(LOST_S, {}).take)["page"] == 2 * EPOCH
+    again = robot()
+    assert dict(again.look(LOST_S, {"hmi": 5 * EPOCH + 1}).take)["page"] == 6 * EPOCH
+
+
+def test_it_is_given_back_when_the_host_was_heard_for_a_while_without_a_break():
+    made = robot()
+    made.look(LOST_S, {})
+    for tenth in range(10, 28):
+        made.heard("ground", tenth / 10)
+        assert made.look(tenth / 10, {}) == Changes()
+    made.heard("ground", 4.0)  # after a break: it begins anew
+    for tenth in range(40, 70):
+        made.heard("ground", tenth / 10)
+        assert made.look(tenth / 10, {}) == Changes()
+    made.heard("ground", 7.1)
+    assert made.look(7.1, {}) == Changes(back=("ground",), drop=("page", "modules"))
+    assert made.held == {"pilot"}
+
+
+def test_who_hears_of_a_higher_incarnation_lets_go_of_its_own_and_starts_it_when_it_is_given_back():
+    ground = Placement("ground", [""], HOMES, LINK, 0.0)
+    news, drop = ground.told("", [row("hmi", EPOCH + 1)], {"hmi": 2}, 1.0)
+    assert [(one.name, one.incarnation) for one in news] == [("hmi", EPOCH + 1)]
+    assert drop == ["page"]
+    assert ground.look(1.1, {}).take == ()
+    ground.told("", [row("pilot", 1, "")], {}, 1.2)
+    assert ground.look(1.3, {}).take == (("page", EPOCH + 1),)
+    assert ground.held == {"page", "modules", "world"}
+
+
+def test_of_an_old_table_nothing_follows():
+    ground = Placement("ground", [""], HOMES, LINK, 0.0)
+    ground.told("", [row("hmi", EPOCH + 1)], {}, 1.0)
+    ground.told("", [], {}, 1.2)
+    assert ground.look(3.0, {}).take == ()
+
+
+def test_another_host_than_the_first_takes_nothing_over():
+    ground = Placement("ground", [""], HOMES, LINK, 0.0)
+    ground.heard("", 0.0)
+    changes = ground.look(100.0, {})
+    assert changes.lost == ("",)
+    assert changes.take == ()
+
+
+def test_a_supervisor_is_believed_about_its_own_host_only():
+    made = robot()
+    news, drop = made.told("ground", [row("pilot", 99)], {"pilot": 1}, 0.1)
+    assert (news, drop) == ([], [])
+    assert made.rows() == []
+
+
+def test_a_unit_that_was_found_running_here_says_that_its_host_is_lost():
+    made = Placement("", ["ground"], HOMES, LINK, 0.0)
+    made.adopted("page")
+    assert made.is_lost("ground")
+    assert [unit for unit, _ in made.look(0.1, {}).take] == ["modules"]
+
+
+@given(st.lists(st.sampled_from(["cut", "join", "robot restarts a unit", "ground restarts a unit",
+                                 "wait"]), max_size=40))
+@settings(deadline=None, max_examples=200)
+def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(steps):
+    """Two supervisors that exchange tables while they are joined; the issued numbers decide."""
+    now_s, joined = 0.0, True
+    sides = {"": Placement("", ["ground"], HOMES, LINK, 0.0),
+             "ground": Placement("ground", [""], HOMES, LINK, 0.0)}
+    issued = {"": {"pilot": 1}, "ground": {"hmi": 1, "DM1": 1, "DM2": 1, "world": 1}}
+
+    def pass_time(seconds: float) -> None:
+        nonlocal now_s
+        until_s = now_s + seconds
+        while now_s < until_s:
+            now_s += 0.1
+            for own, side in sides.items():
+                other = "ground" if own == "" else ""
+                if joined:
+                    sides[other].heard(own, now_s)
+                    rows = [row(node, issued[own][node]) for unit in side.held
+                            for node in HOMES[unit].nodes]
+                    news, _ = sides[other].told(own, rows, issued[other], now_s)
+                    issued[other].update({one.name: max(
+                        one.incarnation, issued[other].get(one.name, 0)) for one in news})
+                for unit, above in side.look(now_s, issued[own]).take:
+                    issued[own].update(dict.fromkeys(HOMES[unit].nodes, above + 1))
+
+    for step in (*steps, "join", "wait"):
+        if step in {"cut", "join"}:
+            joined = step == "join"
+        for side, unit in (("", "pilot"), ("ground", "page")):
+            if step.startswith(side or "robot") and unit in sides[side].held:
+                issued[side].update({node: issued[side][node] + 1 for node in HOMES[unit].nodes})
+        pass_time(12.0 if step == "wait" else 0.5)
+    assert sides[""].held == {"pilot"}
+    assert sides["ground"].held == {"page", "modules", "world"}
+    for node in ("hmi", "DM1", "DM2"):
+        assert issued["ground"][node] >= issued[""].get(node, 0)
+
+
+@pytest.mark.parametrize("host", ["", "ground"])
+def test_what_is_lost_is_known_by_name(host):
+    made = Placement(host, [other for other in ("", "ground") if other != host], HOMES, LINK, 0.0)
+    made.look(20.0, {})
+    assert made.lost_hosts() == [other for other in ("", "ground") if other != host]

@@ -1,0 +1,85 @@
+"""Systems of several hosts: what is refused, and what the link costs."""
+
+from __future__ import annotations
+
+import pytest
+
+from rampart.actors.layout.hosts import Hosts
+from rampart.manager.spec.budget import check
+from rampart.manager.spec.specification import parse_specification
+from rampart.manager.spec.tables import SpecificationError
+from tests.two_hosts import two_hosts
+
+ADDRESSES = {"robot": "192.168.7.1", "ground": "192.168.7.2"}
+TEXT = two_hosts(ADDRESSES)
+SPEC = parse_specification(TEXT, "two.toml")
+TWO = '[[host]]\nname = "ground"\naddress = "192.168.7.2"\n\n'
+
+
+def test_what_does_not_say_runs_on_the_first():
+    assert SPEC.host_of["DM10"] == "ground"
+    assert SPEC.host_of["DM1"] == SPEC.host_of["RM1"] == SPEC.host_of["simulator"] == "robot"
+
+
+def test_the_first_host_s_names_are_those_of_a_system_of_one_machine():
+    hosts = Hosts(SPEC)
+    assert hosts.supervisors == {"": "supervisor", "ground": "supervisor_ground"}
+    assert hosts.guards_of("") == ("supervisor", "router_a", "router_b")
+    assert hosts.home_of["hmi"] == "ground"
+    assert hosts.home_of["DM1"] == ""
+    assert hosts.dials() == []
+    assert hosts.listens(1) == ["tcp/192.168.7.1:7461"]
+    assert Hosts(SPEC, "ground").dials() == ["tcp/192.168.7.1:7460", "tcp/192.168.7.1:7461"]
+    assert hosts.meeting_place() == ("192.168.7.1", 7462)
+
+
+def test_addresses_of_the_sixth_version_are_put_into_brackets():
+    spec = parse_specification(TEXT.replace("192.168.7.1", "fd00::1"), "two.toml")
+    assert Hosts(spec).listens(0) == ["tcp/[fd00::1]:7460"]
+
+
+def test_a_module_beyond_the_link_has_so_much_less_time():
+    alone = {b.name: b for b in check(parse_specification(
+        two_hosts(ADDRESSES, on_ground=("hmi", "teleoperation", "DM5")), "near.toml"))}
+    far = {b.name: b for b in check(SPEC)}
+    assert far["FTM10"].detection_s == pytest.approx(alone["FTM10"].detection_s + 0.3)
+    assert far["FTM1"].detection_s == alone["FTM1"].detection_s
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    (TWO, "", "$.host: one machine needs no [[host]]; leave it out, or name another one"),
+    ('address = "192.168.7.2"', 'address = "ground.local"',
+     "host ground: address = 'ground.local': expected an IP address such as '192.168.7.1'"),
+    ('address = "192.168.7.2"', 'address = "192.168.7.1"\nport = 7462',
+     "host ground: port = 7462: each host uses 3 ports, and robot has the same address and those "
+     "from 7460"),
+    ('name = "ground"\naddress', 'name = "robot"\naddress', "$.host[1].name = 'robot': duplicate"),
+    ('address = "192.168.7.2"', 'address = "192.168.7.2"\nport = 80',
+     "host ground: port = 80: Expected int >= 1024"),
+    ('name = "DM13"\nhost = "ground"', 'name = "DM13"\nhost = "moon"',
+     "detection DM13: host = 'moon': unknown host; known: robot, ground"),
+    ('name = "safety_pilot"', 'name = "safety_pilot"\nhost = "ground"',
+     "node safety_pilot: host = 'ground': safety_pilot moves the robot, so no link may be between "
+     "them; 'robot', the first host, is right"),
+    ('name = "DM3"', 'name = "DM3"\nhost = "ground"\nprocess = "RM1"',
+     "recovery RM1: host = 'robot': DM3 lives in the same process, on ground"),
+    ('name = "DM7"', 'name = "DM7"\nhost = "ground"',
+     "detection DM7: parameters.timeout_s = 0.44: DM7 watches localization over the link: two "
+     "heartbeats and [link] delay_s, 0.58 s, is the least"),
+    ('name = "DM1"', 'name = "DM1"\nhost = "ground"',
+     "$.timing: the time budget does not fit: FTM1"),
+    ('name = "DM9"', 'name = "supervisor_ground"', "supervisor_ground': duplicate name, reserved"),
+    ("[link]\n", "[link]\nlost_after_s = 0\n", "lost_after_s"),
+])
+def test_refused(old, new, message):
+    assert old in TEXT
+    with pytest.raises(SpecificationError) as caught:
+        parse_specification(TEXT.replace(old, new, 1), "two.toml")
+    assert message in str(caught.value)
+
+
+def test_without_hosts_no_node_can_be_on_one():
+    one = '[[host]]\nname = "robot"\naddress = "192.168.7.1"\n\n'
+    text = TEXT.replace(TWO, "").replace(one, "")
+    with pytest.raises(SpecificationError, match=r"host = 'ground': there is no \[\[host\]\]"):
+        parse_specification(text, "one.toml")

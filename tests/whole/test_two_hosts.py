@@ -1,0 +1,118 @@
+"""One system on two machines: network namespaces, joined by a line that may be bad, or cut."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from rampart.testing import RealRun
+from tests.two_hosts import two_hosts
+from tests.whole.network import Line, Network, network, why_not
+
+pytestmark = [pytest.mark.processes,
+              pytest.mark.skipif(bool(why_not()), reason=f"no two hosts here: {why_not()}")]
+
+BAD = {"delay_s": 0.05, "jitter_s": 0.01, "loss": 0.05}
+CELL_ON_GROUND = ("camera", "part_finder", "D_VISION_CRASH")
+
+
+@contextmanager
+def host(net: Network, name: str, folder: Path, spec: Path, *arguments: str):
+    """Have a host take part, the robot's as the first."""
+
+    class OnHost(RealRun):
+        command = net.command(name, sys.executable, "-P", "-m", "rampart.cli.run")
+
+    folder.mkdir()
+    with OnHost(folder, spec, *(["--host", name] if name != "robot" else []), *arguments) as run:
+        yield run
+
+
+@pytest.fixture
+def net():
+    with network(["robot", "ground"]) as made:
+        yield made
+
+
+def specification(net: Network, folder: Path, *arguments: object) -> Path:
+    file = folder / "two.toml"
+    file.write_text(two_hosts(net.addresses, *arguments), encoding="utf-8")
+    return file
+
+
+def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_back(net, tmp_path):
+    spec = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1)
+    with (host(net, "ground", tmp_path / "g", spec) as ground,
+          host(net, "robot", tmp_path / "r", spec) as robot):
+        ground.wait_for("takes part in run")
+        robot.wait_for("ctrl-C ends it")
+        ground.wait_for("router_b_ground adopted")
+        ground.kill("camera")
+        robot.wait_for("camera respawned, incarnation 2")
+        assert robot.pid("camera") is None
+        net.line = Line(is_cut=True)
+        robot.wait_for("supervisor_ground unreachable")
+        robot.wait_for("camera respawned, incarnation 1000001")
+        ground.wait_for("supervisor unreachable host the first")
+        robot.wait_until(lambda: None not in map(robot.pid, CELL_ON_GROUND), 5, "not taken over")
+        assert ground.pid("camera") is not None  # it knows nothing of it
+        net.line = Line(**BAD)
+        ground.wait_for("camera handed over")
+        robot.wait_for("supervisor_ground back")
+        robot.wait_for("camera handed over, incarnation 1000001")
+        ground.wait_for("camera respawned")
+        robot.wait_until(lambda: not any(map(robot.pid, CELL_ON_GROUND)), 5, "not given back")
+        net.line = Line()
+        before = len(robot.story)
+        ground.process.send_signal(signal.SIGKILL)
+        robot.wait_until(lambda: "supervisor_ground unreachable" in robot.story[before:], 10,
+                         "the loss of the other host was not told")
+        robot.wait_until(lambda: None not in map(robot.pid, CELL_ON_GROUND), 5, "not taken over")
+        with host(net, "ground", tmp_path / "again", spec) as again:
+            again.wait_for("takes part in run")
+            again.wait_for("camera respawned")
+            robot.wait_until(lambda: not any(map(robot.pid, CELL_ON_GROUND)), 5, "not given back")
+            robot.process.send_signal(signal.SIGINT)
+            code, _ = robot.result(20)
+            assert again.result(20)[0] == 0
+    assert code == 0
+    assert not [line for line in robot.story.splitlines() if "failed" in line]
+
+
+def test_another_program_or_system_is_refused_before_anything_starts(net, tmp_path):
+    spec, other = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1), tmp_path / "other.toml"
+    other.write_text(spec.read_text().replace("intensity", "# intensity").replace(
+        "Pick and place", "Pick or place"), encoding="utf-8")
+    with (host(net, "robot", tmp_path / "r", spec) as robot,
+          host(net, "ground", tmp_path / "g", other) as ground):
+        assert ground.process.wait(30) == 2
+        assert "--host ground: specification: not the same as on the first host" in ground.story
+        robot.wait_for("waiting for ground: rampart run --host ground there")
+        robot.process.send_signal(signal.SIGINT)
+        robot.process.wait(10)
+
+
+@pytest.mark.slow
+def test_the_mission_goes_on_over_a_bad_line_a_partition_and_the_end_of_the_other_host(
+        net, tmp_path):
+    spec = specification(net, tmp_path)
+    with (host(net, "ground", tmp_path / "g", spec) as ground,
+          host(net, "robot", tmp_path / "r", spec, "--mission", "AB") as robot):
+        robot.wait_for("goal 1/", 60)
+        net.line = Line(**BAD)
+        robot.wait_for("goal 2/", 120)
+        net.line = Line(is_cut=True)
+        robot.wait_for("supervisor_ground unreachable")
+        robot.wait_for("goal 3/", 120)
+        net.line = Line(**BAD)
+        robot.wait_for("supervisor_ground back", 30)
+        before = len(robot.story)
+        ground.process.send_signal(signal.SIGKILL)
+        robot.wait_until(lambda: "supervisor_ground unreachable" in robot.story[before:], 10,
+                         "the loss of the other host was not told")
+        code, result = robot.result(400)
+    assert (code, result["mission"], result["safety"]) == (0, "success", "safe")
