@@ -119,7 +119,8 @@ class Watch:
         self.session = session
         self.picture = RunPicture()
         self.used: dict[str, Any] = {"nodes": {}, "guards": ()}
-        self._processes = ProcessObserver(session.run.base_port, session.run.pid)
+        self._processes = ProcessObserver(
+            session.run.base_port, session.run.pid, session.run.host)
         self._looks = 0
         draw(session, self.picture)
 

@@ -1,8 +1,8 @@
 """A tool's way into a run: it joins a router, announces nothing, and leaves no trace.
 
 Whoever listens only to commands cannot tell whether one arrived: so a command is sent with a
-check of its effect, and repeated as the identical message until the effect shows. Receivers drop
-the copies (see `ArrivalGuard`), a node that had just been restarted gets one of them.
+check of its effect, and repeated under the same number until the effect shows. Receivers drop the
+copies (see `ArrivalGuard`), a node that had just been restarted gets one of them.
 """
 
 from __future__ import annotations
@@ -100,7 +100,8 @@ class Session:
 
     def publish(self, topic: Topic[Any], body: msgspec.Struct) -> None:
         """Send a message once, stamped now; for what is repeated anyway."""
-        self._bus.publish(topic, topic.at(), self._stamped(body))
+        self._sequence += 1
+        self._bus.publish(topic, topic.at(), self._payload(self._sequence, body))
 
     async def command(self, topic: Topic[Any], body: msgspec.Struct,
                       effect: Callable[[], bool], timeout_s: float) -> bool:
@@ -113,9 +114,10 @@ class Session:
         if self.run.replay_of:
             raise UsageError(f"port {self.run.base_port} is a replay of {self.run.replay_of}: "
                              "nobody is there to obey")
-        payload = self._stamped(body)
+        self._sequence += 1
+        sequence = self._sequence
         try:
-            decode(topic, payload)
+            decode(topic, self._payload(sequence, body))
         except UNREADABLE as error:
             raise UsageError(f"not a {topic.type.__name__} that can be sent: {error}") from None
         loop = asyncio.get_running_loop()
@@ -126,14 +128,13 @@ class Session:
             if now >= deadline:
                 return False
             if now >= resend:
-                self._bus.publish(topic, topic.at(), payload)
+                self._bus.publish(topic, topic.at(), self._payload(sequence, body))
                 resend = now + RESEND_S
             await asyncio.sleep(0.01)
         return True
 
-    def _stamped(self, body: msgspec.Struct) -> bytes:
-        self._sequence += 1
-        return encode(Header(self.name, 1, self._sequence, self.clock.now()), body)
+    def _payload(self, sequence: int, body: msgspec.Struct) -> bytes:
+        return encode(Header(self.name, 1, sequence, self.clock.now()), body)
 
 
 class Latest(Generic[T]):

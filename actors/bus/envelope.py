@@ -8,6 +8,7 @@ fresh for ever, and shut out all that is true after it.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
@@ -123,15 +124,18 @@ class ArrivalGuard:
         crowded: called for each stranger that is forgotten.
         register: returns the incarnation of a node that was issued last; None if that is not known,
             as of tools.
+        command_age_s: a command older than this is refused, simulated seconds: it was under way
+            for so long that what it was meant for is past.
     """
 
     def __init__(self, now: Callable[[], float], members: Collection[str] = (),
                  crowded: Callable[[], None] = lambda: None,
-                 register: Register = lambda _node: None) -> None:
+                 register: Register = lambda _node: None, command_age_s: float = math.inf) -> None:
         self._now = now
         self._members = frozenset(members)
         self._crowded = crowded
         self._register = register
+        self._command_age_s = command_age_s
         self._heard: dict[str, _Heard] = {}
         self._strangers: deque[str] = deque()
 
@@ -143,11 +147,11 @@ class ArrivalGuard:
             topic: Which.
             take: Called with the key and the message, unless it is a duplicate or was overtaken.
             refuse: Called with the key and the reason, if it does not decode, is stamped ahead of
-                now, or comes from a superseded incarnation.
+                now, is a command that is too old, or comes from a superseded incarnation.
         """
         unpack, kind = decoder(topic.type), topic.type.__name__
         heard_of, meet, is_command = self._heard, self._meet, topic.qos is Qos.COMMAND
-        now, object_to = self._now, self._object_to
+        now, object_to, age_s = self._now, self._object_to, self._command_age_s
 
         def receive(key: str, payload: bytes) -> None:  # made of every message
             if len(payload) > MAX_PAYLOAD_BYTES:
@@ -158,8 +162,10 @@ class ArrivalGuard:
             except UNREADABLE as error:
                 refuse(key, f"not a {kind}: {error}")
                 return
-            if not message.stamp - now() <= AHEAD_S:  # nor is one that is no number
-                refuse(key, f"stamped {message.stamp - now():.2f} s ahead of now")
+            ahead_s = message.stamp - now()  # which may be no number
+            if not ahead_s <= AHEAD_S or (is_command and ahead_s < -age_s):
+                refuse(key, f"stamped {ahead_s:.2f} s ahead of now" if not ahead_s <= AHEAD_S
+                       else f"a command, given {-ahead_s:.2f} s ago")
                 return
             heard = heard_of.get(message.source)
             if heard is None or heard.incarnation != message.incarnation:

@@ -101,6 +101,16 @@ def issued(folder: str) -> dict[str, int]:
             if not name.endswith("~") and (number := register(name)) is not None}
 
 
+EPOCH = 1_000_000
+"""Beyond a multiple of it begin the incarnations of what is started in another host's place: more
+than the restarts of one process in any run, 50 in a minute being a thousand hours' worth."""
+
+
+def restarts_of(incarnation: int) -> int:
+    """Return how often a node was restarted at least, by its incarnation."""
+    return max(0, sum(divmod(incarnation, EPOCH)) - 1)
+
+
 Register = Callable[[str], int | None]
 """Returns the incarnation of a node that was issued last; None if none ever was."""
 

@@ -19,7 +19,6 @@ from rampart.actors.hosts.meeting import (
     contents_of,
     joined,
 )
-from rampart.actors.hosts.placement import EPOCH
 from rampart.actors.layout.hosts import Hosts
 from rampart.actors.layout.layout import load_application
 from rampart.actors.run.run_context import RunContext
@@ -101,7 +100,7 @@ class OtherHost:
         plan = joined(told.plan, self._own)
         application = load_application(plan, self._spec)
         self._attendance.ready(contents_of(plan, application))
-        plan = msgspec.structs.replace(plan, incarnations=(told.starts - 1) * EPOCH)
+        plan = msgspec.structs.replace(plan, incarnations=(told.starts - 1) * run_folder.EPOCH)
         self.launcher = OtherLauncher(plan, self._spec.title, told.incarnations)
         return plan
 
@@ -213,3 +212,4 @@ class OtherLauncher(Launcher):
     def follow(self, origin_s: float) -> None:
         """Have all processes of this host go by this origin."""
         keep_origin(origin_file(self.plan.folder), origin_s)
+        self.plan = msgspec.structs.replace(self.plan, origin_s=origin_s)

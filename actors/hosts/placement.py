@@ -20,11 +20,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from rampart.actors.bus.run_folder import EPOCH
 from rampart.actors.ftm.messages import NodeInfo
 from rampart.manager.spec.hosts import Link
-
-EPOCH = 1_000_000
-"""More than the restarts of one process in any run: 50 in a minute are a thousand hours' worth."""
 
 FIRST = ""
 """Name of the first host."""

@@ -5,6 +5,7 @@ Hosts are known by name here, the first one, which is the only one as a rule, by
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from rampart.actors.bus.run_folder import ROUTERS
@@ -24,6 +25,7 @@ class Hosts:
         several: whether there is more than one.
         supervisors: name of the supervisor of each host.
         link: what is assumed of the network between them.
+        command_age_s: a command that was under way for longer is not obeyed.
         home_of: name of each node with that of the host on which it runs, unless that is lost.
 
     Raises:
@@ -40,6 +42,8 @@ class Hosts:
         self.home_of = {node: "" if host == first else host
                         for node, host in spec.host_of.items()}
         self.link = spec.link
+        self.command_age_s = (
+            2 * spec.link.delay_s + spec.link.clock_s if self.several else math.inf)
         self._specs: dict[str, HostSpec] = dict(zip(names, spec.hosts, strict=False))
         self._own = own
 

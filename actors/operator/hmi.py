@@ -91,7 +91,7 @@ class Hmi(Actor):
         self._camera = self._make_camera()
         self._table: fm.NodeTable | None = None
         self._server: PageServer | None = None
-        self._observer = ProcessObserver(plan.base_port, plan.launcher_pid)
+        self._observer = ProcessObserver(plan.base_port, plan.launcher_pid, plan.host)
         self._version = -1
         self._unheard: list[str] = []
         if self._port:

@@ -31,16 +31,19 @@ class ProcessObserver:
     Args:
         port: base port of the run; 0 if there is none, then only nodes are looked at.
         launcher: pid of its launcher.
+        host: name of this machine among those of the run.
         meter: counts what they use.
         find: finds the processes of a run by its port.
         state: the kernel's state letter of a process, "X" if there is none.
     """
 
-    def __init__(self, port: int, launcher: int, meter: UsageMeter | None = None,
+    def __init__(self, port: int, launcher: int, host: str = "", *,
+                 meter: UsageMeter | None = None,
                  find: Callable[[int], Sequence[RunProcess]] = find_processes,
                  state: Callable[[int], str] = process_state) -> None:
         self._port = port
         self._launcher = launcher
+        self._host = host
         self._meter = meter or UsageMeter()
         self._find = find
         self._state = state
@@ -55,7 +58,8 @@ class ProcessObserver:
             process that is in no table: name, kind, pid, state, incarnation, restarts, and
             whether it can be sent signals by its name. The usage of a guard is among the nodes'.
         """
-        nodes = table.nodes[:MAX_NODES] if table else ()
+        nodes = [node for node in (table.nodes[:MAX_NODES] if table else ())
+                 if node.host == self._host]
         known = {node.name for node in nodes}
         if self._port and self._looks % SEARCH_EVERY == 0:
             found = self._find(self._port) if nodes else ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -37,6 +38,7 @@ class Context:
         failed: told of the error that ends the actor, while its peers still see it alive.
         register: returns the incarnation of a node that was issued last, None if it is not known.
         members: names of all nodes of the system; what others make it remember is bounded.
+        command_age_s: commands that are older are not obeyed.
         topics: those that parameters of the system's nodes name, by key.
         waits: "warm" or "hot" if it is set up as that, to be silent until `promote`.
         usage: returns what a process has used of the machine.
@@ -55,6 +57,7 @@ class Context:
     failed: Callable[[Exception], None] = lambda _error: None
     register: Register = lambda _node: None
     members: frozenset[str] = frozenset()
+    command_age_s: float = math.inf
     topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
     waits: str = ""
     usage: Callable[[int], ProcessCount | None] = read_count

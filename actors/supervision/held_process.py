@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rampart.actors.bus.run_folder import restarts_of
 from rampart.actors.ftm.messages import NodeInfo
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.processes import Processes, ProcessHandle
@@ -28,7 +29,7 @@ class HeldProcess(SupervisedProcess):
         """Return the rows of its nodes in the table of all; `late_s` says how late one was."""
         for node in self.unit.nodes:
             yield NodeInfo(node.name, node.kind.value, self.pid, self.shown, self.incarnation,
-                           max(0, self.incarnation - 1), late_s(node.name))
+                           restarts_of(self.incarnation), late_s(node.name))
 
     def prepare(self, machine: Processes, kind: Literal["warm", "hot"]
                 ) -> Callable[[], None] | None:

@@ -97,7 +97,8 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
-        members=frozenset((*layout.members, *layout.routers)), topics=layout.topics, waits=waits))
+        members=frozenset((*layout.members, *layout.routers)), topics=layout.topics, waits=waits,
+        command_age_s=layout.hosts.command_age_s))
 
 
 def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:

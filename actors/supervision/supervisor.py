@@ -26,6 +26,7 @@ from typing import Any, ClassVar
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.messages import Heartbeat
+from rampart.actors.bus.run_folder import restarts_of
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
@@ -57,7 +58,6 @@ _CHECK_S = 0.1
 
 _LATE_S = 0.02
 """Wall seconds by which this look is late when its own process lacks processor time."""
-
 _ROUTERS_S = 0.03
 """Wall seconds between two looks whether a router is stopped."""
 
@@ -390,9 +390,9 @@ class Supervisor(Actor):
                 node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
     def _rows(self) -> tuple[fm.NodeInfo, ...]:
-        own = fm.NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid,
-                          fm.NodeState.RUNNING, self._incarnation, self._incarnation - 1,
-                          self._lateness.of(self.name))
+        own = fm.NodeInfo(
+            self.name, Kind.SUPERVISION.value, self.context.pid, fm.NodeState.RUNNING,
+            self._incarnation, restarts_of(self._incarnation), self._lateness.of(self.name))
         rows = (row for p in self._processes.values() for row in p.rows(self._lateness.of))
         return own, *rows
 

@@ -20,8 +20,6 @@ from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from rampart.actors.bus.topic import Topic
 from rampart.actors.foreign.program import LOGS
 from rampart.actors.ftm import messages as fm
@@ -87,8 +85,9 @@ print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"
     if options.json:
         print_json(table.nodes)
     else:
-        print_table(fm.NodeInfo.__struct_fields__,
-                    [msgspec.structs.astuple(node) for node in table.nodes])
+        several = any(node.host for node in table.nodes)
+        fields = [name for name in fm.NodeInfo.__struct_fields__ if several or name != "host"]
+        print_table(fields, [[getattr(node, name) for name in fields] for node in table.nodes])
     return 0
 
 

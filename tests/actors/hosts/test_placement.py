@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rampart.actors.bus.run_folder import EPOCH, restarts_of
 from rampart.actors.ftm.messages import NodeInfo, NodeState
-from rampart.actors.hosts.placement import EPOCH, Changes, Home, Placement
+from rampart.actors.hosts.placement import Changes, Home, Placement
 from rampart.manager.spec.hosts import Link
 
 LINK = Link()
@@ -155,3 +156,9 @@ def test_what_is_lost_is_known_by_name(host):
     made = Placement(host, [other for other in ("", "ground") if other != host], HOMES, LINK, 0.0)
     made.look(20.0, {})
     assert made.lost_hosts() == [other for other in ("", "ground") if other != host]
+
+
+@pytest.mark.parametrize(("incarnation", "restarts"), [
+    (0, 0), (1, 0), (4, 3), (EPOCH + 1, 1), (2 * EPOCH + 3, 4)])
+def test_a_node_in_another_host_s_place_was_not_restarted_a_million_times(incarnation, restarts):
+    assert restarts_of(incarnation) == restarts

@@ -105,8 +105,8 @@ class Kernel:
 
     def observer(self) -> ProcessObserver:
         return ProcessObserver(
-            7450, 5, UsageMeter(self.count, lambda: self.now_s), self.find,
-            lambda pid: "S" if pid in self.alive else "X")
+            7450, 5, meter=UsageMeter(self.count, lambda: self.now_s), find=self.find,
+            state=lambda pid: "S" if pid in self.alive else "X")
 
 
 def table(**pids: int) -> m.NodeTable:

@@ -187,7 +187,7 @@ def test_the_same_can_be_had_as_data():
     assert data["processes"][0] == {
         "name": "localization", "kind": "control", "pid": 12, "state": "crashed",
         "incarnation": 3, "restarts": 2, "cpu": 2.0, "mb": 61.0, "age_s": 3700.0,
-        "late_s": 0.0}
+        "late_s": 0.0, "host": ""}
 
 
 @pytest.mark.parametrize("state", [s for s in fm.NodeState if s is not fm.NodeState.RUNNING])
