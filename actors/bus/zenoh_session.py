@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -47,17 +48,54 @@ def endpoints(folder: str) -> list[str]:
     return [endpoint(folder, name) for name in ROUTERS]
 
 
-def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """By what a session shows who it is, and knows whom it has reached: mutual TLS.
+
+    Attributes:
+        authority: file with the certificate of the authority that everybody's has to be of.
+        own: file with the session's own private key and certificate.
+        doors: by the socket of a router in the folder of the run, where it is spoken with. The
+            socket says no more than that the router is there: by it nobody may anything.
+    """
+
+    authority: str
+    own: str
+    doors: Mapping[str, str] = field(default_factory=dict)
+
+    def door(self, where: str) -> str:
+        """Return where a router is spoken with."""
+        return self.doors.get(where, where)
+
+    def settings(self) -> dict[str, Any]:
+        """Return what Zenoh has to know."""
+        tls = "transport/link/tls"
+        return {f"{tls}/root_ca_certificate": self.authority, f"{tls}/enable_mtls": True,
+                **{f"{tls}/{way}_{what}": self.own for way in ("listen", "connect")
+                   for what in ("private_key", "certificate")},
+                f"{tls}/close_link_on_expiration": True}
+
+
+def session_config(listen: str | None, dial: Sequence[str],
+                   credentials: Credentials | None = None,
+                   access: Mapping[str, Any] | None = None) -> zenoh.Config:
     """Return the configuration of a session that finds others only where it is told.
 
     Args:
         listen: where a router listens; None for a client.
         dial: a client goes to the first of these that answers, a router to all, again and again.
+        credentials: None in a run without keys.
+        access: what a router lets through, as `rampart.actors.access.rules` has it; None for
+            everything.
     """
     config = zenoh.Config()
+    listening = [listen] if listen else []
+    if credentials is not None:
+        listening = [*(credentials.door(one) for one in listening), *listening]
+        dial = [credentials.door(one) for one in dial]
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",
-        "listen/endpoints": [listen] if listen else [],
+        "listen/endpoints": listening,
         "listen/exit_on_failure": True,
         "connect/endpoints": list(dial),
         "connect/timeout_ms": -1 if listen else 0,  # in the background, or each once
@@ -70,7 +108,9 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
         "transport/shared_memory/enabled": False,  # a SIGKILL would leave its segment behind
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
-        "transport/link/tx/lease": LEASE_MS}
+        "transport/link/tx/lease": LEASE_MS,
+        **(credentials.settings() if credentials is not None else {}),
+        **({"access_control": access} if access is not None else {})}
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
@@ -92,16 +132,30 @@ def answering(where: Sequence[str]) -> list[str]:
     return [one for _, one in sorted(found)]
 
 
-def open_client(dial: Sequence[str]) -> zenoh.Session:
+def open_client(dial: Sequence[str], credentials: Credentials | None = None) -> zenoh.Session:
     """Open the session of a client of the first router that answers.
 
     Raises:
         ZError: none does.
     """
+    return _open(session_config(None, dial, credentials))
+
+
+def warm_up(credentials: Credentials) -> None:
+    """Open a session without any link and close it: the next one of this process opens sooner.
+
+    For a spare of a run with keys, which cannot join the bus before it knows who it is.
+    """
+    config = session_config(None, [], credentials)
+    config.insert_json5("mode", '"peer"')
+    _open(config).close()  # type: ignore[no-untyped-call]
+
+
+def _open(config: zenoh.Config) -> zenoh.Session:
     if _RUNTIME in os.environ:
-        return zenoh.open(session_config(None, dial))
+        return zenoh.open(config)
     os.environ[_RUNTIME] = _THREADS  # read when a process opens its first session
     try:
-        return zenoh.open(session_config(None, dial))
+        return zenoh.open(config)
     finally:
         del os.environ[_RUNTIME]  # commands that this process starts have their own

@@ -66,6 +66,12 @@ class CommandNode(Actor):
         for key in self.parameters.hears:
             self.hear_topic(key, partial(self._pass_on, key))
 
+    @classmethod
+    def own_keys(cls, parameters: Any) -> tuple[str, ...]:
+        """Hear the heartbeat of a command with a Zenoh client of its own."""
+        beat = parameters.heartbeat
+        return (beat.key,) if beat is not None and beat.key else ()
+
     def on_start(self) -> None:
         """Start the command; what an earlier one has left is killed first.
 
