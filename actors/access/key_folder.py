@@ -2,9 +2,9 @@
 
 `keys/` has mode 0700 and holds
 
-* `authority.pem`, the authority's private key and certificate: for `rampart keys` alone, no run
+* `authority.key`, the authority's private key and certificate: for `rampart keys` alone, no run
   needs it;
-* `ca.pem`, its certificate; `register.json`, who has one and who no longer: no secrets, the same
+* `ca.crt`, its certificate; `register.json`, who has one and who no longer: no secrets, the same
   on every host;
 * `NAME.pem` of each identity, private key and certificate, mode 0600: for the host on which it is.
 
@@ -33,16 +33,15 @@ from rampart.actors.access.certificates import (
     read_certificate,
 )
 from rampart.actors.access.register import (
-    AUTHORITY,
-    CERTIFICATE,
     REGISTER,
+    SIGNING,
     Identity,
     KeysError,
     Kind,
     Register,
-    key_file,
     read_register,
 )
+from rampart.actors.bus.zenoh_session import AUTHORITY, key_file
 from rampart.files.reading import FileError, read_bytes
 
 AUTHORITY_DAYS = 1826.0
@@ -78,7 +77,7 @@ def init(folder: Path, days: float = AUTHORITY_DAYS) -> None:
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     with _held(folder):
-        own, public, register = (folder / name for name in (AUTHORITY, CERTIFICATE, REGISTER))
+        own, public, register = (folder / name for name in (SIGNING, AUTHORITY, REGISTER))
         if own.exists() and public.exists() and register.exists():
             raise KeysError(f"{folder}: has an authority already; a new one would make all that it "
                             "has issued worthless")
@@ -113,7 +112,7 @@ def issue(folder: Path, names: Sequence[str], kind: Kind, addresses: Sequence[st
         common_names = register.of_kind(kind)
         _keep(folder, register)
         for name in names:
-            _write(key_file(folder, name), new_certificate(
+            _write(_file(folder, name), new_certificate(
                 authority, common_names[name], kind, addresses=addresses, now=_now(),
                 days=DAYS[kind] if days is None else days))
 
@@ -157,7 +156,7 @@ def revoke(folder: Path, names: Sequence[str]) -> None:
     with _held(folder):
         _keep(folder, read_register(folder).revoked(names))
         for name in names:
-            key_file(folder, name).unlink(missing_ok=True)
+            _file(folder, name).unlink(missing_ok=True)
 
 
 def entries(folder: Path) -> list[Entry]:
@@ -167,12 +166,12 @@ def entries(folder: Path) -> list[Entry]:
         KeysError: the folder is none, or has no certificate of an authority.
     """
     register = read_register(folder)
-    authority = _read(folder / CERTIFICATE)
+    authority = _read(folder / AUTHORITY)
     found = []
     for name, identity in sorted(register.identities.items()):
         certificate, trouble = None, ""
         try:
-            certificate = read_certificate(_read(key_file(folder, name)), authority)
+            certificate = read_certificate(_read(_file(folder, name)), authority)
             trouble = _trouble(name, identity, certificate)
         except FileNotFoundError:
             pass
@@ -206,7 +205,7 @@ def check(folder: Path, names: Sequence[str]) -> dt.datetime:
     here = {entry.name: entry for entry in entries(folder)}
     until, now = dt.datetime.max.replace(tzinfo=dt.UTC), _now()
     for name in names:
-        entry, file = here.get(name), key_file(folder, name)
+        entry, file = here.get(name), _file(folder, name)
         if entry is None or entry.identity.revoked or (
                 entry.certificate is None and not entry.trouble):
             why = "is revoked" if entry and entry.identity.revoked else "has no certificate"
@@ -229,11 +228,15 @@ def _check_private(folder: Path) -> None:
         raise KeysError(f"{folder}: must be yours alone; chmod 700 it")
 
 
+def _file(folder: Path, name: str) -> Path:
+    return Path(key_file(str(folder), name))
+
+
 def _authority(folder: Path) -> bytes:
     try:
-        return _read(folder / AUTHORITY)
+        return _read(folder / SIGNING)
     except FileNotFoundError:
-        raise KeysError(f"{folder / AUTHORITY}: there is none; certificates are issued where the "
+        raise KeysError(f"{folder / SIGNING}: there is none; certificates are issued where the "
                         "authority is") from None
 
 

@@ -23,10 +23,8 @@ IdentityName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}
 """As nodes are called."""
 
 REGISTER = "register.json"
-AUTHORITY = "authority.pem"
+SIGNING = "authority.key"
 """Key and certificate of the authority; to be kept where no robot is."""
-CERTIFICATE = "ca.pem"
-"""The certificate of the authority alone."""
 
 _MOST_BYTES = 1 << 20
 
@@ -109,8 +107,3 @@ def read_register(folder: Path) -> Register:
                         ) from None
     except (FileError, msgspec.MsgspecError, RecursionError) as error:
         raise KeysError(f"{file}: {error}") from None
-
-
-def key_file(folder: Path, name: str) -> Path:
-    """Return where the private key of an identity is, and its certificate."""
-    return folder / f"{name}.pem"

@@ -17,6 +17,9 @@ from rampart.actors.bus.unix_peer import peer, process_state
 
 ROUTERS = ("router_a", "router_b")
 
+AUTHORITY = "ca.crt"
+"""In a folder of keys: the certificate of the authority."""
+
 LEASE_MS = 2000
 """A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
 
@@ -74,6 +77,28 @@ class Credentials:
                 **{f"{tls}/{way}_{what}": self.own for way in ("listen", "connect")
                    for what in ("private_key", "certificate")},
                 f"{tls}/close_link_on_expiration": True}
+
+
+def credentials_in(keys: str, name: str, folder: str = "",
+                   ports: Sequence[int] = ()) -> Credentials | None:
+    """Return the credentials of an identity; None in a run without keys.
+
+    Args:
+        keys: folder of keys; "" for none.
+        name: of the identity.
+        folder: of the run.
+        ports: of loopback, on which its routers are spoken with.
+    """
+    if not keys:
+        return None
+    doors = {endpoint(folder, router): f"tls/127.0.0.1:{port}"
+             for router, port in zip(ROUTERS, ports, strict=False)}
+    return Credentials(f"{keys}/{AUTHORITY}", key_file(keys, name), doors)
+
+
+def key_file(keys: str, name: str) -> str:
+    """Return the file in a folder of keys with the private key of an identity, and certificate."""
+    return f"{keys}/{name}.pem"
 
 
 def session_config(listen: str | None, dial: Sequence[str],

@@ -30,7 +30,8 @@ class RunInfo(msgspec.Struct, frozen=True):
 
     `folder` holds the sockets of its nodes, `nodes`; `origin_s` is a reading of the machine's
     monotonic clock. `page` is where the operator's page is, without its token. `plan` is
-    what a recording keeps of the run's plan. `replay_of` names the file of a replay.
+    what a recording keeps of the run's plan. `replay_of` names the file of a replay. `keys` is the run's folder of keys, and `ports` are
+    those on which its routers are spoken with, in a run with keys.
     """
 
     pid: int
@@ -46,6 +47,8 @@ class RunInfo(msgspec.Struct, frozen=True):
     page: str = ""
     plan: dict[str, Any] = {}
     replay_of: str = ""
+    keys: str = ""
+    ports: tuple[int, ...] = ()
 
     @property
     def endpoints(self) -> list[str]:

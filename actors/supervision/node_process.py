@@ -33,6 +33,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rampart.actors.access.rules import access_of
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import register_of
@@ -90,9 +91,10 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
     folder = layout.plan.folder
     recorder = RecorderConnection(layout.plan.base_port)
     if bus is None:
-        own = endpoint(folder, name) if name in ROUTERS else None
+        plan, own = layout.plan, endpoint(folder, name) if name in ROUTERS else None
         bus = ZenohBus(name, incarnation, [one for one in endpoints(folder) if one != own], own,
-                       recorder)
+                       recorder, credentials=plan.credentials(name),
+                       access=access_of(layout, plan.keys) if plan.keys and own else None)
     else:
         bus.take_name(name, incarnation, recorder)
     return member.actor(Context(
