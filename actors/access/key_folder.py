@@ -27,6 +27,7 @@ import msgspec
 
 from rampart.actors.access.certificates import (
     Certificate,
+    check_address,
     new_authority,
     new_certificate,
     public_part,
@@ -43,6 +44,8 @@ from rampart.actors.access.register import (
 )
 from rampart.actors.bus.zenoh_session import AUTHORITY, key_file
 from rampart.files.reading import FileError, read_bytes
+
+__all__ = ["check", "check_address", "entries", "init", "issue", "revoke", "rotate"]
 
 AUTHORITY_DAYS = 1826.0
 DAYS: dict[str, float] = {"router": 30.0, "node": 30.0, "operator": 7.0, "viewer": 7.0}

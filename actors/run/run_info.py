@@ -30,8 +30,9 @@ class RunInfo(msgspec.Struct, frozen=True):
 
     `folder` holds the sockets of its nodes, `nodes`; `origin_s` is a reading of the machine's
     monotonic clock. `page` is where the operator's page is, without its token. `plan` is
-    what a recording keeps of the run's plan. `replay_of` names the file of a replay. `keys` is the run's folder of keys, and `ports` are
-    those on which its routers are spoken with, in a run with keys.
+    what a recording keeps of the run's plan. `replay_of` names the file of a replay. `keys` is the
+    folder of keys of a run that has one, and `ports` are those of loopback on which its routers
+    are spoken with then.
     """
 
     pid: int
