@@ -299,21 +299,22 @@ class Launcher:
         self._reap()
 
 
-def kept_ports(first: int) -> list[socket.socket]:
-    """Return sockets that keep a port of loopback for each router of a run with keys.
+def kept_ports(first: int, number: int = len(ROUTERS)) -> list[socket.socket]:
+    """Return sockets that keep ports of loopback for the routers of a run with keys.
 
     A router listens on a port that is kept all the same, for both have SO_REUSEADDR; no other run
     takes it while the router is restarted, and the kernel gives it to no outgoing connection.
 
     Args:
         first: of the ports that are tried.
+        number: of ports.
 
     Raises:
         LaunchError: there are too few.
     """
     found: list[socket.socket] = []
     for port in range(first, LAST_PORT + 1):
-        if len(found) == len(ROUTERS):
+        if len(found) == number:
             break
         kept = socket.socket()
         try:
@@ -323,7 +324,7 @@ def kept_ports(first: int) -> list[socket.socket]:
             continue
         kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # not before: it would fit any
         found.append(kept)
-    if len(found) < len(ROUTERS):
+    if len(found) < number:
         raise LaunchError(f"--port {first}: no ports for the routers from there to {LAST_PORT}")
     return found
 

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from rampart import systems as shipped
-from rampart.actors.access.register import IdentityName, KeysError, Kind
+from rampart.actors.access.register import IdentityName, KeysError, Kind, read_register
 from rampart.actors.bus.zenoh_session import ROUTERS
 from rampart.actors.layout.layout import Layout
 from rampart.actors.run.run_plan import RunPlan, load_system
@@ -144,6 +144,9 @@ def issue(options: argparse.Namespace) -> int:
                              f"address; {' '.join(ROUTERS)} or --system is right with it")
         for address in options.address:
             keys.check_address(address)
+        register = read_register(folder)
+        for kind, those in wanted:  # all of them, before the first is issued
+            register = register.issued(those, kind)
         for kind, those in wanted:
             if those:
                 keys.issue(folder, those, kind, options.address if kind == "router" else (),
