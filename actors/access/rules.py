@@ -176,6 +176,17 @@ def one_host(layout: Layout) -> Host:
     return Host(routers=tuple(layout.routers), nodes=frozenset(layout.members))
 
 
+def rules_as_declared(layout: Layout) -> dict[str, Any]:
+    """Return what routers let through if each process has a certificate of its own name.
+
+    And an operator and a viewer, called so.
+    """
+    host = one_host(layout)
+    register = Register().issued(host.routers, "router").issued(sorted(host.nodes), "node").issued(
+        [OPERATOR], OPERATOR).issued([VIEWER], VIEWER)
+    return rules_of(host, [host], rights_of_all(layout), register).config()
+
+
 def access_of(layout: Layout, keys: str) -> dict[str, Any]:
     """Return what the routers of a run on one machine let through, as Zenoh's `access_control`.
 
