@@ -116,7 +116,7 @@ def session_config(listen: str | None, dial: Sequence[str],
     config = zenoh.Config()
     listening = [listen] if listen else []
     if credentials is not None:
-        listening = [*(credentials.door(one) for one in listening), *listening]
+        listening = list(dict.fromkeys((*map(credentials.door, listening), *listening)))
         dial = [credentials.door(one) for one in dial]
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",
