@@ -190,7 +190,7 @@ def _trouble(name: str, identity: Identity, certificate: Certificate) -> str:
     if not certificate.has_key:
         return "without its private key"
     if certificate.common_name != identity.common_name(name):
-        return f"of {certificate.common_name}, which is revoked"
+        return f"of {certificate.common_name}, and not of {identity.common_name(name)}"
     return ""
 
 
