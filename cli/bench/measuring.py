@@ -85,7 +85,16 @@ def bench(options: argparse.Namespace) -> int:
 
 
 def _of_keys() -> Any:
-    from rampart.cli.bench import keys  # noqa: PLC0415 of an extra
+    """Return the part of that name.
+
+    Raises:
+        BenchError: the extra that it needs is not installed.
+    """
+    try:
+        extra("keys", "cryptography")
+    except UsageError as error:
+        raise BenchError(str(error)) from None
+    from rampart.cli.bench import keys  # noqa: PLC0415 of the extra
 
     return keys
 
@@ -98,8 +107,6 @@ def _checked(options: argparse.Namespace, parts: Sequence[str]
         UsageError: one of them cannot be, or is no business of the parts.
     """
     between("--kills", options.kills, 1, MOST_KILLS)
-    if "keys" in parts:
-        extra("keys", "cryptography")
     for name, value, of in (("peer", options.peer, ["peers"]), ("node", options.node, _OF_NODES),
                             ("system", options.system, _OF_NODES)):
         if value and not set(of) & set(parts):

@@ -179,7 +179,8 @@ def test_a_run_is_started_with_certificates_that_are_valid(keys):
 
 @pytest.mark.parametrize("text", [
     "", "[]", "{", '{"identities": {"a b": {"kind": "node"}}}', "[" * 100_000,
-    '{"identities": {"DM4": {"kind": "king"}}}', '{"identities": {"DM4": {"kind": "node", "x": 1}}}',
+    '{"identities": {"DM4": {"kind": "king"}}}',
+    '{"identities": {"DM4": {"kind": "node", "x": 1}}}',
     '{"identities": {"DM4": {"kind": "node", "number": 0}}}', "\udcff"])
 def test_a_register_that_is_none_is_refused(keys, text):
     (keys / "register.json").write_text(text, errors="surrogateescape")
@@ -231,7 +232,8 @@ def test_who_is_killed_leaves_whole_files_and_can_go_on(tmp_path, number):
 
 def test_two_at_once_lose_nothing(keys):
     code = ("import sys; from pathlib import Path; from rampart.actors.access import key_folder\n"
-            "for i in range(8): key_folder.issue(Path(sys.argv[1]), [sys.argv[2] + str(i)], 'node')")
+            "for i in range(8):\n"
+            "    key_folder.issue(Path(sys.argv[1]), [sys.argv[2] + str(i)], 'node')")
     running = [subprocess.Popen([sys.executable, "-c", code, str(keys), name])
                for name in ("A", "B")]
     assert [one.wait(60) for one in running] == [0, 0]
