@@ -65,7 +65,7 @@ def message(i):
     return bus_topics.INJECT.at(), encode(Header(name, 1, i, 0.0), order)
 def ask():
     session.get(ftm_topics.DETECTION.pattern, lambda reply: None, timeout=0.1)
-with zenoh.open(session_config(None, dial)) as session:
+with zenoh.open(session_config((), dial)) as session:
     time.sleep(1)
     publishers, begun, sent = {}, time.monotonic(), 0
     while (passed := time.monotonic() - begun) < seconds:

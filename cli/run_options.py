@@ -16,6 +16,7 @@ there is no "report"
 from __future__ import annotations
 
 import argparse
+import datetime as dt
 import os
 import socket
 import uuid
@@ -26,18 +27,21 @@ from typing import Any
 import msgspec
 
 from rampart import systems
+from rampart.actors.access.register import KeysError
 from rampart.actors.layout.layout import Layout, application_class
 from rampart.actors.layout.wiring import load_class
 from rampart.actors.recording.bag_writer import check_target
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_plan import DEFAULT_PORT, RunPlan, load_system
+from rampart.actors.supervision.launcher import LAST_PORT
 from rampart.actors.web.access import Access, AccessError, is_loopback, new_token
 from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.cli import application_options
-from rampart.cli.output import UsageError, between, positive
+from rampart.cli.output import UsageError, between, positive, refusing, using, warn
 from rampart.cli.verbs import (
     PORT_VARIABLE,
     add_options,
+    extra,
     flag,
     help_of,
     number,
@@ -55,11 +59,13 @@ from rampart.sim.runs.rate_search import LEAST, MOST
 from rampart.sim.virtual.network import NETWORKS
 
 ERROR_LOG = "errors.log"
-LAST_PORT = 32_000
 TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
 HMI = "rampart.actors.operator.hmi:Hmi"
 
 MAX_RATE = "max"
+
+SOON = dt.timedelta(days=1)
+"""Who starts a run is told of a certificate that expires sooner."""
 
 
 def _rate(text: str) -> float | str:
@@ -107,6 +113,9 @@ _OPTIONS = (
     port_option("--port", "number that tells runs on this machine apart; no port is opened "
                 f"(default: that of {PORT_VARIABLE}, else {DEFAULT_PORT})", DEFAULT_PORT,
                 metavar="PORT"),
+    word("--keys", "DIR", "a folder of keys, as `rampart keys` makes it: every link is mutual TLS, "
+         "and a router lets through what the owner of a certificate declares and no more (default: "
+         "none; the kernel keeps other users out)", ""),
     number("--patience", "S", "simulated seconds without progress after which the mission counts "
            "as failed (default: 60)", 60.0),
     number("--duration", "S", "simulated seconds after which a system without a mission ends "
@@ -204,6 +213,8 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
         waits=options.wait, virtual=options.virtual, host=host)
     spec = load_system(plan)
     layout = Layout(plan, spec)
+    if options.keys:
+        plan = msgspec.structs.replace(plan, keys=_checked_keys(options, layout))
     if not options.no_hmi:
         plan = msgspec.structs.replace(plan, faults=faults_of(spec).offered())
     if not any(issubclass(member.actor, load_class(HMI)) and layout.hosts.home_of[name] == host
@@ -227,6 +238,28 @@ def _host(options: argparse.Namespace, spec: SystemSpec) -> str:
     if options.virtual:
         raise UsageError(f"--host {options.host}: virtual time is on one machine")
     return "" if options.host == names[0] else str(options.host)
+
+
+def _checked_keys(options: argparse.Namespace, layout: Layout) -> str:
+    """Return the folder of keys of a run, which has all that it needs.
+
+    Raises:
+        UsageError: it has not.
+    """
+    if options.virtual:
+        raise UsageError(f"--keys {options.keys}: in virtual time there are no links")
+    extra("keys", "cryptography")
+    from rampart.actors.access import key_folder  # noqa: PLC0415 of the extra
+
+    folder = Path(options.keys).resolve()
+    with refusing(KeysError), using(folder):
+        until = key_folder.check(folder, [*layout.routers, *sorted(
+            layout.hosts.may_run(layout.plan.host, layout.members))])
+    left = until - dt.datetime.now(dt.UTC)
+    if left < SOON:
+        warn(f"--keys {options.keys}: the first certificate expires at {until:%Y-%m-%d %H:%M} UTC; "
+             "whose has expired is cut off; `rampart keys rotate` renews it")
+    return str(folder)
 
 
 def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:

@@ -9,22 +9,30 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import uuid
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import msgspec
 
+from rampart.actors.access.register import KeysError, read_register
+from rampart.actors.access.rights import OPERATOR, VIEWER
 from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode, encode
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import Credentials, credentials_in, key_file
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.actors.runtime.clock import Clock
 from rampart.cli.output import UsageError, refusing
 
 T = TypeVar("T")
+
+KEY_VARIABLE = "RAMPART_KEY"
 
 RESEND_S = 0.1
 """Real seconds between copies of a command whose effect does not show."""
@@ -46,14 +54,16 @@ class Session:
         run: the run.
         bus: access to its bus, opened by `connect`.
         clock: the run's simulated time.
+        may_order: False with the certificate of a viewer, whose commands no router lets through.
     """
 
-    def __init__(self, run: RunInfo, bus: Bus, clock: Clock) -> None:
+    def __init__(self, run: RunInfo, bus: Bus, clock: Clock, *, may_order: bool = True) -> None:
         self.run = run
         self.clock = clock
         self.name = f"rampart-{uuid.uuid4().hex[:10]}"
         self._bus = bus
         self._sequence = 0
+        self._may_order = may_order
 
     def real_s(self, simulated_s: float) -> float:
         """Return how many real seconds to wait for something due in simulated seconds."""
@@ -99,7 +109,12 @@ class Session:
         return {key: one.value for key, one in heard.items() if one.value is not None}
 
     def publish(self, topic: Topic[Any], body: msgspec.Struct) -> None:
-        """Send a message once, stamped now; for what is repeated anyway."""
+        """Send a message once, stamped now; for what is repeated anyway.
+
+        Raises:
+            UsageError: this tool may only look.
+        """
+        self._check_may_order()
         self._sequence += 1
         self._bus.publish(topic, topic.at(), self._payload(self._sequence, body))
 
@@ -108,12 +123,13 @@ class Session:
         """Send a command until `effect` holds; return False if it did not within real seconds.
 
         Raises:
-            UsageError: the run is a replay, where nobody obeys, or the message has a value that
-                every reader would refuse.
+            UsageError: the run is a replay, where nobody obeys, this tool may only look, or the
+                message has a value that every reader would refuse.
         """
         if self.run.replay_of:
             raise UsageError(f"port {self.run.base_port} is a replay of {self.run.replay_of}: "
                              "nobody is there to obey")
+        self._check_may_order()
         self._sequence += 1
         sequence = self._sequence
         try:
@@ -132,6 +148,11 @@ class Session:
                 resend = now + RESEND_S
             await asyncio.sleep(0.01)
         return True
+
+    def _check_may_order(self) -> None:
+        if not self._may_order:
+            raise UsageError("a viewer's certificate is for looking; what changes a run takes an "
+                             "operator's (`rampart keys issue --operator NAME`)")
 
     def _payload(self, sequence: int, body: msgspec.Struct) -> bytes:
         return encode(Header(self.name, 1, sequence, self.clock.now()), body)
@@ -155,6 +176,35 @@ class Latest(Generic[T]):
         return self.value
 
 
+def tools_credentials(run: RunInfo) -> tuple[Credentials | None, str]:
+    """Return what a tool shows to join a run, and of which kind it is; None where nothing is asked.
+
+    That is the file that `RAMPART_KEY` names, or of the run's folder of keys the first operator's,
+    else the first viewer's, by name.
+
+    Raises:
+        KeysError: there is no such file.
+        UsageError: there is none of either.
+    """
+    if not run.keys:
+        return None, OPERATOR
+    register = read_register(Path(run.keys))
+    doors = credentials_in(run.keys, "", run.folder, run.ports)
+    assert doors is not None  # noqa: S101 for the type checker
+    chosen = os.environ.get(KEY_VARIABLE, "")
+    people = {name: kind for kind in (OPERATOR, VIEWER) for name in sorted(register.of_kind(kind))}
+    if chosen:
+        if not os.access(chosen, os.R_OK):
+            raise UsageError(f"{KEY_VARIABLE}={chosen}: no file that can be read")
+        return replace(doors, own=chosen), people.get(Path(chosen).stem, "")
+    for name, kind in people.items():
+        own = key_file(run.keys, name)
+        if os.access(own, os.R_OK):
+            return replace(doors, own=own), kind
+    raise UsageError(f"{run.keys}: no operator's and no viewer's certificate; `rampart keys issue "
+                     f"--viewer NAME` issues one, or {KEY_VARIABLE} names the file of one")
+
+
 @contextlib.asynccontextmanager
 async def connect(port: int | None = None) -> AsyncIterator[Session]:
     """Join the run on this machine (on base port `port` if there are several).
@@ -162,11 +212,13 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
     Raises:
         UsageError: there is no run, or it must be chosen.
     """
-    with refusing(NoRunError, BusError):
+    with refusing(NoRunError, BusError, KeysError):
         run = find_run(port)
-        bus = ZenohBus("", 0, run.endpoints, recorder=RecorderConnection(run.base_port))
+        shown, kind = tools_credentials(run)
+        bus = ZenohBus("", 0, run.endpoints, recorder=RecorderConnection(run.base_port),
+                       credentials=shown)
         await bus.open()
     try:
-        yield Session(run, bus, Clock(run.origin_s, run.rate))
+        yield Session(run, bus, Clock(run.origin_s, run.rate), may_order=kind != VIEWER)
     finally:
         await bus.close()

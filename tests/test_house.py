@@ -25,7 +25,7 @@ ROOMS = (
     "manager.analysis", "manager.drawing",
     "actors.bus", "actors.ftm", "actors.web", "actors.run", "actors.runtime",
     "actors.detection", "actors.recovery", "actors.foreign", "actors.layout", "manager.actor",
-    "actors.supervision", "actors.hosts", "actors.recording", "actors.operator",
+    "actors.access", "actors.supervision", "actors.hosts", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
     "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.bench",
     "cli.host", "cli.run", "cli.new", "cli.main",

@@ -22,7 +22,7 @@ import asyncio
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import zenoh
@@ -32,7 +32,7 @@ from rampart.actors.bus.bus import BusError, Deliver, PeerChange
 from rampart.actors.bus.limits import RateLimit
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.bus.zenoh_session import answering, open_client, session_config
+from rampart.actors.bus.zenoh_session import Credentials, answering, open_client, session_config
 
 PATIENCE_S = 10.0
 """Real seconds that a client looks for a router when it starts."""
@@ -83,17 +83,23 @@ class ZenohBus:
         dial: endpoints of the routers; to a router, of the other one.
         listen: endpoints of a router, that in the folder first; none for a client.
         recorder: connection to a recorder of the run; None for none.
+        credentials: by which it shows who it is; None in a run without keys.
+        access: what a router lets through; None for everything.
     """
 
     bursts = True
 
     def __init__(self, node: str, incarnation: int, dial: Sequence[str],
-                 listen: Sequence[str] = (), recorder: RecorderConnection | None = None) -> None:
+                 listen: Sequence[str] = (), recorder: RecorderConnection | None = None, *,
+                 credentials: Credentials | None = None,
+                 access: Mapping[str, Any] | None = None) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
         self._dial = dial
         self._recorder = recorder
+        self._credentials = credentials
+        self._access = access
         self._session: zenoh.Session | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._arrived: deque[Callable[[], None]] = deque()
@@ -126,7 +132,8 @@ class ZenohBus:
         self._loop = asyncio.get_running_loop()
         try:
             self._session = (await self._joined(self._loop) if not self._listen
-                             else zenoh.open(session_config(self._listen, self._dial)))
+                             else zenoh.open(session_config(
+                                 self._listen, self._dial, self._credentials, self._access)))
         except zenoh.ZError as error:
             text = " ".join(str(error).split())
             node = f"(node {self._node})"
@@ -151,7 +158,7 @@ class ZenohBus:
             try:
                 if found:
                     both = [*found, *(one for one in self._dial if one not in found)]
-                    return open_client(both)
+                    return open_client(both, self._credentials)
             except zenoh.ZError:  # it ended in this moment
                 pass
             if loop.time() > until_s:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,9 @@ import zenoh
 
 from rampart.actors.bus.run_folder import ROUTERS, socket_path
 from rampart.actors.bus.unix_peer import peer, process_state
+
+AUTHORITY = "ca.crt"
+"""In a folder of keys: the certificate of the authority."""
 
 LEASE_MS = 2000
 """A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
@@ -55,20 +59,79 @@ def endpoints(folder: str) -> list[str]:
     return [endpoint(folder, name) for name in ROUTERS]
 
 
-def session_config(listen: Sequence[str], dial: Sequence[str]) -> zenoh.Config:
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """By what a session shows who it is, and knows whom it has reached: mutual TLS.
+
+    Attributes:
+        authority: file with the certificate of the authority that everybody's has to be of.
+        own: file with the session's own private key and certificate.
+        doors: by the socket of a router in the folder of the run, where it is spoken with. The
+            socket says no more than that the router is there: by it nobody may anything.
+    """
+
+    authority: str
+    own: str
+    doors: Mapping[str, str] = field(default_factory=dict)
+
+    def door(self, where: str) -> str:
+        """Return where a router is spoken with."""
+        return self.doors.get(where, where)
+
+    def settings(self) -> dict[str, Any]:
+        """Return what Zenoh has to know."""
+        tls = "transport/link/tls"
+        return {f"{tls}/root_ca_certificate": self.authority, f"{tls}/enable_mtls": True,
+                **{f"{tls}/{way}_{what}": self.own for way in ("listen", "connect")
+                   for what in ("private_key", "certificate")},
+                f"{tls}/close_link_on_expiration": True}
+
+
+def credentials_in(keys: str, name: str, folder: str = "",
+                   ports: Sequence[int] = ()) -> Credentials | None:
+    """Return the credentials of an identity; None in a run without keys.
+
+    Args:
+        keys: folder of keys; "" for none.
+        name: of the identity.
+        folder: of the run.
+        ports: of loopback, on which its routers are spoken with.
+    """
+    if not keys:
+        return None
+    doors = {endpoint(folder, router): f"tls/127.0.0.1:{port}"
+             for router, port in zip(ROUTERS, ports, strict=False)}
+    return Credentials(f"{keys}/{AUTHORITY}", key_file(keys, name), doors)
+
+
+def key_file(keys: str, name: str) -> str:
+    """Return the file in a folder of keys with the private key of an identity, and certificate."""
+    return f"{keys}/{name}.pem"
+
+
+def session_config(listen: Sequence[str], dial: Sequence[str],
+                   credentials: Credentials | None = None,
+                   access: Mapping[str, Any] | None = None) -> zenoh.Config:
     """Return the configuration of a session that finds others only where it is told.
 
     Args:
         listen: where a router listens, in the folder first; none for a client. It goes on
             without the others: an address that is not there now may come.
         dial: a client goes to the first of these that answers, a router to all, again and again.
+        credentials: None in a run without keys.
+        access: what a router lets through, as `rampart.actors.access.rules` has it; None for
+            everything.
     """
     config = zenoh.Config()
-    is_far = any(not one.startswith(_PROTOCOL) for one in (*listen, *dial))
+    near = list(listen[:1])
+    is_far = len(listen) > 1 or any(one.startswith(("tcp/", "tls/")) for one in dial)
     handshake_ms = FAR_HANDSHAKE_MS if is_far else HANDSHAKE_MS
+    if credentials is not None:
+        near = list(dict.fromkeys((*map(credentials.door, near), *near)))
+        dial = [credentials.door(one) for one in dial]
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",
-        "listen/endpoints": [*listen[:1], *(f"{far}#{_NOT_FATAL}" for far in listen[1:])],
+        "listen/endpoints": [*near, *(f"{far}#{_NOT_FATAL}" for far in listen[1:])],
         "listen/exit_on_failure": True,
         "connect/endpoints": list(dial),
         "connect/timeout_ms": -1 if listen else 0,  # in the background, or each once
@@ -82,7 +145,9 @@ def session_config(listen: Sequence[str], dial: Sequence[str]) -> zenoh.Config:
         "transport/unicast/open_timeout": handshake_ms,
         "transport/unicast/accept_timeout": handshake_ms,
         "transport/link/tx/lease": LEASE_MS,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": FULL_US}
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": FULL_US,
+        **(credentials.settings() if credentials is not None else {}),
+        **({"access_control": access} if access is not None else {})}
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
@@ -104,16 +169,30 @@ def answering(where: Sequence[str]) -> list[str]:
     return [one for _, one in sorted(found)]
 
 
-def open_client(dial: Sequence[str]) -> zenoh.Session:
+def open_client(dial: Sequence[str], credentials: Credentials | None = None) -> zenoh.Session:
     """Open the session of a client of the first router that answers.
 
     Raises:
         ZError: none does.
     """
+    return _open(session_config((), dial, credentials))
+
+
+def warm_up(credentials: Credentials) -> None:
+    """Open a session without any link and close it: the next one of this process opens sooner.
+
+    For a spare of a run with keys, which cannot join the bus before it knows who it is.
+    """
+    config = session_config((), [], credentials)
+    config.insert_json5("mode", '"peer"')
+    _open(config).close()  # type: ignore[no-untyped-call]
+
+
+def _open(config: zenoh.Config) -> zenoh.Session:
     if _RUNTIME in os.environ:
-        return zenoh.open(session_config((), dial))
+        return zenoh.open(config)
     os.environ[_RUNTIME] = _THREADS  # read when a process opens its first session
     try:
-        return zenoh.open(session_config((), dial))
+        return zenoh.open(config)
     finally:
         del os.environ[_RUNTIME]  # commands that this process starts have their own

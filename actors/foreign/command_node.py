@@ -66,6 +66,12 @@ class CommandNode(Actor):
         for key in self.parameters.hears:
             self.hear_topic(key, partial(self._pass_on, key))
 
+    @classmethod
+    def own_keys(cls, parameters: Any) -> tuple[str, ...]:
+        """Hear the heartbeat of a command with a Zenoh client of its own."""
+        beat = parameters.heartbeat
+        return (beat.key,) if beat is not None and beat.key else ()
+
     def on_start(self) -> None:
         """Start the command; what an earlier one has left is killed first.
 
@@ -88,7 +94,7 @@ class CommandNode(Actor):
                "RAMPART_ORIGIN_S": repr(self.clock.source_time(0.0)),
                "RAMPART_RATE": repr(self.clock.rate), "RAMPART_SEED": str(plan.seed),
                "RAMPART_SOCKET": str(channel.other.fileno()),
-               "RAMPART_ZENOH": ",".join(endpoints(plan.folder))}
+               **self._reached()}
         own |= self._watch()
         self._child.start(
             who=f"{self.name} #{self.context.incarnation}",
@@ -122,6 +128,15 @@ class CommandNode(Actor):
                                " shows its output")
 
         self.call_later(0.0, fail)  # in its mailbox, where an error ends the actor
+
+    def _reached(self) -> dict[str, str]:
+        """Return the variables by which a Zenoh client of its own reaches the routers."""
+        plan = self.context.run.plan
+        where, shown = endpoints(plan.folder), plan.credentials(self.name)
+        if shown is None:
+            return {"RAMPART_ZENOH": ",".join(where)}
+        return {"RAMPART_ZENOH": ",".join(map(shown.door, where)),
+                "RAMPART_AUTHORITY": shown.authority, "RAMPART_KEY": shown.own}
 
     def _watch(self) -> dict[str, str]:
         """Listen for its heartbeat; return the variables that say where it is awaited."""

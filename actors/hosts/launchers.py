@@ -22,7 +22,7 @@ from rampart.actors.hosts.meeting import (
 from rampart.actors.layout.hosts import Hosts
 from rampart.actors.layout.layout import load_application
 from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_system, on_host
 from rampart.actors.runtime.clock import keep_origin, origin_file
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 
@@ -50,7 +50,8 @@ class FirstLauncher(Launcher):
             self._meeting = Meeting(
                 self.plan, tuple(host for host in hosts.supervisors if host), contents,
                 lambda: run_folder.issued(self.plan.folder))
-            await self._meeting.open(*hosts.meeting_place())
+            await self._meeting.open(
+                *hosts.meeting_place(), self.plan.credentials(OBSERVER))
         except (MeetingError, OSError) as error:
             raise LaunchError(str(error)) from None
         await self._meeting.all_ready(self.say)
@@ -85,7 +86,9 @@ class OtherHost:
         hosts = Hosts(self._spec, own.host)
         self._where = hosts.meeting_place()
         self._link = hosts.link
-        self._attendance = Attendance(own.host, self._where, contents_of(own))
+        self._attendance = Attendance(
+            own.host, self._where, contents_of(own),
+            own.credentials(on_host(OBSERVER, own.host)))
         self._clocks = ClockSync()
         self._said = ""
         self._is_trusted = True

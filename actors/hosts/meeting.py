@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import ssl
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,9 +20,11 @@ from typing import Any
 import msgspec
 
 import rampart
+from rampart.actors.access.register import read_register
 from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.zenoh_session import Credentials
 from rampart.actors.run.application import Application
-from rampart.actors.run.run_plan import RunPlan, load_document
+from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_document, on_host
 from rampart.files.reading import plain_line
 
 PERIOD_S = 0.25
@@ -88,18 +91,26 @@ class Meeting:
         self._origin_s: float | None = None
         self._over = ""
         self._server: asyncio.Server | None = None
+        self._shown: Credentials | None = None
         self._told: dict[str, asyncio.Event] = {}
         self._writers: set[asyncio.StreamWriter] = set()
 
-    async def open(self, address: str, port: int) -> None:
+    async def open(self, address: str, port: int, shown: Credentials | None = None) -> None:
         """Listen.
+
+        Args:
+            address: at which.
+            port: likewise.
+            shown: by what this host shows who it is; None in a run without keys.
 
         Raises:
             MeetingError: the address is not one of this machine's, or in use.
         """
+        self._shown = shown
         try:
             self._server = await asyncio.start_server(
-                self._serve, address, port, limit=_MAX_LINE, reuse_address=True)
+                self._serve, address, port, limit=_MAX_LINE, reuse_address=True,
+                ssl=context(shown, ssl.Purpose.CLIENT_AUTH) if shown else None)
         except OSError as error:
             raise MeetingError(f"cannot listen at {address} port {port} for the other hosts: "
                                f"{error.strerror or error}") from None
@@ -141,6 +152,8 @@ class Meeting:
                 line = await asyncio.wait_for(reader.readuntil(), _PATIENCE_S)
                 ask = msgspec.json.decode(line, type=Ask)
                 host = ask.host
+                if self._shown and not _is(writer, self._shown, on_host(OBSERVER, host)):
+                    raise ValueError(f"somebody else asks for host {host}")
                 self._told[host] = told_of_end
                 answer = self._answer(ask)
                 writer.write(msgspec.json.encode(answer) + b"\n")
@@ -188,11 +201,15 @@ class Attendance:
         host: its name.
         where: address and port of the first host.
         contents: what the files of this host are.
+        shown: by what it shows who it is; None in a run without keys.
     """
 
-    def __init__(self, host: str, where: tuple[str, int], contents: Mapping[str, str]) -> None:
+    def __init__(self, host: str, where: tuple[str, int], contents: Mapping[str, str],
+                 shown: Credentials | None = None) -> None:
         self._ask = Ask(host, f"{time.time_ns()}", dict(contents))
         self._where = where
+        self._shown = shown
+        self._context = context(shown, ssl.Purpose.SERVER_AUTH) if shown else None
         self._ends: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     def ready(self, contents: Mapping[str, str]) -> None:
@@ -209,7 +226,10 @@ class Attendance:
         try:
             async with asyncio.timeout(_PATIENCE_S):
                 if self._ends is None:
-                    self._ends = await asyncio.open_connection(*self._where, limit=_MAX_LINE)
+                    self._ends = await asyncio.open_connection(
+                        *self._where, limit=_MAX_LINE, ssl=self._context)
+                    if self._shown and not _is(self._ends[1], self._shown, OBSERVER):
+                        raise MeetingError("somebody else answers in the first host's place")
                 reader, writer = self._ends
                 asked_s = time.monotonic()
                 writer.write(msgspec.json.encode(self._ask) + b"\n")
@@ -235,7 +255,8 @@ class Attendance:
 
 
 _OWN = ("base_port", "hmi_port", "hmi_host", "hmi_token", "hmi_token_is_new", "launcher_pid",
-        "folder", "error_log", "origin_s", "checkpoints", "system_file", "host", "incarnations")
+        "folder", "error_log", "origin_s", "checkpoints", "system_file", "host", "incarnations",
+        "keys", "ports")
 """Of a plan, what is each host's own."""
 
 
@@ -277,6 +298,25 @@ def _difference(ours: Mapping[str, str], ask: Ask) -> str:
     return (f"{', '.join(different)}: not the same as on the first host "
             f"({theirs.get(different[0], 'none')[:12]} here, "
             f"{ours.get(different[0], 'none')[:12]} there); copy it from there")
+
+
+def context(shown: Credentials, purpose: ssl.Purpose) -> ssl.SSLContext:
+    """Return how a launcher shows who it is, and has to be shown: mutual TLS, as on the bus."""
+    made = ssl.create_default_context(purpose, cafile=shown.authority)
+    made.load_cert_chain(shown.own)
+    made.check_hostname = False  # the name in the certificate is looked at, whatever its address
+    made.verify_mode = ssl.CERT_REQUIRED
+    made.minimum_version = ssl.TLSVersion.TLSv1_3
+    return made
+
+
+def _is(writer: asyncio.StreamWriter, shown: Credentials, identity: str) -> bool:
+    """Whether the certificate at the other end is that of an identity, and not revoked."""
+    certificate = writer.get_extra_info("peercert") or {}
+    names = [value for part in certificate.get("subject", ()) for name, value in part
+             if name == "commonName"]
+    register = read_register(Path(shown.authority).parent)
+    return names == [register.of_kind("node").get(identity)]
 
 
 async def _closed(writer: asyncio.StreamWriter) -> None:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 
 from rampart.actors.bus.run_folder import ROUTERS
-from rampart.actors.run.run_plan import SUPERVISOR, on_host
+from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, on_host
 from rampart.manager.spec.hosts import HostSpec
 from rampart.manager.spec.schema import SystemSpec
 
@@ -49,7 +49,25 @@ class Hosts:
 
     def guards_of(self, host: str) -> tuple[str, ...]:
         """Return the names of a host's supervisor and routers, by which it is known to be there."""
-        return (self.supervisors[host], *(on_host(name, host) for name in ROUTERS))
+        return (self.supervisors[host], *self.routers_of(host))
+
+    def routers_of(self, host: str) -> tuple[str, ...]:
+        """Return the names of a host's routers."""
+        return tuple(on_host(name, host) for name in ROUTERS)
+
+    def may_run(self, host: str, members: Iterable[str]) -> frozenset[str]:
+        """Return those of a system's actors that a host may run, its guards among them.
+
+        The first one may have to run what has its home elsewhere.
+        """
+        guards = {on_host(name, other): other for other in self.supervisors
+                  for name in (SUPERVISOR, OBSERVER)}
+        return frozenset(name for name in members if (
+            guards[name] == host if name in guards else host in {"", self.home_of[name]}))
+
+    def address_of(self, host: str) -> str:
+        """Return the address of a host, "" if there is only one."""
+        return self._specs[host].address if self.several else ""
 
     def heard_by(self, host: str, nodes: Iterable[str]) -> tuple[str, ...]:
         """Return whose heartbeats the supervisor of a host hears.
@@ -62,18 +80,19 @@ class Hosts:
                 *(name for other in self.supervisors if other != host
                   for name in self.guards_of(other)))
 
-    def listens(self, place: int) -> list[str]:
+    def listens(self, place: int, protocol: str) -> list[str]:
         """Return where a router of this host listens for those of the others.
 
         Args:
             place: of the router, 0 or 1.
+            protocol: "tcp" or "tls".
         """
-        return [_endpoint(self._specs[self._own], place)] if self.several else []
+        return [_endpoint(self._specs[self._own], place, protocol)] if self.several else []
 
-    def dials(self) -> list[str]:
+    def dials(self, protocol: str) -> list[str]:
         """Return where the routers are that those of this host dial: of the hosts before it."""
         before = list(self._specs)[:list(self._specs).index(self._own)] if self.several else []
-        return [_endpoint(self._specs[host], place) for host in before
+        return [_endpoint(self._specs[host], place, protocol) for host in before
                 for place in range(len(ROUTERS))]
 
     def meeting_place(self) -> tuple[str, int]:
@@ -82,6 +101,6 @@ class Hosts:
         return first.address, first.port + len(ROUTERS)
 
 
-def _endpoint(host: HostSpec, place: int) -> str:
+def _endpoint(host: HostSpec, place: int, protocol: str) -> str:
     address = f"[{host.address}]" if ":" in host.address else host.address
-    return f"tcp/{address}:{host.port + place}"
+    return f"{protocol}/{address}:{host.port + place}"

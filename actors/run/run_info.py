@@ -31,7 +31,9 @@ class RunInfo(msgspec.Struct, frozen=True):
     `folder` holds the sockets of its nodes, `nodes`; `origin_s` is a reading of the machine's
     monotonic clock. `page` is where the operator's page is, without its token. `plan` is
     what a recording keeps of the run's plan. `replay_of` names the file of a replay. `host` is
-    which of the run's machines this is, "" the first, and the only one.
+    which of the run's machines this is, "" the first, and the only one. `keys` is the folder of
+    keys of a run that has one, and `ports` are those of loopback on which its routers are spoken
+    with then.
     """
 
     pid: int
@@ -48,6 +50,8 @@ class RunInfo(msgspec.Struct, frozen=True):
     plan: dict[str, Any] = {}
     replay_of: str = ""
     host: str = ""
+    keys: str = ""
+    ports: tuple[int, ...] = ()
 
     @property
     def endpoints(self) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.run_folder import ROUTERS
+from rampart.actors.bus.zenoh_session import Credentials, credentials_in
 from rampart.actors.ftm.messages import NamedFault
 from rampart.actors.web.access import page_url
 from rampart.files import toml
@@ -54,6 +55,8 @@ class RunPlan(msgspec.Struct, frozen=True):
         faults: what the page offers to inject by name.
         waits: True has the mission wait until the operator starts it from the page.
         virtual: whether time is virtual: nothing outside of the process is used.
+        keys: folder of keys, "" for a run without.
+        ports: of loopback, on which the routers are spoken with in a run with keys; the launcher's.
         options: of the system's application, in place of what the spec says.
         host: name of the machine that this is the plan of; "" on the first, and on the only one.
         incarnations: of the supervisor and the routers of this host begin above this number.
@@ -79,6 +82,8 @@ class RunPlan(msgspec.Struct, frozen=True):
     faults: tuple[NamedFault, ...] = ()
     waits: bool = False
     virtual: bool = False
+    keys: str = ""
+    ports: tuple[int, ...] = ()
     options: dict[str, Any] = {}
     host: str = ""
     incarnations: int = 0
@@ -98,6 +103,10 @@ class RunPlan(msgspec.Struct, frozen=True):
         """What a recording keeps of it: no secrets, and nothing that is true of one run only."""
         return {**self.options, **{name: getattr(self, name) for name in (
             "system_file", "strategy", "shadow", "seed", "ftm")}}
+
+    def credentials(self, name: str) -> Credentials | None:
+        """Return those of one of its processes; None in a run without keys."""
+        return credentials_in(self.keys, name, self.folder, self.ports)
 
     @property
     def hmi_page(self) -> str:

@@ -177,6 +177,11 @@ class Declared(Handlers):
         return ()
 
     @classmethod
+    def own_keys(cls, parameters: Any) -> tuple[str, ...]:  # noqa: ARG003
+        """Keys below `rampart/` that are no topics, between the node and what it has started."""
+        return ()
+
+    @classmethod
     def published(cls, key: str, name: str, parameters: Any) -> Topic[Any] | None:
         """Return the topic of a key below `rampart/`, if the node `name` publishes it."""
         for topic in (*cls.outputs, *BASE_OUTPUTS):

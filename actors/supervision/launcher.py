@@ -44,6 +44,9 @@ from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 from rampart.files import working_folder
 
 LOAD_TIMEOUT_S = 60.0
+LAST_PORT = 32_000
+"""Above are those that the kernel gives to outgoing connections."""
+
 STARTUP_S = (0.8, 5.0)
 """Simulated time 0 lies between so many wall seconds after the start of the first actor: until
 then all processes start at once, and silence is no fault."""
@@ -85,6 +88,7 @@ class Launcher:
         self._loaded: BinaryIO | None = None
         self._begun_s = self._load_s = 0.0
         self._info: socket.socket | None = None
+        self._kept_ports: list[socket.socket] = []
         self._descriptors = 0
         self.guard = Guard(self.plan, self._spawners, self._load)
         self._keeping: asyncio.Task[None] | None = None
@@ -114,9 +118,12 @@ class Launcher:
                 run_folder.issue(folder, (OBSERVER,), 1)
             except OSError as error:
                 raise LaunchError(f"no folder for the run's sockets: {error}") from None
+            if self.plan.keys:
+                self._kept_ports = kept_ports(port)
             on_failure.pop_all()
         self._info = info
-        self.plan = msgspec.structs.replace(self.plan, folder=folder)
+        self.plan = msgspec.structs.replace(self.plan, folder=folder, ports=tuple(
+            one.getsockname()[1] for one in self._kept_ports))
         self._spawners.folder = folder
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self._lifeline = os.pipe()
@@ -157,8 +164,9 @@ class Launcher:
             set_title(self.plan.base_port, self.plan.launcher_pid, (f"spawner_{name}",), 1)
             os.close(output)
             os.close(self._lifeline[1])
-            if self._info is not None:
-                self._info.close()
+            for listener in (self._info, *self._kept_ports):
+                if listener is not None:
+                    listener.close()
             nothing = os.open(os.devnull, os.O_RDONLY)
             os.dup2(nothing, 0)
             os.close(nothing)
@@ -242,8 +250,10 @@ class Launcher:
 
     def observers_bus(self) -> ZenohBus:
         """Return the bus of an observer in this process, which hears all nodes; not yet open."""
-        return ZenohBus(on_host(OBSERVER, self.plan.host), 1, endpoints(self.plan.folder),
-                        recorder=RecorderConnection(self.plan.base_port))
+        name = on_host(OBSERVER, self.plan.host)
+        return ZenohBus(name, 1, endpoints(self.plan.folder),
+                        recorder=RecorderConnection(self.plan.base_port),
+                        credentials=self.plan.credentials(name))
 
     # -- tools ----------------------------------------------------------------------------------
 
@@ -253,7 +263,7 @@ class Launcher:
             os.getpid(), self.plan.base_port, self.plan.rate, self.plan.origin_s,
             self.plan.system_file, self.plan.folder, self.names, self.plan.run_id,
             self.plan.hmi_port, self._title, self.plan.hmi_page, self.plan.description,
-            host=self.plan.host)
+            host=self.plan.host, keys=self.plan.keys, ports=self.plan.ports)
 
     # -- end ------------------------------------------------------------------------------------
 
@@ -274,6 +284,8 @@ class Launcher:
     def abort(self) -> None:
         """End all processes of the run at once. Harmless when there are none."""
         self._spawners.close()
+        for port in self._kept_ports:
+            port.close()
         for end in self._lifeline:
             if end >= 0:
                 os.close(end)
@@ -290,6 +302,36 @@ class Launcher:
         end_commands(self.plan.folder)
         run_folder.remove(self.plan.folder)
         self._reap()
+
+
+def kept_ports(first: int, number: int = len(run_folder.ROUTERS)) -> list[socket.socket]:
+    """Return sockets that keep ports of loopback for the routers of a run with keys.
+
+    A router listens on a port that is kept all the same, for both have SO_REUSEADDR; no other run
+    takes it while the router is restarted, and the kernel gives it to no outgoing connection.
+
+    Args:
+        first: of the ports that are tried.
+        number: of ports.
+
+    Raises:
+        LaunchError: there are too few.
+    """
+    found: list[socket.socket] = []
+    for port in range(first, LAST_PORT + 1):
+        if len(found) == number:
+            break
+        kept = socket.socket()
+        try:
+            kept.bind(("127.0.0.1", port))
+        except OSError:
+            kept.close()
+            continue
+        kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # not before: it would fit any
+        found.append(kept)
+    if len(found) < number:
+        raise LaunchError(f"--port {first}: no ports for the routers from there to {LAST_PORT}")
+    return found
 
 
 def _has_one_thread() -> bool:

@@ -33,6 +33,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rampart.actors.access.rules import access_of
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import ROUTERS, register_of
@@ -89,7 +90,11 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
     clock = clock_of(layout.plan, loop.time)
     recorder = RecorderConnection(layout.plan.base_port)
     if bus is None:
-        bus = ZenohBus(name, incarnation, *_ends(layout, name), recorder)
+        plan = layout.plan
+        bus = ZenohBus(name, incarnation, *_ends(layout, name), recorder,
+                       credentials=plan.credentials(name),
+                       access=access_of(layout, plan.keys)
+                       if plan.keys and name in plan.routers else None)
     else:
         bus.take_name(name, incarnation, recorder)
     return member.actor(Context(
@@ -104,11 +109,13 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
 def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:
     """Return what an actor's session dials, and where it listens, which a router's does."""
     folder, place = layout.plan.folder, layout.plan.routers.get(name)
+    protocol = "tls" if layout.plan.keys else "tcp"
     if place is None:
         return endpoints(folder), []
     own, hosts = endpoint(folder, place), layout.hosts
     beside = [one for one in endpoints(folder) if one != own]
-    return [*beside, *hosts.dials()], [own, *hosts.listens(ROUTERS.index(place))]
+    return [*beside, *hosts.dials(protocol)], [
+        own, *hosts.listens(ROUTERS.index(place), protocol)]
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:

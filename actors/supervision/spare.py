@@ -2,6 +2,7 @@
 
 A spawner keeps some (`[supervision] spares`), and hands a request to fork over to one instead of
 forking: that saves the fork and the opening of the session, two thirds of what a new process takes.
+In a run with keys the session is the node's, by whose key it is opened; then it saves the rest.
 It is a process like others. One that was killed is seen at once. It is asked each second whether it
 turns, so one that is stopped or hangs is found out though nobody needs it; if somebody does before,
 it does not take the request within `_TAKE_MS`, and the spawner forks as if there were none. Which
@@ -27,8 +28,9 @@ from typing import Any, NoReturn
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.bus.zenoh_session import endpoints
+from rampart.actors.bus.zenoh_session import endpoints, warm_up
 from rampart.actors.ftm.patience import Patience, usage
+from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.supervision.process_title import kill
 
 _TAKE_MS = 10
@@ -49,8 +51,9 @@ _HUNG_S = 0.9
 _READY, _TAKEN, _ASKED = b"r", b"t", b"?"
 _REQUEST_BYTES = 160_000
 
-Begin = Callable[[bytes, socket.socket, ZenohBus], Coroutine[Any, Any, int]]
-"""What a spare does with a request: given it, the connection it came by, and the open bus."""
+Begin = Callable[[bytes, socket.socket, ZenohBus | None], Coroutine[Any, Any, int]]
+"""What a spare does with a request: given it, the connection it came by, and the open bus, if it
+has one."""
 
 
 class Spare:
@@ -210,18 +213,32 @@ def _read(token: int) -> bool:
         return False
 
 
-async def wait(control: socket.socket, folder: str, begin: Begin) -> int:
+async def _session(plan: RunPlan) -> ZenohBus | None:
+    """Return an open session; None in a run with keys, where it takes the key of a node to join.
+
+    Raises:
+        BusError: there is no router.
+    """
+    shown = plan.credentials("")
+    if shown is not None:
+        await asyncio.to_thread(warm_up, shown)
+        return None
+    bus = ZenohBus("", 0, endpoints(plan.folder))
+    await bus.open()
+    return bus
+
+
+async def wait(control: socket.socket, plan: RunPlan, begin: Begin) -> int:
     """Be a spare: open a session, take one request, run until that is over, return its exit code.
 
     Args:
         control: connection to the spawner; when it ends, so does this.
-        folder: of the run.
+        plan: of the run.
         begin: what to do with the request.
     """
     loop = asyncio.get_running_loop()
-    bus = ZenohBus("", 0, endpoints(folder))
     try:
-        await bus.open()
+        bus = await _session(plan)
     except BusError:  # without routers nobody needs it
         return 0
     control.setblocking(False)

@@ -270,11 +270,12 @@ class Spawner:
             set_title(plan.base_port, plan.launcher_pid, (f"spare_{self.name}",), 1)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
-            async def begin(data: bytes, connection: socket.socket, bus: ZenohBus) -> int:
+            async def begin(data: bytes, connection: socket.socket,
+                            bus: ZenohBus | None) -> int:
                 role = self._role(msgspec.json.decode(data, type=ForkRequest), connection)
                 return await live(self._layout, role, self._known(), self._lifeline, bus)
 
-            code = asyncio.run(wait(control, plan.folder, begin))
+            code = asyncio.run(wait(control, plan, begin))
         finally:
             sys.stdout.flush()
             sys.stderr.flush()

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-PARTS = ("peers", "floors", "restart", "size")
+PARTS = ("peers", "floors", "restart", "size", "keys")
 """Of the benchmark, in the sequence in which they are measured; fields of `Figures`."""
 
 SIZES = "10,35,70,140"
@@ -196,3 +196,4 @@ class Figures(msgspec.Struct, frozen=True):
     floors: tuple[Floor, ...] | None = None
     restart: tuple[Killed, ...] | None = None
     size: tuple[Size, ...] | None = None
+    keys: tuple[Floor, ...] | None = None

@@ -117,12 +117,14 @@ def _trips(folder: Path, show: Show) -> Floor:
     raw: list[float] = []
     ours: list[float] = []
     note = ""
+    file = folder / "talk.toml"
+    file.write_text(talking_system(), encoding="utf-8")
     try:
         for number in range(_TRIP_ROUNDS):
             show(f"round trip without actors, {number + 1} of {_TRIP_ROUNDS}")
             raw += _raw_trips(folder, number)
             show(f"round trip of actors, {number + 1} of {_TRIP_ROUNDS}")
-            ours += _actors_trips(folder)
+            ours += trips_of_actors(file, folder)
     except BenchError as error:
         note = str(error)
     floor, against = spread([1e3 * s for s in raw]), spread([1e3 * s for s in ours])
@@ -143,10 +145,18 @@ def _raw_trips(folder: Path, number: int) -> list[float]:
                          if line.text != "ready"], "raw asker")
 
 
-def _actors_trips(folder: Path) -> list[float]:
-    file = folder / "talk.toml"
-    file.write_text(talking_system(), encoding="utf-8")
-    with System(file, folder, changes=[PING.key]) as system:
+def trips_of_actors(file: Path, folder: Path, keys: str = "") -> list[float]:
+    """Return round trips of the two actors of `talking_system`, seconds.
+
+    Args:
+        file: the system.
+        folder: for checkpoints.
+        keys: folder of keys; "" for none.
+
+    Raises:
+        BenchError: it cannot be started, or too little was heard.
+    """
+    with System(file, folder, changes=[PING.key], keys=keys) as system:
         time.sleep(_TRIP_S)
         found = [said for line in list(system.ear.lines) if (said := heard(line))]
         return _settled([said.body["last_s"] for said in found if said.body["last_s"] > 0],

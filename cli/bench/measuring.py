@@ -36,9 +36,11 @@ from rampart.cli.output import (
     unknown,
     warn,
 )
+from rampart.cli.verbs import extra
 from rampart.sim.runs.report import write_atomically
 
 MOST_KILLS, MOST_PROCESSES = 1000, 500
+_OF_NODES = ["restart", "keys"]
 _DIGITS, _PATH_BYTES = 5, 40
 
 
@@ -60,7 +62,8 @@ def bench(options: argparse.Namespace) -> int:
                 keepers, kills, Path(options.peers_in), folder, show),
             "floors": lambda: floors.measure_floors(kills, folder, show, figures.peers or ()),
             "restart": lambda: restart.measure_restart(file, nodes, kills, folder, show),
-            "size": lambda: size.measure_size(sizes, kills, folder, show)}
+            "size": lambda: size.measure_size(sizes, kills, folder, show),
+            "keys": lambda: _of_keys().measure_keys(file, nodes, kills, folder, show)}
         for part in parts:
             try:
                 rows = measure[part]()
@@ -81,6 +84,21 @@ def bench(options: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
+def _of_keys() -> Any:
+    """Return the part of that name.
+
+    Raises:
+        BenchError: the extra that it needs is not installed.
+    """
+    try:
+        extra("keys", "cryptography")
+    except UsageError as error:
+        raise BenchError(str(error)) from None
+    from rampart.cli.bench import keys  # noqa: PLC0415 of the extra
+
+    return keys
+
+
 def _checked(options: argparse.Namespace, parts: Sequence[str]
              ) -> tuple[list[str], list[int], Path, list[str]]:
     """Return keepers, sizes, system and its nodes, as they were chosen.
@@ -89,11 +107,11 @@ def _checked(options: argparse.Namespace, parts: Sequence[str]
         UsageError: one of them cannot be, or is no business of the parts.
     """
     between("--kills", options.kills, 1, MOST_KILLS)
-    for name, value, part in (("peer", options.peer, "peers"), ("node", options.node, "restart"),
-                              ("system", options.system, "restart")):
-        if value and part not in parts:
-            raise UsageError(f"--{name}: only with the part {part}; leave out --only, or say "
-                             f"--only {part}")
+    for name, value, of in (("peer", options.peer, ["peers"]), ("node", options.node, _OF_NODES),
+                            ("system", options.system, _OF_NODES)):
+        if value and not set(of) & set(parts):
+            raise UsageError(f"--{name}: only with the part {' or '.join(of)}; leave out --only, "
+                             f"or say --only {of[0]}")
     for name in options.peer:
         if name not in KEEPERS:
             raise unknown("peer", name, KEEPERS)
@@ -106,7 +124,7 @@ def _checked(options: argparse.Namespace, parts: Sequence[str]
         sizes.append(int(text))
     file = systems.find(options.system) if options.system else systems.DEFAULT
     nodes: list[str] = []
-    if "restart" in parts:
+    if set(_OF_NODES) & set(parts):
         systems_of_tools.load(options.system)
         with refusing(ValueError):
             members = restart.members_of(file)

@@ -149,13 +149,21 @@ def _peers(rows: Sequence[Killed]) -> Section:
         plot("SIGKILL to the replacement's first output", _outputs(rows, tuple(OURS))))
 
 
-def _floors(rows: Sequence[Floor]) -> Section:
+def _beside(rows: Sequence[Floor]) -> list[Lane]:
     lanes = []
     for row in rows:
         if row.floor and row.unit == "ms":
             lanes.append(Lane(row.title, (), row.floor))
             if row.ours:
                 lanes.append(Lane(row.against, (), row.ours, ours=True))
+    return lanes
+
+
+def _aim(row: Floor) -> str:
+    return row.note or (f"at most {row.target:g}" if row.target else "")
+
+
+def _floors(rows: Sequence[Floor]) -> Section:
     return Section(
         "floors", "What cannot be beaten",
         "Milliseconds, median (5 to 95 %), and how many times as long what is compared with it "
@@ -163,9 +171,18 @@ def _floors(rows: Sequence[Floor]) -> Section:
         ("floor", "takes", "5 to 95 %", "compared with it", "takes", "5 to 95 %", "ratio",
          "target"),
         tuple((row.title, _median(row.floor), _range(row.floor), row.against, _median(row.ours),
-               _range(row.ours), number(row.ratio),
-               row.note or (f"at most {row.target:g}" if row.target else "")) for row in rows),
-        plot("Floors, and what stands on them", lanes))
+               _range(row.ours), number(row.ratio), _aim(row)) for row in rows),
+        plot("Floors, and what stands on them", _beside(rows)))
+
+
+def _keys(rows: Sequence[Floor]) -> Section:
+    return Section(
+        "keys", "What keys cost",
+        "Milliseconds, median (5 to 95 %), without keys and with them, in turn.",
+        ("", "without", "5 to 95 %", "with keys", "5 to 95 %", "ratio", "target"),
+        tuple((row.title, _median(row.floor), _range(row.floor), _median(row.ours),
+               _range(row.ours), number(row.ratio), _aim(row)) for row in rows),
+        plot("Without keys, and with them", _beside(rows)))
 
 
 def _restart(rows: Sequence[Killed]) -> Section:
@@ -211,6 +228,8 @@ def sections(figures: Figures) -> list[Section]:
         found.append(_restart(figures.restart))
     if figures.size is not None:
         found.append(_size(figures.size))
+    if figures.keys is not None:
+        found.append(_keys(figures.keys))
     return found
 
 

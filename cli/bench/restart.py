@@ -75,7 +75,7 @@ def output_of(member: Member, said: Sequence[Heard]) -> str | None:
 
 
 def measure_restart(file: Path, names: Sequence[str], kills: int, folder: Path,
-                    show: Show) -> tuple[Killed, ...]:
+                    show: Show, *, keys: str = "") -> tuple[Killed, ...]:
     """Kill nodes of a system that runs, in rounds.
 
     Args:
@@ -84,6 +84,7 @@ def measure_restart(file: Path, names: Sequence[str], kills: int, folder: Path,
         kills: Of each.
         folder: For checkpoints.
         show: Shows what is being done.
+        keys: Folder of keys; "" for none.
 
     Raises:
         BenchError: The system cannot be started.
@@ -94,7 +95,7 @@ def measure_restart(file: Path, names: Sequence[str], kills: int, folder: Path,
     show(f"starting {file.stem}")
     with System(file, folder, sorted(patterns), [
             topics.PROCESS_EVENT.key, topics.DECISION.key,
-            topics.DETECTION.key.replace("{name}", "*")]) as system:
+            topics.DETECTION.key.replace("{name}", "*")], keys) as system:
         show(f"{file.stem} comes to work")
         time.sleep(WARM_S)
         said = [one for line in list(system.ear.lines) if (one := heard(line))]

@@ -101,6 +101,7 @@ class System:
         folder: For what it keeps.
         first: Keys of which the first message of each process is observed.
         changes: Keys of which each message that says something new is.
+        keys: Folder of keys; "" for none.
 
     Attributes:
         port: Its base port.
@@ -112,18 +113,19 @@ class System:
     """
 
     def __init__(self, file: Path, folder: Path, first: Sequence[str] = (),
-                 changes: Sequence[str] = ()) -> None:
+                 changes: Sequence[str] = (), keys: str = "") -> None:
         self.port = free_port()
         begun_s = time.monotonic()
         with contextlib.ExitStack() as running:
             self.program = running.enter_context(Program(file.stem, of_ours(
-                "system_process", str(self.port), str(file), str(folder / "checkpoints")), folder))
-            self.folder = self.program.wait_for(_folder, START_S, "its sockets")
+                "system_process", str(self.port), str(file), str(folder / "checkpoints"), keys),
+                folder))
+            self.program.wait_for(_begun, START_S, "its sockets")
             ran_s = self.program.wait_for(_running, START_S, "the last of its processes")
             self.start_s = ran_s - begun_s
-            keys = [("--first", key) for key in first] + [("--changes", key) for key in changes]
+            heard = [("--first", key) for key in first] + [("--changes", key) for key in changes]
             self.ear = running.enter_context(observer(
-                "system", self.folder, *(word for pair in keys for word in pair)))
+                "system", str(self.port), *(word for pair in heard for word in pair)))
             self._running = running.pop_all()
 
     def __enter__(self) -> Self:
@@ -147,10 +149,10 @@ def observer(*arguments: str) -> Program:
     return program
 
 
-def _folder(line: Line) -> str | None:
+def _begun(line: Line) -> bool | None:
     if line.text.startswith("error: "):
         raise BenchError(line.text.removeprefix("error: "))
-    return line.text.removeprefix("folder ") if line.text.startswith("folder ") else None
+    return line.text == "begun" or None
 
 
 def _running(line: Line) -> float | None:

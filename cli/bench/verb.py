@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
     """Measure, show, and write the page.
 
     Measure how soon a killed process works again, and what a system costs, on
-    this machine. Four parts:
+    this machine. Five parts:
 
       peers    one small node (Zenoh, numpy, input at 20 Hz) killed under dora,
                supervisord, circus, a loop round subprocess, and under Rampart: as
@@ -44,6 +44,8 @@ def run(options: argparse.Namespace) -> int:
                alone: what cannot be beaten, with the ratio to what Rampart takes
       restart  every node of a whole system killed while it works
       size     systems of 10 to 140 processes: start, memory, processor, restart
+      keys     the same nodes killed, and round trips, with keys and without, in turn;
+               needs the extra: pip install 'rampart[keys]'
 
     Kills go round: each round kills once under each keeper, so that a slow moment of
     the machine hits all. Ratios are of the same run; figures of two runs, or of a

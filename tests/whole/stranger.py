@@ -55,7 +55,7 @@ def talk_zenoh(endpoint: str, seconds: float) -> int:
     """Join by plain Zenoh, say everything to everybody, and return how much was heard."""
     heard: list[Any] = []
     try:
-        session = zenoh.open(session_config(None, [endpoint]))
+        session = zenoh.open(session_config((), [endpoint]))
     except zenoh.ZError:
         return 0
     with session:

@@ -176,7 +176,7 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
         "import sys, zenoh, time\n"
         "from rampart.actors.osmosis import topics\n"
         "from rampart.actors.bus.zenoh_bus import session_config\n"
-        "s = zenoh.open(session_config(None, sys.argv[1:]))\n"
+        "s = zenoh.open(session_config((), sys.argv[1:]))\n"
         "time.sleep(1)\n"
         "names = ['DM1', 'RM1', 'osmosis_control', 'no/such', 'x']\n"
         "for _ in range(3):\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,10 +45,26 @@ def specification(net: Network, folder: Path, *arguments: object) -> Path:
     return file
 
 
-def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_back(net, tmp_path):
+def with_keys(folder: Path, spec: Path) -> dict[str, tuple[str, ...]]:
+    """Return the arguments of each host by which it uses what it was given of a folder of keys."""
+    def keys(*arguments: object) -> None:
+        subprocess.run([sys.executable, "-m", "rampart.cli.main", "keys", *map(str, arguments)],
+                       check=True, capture_output=True, cwd=folder, timeout=60)
+
+    keys("init")
+    keys("issue", "--system", spec, "--operator", "ada")
+    for name in ("robot", "ground"):
+        keys("share", name, "--system", spec, "--to", name, "--person", "ada")
+    return {name: ("--keys", str(folder / name)) for name in ("robot", "ground")}
+
+
+@pytest.mark.parametrize("keyed", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_back(
+        net, tmp_path, keyed):
     spec = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1)
-    with (host(net, "ground", tmp_path / "g", spec) as ground,
-          host(net, "robot", tmp_path / "r", spec) as robot):
+    own = with_keys(tmp_path, spec) if keyed else {"robot": (), "ground": ()}
+    with (host(net, "ground", tmp_path / "g", spec, *own["ground"]) as ground,
+          host(net, "robot", tmp_path / "r", spec, *own["robot"]) as robot):
         ground.wait_for("takes part in run")
         robot.wait_for("ctrl-C ends it")
         ground.wait_for("router_b_ground adopted")
@@ -72,7 +89,7 @@ def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_ba
         robot.wait_until(lambda: "supervisor_ground unreachable" in robot.story[before:], 10,
                          "the loss of the other host was not told")
         robot.wait_until(lambda: None not in map(robot.pid, CELL_ON_GROUND), 5, "not taken over")
-        with host(net, "ground", tmp_path / "again", spec) as again:
+        with host(net, "ground", tmp_path / "again", spec, *own["ground"]) as again:
             again.wait_for("takes part in run")
             again.wait_for("camera respawned")
             robot.wait_until(lambda: not any(map(robot.pid, CELL_ON_GROUND)), 5, "not given back")

@@ -1,7 +1,7 @@
 """Who hears when a replacement works: a process of its own that prints what it hears, and when.
 
     observer.py bus ENDPOINT
-    observer.py system FOLDER [--first KEY]... [--changes KEY]...
+    observer.py system PORT [--first KEY]... [--changes KEY]...
 
 On a bus it is the router, publishes the input, and hears the output of the peers' nodes. In a
 Rampart system it is a client of the routers like any tool. A line of JSON is a `Heard`; `at_s` is
@@ -23,8 +23,10 @@ import zenoh
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.bus.zenoh_bus import PATIENCE_S
-from rampart.actors.bus.zenoh_session import endpoints, session_config
+from rampart.actors.bus.zenoh_session import Credentials, session_config
+from rampart.actors.run.run_info import find_run
 from rampart.cli.bench.actors import INPUT_HZ, OUTPUT, is_mean, scan
+from rampart.cli.session import tools_credentials
 
 _LOOK_S = 0.05
 
@@ -98,8 +100,8 @@ def bus(observer: Observer, endpoint: str) -> None:
             source.put(scan(number))
 
 
-def system(observer: Observer, folder: str, first: list[str], changes: list[str]) -> None:
-    """Hear topics of the Rampart system whose sockets are in a folder, until stdin closes."""
+def system(observer: Observer, port: int, first: list[str], changes: list[str]) -> None:
+    """Hear topics of the Rampart system on a base port, until stdin closes."""
     decode = msgspec.msgpack.Decoder(tuple[str, int, int, float, msgspec.Raw]).decode
 
     def hear(key: str, tell: Callable[[Heard], None]) -> None:
@@ -118,7 +120,8 @@ def system(observer: Observer, folder: str, first: list[str], changes: list[str]
 
         session.declare_subscriber(f"{ROOT}/{key}", arrived)
 
-    with joined(endpoints(folder)) as session:
+    run = find_run(port)
+    with joined(run.endpoints, tools_credentials(run)[0]) as session:
         for key in first:
             hear(key, observer.first)
         for key in changes:
@@ -127,7 +130,7 @@ def system(observer: Observer, folder: str, first: list[str], changes: list[str]
         _closed().wait()
 
 
-def joined(dial: Sequence[str]) -> zenoh.Session:
+def joined(dial: Sequence[str], shown: Credentials | None = None) -> zenoh.Session:
     """Return the session of a client; on a busy machine a router may not answer at once.
 
     Raises:
@@ -136,7 +139,7 @@ def joined(dial: Sequence[str]) -> zenoh.Session:
     until_s = time.monotonic() + PATIENCE_S
     while True:
         try:
-            return zenoh.open(session_config((), dial))
+            return zenoh.open(session_config((), dial, shown))
         except zenoh.ZError:
             if time.monotonic() > until_s:
                 raise
@@ -159,14 +162,14 @@ def main() -> None:
     """Hear what the command line says."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=("bus", "system"))
-    parser.add_argument("where", metavar="ENDPOINT|FOLDER")
+    parser.add_argument("where", metavar="ENDPOINT|PORT")
     parser.add_argument("--first", action="append", default=[], metavar="KEY")
     parser.add_argument("--changes", action="append", default=[], metavar="KEY")
     options = parser.parse_args()
     if options.what == "bus":
         bus(Observer(), options.where)
     else:
-        system(Observer(), options.where, options.first, options.changes)
+        system(Observer(), int(options.where), options.first, options.changes)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """One Rampart system without a judge, for as long as it is measured: a process of its own.
 
-`system_process.py PORT SYSTEM CHECKPOINTS` prints `folder PATH` when the system's sockets are
+`system_process.py PORT SYSTEM CHECKPOINTS KEYS` prints `begun` when the system's sockets are
 there, and `running` when all of its processes are. It ends when its stdin closes, or at SIGTERM.
 """
 
@@ -36,7 +36,7 @@ class Watch(Actor):
             print("running", flush=True)
 
 
-async def run(port: int, system: str, checkpoints: str) -> None:
+async def run(port: int, system: str, checkpoints: str, keys: str) -> None:
     """Run a system until stdin closes.
 
     Raises:
@@ -46,13 +46,13 @@ async def run(port: int, system: str, checkpoints: str) -> None:
     loop = asyncio.get_running_loop()
     loop.add_signal_handler(signal.SIGTERM, over.set)
     await loop.connect_read_pipe(lambda: _UntilClosed(over), sys.stdin)
-    launcher = Launcher(RunPlan("bench", port, system_file=system, checkpoints=checkpoints),
-                        "benchmark")
+    launcher = Launcher(RunPlan("bench", port, system_file=system, checkpoints=checkpoints,
+                                keys=keys), "benchmark")
     launcher.begin()
     try:
         await launcher.load()
         await launcher.start()
-        print("folder", launcher.plan.folder, flush=True)
+        print("begun", flush=True)
         bus, clock = launcher.observers_bus(), Clock(launcher.plan.origin_s)
         watch = Watch(Context(OBSERVER, 1, clock, bus), launcher)
         task = asyncio.create_task(watch.run())
@@ -76,7 +76,7 @@ def main() -> int:
     """Run what the command line says."""
     working_folder.admit()
     try:
-        asyncio.run(run(int(sys.argv[1]), *sys.argv[2:4]))
+        asyncio.run(run(int(sys.argv[1]), *sys.argv[2:5]))
     except (LaunchError, ValueError, OSError) as error:
         print(f"error: {error}", flush=True)
         return 2

@@ -33,8 +33,8 @@ from tests import CELL
                            "rampart-actor, rampart-hot, rampart-command"),
     (["--only", "floors", "--peer", "dora"], "--peer: only with the part peers; leave out --only, "
                                              "or say --only peers"),
-    (["--only", "size", "--node", "x"], "--node: only with the part restart; leave out --only, or "
-                                        "say --only restart"),
+    (["--only", "size", "--node", "x"], "--node: only with the part restart or keys; leave "
+                                        "out --only, or say --only restart"),
     (["--sizes", "10,many"], "--sizes 10,many: 'many' is no number of processes; whole numbers "
                              "with commas between are right, as 10,35,70,140"),
     (["--sizes", "9"], "--sizes 9: must be between 10 and 500"),

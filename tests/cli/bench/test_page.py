@@ -29,7 +29,9 @@ ALL = Figures(
     restart=(killed("planner", "plan/route", [Kill(9.0, 10.0, None, 40.0)]),),
     size=(Size(10, 1.5, 12.0, 8.0, 120.0, 0.1, Spread(1, 30.0, 30.0, 30.0), 1.0,
                samples_ms=(30.0,)),
-          Size(140, note="did not start")))
+          Size(140, note="did not start")),
+    keys=(Floor("DM4", "DM4, killed", "ms", Spread(3, 20.0, 19.0, 25.0), "with keys",
+                Spread(3, 22.0, 20.0, 30.0), 1.1, 1.5),))
 
 
 @pytest.mark.parametrize(("low", "high", "expected"), [
@@ -56,13 +58,14 @@ def test_figures_have_three_digits(value, text):
 
 def test_each_part_has_its_rows():
     shown = {section.name: section for section in sections(ALL)}
-    assert list(shown) == ["peers", "floors", "restart", "size"]
+    assert list(shown) == ["peers", "floors", "restart", "size", "keys"]
     assert shown["peers"].rows[0] == (
         "dora & co", "5", "20", "300", "300 to 300", "10", "10 to 10", "1")
     assert shown["peers"].rows[2][-1] == "0; not installed: make bench-peers"
     assert shown["floors"].rows[1][-2:] == ("1.2", "at most 1.25")
     assert shown["restart"].rows[0][:3] == ("planner", "plan/route", "9")
     assert shown["size"].rows[1][-1] == "did not start"
+    assert shown["keys"].rows[0][-2:] == ("1.1", "at most 1.5")
     for section in shown.values():
         assert {len(row) for row in section.rows} == {len(section.head)}
 
@@ -75,7 +78,7 @@ def test_the_page_needs_nothing_but_itself():
     page = html(ALL)
     assert "rampart bench &lt;b&gt;" in page
     assert "dora &amp; co" in page
-    assert page.count("<svg") == 4
+    assert page.count("<svg") == 5
     assert not re.search(r"<script|<link|\bsrc=|@import|url\(", page)
     assert set(re.findall(r"https?://[^\"']+", page)) == {"http://www.w3.org/2000/svg"}
 

@@ -27,15 +27,15 @@ def test_the_first_host_s_names_are_those_of_a_system_of_one_machine():
     assert hosts.guards_of("") == ("supervisor", "router_a", "router_b")
     assert hosts.home_of["hmi"] == "ground"
     assert hosts.home_of["DM1"] == ""
-    assert hosts.dials() == []
-    assert hosts.listens(1) == ["tcp/192.168.7.1:7461"]
-    assert Hosts(SPEC, "ground").dials() == ["tcp/192.168.7.1:7460", "tcp/192.168.7.1:7461"]
+    assert hosts.dials("tcp") == []
+    assert hosts.listens(1, "tcp") == ["tcp/192.168.7.1:7461"]
+    assert Hosts(SPEC, "ground").dials("tls") == ["tls/192.168.7.1:7460", "tls/192.168.7.1:7461"]
     assert hosts.meeting_place() == ("192.168.7.1", 7462)
 
 
 def test_addresses_of_the_sixth_version_are_put_into_brackets():
     spec = parse_specification(TEXT.replace("192.168.7.1", "fd00::1"), "two.toml")
-    assert Hosts(spec).listens(0) == ["tcp/[fd00::1]:7460"]
+    assert Hosts(spec).listens(0, "tcp") == ["tcp/[fd00::1]:7460"]
 
 
 def test_a_module_beyond_the_link_has_so_much_less_time():

@@ -1,0 +1,182 @@
+"""Certificates: of an authority, and of those to whom it issues them. Pure; needs `cryptography`.
+
+Keys are of the curve P-256, which TLS libraries and browsers take alike. A file holds a private key
+and its certificate together, so that one cannot be exchanged without the other. Only a router's
+certificate is good for the listening side of a link: with a node's key nobody can pose as a router.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import ipaddress
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+"""Where a router of the same machine is spoken with."""
+
+_BACK = dt.timedelta(minutes=5)
+"""A certificate is valid from so long ago, for hosts whose clocks are behind."""
+
+_AUTHORITY = "Rampart authority"
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """What a certificate says.
+
+    Attributes:
+        common_name: of whom.
+        kind: what the owner is: router, node, operator, viewer.
+        not_before, not_after: between which it is valid, UTC.
+        fingerprint: SHA-256, in hexadecimal.
+        addresses: alternative names.
+        is_ours: whether the authority has signed it.
+        has_key: whether the private key with it is its own.
+    """
+
+    common_name: str
+    kind: str
+    not_before: dt.datetime
+    not_after: dt.datetime
+    fingerprint: str
+    addresses: tuple[str, ...]
+    is_ours: bool
+    has_key: bool
+
+
+def new_authority(now: dt.datetime, days: float) -> bytes:
+    """Return key and certificate of a new authority, PEM."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name(f"{_AUTHORITY} {secrets.token_hex(4)}", "authority")
+    certificate = _begun(name, name, key, now, days).add_extension(
+        x509.BasicConstraints(ca=True, path_length=0), critical=True).add_extension(
+        _usage(signs=True), critical=True).sign(key, hashes.SHA256())
+    return _pem(key, certificate)
+
+
+def public_part(pem: bytes) -> bytes:
+    """Return the certificate alone."""
+    return x509.load_pem_x509_certificate(pem).public_bytes(serialization.Encoding.PEM)
+
+
+def new_certificate(authority: bytes, common_name: str, kind: str, *,
+                    addresses: Sequence[str], now: dt.datetime, days: float) -> bytes:
+    """Return a new key and the certificate for it, PEM.
+
+    Args:
+        authority: key and certificate, PEM.
+        common_name: of whom.
+        kind: what that is; a router can be listened to.
+        addresses: of a router, at which it is spoken with: IP addresses and names.
+        now: UTC.
+        days: how long it is valid.
+
+    Raises:
+        ValueError: the authority's file is none.
+    """
+    issuer = x509.load_pem_x509_certificate(authority)
+    signing = serialization.load_pem_private_key(authority, None)
+    if not isinstance(signing, ec.EllipticCurvePrivateKey):
+        raise ValueError("not a key that rampart has made")
+    key = ec.generate_private_key(ec.SECP256R1())
+    uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
+    certificate = _begun(_name(common_name, kind), issuer.subject, key, now, days)
+    if kind == "router":
+        uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
+        certificate = certificate.add_extension(x509.SubjectAlternativeName(
+            [_alternative(one) for one in dict.fromkeys((*LOOPBACK, *addresses))]), critical=False)
+    signed = certificate.add_extension(
+        x509.BasicConstraints(ca=False, path_length=None), critical=True).add_extension(
+        _usage(signs=False), critical=True).add_extension(
+        x509.ExtendedKeyUsage(uses), critical=False).sign(signing, hashes.SHA256())
+    return _pem(key, signed)
+
+
+def read_certificate(pem: bytes, authority: bytes) -> Certificate:
+    """Return what the certificate in a file says.
+
+    Args:
+        pem: certificate, and its key or none.
+        authority: certificate of the authority.
+
+    Raises:
+        ValueError: either is none.
+    """
+    found, issuer = x509.load_pem_x509_certificate(pem), x509.load_pem_x509_certificate(authority)
+    try:
+        found.verify_directly_issued_by(issuer)
+        is_ours = True
+    except (ValueError, TypeError, InvalidSignature):
+        is_ours = False
+    try:
+        has_key = serialization.load_pem_private_key(pem, None).public_key() == found.public_key()
+    except (ValueError, TypeError):
+        has_key = False
+    try:
+        names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        addresses = tuple(str(one.value) for one in names)
+    except x509.ExtensionNotFound:
+        addresses = ()
+    return Certificate(
+        _said(found, NameOID.COMMON_NAME), _said(found, NameOID.ORGANIZATIONAL_UNIT_NAME),
+        found.not_valid_before_utc, found.not_valid_after_utc,
+        found.fingerprint(hashes.SHA256()).hex(), addresses, is_ours, has_key)
+
+
+def check_address(text: str) -> None:
+    """Refuse what can be no alternative name.
+
+    Raises:
+        ValueError: it is none.
+    """
+    _alternative(text)
+
+
+def _begun(subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey,
+           now: dt.datetime, days: float) -> x509.CertificateBuilder:
+    return x509.CertificateBuilder(
+        issuer, subject, key.public_key(), x509.random_serial_number(), now - _BACK,
+        now + dt.timedelta(days=days))
+
+
+def _name(common_name: str, kind: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, kind),
+                      x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _usage(*, signs: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs, content_commitment=False, key_encipherment=False,
+        data_encipherment=False, key_agreement=False, key_cert_sign=signs, crl_sign=signs,
+        encipher_only=False, decipher_only=False)
+
+
+def _alternative(text: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(text))
+    except ValueError:
+        pass
+    labels = text.split(".")
+    if not text.isascii() or len(text) > 253 or not all(
+            0 < len(one) < 64 and one.replace("-", "a").isalnum() for one in labels):
+        raise ValueError(f"{text!r} is no IP address and no name of a host")
+    return x509.DNSName(text)
+
+
+def _said(found: x509.Certificate, what: x509.ObjectIdentifier) -> str:
+    values = found.subject.get_attributes_for_oid(what)
+    return str(values[0].value) if values else ""
+
+
+def _pem(key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption()) + certificate.public_bytes(serialization.Encoding.PEM)

@@ -1,0 +1,309 @@
+"""A folder of keys: an authority, and what it has issued. Needs `cryptography`.
+
+`keys/` has mode 0700 and holds
+
+* `authority.key`, the authority's private key and certificate: for `rampart keys` alone, no run
+  needs it;
+* `ca.crt`, its certificate; `register.json`, who has one and who no longer: no secrets, the same
+  on every host;
+* `NAME.pem` of each identity, private key and certificate, mode 0600: for the host on which it is.
+
+Each file is written beside its place, synchronised, and renamed, so it is whole at every moment.
+The register comes first: who is killed between the two has an identity without a certificate, or a
+revoked one with a certificate that counts nowhere; either is shown, and mended by doing it again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import fcntl
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from rampart.actors.access.certificates import (
+    Certificate,
+    check_address,
+    new_authority,
+    new_certificate,
+    public_part,
+    read_certificate,
+)
+from rampart.actors.access.register import (
+    REGISTER,
+    SIGNING,
+    Identity,
+    KeysError,
+    Kind,
+    Register,
+    read_register,
+)
+from rampart.actors.bus.zenoh_session import AUTHORITY, key_file
+from rampart.files.reading import FileError, read_bytes
+
+__all__ = ["check", "check_address", "entries", "init", "issue", "revoke", "rotate"]
+
+AUTHORITY_DAYS = 1826.0
+DAYS: dict[str, float] = {"router": 30.0, "node": 30.0, "operator": 7.0, "viewer": 7.0}
+"""For how long certificates are valid unless told otherwise."""
+
+_MOST_BYTES = 64 << 10
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What there is of one identity.
+
+    Attributes:
+        name: of it.
+        identity: as the register has it.
+        certificate: None if there is no file of it here.
+        trouble: why its file cannot be used; "" if nothing is wrong, or there is none.
+    """
+
+    name: str
+    identity: Identity
+    certificate: Certificate | None
+    trouble: str
+
+
+def init(folder: Path, days: float = AUTHORITY_DAYS) -> None:
+    """Make a folder of keys with a new authority, or complete one whose making was interrupted.
+
+    Raises:
+        KeysError: there is an authority already, or the folder is not this user's alone.
+        OSError: it cannot be written.
+    """
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with _held(folder):
+        own, public, register = (folder / name for name in (SIGNING, AUTHORITY, REGISTER))
+        if own.exists() and public.exists() and register.exists():
+            raise KeysError(f"{folder}: has an authority already; a new one would make all that it "
+                            "has issued worthless")
+        if public.exists() and not own.exists():
+            raise KeysError(f"{folder}: has keys that were issued elsewhere; another folder is "
+                            "right")
+        if not own.exists():
+            _write(own, new_authority(_now(), days))
+        _write(public, public_part(_read(own)), 0o644)
+        if not register.exists():
+            _keep(folder, Register())
+
+
+def issue(folder: Path, names: Sequence[str], kind: Kind, addresses: Sequence[str] = (),
+          days: float | None = None) -> None:
+    """Issue certificates; who has one gets another, and the one before is good until it expires.
+
+    Args:
+        folder: of the keys.
+        names: of whom.
+        kind: what they are.
+        addresses: of routers, besides those of the loopback.
+        days: for how long; None for the default of the kind.
+
+    Raises:
+        KeysError: the authority is not here, or a name is another kind's.
+        OSError: a file cannot be written.
+    """
+    with _held(folder):
+        authority = _authority(folder)
+        register = read_register(folder).issued(names, kind)
+        common_names = register.of_kind(kind)
+        _keep(folder, register)
+        for name in names:
+            _write(_file(folder, name), new_certificate(
+                authority, common_names[name], kind, addresses=addresses, now=_now(),
+                days=DAYS[kind] if days is None else days))
+
+
+def rotate(folder: Path, names: Sequence[str], days: float | None = None) -> list[str]:
+    """Issue new keys and certificates to who has some, with the addresses that these have.
+
+    Args:
+        folder: of the keys.
+        names: of whom; empty for all.
+        days: for how long; None for the default of each kind.
+
+    Returns:
+        The names.
+
+    Raises:
+        KeysError: the authority is not here, or one of them has no certificate.
+        OSError: a file cannot be written.
+    """
+    here = {entry.name: entry for entry in entries(folder)}
+    chosen = list(names) or [name for name, one in here.items()
+                             if one.certificate is not None and not one.identity.revoked]
+    for name in chosen:
+        if name not in here or here[name].identity.revoked:
+            raise KeysError(f"{name}: has no certificate; `rampart keys issue` gives it one")
+    for name in chosen:
+        found, kind = here[name].certificate, here[name].identity.kind
+        issue(folder, [name], kind, found.addresses if found is not None else (), days)
+    return chosen
+
+
+def revoke(folder: Path, names: Sequence[str]) -> None:
+    """Have identities count no longer, and remove their files.
+
+    In force on a host when its routers have started with the register as it is then.
+
+    Raises:
+        KeysError: one of them has no certificate.
+        OSError: a file cannot be written.
+    """
+    with _held(folder):
+        _keep(folder, read_register(folder).revoked(names))
+        for name in names:
+            _file(folder, name).unlink(missing_ok=True)
+
+
+def share(folder: Path, to: Path, names: Sequence[str]) -> None:
+    """Copy the keys of some identities, and what everybody needs, into a new folder.
+
+    Raises:
+        KeysError: one of them has none that counts, or the new folder is there already.
+        OSError: a file cannot be read or written.
+    """
+    check(folder, names)
+    if to.exists():
+        raise KeysError(f"{to}: is there already; a new folder is right")
+    to.mkdir(mode=0o700)
+    for file in (folder / AUTHORITY, folder / REGISTER, *(_file(folder, name) for name in names)):
+        _write(to / file.name, _read(file))
+
+
+def entries(folder: Path) -> list[Entry]:
+    """Return what there is of each identity, by name.
+
+    Raises:
+        KeysError: the folder is none, or has no certificate of an authority.
+    """
+    register = read_register(folder)
+    authority = _read(folder / AUTHORITY)
+    found = []
+    for name, identity in sorted(register.identities.items()):
+        certificate, trouble = None, ""
+        try:
+            certificate = read_certificate(_read(_file(folder, name)), authority)
+            trouble = _trouble(name, identity, certificate)
+        except FileNotFoundError:
+            pass
+        except ValueError as error:
+            trouble = " ".join(str(error).split())
+        found.append(Entry(name, identity, certificate, trouble))
+    return found
+
+
+def _trouble(name: str, identity: Identity, certificate: Certificate) -> str:
+    if not certificate.is_ours:
+        return "of another authority"
+    if not certificate.has_key:
+        return "without its private key"
+    if certificate.common_name != identity.common_name(name):
+        return f"of {certificate.common_name}, and not of {identity.common_name(name)}"
+    return ""
+
+
+def check(folder: Path, names: Sequence[str]) -> dt.datetime:
+    """Check that a run can be started with the keys of a folder, and return until when.
+
+    Args:
+        folder: of the keys.
+        names: of all processes of the run.
+
+    Raises:
+        KeysError: others can read the folder, or one of them has no certificate that is valid.
+    """
+    _check_private(folder)
+    here = {entry.name: entry for entry in entries(folder)}
+    until, now = dt.datetime.max.replace(tzinfo=dt.UTC), _now()
+    for name in names:
+        entry, file = here.get(name), _file(folder, name)
+        if entry is None or entry.identity.revoked or (
+                entry.certificate is None and not entry.trouble):
+            why = "is revoked" if entry and entry.identity.revoked else "has no certificate"
+            raise KeysError(f"{file}: {name} {why}; `rampart keys issue` gives it one")
+        if entry.trouble or entry.certificate is None:
+            raise KeysError(f"{file}: {entry.trouble}; `rampart keys issue {name}` mends it")
+        if file.stat().st_mode & 0o077:
+            raise KeysError(f"{file}: others can read it; chmod 600 it")
+        if not entry.certificate.not_before <= now < entry.certificate.not_after:
+            raise KeysError(f"{file}: valid from {entry.certificate.not_before:%Y-%m-%d %H:%M} to "
+                            f"{entry.certificate.not_after:%Y-%m-%d %H:%M} UTC, and it is "
+                            f"{now:%Y-%m-%d %H:%M}; `rampart keys rotate` renews it")
+        until = min(until, entry.certificate.not_after)
+    return until
+
+
+def _check_private(folder: Path) -> None:
+    found = folder.stat()
+    if found.st_uid != os.geteuid() or found.st_mode & 0o077:
+        raise KeysError(f"{folder}: must be yours alone; chmod 700 it")
+
+
+def _file(folder: Path, name: str) -> Path:
+    return Path(key_file(str(folder), name))
+
+
+def _authority(folder: Path) -> bytes:
+    try:
+        return _read(folder / SIGNING)
+    except FileNotFoundError:
+        raise KeysError(f"{folder / SIGNING}: there is none; certificates are issued where the "
+                        "authority is") from None
+
+
+def _read(file: Path) -> bytes:
+    try:
+        return read_bytes(file, _MOST_BYTES)
+    except FileNotFoundError:
+        raise
+    except (OSError, FileError) as error:
+        raise KeysError(f"{file}: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _keep(folder: Path, register: Register) -> None:
+    text = msgspec.json.format(msgspec.json.encode(register, order="sorted"), indent=1)
+    _write(folder / REGISTER, text + b"\n", 0o644)
+
+
+def _write(file: Path, content: bytes, mode: int = 0o600) -> None:
+    """Write a file whole, or not at all."""
+    fresh = file.with_name(f".{file.name}~")
+    fresh.unlink(missing_ok=True)  # left by one that was killed here
+    made = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    with os.fdopen(made, "wb") as out:
+        os.fchmod(out.fileno(), mode)
+        out.write(content)
+        out.flush()
+        os.fsync(out.fileno())
+    fresh.replace(file)
+    place = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(place)
+    finally:
+        os.close(place)
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Have a folder for oneself: of two that change it at once the second one waits."""
+    try:
+        place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise KeysError(f"{folder}: {error.strerror}; `rampart keys init` makes it") from None
+    try:
+        _check_private(folder)
+        fcntl.flock(place, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(place)
+
+
+def _now() -> dt.datetime:
+    return dt.datetime.now(dt.UTC)

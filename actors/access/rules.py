@@ -1,0 +1,206 @@
+"""The access rules that a router enforces, as Zenoh's `access_control`.
+
+Nothing but what they allow is let through.
+
+A router knows who is at the other end of a link by the name in its certificate, and looks at each
+message that comes in by the link and each that goes out. Names are literal to Zenoh, so a rule is
+written for each identity.
+
+* A client gets its own rights (`rampart.actors.access.rights`).
+* The other router of the same host gets everything: it has checked what it hands on.
+* A router of another host gets what the nodes there may do together, and people if tools are used
+  there. What it says beyond that is refused, whoever it claims to hand it on for.
+
+Going out, besides what somebody hears, is who else hears and asks: a publisher that did not know
+would not send. So of all subscriptions and questions of the system those go out that meet what the
+other end may say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from rampart.actors.access.register import Register, read_register
+from rampart.actors.access.rights import (
+    EVERYTHING,
+    OPERATOR,
+    VIEWER,
+    Rights,
+    rights_of_all,
+    together,
+)
+from rampart.actors.bus.run_folder import ROUTERS
+from rampart.actors.layout.layout import Layout
+
+INGRESS, EGRESS = "ingress", "egress"
+PUT, SUBSCRIBER, QUERY, QUERYABLE, REPLY = (
+    "put", "declare_subscriber", "query", "declare_queryable", "reply")
+TOKEN, TOKENS, TOKEN_QUERY = (
+    "liveliness_token", "declare_liveliness_subscriber", "liveliness_query")
+MESSAGES = (PUT, SUBSCRIBER, QUERY, QUERYABLE, REPLY, TOKEN, TOKENS, TOKEN_QUERY, "delete")
+"""All that Zenoh can refuse."""
+
+Grant = tuple[str, tuple[str, ...], frozenset[str]]
+"""Flow, messages, and the key expressions for which they are let through."""
+
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """One machine of a system.
+
+    Attributes:
+        name: of it; "" where there is one only.
+        routers: names of its routers.
+        nodes: names of the other processes there that have certificates.
+        people: whether tools of operators and viewers are used there.
+    """
+
+    name: str = ""
+    routers: tuple[str, ...] = ROUTERS
+    nodes: frozenset[str] = frozenset()
+    people: bool = True
+
+
+class _Meeting:
+    """Which key expressions of a system meet others."""
+
+    def __init__(self) -> None:
+        self._parsed: dict[str, zenoh.KeyExpr] = {}
+
+    def of(self, those: Iterable[str], these: Iterable[str]) -> frozenset[str]:
+        """Return those of the first that have a key in common with one of the second."""
+        wanted = [self._parse(key) for key in these]
+        return frozenset(key for key in those
+                         if any(self._parse(key).intersects(one) for one in wanted))
+
+    def _parse(self, key: str) -> zenoh.KeyExpr:
+        found = self._parsed.get(key)
+        if found is None:
+            found = self._parsed[key] = zenoh.KeyExpr(key)
+        return found
+
+
+def grants(own: Rights, everybody: Rights, meeting: _Meeting | None = None) -> list[Grant]:
+    """Return what a router lets through on a link to somebody.
+
+    Args:
+        own: what that one may.
+        everybody: what all of the system may.
+        meeting: keeps what it has parsed.
+    """
+    meet = (meeting or _Meeting()).of
+    found: list[Grant] = [
+        (INGRESS, (PUT,), own.says),
+        (INGRESS, (SUBSCRIBER,), own.hears),
+        (INGRESS, (QUERY,), own.asks),
+        (INGRESS, (QUERYABLE, REPLY), own.answers),
+        (INGRESS, (TOKEN,), own.is_there),
+        (INGRESS, (TOKENS, TOKEN_QUERY), own.watches),
+        (EGRESS, (PUT,), own.hears),
+        (EGRESS, (SUBSCRIBER,), meet(everybody.hears, own.says)),
+        (EGRESS, (QUERY,), meet(everybody.asks, own.answers)),
+        (EGRESS, (QUERYABLE,), meet(everybody.answers, own.asks)),
+        (EGRESS, (REPLY,), own.asks),
+        (EGRESS, (TOKEN,), own.watches),
+        (EGRESS, (TOKENS, TOKEN_QUERY), meet(everybody.watches, own.is_there))]
+    return [grant for grant in found if grant[2]]
+
+
+_BETWEEN_ROUTERS: list[Grant] = [
+    (flow, tuple(one for one in MESSAGES if one != "delete"), frozenset({EVERYTHING}))
+    for flow in (INGRESS, EGRESS)]
+
+
+@dataclass(slots=True)
+class Rules:
+    """What the routers of one host let through, by the names in certificates."""
+
+    of: dict[str, list[Grant]] = field(default_factory=dict)
+
+    def config(self) -> dict[str, Any]:
+        """Return Zenoh's `access_control`."""
+        rules: list[dict[str, Any]] = []
+        subjects, policies = [], []
+        for name, granted in sorted(self.of.items()):
+            own = []
+            for number, (flow, messages, keys) in enumerate(granted):
+                own.append(f"{name} {number}")
+                rules.append({"id": own[-1], "permission": "allow", "flows": [flow],
+                              "messages": list(messages), "key_exprs": sorted(keys)})
+            if own:
+                subjects.append({"id": name, "cert_common_names": [name]})
+                policies.append({"rules": own, "subjects": [name]})
+        return {"enabled": True, "default_permission": "deny", "rules": rules,
+                "subjects": subjects, "policies": policies}
+
+
+def rules_of(host: Host, hosts: Sequence[Host], rights: Mapping[str, Rights],
+             register: Register) -> Rules:
+    """Return what the routers of a host let through.
+
+    Args:
+        host: theirs.
+        hosts: all of the system, this one among them.
+        rights: of all, see `rights_of_all`.
+        register: who has which certificate; nobody else may anything.
+    """
+    everybody, meeting = together(rights.values()), _Meeting()
+    routers, nodes = register.of_kind("router"), register.of_kind("node")
+    found: dict[str, list[Grant]] = {}
+    for name in host.routers:
+        if name in routers:
+            found[routers[name]] = _BETWEEN_ROUTERS
+    for name in host.nodes:
+        if name in nodes:
+            found[nodes[name]] = grants(rights[name], everybody, meeting)
+    for kind in (OPERATOR, VIEWER) if host.people else ():
+        people = register.of_kind(kind)
+        granted = grants(rights[kind], everybody, meeting) if people else []
+        found.update((common_name, granted) for common_name in people.values())
+    for other in hosts:
+        if other.name != host.name:
+            there = [rights[name] for name in (*other.nodes, *other.routers)]
+            there += [rights[kind] for kind in (OPERATOR, VIEWER) if other.people]
+            between = grants(together(there), everybody, meeting)
+            found.update((routers[name], between) for name in other.routers if name in routers)
+    return Rules(found)
+
+
+def hosts_of(layout: Layout) -> dict[str, Host]:
+    """Return the hosts of a system by name; "" is the first, which may run what others do."""
+    hosts = layout.hosts
+    return {name: Host(name, hosts.routers_of(name), hosts.may_run(name, layout.members))
+            for name in hosts.supervisors}
+
+
+def rules_as_declared(layout: Layout) -> dict[str, Any]:
+    """Return what routers let through if each process has a certificate of its own name.
+
+    And an operator and a viewer, called so.
+    """
+    hosts = hosts_of(layout)
+    register = Register().issued([OPERATOR], OPERATOR).issued([VIEWER], VIEWER)
+    for host in hosts.values():
+        register = register.issued(host.routers, "router").issued(sorted(host.nodes), "node")
+    return rules_of(hosts[layout.plan.host], list(hosts.values()), rights_of_all(layout),
+                    register).config()
+
+
+def access_of(layout: Layout, keys: str) -> dict[str, Any]:
+    """Return what the routers of a run on this host let through, as Zenoh's `access_control`.
+
+    Args:
+        layout: of the run.
+        keys: folder of keys, with the register as it is now.
+
+    Raises:
+        KeysError: there is no sound register.
+    """
+    hosts = hosts_of(layout)
+    return rules_of(hosts[layout.plan.host], list(hosts.values()), rights_of_all(layout),
+                    read_register(Path(keys))).config()

@@ -1,0 +1,322 @@
+"""`rampart keys`: who has a certificate, and so may join a run with keys.
+
+Issue and revoke the certificates of a run with keys.
+
+A folder of keys has an authority and a private key and certificate of each
+process and of each person. `rampart run --keys DIR` starts a run in which
+every link is mutual TLS, and in which a router lets through what the owner of
+a certificate declares and no more. Needs the extra:
+pip install 'rampart[keys]'.
+
+Examples:
+  rampart keys init                               an authority, in keys/
+  rampart keys issue --system osmosis             for all that runs
+  rampart keys issue --operator ada --viewer bob  for people
+  rampart run --keys keys
+  rampart keys show                               who, until when
+  rampart keys rotate                             new keys for all
+  rampart keys revoke ada                         no longer
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime as dt
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from rampart import systems as shipped
+from rampart.actors.access.register import IdentityName, KeysError, Kind, read_register
+from rampart.actors.bus.run_folder import ROUTERS
+from rampart.actors.layout.layout import Layout
+from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.cli import systems
+from rampart.cli.output import (
+    UsageError,
+    positive,
+    print_json,
+    print_table,
+    refusing,
+    say,
+    using,
+)
+from rampart.cli.verbs import (
+    JSON,
+    Option,
+    add_family,
+    add_verb,
+    extra,
+    number,
+    option,
+    several,
+    word,
+)
+
+if TYPE_CHECKING:
+    from rampart.actors.access.key_folder import Entry
+
+DEFAULT = "keys"
+
+_MOST_DAYS = 36_525
+_ROUTER = re.compile(rf"({'|'.join(ROUTERS)})(_\w+)?\Z")
+_SHOWN = 16
+"""Digits of a fingerprint in the table; --json has all 64."""
+
+
+def _names(text: str) -> Option:
+    return option("names", nargs="*", metavar="NAME", help=text)
+
+
+_FOLDER = word("--keys", "DIR", f"the folder of keys (default: {DEFAULT})", DEFAULT)
+_DAYS = number("--days", "N", "days until it expires (default: 30 for what runs, 7 for people)")
+
+
+def add(verbs: Any) -> None:
+    """Add the family to the parser."""
+    family = add_family(verbs, "keys", "issue and revoke certificates", __doc__ or "")
+    add_verb(family, "init", "make a folder of keys with an authority", init, _FOLDER,
+             number("--days", "N", "days until the authority expires (default: 1826)", 1826.0))
+    add_verb(family, "issue", "issue certificates", issue,
+             _names("of processes: nodes, modules, supervisor, observer, routers"), _FOLDER,
+             word("--system", "SPEC", "to all processes of this system, a file or the name of a "
+                  "shipped one"),
+             several("--operator", "NAME", "to somebody who may inject, adapt, reset and order; "
+                     "repeatable"),
+             several("--viewer", "NAME", "to somebody who may only look; repeatable"),
+             several("--address", "ADDRESS", "IP address or name at which other hosts reach the "
+                     "routers, besides the loopback; repeatable"), _DAYS)
+    add_verb(family, "rotate", "issue new keys to who has some", rotate,
+             _names("of whom (default: all)"), _FOLDER, _DAYS)
+    add_verb(family, "revoke", "let somebody in no more", revoke, _names("of whom"), _FOLDER)
+    add_verb(family, "share", "copy what a host needs", share,
+             option("host", metavar="HOST", help="name of the host"), _FOLDER,
+             option("--system", metavar="SPEC", required=True, help="the system"),
+             option("--to", metavar="DIR", required=True, help="the new folder"),
+             several("--person", "NAME", "the key of an operator or viewer who uses tools there, "
+                     "too; repeatable"))
+    add_verb(family, "show", "who has a certificate, and until when", show,
+             _names("of whom (default: all)"), _FOLDER, JSON)
+
+
+def init(options: argparse.Namespace) -> int:
+    """Make a folder of keys.
+
+    Make a folder of keys, mode 0700, with a new authority. Its private key,
+    authority.key, issues certificates and is needed by no run: keep it where no
+    robot is.
+
+    Examples:
+      rampart keys init
+      rampart keys init --keys ~/fleet --days 3650
+    """
+    positive("--days", options.days, below=_MOST_DAYS)
+    folder = Path(options.keys)
+    keys = _keys()
+    with refusing(KeysError), using(folder):
+        keys.init(folder, options.days)
+    say(f"{folder}: an authority; `rampart keys issue --keys {folder} --system NAME` is next")
+    return 0
+
+
+def issue(options: argparse.Namespace) -> int:
+    """Issue certificates.
+
+    Issue a private key and a certificate to processes and people. Who has one
+    gets another; the one before is good until it expires, or is revoked.
+
+    Examples:
+      rampart keys issue --system osmosis
+      rampart keys issue DM4 RM3 --days 2
+      rampart keys issue router_a router_b --address 10.0.0.2
+      rampart keys issue --operator ada
+    """
+    positive("--days", options.days, below=_MOST_DAYS)
+    names = dict.fromkeys([*options.names, *(_of_system(options.system) if options.system else ())])
+    routers = [name for name in names if _ROUTER.match(name)]
+    wanted: list[tuple[Kind, list[str]]] = [
+        ("router", routers), ("node", [name for name in names if name not in routers]),
+        ("operator", options.operator), ("viewer", options.viewer)]
+    if not any(those for _, those in wanted):
+        raise UsageError("issue: to whom? names are right, --system SPEC, --operator or --viewer")
+    for name in (name for _, those in wanted for name in those):
+        _check_name(name)
+    at = _addresses(options.system) if options.system else {}
+    folder, keys = Path(options.keys), _keys()
+    with refusing(KeysError, ValueError), using(folder):
+        if options.address and not routers:
+            raise UsageError(f"--address {options.address[0]}: only routers are reached by an "
+                             f"address; {' '.join(ROUTERS)} or --system is right with it")
+        for address in options.address:
+            keys.check_address(address)
+        register = read_register(folder)
+        for kind, those in wanted:  # all of them, before the first is issued
+            register = register.issued(those, kind)
+        for kind, those in wanted:
+            for addresses in dict.fromkeys(at.get(name, ()) for name in those):
+                there = [name for name in those if at.get(name, ()) == addresses]
+                reached = (*options.address, *addresses) if kind == "router" else ()
+                keys.issue(folder, there, kind, reached, options.days)
+            if those:
+                say(f"{kind}: {', '.join(those)}")
+    return 0
+
+
+def rotate(options: argparse.Namespace) -> int:
+    """Issue new keys.
+
+    Issue a new private key and certificate to who has some, of all kinds and
+    with the same addresses. A process takes them when it starts the next time,
+    and who is cut off because his has expired is restarted; the old ones are
+    good until they expire.
+
+    Examples:
+      rampart keys rotate
+      rampart keys rotate ada --days 1
+    """
+    positive("--days", options.days, below=_MOST_DAYS)
+    folder, keys = Path(options.keys), _keys()
+    with refusing(KeysError), using(folder):
+        done = keys.rotate(folder, options.names, options.days)
+    say(f"new: {', '.join(done) or 'none; nobody has a certificate'}")
+    return 0
+
+
+def revoke(options: argparse.Namespace) -> int:
+    """Let somebody in no more.
+
+    Revoke all certificates of a name. It is in force on a host when
+    register.json is there and its routers were restarted, one after the other:
+    kill-node router_a; kill-node router_b. A name that is issued to again
+    afterwards is another identity to the routers; they are to be restarted for
+    it, too.
+
+    Examples:
+      rampart keys revoke ada
+    """
+    if not options.names:
+        raise UsageError("revoke: whom? a name is right; `rampart keys show` lists them")
+    folder, keys = Path(options.keys), _keys()
+    with refusing(KeysError), using(folder):
+        keys.revoke(folder, options.names)
+    say(f"revoked: {', '.join(options.names)}; in force when the routers have been restarted: "
+        f"{'; '.join(f'kill-node {name}' for name in ROUTERS)}")
+    return 0
+
+
+def show(options: argparse.Namespace) -> int:
+    """Show who has a certificate.
+
+    Show each identity of a folder of keys: its kind, the name in its
+    certificate, until when that is valid, its fingerprint (SHA-256), and what is
+    wrong with it.
+
+    Examples:
+      rampart keys show
+      rampart keys show router_a --json
+
+    exit code: 0 all that are shown are valid; 1 one is not; 2 bad usage
+    """
+    folder, keys = Path(options.keys), _keys()
+    with refusing(KeysError), using(folder):
+        found = {entry.name: entry for entry in keys.entries(folder)}
+    for name in options.names:
+        if name not in found:
+            raise UsageError(f"{name}: {folder} knows nobody of this name")
+    shown = [found[name] for name in options.names or found]
+    now = dt.datetime.now(dt.UTC)
+    rows = [_row(entry, now) for entry in shown]
+    if options.json:
+        print_json({"keys": str(folder), "identities": rows})
+    else:
+        print_table(("name", "kind", "in its certificate", "until (UTC)", "fingerprint", "state"), [
+            (r["name"], r["kind"], r["common_name"], (r["not_after"] or "")[:16].replace("T", " "),
+             r["fingerprint"][:_SHOWN], r["state"]) for r in rows])
+    return 0 if all(row["state"] in {"valid", "revoked", "not here"} for row in rows) else 1
+
+
+def _row(entry: Entry, now: dt.datetime) -> dict[str, Any]:
+    certificate, identity = entry.certificate, entry.identity
+    state = "valid"
+    if identity.revoked:
+        state = "revoked"
+    elif entry.trouble:
+        state = entry.trouble
+    elif certificate is None:
+        state = "not here"
+    elif now >= certificate.not_after:
+        state = "expired"
+    elif now < certificate.not_before:
+        state = "not yet valid"
+    return {"name": entry.name, "kind": identity.kind,
+            "common_name": identity.common_name(entry.name), "state": state,
+            "revoked": identity.revoked,
+            "not_before": certificate.not_before.isoformat() if certificate else None,
+            "not_after": certificate.not_after.isoformat() if certificate else None,
+            "fingerprint": certificate.fingerprint if certificate else "",
+            "addresses": list(certificate.addresses) if certificate else []}
+
+
+def share(options: argparse.Namespace) -> int:
+    """Copy what a host needs.
+
+    Copy the keys of what may run on a host of a system, the register and the
+    certificate of the authority into a new folder, to be taken there. The first
+    host's has the keys of what others run, too: it takes over from them. The
+    authority's private key stays here.
+
+    Examples:
+      rampart keys share ground --system my.toml --to ground-keys
+      scp -pr ground-keys 192.168.7.2:
+    """
+    layout = _layout(options.system)
+    names = [host.name for host in layout.spec.hosts]
+    if options.host not in names:
+        raise UsageError(f"{options.host}: no host of {options.system}; known: "
+                         f"{', '.join(names) or 'none, it runs on one machine'}")
+    host = "" if options.host == names[0] else options.host
+    needed = [*layout.hosts.routers_of(host), *sorted(
+        layout.hosts.may_run(host, layout.members)), *options.person]
+    folder, to, keys = Path(options.keys), Path(options.to), _keys()
+    with refusing(KeysError), using(to):
+        keys.share(folder, to, needed)
+    say(f"{to}: {len(needed)} keys for host {options.host}; start it there with --keys")
+    return 0
+
+
+def _of_system(system: str) -> list[str]:
+    """Return the names of all processes of a system that have certificates."""
+    layout = _layout(system)
+    return [*(name for host in layout.hosts.supervisors for name in layout.hosts.routers_of(host)),
+            *layout.members]
+
+
+def _addresses(system: str) -> dict[str, tuple[str, ...]]:
+    """Return the addresses at which each router of a system is reached from other hosts."""
+    hosts = _layout(system).hosts
+    return {name: (hosts.address_of(host),) for host in hosts.supervisors
+            for name in hosts.routers_of(host)} if hosts.several else {}
+
+
+def _layout(system: str) -> Layout:
+    systems.load(system)
+    plan = RunPlan(system_file=str(shipped.find(system)))
+    with refusing(ValueError):
+        return Layout(plan, load_system(plan))
+
+
+def _check_name(name: str) -> None:
+    try:
+        msgspec.convert(name, IdentityName)
+    except msgspec.ValidationError:
+        raise UsageError(f"{name!r}: no name; a letter and up to 63 letters, digits and _ are "
+                         "right") from None
+
+
+def _keys() -> Any:
+    extra("keys", "cryptography")
+    from rampart.actors.access import key_folder  # noqa: PLC0415 of the extra
+
+    return key_folder

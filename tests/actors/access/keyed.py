@@ -1,0 +1,125 @@
+"""A router with keys in the process of a test, sessions by any certificate, what they achieve."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+
+import zenoh
+
+from rampart import systems
+from rampart.actors.access import key_folder
+from rampart.actors.access.rules import access_of
+from rampart.actors.bus.zenoh_session import Credentials, credentials_in, endpoint, session_config
+from rampart.actors.layout.layout import Layout, router
+from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
+from rampart.actors.supervision.launcher import kept_ports
+from tests import ROOT
+
+PATIENCE_S = 20.0
+
+
+def layout_of(system: str) -> Layout:
+    plan = RunPlan(system_file=str(systems.find(system)))
+    return Layout(plan, load_system(plan))
+
+
+def make_keys(folder: Path, layout: Layout, addresses=()) -> Path:
+    key_folder.init(folder)
+    key_folder.issue(folder, tuple(layout.routers), "router", addresses)
+    key_folder.issue(folder, tuple(layout.members), "node")
+    key_folder.issue(folder, ("ada",), "operator")
+    key_folder.issue(folder, ("bob",), "viewer")
+    return folder
+
+
+def members_of(layout: Layout) -> dict:
+    return {**{name: router(name) for name in layout.routers}, **layout.members}
+
+
+def every_key(layout: Layout) -> list[str]:
+    """All keys of topics.md below the root, families spelt out for each member of the system."""
+    table = (line.split("`")[1] for line in
+             (ROOT / "topics.md").read_text().splitlines() if line.startswith("| `"))
+    names = sorted(members_of(layout))
+    return [key for row in table for key in (
+        [row.replace("{name}", name) for name in names] if "{name}" in row else [row])]
+
+
+def may_say(member, key: str) -> bool:
+    """Whether a class declares that it publishes a key, or its parameters say so."""
+    return member.actor.published(key, member.name, member.parameters) is not None or any(
+        topic == key for topic in member.publishes)
+
+
+def may_hear(member, key: str) -> bool:
+    for topic in (*member.actor.inputs(), *BASE_INPUTS):
+        one = topic.member(key)
+        if one is not None:
+            names = (member.actor.names(topic, member.name, member.parameters)
+                     if topic.is_family else None)
+            if names is None or one in names:
+                return True
+    return any(key == topic or (names is not None and any(
+        key == topic.replace("{name}", name) for name in names))
+        for topic, names in member.hears.items())
+
+
+def is_own(key: str, name: str) -> bool:
+    return any(topic.member(key) == name for topic in BASE_OUTPUTS if topic.is_family)
+
+
+@contextlib.contextmanager
+def opened(config: zenoh.Config):
+    session = zenoh.open(config)
+    try:
+        yield session
+    finally:
+        session.close()
+
+
+class Keyed:
+    """A router, and by whose certificate what can be done there."""
+
+    def __init__(self, folder: str, keys: Path, layout: Layout, where: str = "127.0.0.1"):
+        self.folder, self.keys, self.layout = folder, keys, layout
+        self._kept = kept_ports(9_000, 1)
+        self.port = self._kept[0].getsockname()[1]
+        self.at = f"tls/{where}:{self.port}"
+        self.socket = endpoint(folder, "router_a")
+        self._where = where
+
+    def shown(self, name: str) -> Credentials:
+        found = credentials_in(str(self.keys), name)
+        return Credentials(found.authority, found.own, {self.socket: self.at})
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *_):
+        self.router.close()
+        for one in self._kept:
+            one.close()
+
+    def start(self):
+        self.router = zenoh.open(session_config(
+            [self.socket], [], self.shown("router_a"), access_of(self.layout, str(self.keys))))
+
+    def restart(self):
+        self.router.close()
+        self.start()
+
+    def joined(self, name: str, credentials: Credentials | None = None):
+        return opened(session_config((), [self.socket], credentials or self.shown(name)))
+
+
+def wait_for(what, seconds: float = PATIENCE_S) -> bool:
+    end = time.monotonic() + seconds
+    while not what():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True

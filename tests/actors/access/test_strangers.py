@@ -1,0 +1,280 @@
+"""Strangers at the port of a router with keys: nothing read, nothing accepted."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from rampart.actors.access import key_folder
+from rampart.actors.access.certificates import new_authority, new_certificate, public_part
+from rampart.actors.bus import run_folder
+from rampart.actors.bus.zenoh_session import Credentials, session_config
+from tests import ROOT
+from tests.actors.access.keyed import Keyed, every_key, layout_of, make_keys, opened, wait_for
+from tests.other_user import needs_root
+
+pytestmark = pytest.mark.processes
+
+LAYOUT = layout_of("osmosis")
+KEYS = every_key(LAYOUT)
+STRANGER = ROOT / "tests/actors/access/tls_stranger.py"
+NOW = dt.datetime.now(dt.UTC)
+
+
+@pytest.fixture
+def folder():
+    made = run_folder.make(0, os.getpid())
+    yield made
+    run_folder.remove(made)
+
+
+@pytest.fixture
+def keyed(folder, tmp_path):
+    with Keyed(folder, make_keys(tmp_path / "keys", LAYOUT), LAYOUT) as one:
+        yield one
+
+
+@pytest.fixture
+def public(keyed):
+    """What any stranger may have: the authority's certificate, and keys of an authority of his."""
+    with tempfile.TemporaryDirectory(prefix="stranger-", dir="/tmp") as place:
+        here = Path(place)
+        here.chmod(0o755)
+        shutil.copy(keyed.keys / "ca.crt", here / "ca.crt")
+        forged = new_authority(NOW, 10)
+        (here / "forged.pem").write_bytes(new_certificate(
+            forged, "safety_pilot", "node", addresses=(), now=NOW, days=5))
+        for file in here.iterdir():
+            file.chmod(0o644)
+        yield here
+
+
+def shown_by_strangers(public):
+    own = str(public / "forged.pem")
+    return {"nothing": {},
+            "no certificate": {"root_ca_certificate": str(public / "ca.crt")},
+            "one of his own": {"root_ca_certificate": str(public / "ca.crt"), "enable_mtls": True,
+                               "connect_private_key": own, "connect_certificate": own}}
+
+
+@contextlib.contextmanager
+def a_busy_bus(keyed):
+    """Something comes on every key all the time; yields what of strangers' arrives."""
+    accepted: list[str] = []
+    over = threading.Event()
+    with keyed.joined("router_b") as everybody, keyed.joined("bob") as viewer:
+        held = viewer.declare_subscriber("rampart/**", lambda s: accepted.append(
+            str(s.key_expr)) if s.payload.to_bytes() == b"stranger" else None)
+        tokens = viewer.liveliness().declare_subscriber(
+            "rampart/alive/*/77", lambda s: accepted.append(str(s.key_expr)))
+
+        def work():
+            while not over.wait(0.05):
+                for key in KEYS:
+                    everybody.put(f"rampart/{key}", "robot")
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        try:
+            yield accepted
+        finally:
+            over.set()
+            thread.join()
+            del held, tokens
+
+
+def try_all(endpoints, shown, *, becomes_nobody, before=()):
+    order = {"endpoints": endpoints, "shown": shown, "keys": KEYS,
+             "becomes_nobody": becomes_nobody}
+    done = subprocess.run([*before, sys.executable, str(STRANGER)], input=json.dumps(order),
+                          env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True,
+                          text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@needs_root
+def test_another_user_reads_nothing_and_is_not_heard(keyed, public):
+    with a_busy_bus(keyed) as accepted:
+        plain = f"tcp/127.0.0.1:{keyed.port}"
+        found = try_all([keyed.at, plain, keyed.socket], shown_by_strangers(public),
+                        becomes_nobody=True)
+        assert found["user"] == 65534
+        assert len(found["tried"]) == 9
+        assert sum(one["heard"] for one in found["tried"].values()) == 0, found
+        assert accepted == []
+
+
+def test_the_same_attempts_succeed_with_a_key(keyed):
+    """So the others fail for want of one."""
+    own, ours = str(keyed.keys / "ada.pem"), str(keyed.keys / "ca.crt")
+    with a_busy_bus(keyed) as accepted:
+        found = try_all([keyed.at], {"a key": {
+            "root_ca_certificate": ours, "enable_mtls": True,
+            "connect_private_key": own, "connect_certificate": own}}, becomes_nobody=False)
+        (one,) = found["tried"].values()
+        assert one["joined"]
+        assert one["heard"] > len(KEYS)
+        assert set(accepted) == {"rampart/" + key for key in (
+            "inject/order", "manager/adapt", "manager/reset", "mission/order", "mission/request",
+            "stub/trigger", "teleoperation/joystick", "world/actuator_fault", "world/obstacle")}
+
+
+@pytest.fixture
+def network():
+    """Another network namespace with a cable to this one: (its name, our address on it)."""
+    name, own = f"rampart{os.getpid()}", f"10.231.{os.getpid() % 250}"
+    cable = (f"rv{os.getpid() % 100_000}a", f"rv{os.getpid() % 100_000}b")
+
+    def ip(*words):
+        subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
+
+    try:
+        ip("netns", "add", name)
+    except (OSError, subprocess.CalledProcessError) as error:
+        why = getattr(error, "stderr", "") or str(error)
+        pytest.skip(f"no network namespace can be made here: {why.strip()}")
+    try:
+        ip("link", "add", cable[0], "type", "veth", "peer", "name", cable[1], "netns", name)
+        ip("addr", "add", f"{own}.1/24", "dev", cable[0])
+        ip("link", "set", cable[0], "up")
+        ip("-n", name, "addr", "add", f"{own}.2/24", "dev", cable[1])
+        ip("-n", name, "link", "set", cable[1], "up")
+        ip("-n", name, "link", "set", "lo", "up")
+        yield name, f"{own}.1"
+    finally:
+        ip("netns", "del", name)
+
+
+@needs_root
+def test_another_network_reads_nothing_and_is_not_heard(folder, tmp_path, network):
+    name, address = network
+    keys = make_keys(tmp_path / "keys", LAYOUT, (address,))
+    inside = ("ip", "netns", "exec", name)
+    with Keyed(folder, keys, LAYOUT, address) as keyed:
+        shown = shown_by_strangers(tmp_path)
+        shutil.copy(keys / "ca.crt", tmp_path / "ca.crt")
+        (tmp_path / "forged.pem").write_bytes(new_certificate(
+            new_authority(NOW, 10), "router_b", "router", addresses=(address,), now=NOW, days=5))
+        with a_busy_bus(keyed) as accepted:
+            plain = f"tcp/{address}:{keyed.port}"
+            found = try_all([keyed.at, plain, f"tls/127.0.0.1:{keyed.port}"], shown,
+                            becomes_nobody=False, before=inside)
+            assert len(found["tried"]) == 9
+            assert sum(one["heard"] for one in found["tried"].values()) == 0, found
+            assert accepted == []
+            own = str(keys / "bob.pem")
+            with_key = try_all([keyed.at], {"a key": {
+                "root_ca_certificate": str(keys / "ca.crt"), "enable_mtls": True,
+                "connect_private_key": own, "connect_certificate": own}},
+                becomes_nobody=False, before=inside)
+            assert next(iter(with_key["tried"].values()))["heard"] > 0  # the cable is there
+
+
+def test_the_socket_in_the_folder_lets_nothing_through(keyed):
+    """By it a client finds out that the router is there, as the run's user; and no more."""
+    with a_busy_bus(keyed) as accepted:
+        found = try_all([keyed.socket], {"nothing": {}}, becomes_nobody=False)
+        assert found["tried"][f"{keyed.socket} nothing"]["heard"] == 0
+        assert accepted == []
+
+
+def written(keyed, content, name="own"):
+    file = keyed.keys / f"{name}.pem"
+    file.write_bytes(content)
+    return Credentials(str(keyed.keys / "ca.crt"), str(file), {keyed.socket: keyed.at})
+
+
+def is_let_in(keyed, credentials):
+    """Whether a message on a key that is safety_pilot's arrives from who shows this."""
+    seen: list[bytes] = []
+    with keyed.joined("bob") as viewer:
+        held = viewer.declare_subscriber(
+            "rampart/summit_xl/command", lambda s: seen.append(s.payload.to_bytes()))
+        try:
+            with keyed.joined("", credentials) as session:
+                end = time.monotonic() + 1.0
+                while time.monotonic() < end and not seen:
+                    session.put("rampart/summit_xl/command", "stranger")
+                    time.sleep(0.02)
+        except zenoh.ZError:
+            pass
+        held.undeclare()
+    return bool(seen)
+
+
+def test_a_certificate_of_the_authority_is_let_in(keyed):
+    assert is_let_in(keyed, keyed.shown("safety_pilot"))
+
+
+def test_an_expired_certificate_is_not(keyed):
+    authority = (keyed.keys / "authority.key").read_bytes()
+    old = new_certificate(authority, "safety_pilot", "node", addresses=(),
+                          now=NOW - dt.timedelta(days=9), days=8)
+    assert not is_let_in(keyed, written(keyed, old))
+
+
+def test_nor_is_one_of_another_authority(keyed):
+    other = new_certificate(new_authority(NOW, 9), "safety_pilot", "node", addresses=(), now=NOW,
+                            days=8)
+    assert not is_let_in(keyed, written(keyed, other))
+
+
+def test_nor_one_that_another_certificate_has_signed(keyed):
+    """A node's certificate is no authority."""
+    signed = new_certificate((keyed.keys / "DM4.pem").read_bytes(), "safety_pilot", "node",
+                             addresses=(), now=NOW, days=8)
+    chain = signed + public_part((keyed.keys / "DM4.pem").read_bytes())
+    assert not is_let_in(keyed, written(keyed, chain))
+
+
+def test_a_revoked_one_is_out_when_the_router_has_restarted(keyed):
+    stolen = written(keyed, (keyed.keys / "safety_pilot.pem").read_bytes(), "stolen")
+    key_folder.revoke(keyed.keys, ["safety_pilot"])
+    assert is_let_in(keyed, stolen)  # no router has read it yet
+    keyed.restart()
+    assert not is_let_in(keyed, stolen)
+    key_folder.issue(keyed.keys, ["safety_pilot"], "node")
+    keyed.restart()
+    assert is_let_in(keyed, keyed.shown("safety_pilot"))
+    assert not is_let_in(keyed, stolen)  # the same name, another identity
+
+
+def test_a_rotated_one_is_taken_by_the_same_router(keyed):
+    before = (keyed.keys / "safety_pilot.pem").read_bytes()
+    key_folder.rotate(keyed.keys, ["safety_pilot"])
+    assert (keyed.keys / "safety_pilot.pem").read_bytes() != before
+    assert is_let_in(keyed, keyed.shown("safety_pilot"))
+    assert is_let_in(keyed, written(keyed, before))  # until it expires
+
+
+def test_who_is_in_is_cut_off_when_his_certificate_expires(keyed):
+    authority = (keyed.keys / "authority.key").read_bytes()
+    short = written(keyed, new_certificate(
+        authority, "safety_pilot", "node", addresses=(), now=dt.datetime.now(dt.UTC),
+        days=3 / 86_400))
+    with keyed.joined("", short) as session:
+        assert list(session.info.routers_zid())
+        assert wait_for(lambda: not list(session.info.routers_zid()))
+
+
+def test_nobody_poses_as_a_router_with_a_nodes_key(keyed, folder, tmp_path):
+    own = keyed.shown("DM4")
+    socket = f"unixsock-stream/{folder}/router_b"
+    there = Credentials(own.authority, own.own, {socket: "tls/127.0.0.1:9499"})
+    with opened(session_config([socket], [], there)):
+        victim = keyed.shown("safety_pilot")
+        with pytest.raises(zenoh.ZError):
+            zenoh.open(session_config((), ["tls/127.0.0.1:9499"], victim))

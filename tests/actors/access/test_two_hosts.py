@@ -1,0 +1,167 @@
+"""The link between the routers of two hosts, over real TLS: what nodes there declare, no more."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+
+import pytest
+
+from rampart.actors.access import key_folder
+from rampart.actors.access.register import read_register
+from rampart.actors.access.rights import rights_of_all
+from rampart.actors.access.rules import Host, rules_of
+from rampart.actors.bus import run_folder
+from rampart.actors.bus.zenoh_session import Credentials, credentials_in, session_config
+from rampart.actors.supervision.launcher import kept_ports
+from tests.actors.access.keyed import layout_of, make_keys, opened, wait_for
+
+pytestmark = pytest.mark.processes
+
+LAYOUT = layout_of("osmosis")
+GROUND = frozenset({"hmi", "teleoperation", "DM5"})
+HOSTS = [Host("", nodes=frozenset(LAYOUT.members) - GROUND, people=False),
+         Host("ground", ("router_a_ground",), GROUND, people=False)]
+
+
+class Hosts:
+    """A router on each of two hosts, linked, and clients of either."""
+
+    def __init__(self, keys):
+        self.keys = keys
+        self.kept = kept_ports(9_100, 2)
+        self.at = {name: f"tls/127.0.0.1:{kept.getsockname()[1]}"
+                   for name, kept in zip(("router_a", "router_a_ground"), self.kept, strict=True)}
+
+    def shown(self, name):
+        found = credentials_in(str(self.keys), name)
+        return Credentials(found.authority, found.own)
+
+    def router(self, host, dial=()):
+        rights = rights_of_all(LAYOUT)
+        rights["router_a_ground"] = rights["router_a"]
+        name = host.routers[0]
+        rules = rules_of(host, HOSTS, rights, read_register(self.keys))
+        return opened(session_config(
+            [self.at[name]], [self.at[one] for one in dial], self.shown(name), rules.config()))
+
+    def client(self, name):
+        at = self.at["router_a_ground" if name in GROUND else "router_a"]
+        return opened(session_config((), [at], self.shown(name)))
+
+
+@pytest.fixture
+def hosts(tmp_path):
+    keys = make_keys(tmp_path / "keys", LAYOUT)
+    key_folder.issue(keys, ["router_a_ground"], "router")
+    made = Hosts(keys)
+    folder = run_folder.make(0, os.getpid())
+    try:
+        yield made
+    finally:
+        run_folder.remove(folder)
+        for one in made.kept:
+            one.close()
+
+
+@contextlib.contextmanager
+def linked(hosts):
+    with hosts.router(HOSTS[0]) as robot, hosts.router(HOSTS[1], ["router_a"]) as ground:
+        assert wait_for(lambda: list(ground.info.routers_zid()))
+        yield robot, ground
+
+
+def heard_by(session, key):
+    found = []
+    held = session.declare_subscriber(key, lambda s: found.append(s.payload.to_bytes()))
+    return found, held
+
+
+def test_what_nodes_declare_crosses_both_ways(hosts):
+    with linked(hosts), hosts.client("ftm_manager") as manager, hosts.client("DM5") as module:
+        reports, _a = heard_by(manager, "rampart/detection/*")
+        orders, _b = heard_by(module, "rampart/heartbeat/teleoperation")
+
+        def reported():
+            module.put("rampart/detection/DM5", "active")
+            return b"active" in reports
+
+        assert wait_for(reported)
+        with hosts.client("teleoperation") as teleoperation:
+            def beats():
+                teleoperation.put("rampart/heartbeat/teleoperation", "beat")
+                return b"beat" in orders
+
+            assert wait_for(beats)
+
+
+def test_tokens_and_questions_cross(hosts):
+    with linked(hosts), hosts.client("hmi") as page, hosts.client("safety_pilot") as pilot:
+        answering = pilot.declare_queryable(
+            "rampart/pilot/status", lambda q: q.reply("rampart/pilot/status", "drives"))
+
+        def answered():
+            return any(r.ok is not None for r in page.get("rampart/pilot/status", timeout=1.0))
+
+        assert wait_for(answered)
+        answering.undeclare()
+        with hosts.client("RM4") as watcher:
+            seen = []
+            held = watcher.liveliness().declare_subscriber(
+                "rampart/alive/teleoperation/*", lambda s: seen.append(str(s.key_expr)),
+                history=True)
+            with hosts.client("teleoperation") as node:
+                token = node.liveliness().declare_token("rampart/alive/teleoperation/1")
+                assert wait_for(lambda: seen == ["rampart/alive/teleoperation/1"])
+                del token
+            held.undeclare()
+
+
+def test_a_host_that_is_taken_over_says_nothing_that_is_not_its_nodes(hosts):
+    """Its router, with its key, tries every way; the robot's router lets nothing through."""
+    forged = ("summit_xl/command", "supervisor/nodes", "supervisor/event", "gone/DM4/9",
+              "recovery/RM1/command", "detection/DM4", "inject/order", "**")
+    with hosts.router(HOSTS[0]), hosts.client("router_a") as everybody:
+        got: list[str] = []
+        held = everybody.declare_subscriber("rampart/**", lambda s: got.append(str(s.key_expr)))
+        tokens = everybody.liveliness().declare_subscriber(
+            "rampart/alive/*/*", lambda s: got.append(str(s.key_expr)))
+        taken = session_config([hosts.at["router_a_ground"]], [hosts.at["router_a"]],
+                               hosts.shown("router_a_ground"))
+        with opened(taken) as ground:
+            listening, _held = heard_by(ground, "rampart/**")
+            token = ground.liveliness().declare_token("rampart/alive/DM4/9")
+
+            def arrived():
+                for key in forged:
+                    ground.put(f"rampart/{key}", "forged")
+                ground.put("rampart/detection/DM5", "own")
+                everybody.put("rampart/world/truth", "secret")
+                everybody.put("rampart/mission/status", "heard")
+                return "rampart/detection/DM5" in got
+
+            assert wait_for(arrived)
+            arrived()
+            del token
+            answers = [r for r in everybody.get("rampart/summit_xl/command", timeout=0.5)
+                       if r.ok is not None]
+        # inject/order is the page's to say, and the page is there
+        assert set(got) - {"rampart/world/truth", "rampart/mission/status"} == {
+            "rampart/detection/DM5", "rampart/inject/order"}
+        assert b"secret" not in listening
+        assert answers == []
+        held.undeclare()
+        tokens.undeclare()
+
+
+def test_a_nodes_key_is_no_key_to_another_hosts_router(hosts):
+    with hosts.router(HOSTS[0]), hosts.client("ftm_manager") as manager:
+        reports, held = heard_by(manager, "rampart/detection/*")
+        with opened(session_config((), [hosts.at["router_a"]], hosts.shown("DM5"))) as stray:
+            for _ in range(20):
+                stray.put("rampart/detection/DM5", "active")
+            with hosts.client("DM4") as own:
+                assert wait_for(lambda: own.put("rampart/detection/DM4", "idle")
+                                or b"idle" in reports)
+        assert b"active" not in reports
+        held.undeclare()

@@ -1,0 +1,154 @@
+"""Whole runs with keys: missions with nodes and routers killed, tools, strangers, rotation."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import psutil
+import pytest
+
+from rampart.actors.access import key_folder
+from rampart.actors.supervision.process_title import find_processes
+from rampart.cli.main import main
+from rampart.testing import RealRun
+from tests import ROOT
+from tests.actors.access.keyed import every_key, layout_of, make_keys
+from tests.other_user import needs_root
+
+pytestmark = pytest.mark.processes
+
+
+@pytest.fixture
+def keys(tmp_path):
+    return make_keys(tmp_path / "keys", layout_of("paper"))
+
+
+def kill(run, *words):
+    done = subprocess.run([sys.executable, "-P", "-m", "rampart.actors.supervision.kill_node",
+                           *words, "--port", str(run.port)], capture_output=True, text=True,
+                          timeout=30, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def rampart(run, *words, key=None):
+    environment = {**os.environ, **({"RAMPART_KEY": str(key)} if key else {})}
+    return subprocess.run([sys.executable, "-P", "-m", "rampart.cli.main", *words,
+                           "--port", str(run.port)], capture_output=True, text=True, timeout=60,
+                          env=environment, check=False)
+
+
+def test_a_mission_with_keys_survives_kills_of_nodes_and_routers(tmp_path, keys):
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2", "--keys", str(keys)) as run:
+        run.wait_for("goal 1/3", 60)
+        for victim in ("osmosis_control", "router_a", "localization", "router_b", "ftm_manager"):
+            kill(run, victim)
+        run.wait_for("goal 2/3", 90)
+        pids = [run.process.pid, *(p.pid for p in find_processes(run.port))]
+        listening = {c.laddr for pid in pids for c in psutil.Process(pid).net_connections("inet")
+                     if c.status == psutil.CONN_LISTEN}
+        assert {ip for ip, _ in listening} == {"127.0.0.1"}
+        assert {port for _, port in listening} == set(run.info.ports)
+        _, result = run.result(120)
+        assert (result["mission"], result["safety"]) == ("success", "safe"), run.story
+        assert "payload rejected" not in run.story
+        assert result["restarts"]["osmosis_control"] >= 1
+
+
+def test_tools_may_what_their_certificate_says(tmp_path, keys):
+    with RealRun(tmp_path, "paper", "--mission", "A", "--keys", str(keys)) as run:
+        run.wait_for("goal 1/3", 60)
+        assert rampart(run, "node", "list").returncode == 0
+        injected = rampart(run, "inject", "drop:localization/pose", "--duration", "0.1")
+        assert injected.returncode == 0, injected.stderr
+        looking = rampart(run, "status", key=keys / "bob.pem")
+        assert looking.returncode == 0, looking.stderr
+        refused = rampart(run, "inject", "drop:localization/pose", key=keys / "bob.pem")
+        assert refused.returncode == 2
+        assert "a viewer's certificate is for looking" in refused.stderr
+        as_node = rampart(run, "inject", "drop:localization/pose", key=keys / "DM4.pem")
+        assert as_node.returncode == 1  # the router lets nothing through
+        missing = rampart(run, "status", key=keys / "none.pem")
+        assert missing.returncode == 2
+        assert "RAMPART_KEY=" in missing.stderr
+
+
+def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
+    with RealRun(tmp_path, "paper", "--mission", "A", "--keys", str(keys)) as run:
+        run.wait_for("goal 1/3", 60)
+        stolen = tmp_path / "ada.pem"
+        stolen.write_bytes((keys / "ada.pem").read_bytes())
+        stolen.chmod(0o600)
+        key_folder.rotate(keys, [])
+        assert "incarnation 2" in kill(run, "osmosis_control")
+        key_folder.revoke(keys, ["ada"])
+        for router in ("router_a", "router_b"):
+            kill(run, router)
+        key_folder.issue(keys, ["eve"], "operator")
+        refused = rampart(run, "inject", "drop:localization/pose", key=stolen)
+        assert refused.returncode != 0
+        assert "goal" in run.story
+        assert run.process.poll() is None
+
+
+@needs_root
+def test_another_user_at_the_ports_of_a_run_hears_nothing_and_is_not_heard(tmp_path, keys):
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2", "--keys", str(keys)) as run:
+        run.wait_for("goal 1/3", 60)
+        ports = run.info.ports
+        assert len(ports) == 2
+        (tmp_path / "ca.crt").write_bytes((keys / "ca.crt").read_bytes())
+        order = {"endpoints": [f"{kind}/127.0.0.1:{port}" for port in ports
+                               for kind in ("tls", "tcp")],
+                 "shown": {"nothing": {}, "the authority": {
+                     "root_ca_certificate": str(keys / "ca.crt")}},
+                 "keys": every_key(layout_of("osmosis")), "becomes_nobody": True}
+        done = subprocess.run(
+            [sys.executable, str(ROOT / "tests/actors/access/tls_stranger.py")],
+            input=json.dumps(order), env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True, text=True, timeout=100, check=False)
+        assert done.returncode == 0, done.stderr
+        found = json.loads(done.stdout)
+        assert found["user"] == 65534
+        assert sum(one["heard"] for one in found["tried"].values()) == 0
+        assert not any(one["joined"] for one in found["tried"].values())
+        run.wait_for("goal 2/3", 90)
+        assert "payload rejected" not in run.story
+        assert "crashed" not in run.story
+
+
+@pytest.mark.parametrize(("spoil", "words"), [
+    (lambda keys: (keys / "DM4.pem").unlink(), "DM4 has no certificate; `rampart keys issue`"),
+    (lambda keys: key_folder.issue(keys, ["DM4"], "node", days=-1), "`rampart keys rotate` renews"),
+    (lambda keys: key_folder.revoke(keys, ["supervisor"]), "supervisor is revoked"),
+    (lambda keys: keys.chmod(0o755), "must be yours alone; chmod 700 it"),
+    (lambda keys: (keys / "register.json").write_text("[]"), "register.json: "),
+])
+def test_a_run_is_not_started_with_keys_that_are_no_good(keys, capsys, spoil, words):
+    spoil(keys)
+    assert main(["run", "--system", "paper", "--keys", str(keys), "--no-hmi"]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count("\n") == 1
+
+
+def test_there_are_no_links_in_virtual_time(keys, capsys):
+    assert main(["run", "--virtual", "--keys", str(keys)]) == 2
+    assert "in virtual time there are no links" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_full_mission_with_keys_and_kills(tmp_path):
+    keys = make_keys(tmp_path / "keys", layout_of("osmosis"))
+    with RealRun(tmp_path, "osmosis", "--keys", str(keys)) as run:
+        run.wait_for("goal 1/", 60)
+        for goal in range(2, 5):
+            for victim in ("osmosis_control", "safety_pilot", "DM4", "RM3", "supervisor",
+                           "router_a", "router_b"):
+                kill(run, victim)
+            run.wait_for(f"goal {goal}/", 120)
+        _, result = run.result(300)
+        assert (result["mission"], result["safety"]) == ("success", "safe"), run.story
