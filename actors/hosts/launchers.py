@@ -11,6 +11,7 @@ import msgspec
 from rampart.actors.bus import run_folder
 from rampart.actors.hosts.clock_sync import ClockSync
 from rampart.actors.hosts.meeting import (
+    DOOR,
     PERIOD_S,
     Attendance,
     Meeting,
@@ -51,7 +52,7 @@ class FirstLauncher(Launcher):
                 self.plan, tuple(host for host in hosts.supervisors if host), contents,
                 lambda: run_folder.issued(self.plan.folder))
             await self._meeting.open(
-                *hosts.meeting_place(), self.plan.credentials(OBSERVER))
+                *hosts.meeting_place(), self.plan.credentials(DOOR))
         except (MeetingError, OSError) as error:
             raise LaunchError(str(error)) from None
         await self._meeting.all_ready(self.say)

@@ -20,8 +20,9 @@ from typing import Any
 import msgspec
 
 import rampart
-from rampart.actors.access.register import read_register
+from rampart.actors.access.register import Kind, read_register
 from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.zenoh_session import Credentials
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_document, on_host
@@ -29,6 +30,9 @@ from rampart.files.reading import plain_line
 
 PERIOD_S = 0.25
 """Real seconds between two questions."""
+
+DOOR = ROUTERS[0]
+"""By whose certificate the first host's launcher is known: routers have those of servers."""
 
 _PATIENCE_S = 3.0
 """For an answer, or for the next question: then the connection is made again."""
@@ -152,7 +156,7 @@ class Meeting:
                 line = await asyncio.wait_for(reader.readuntil(), _PATIENCE_S)
                 ask = msgspec.json.decode(line, type=Ask)
                 host = ask.host
-                if self._shown and not _is(writer, self._shown, on_host(OBSERVER, host)):
+                if self._shown and not _is(writer, self._shown, "node", on_host(OBSERVER, host)):
                     raise ValueError(f"somebody else asks for host {host}")
                 self._told[host] = told_of_end
                 answer = self._answer(ask)
@@ -228,7 +232,7 @@ class Attendance:
                 if self._ends is None:
                     self._ends = await asyncio.open_connection(
                         *self._where, limit=_MAX_LINE, ssl=self._context)
-                    if self._shown and not _is(self._ends[1], self._shown, OBSERVER):
+                    if self._shown and not _is(self._ends[1], self._shown, "router", DOOR):
                         raise MeetingError("somebody else answers in the first host's place")
                 reader, writer = self._ends
                 asked_s = time.monotonic()
@@ -310,13 +314,13 @@ def context(shown: Credentials, purpose: ssl.Purpose) -> ssl.SSLContext:
     return made
 
 
-def _is(writer: asyncio.StreamWriter, shown: Credentials, identity: str) -> bool:
+def _is(writer: asyncio.StreamWriter, shown: Credentials, kind: Kind, identity: str) -> bool:
     """Whether the certificate at the other end is that of an identity, and not revoked."""
     certificate = writer.get_extra_info("peercert") or {}
     names = [value for part in certificate.get("subject", ()) for name, value in part
              if name == "commonName"]
     register = read_register(Path(shown.authority).parent)
-    return names == [register.of_kind("node").get(identity)]
+    return names == [register.of_kind(kind).get(identity)]
 
 
 async def _closed(writer: asyncio.StreamWriter) -> None:
