@@ -19,7 +19,7 @@ from rampart.actors.bus.topics import INJECT
 from rampart.actors.layout.layout import Layout, router
 from rampart.actors.layout.system_topics import declared_topics
 from rampart.actors.layout.wiring import Member, shows_panels
-from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR
+from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 
 PEOPLE = ("operator", "viewer")
@@ -45,7 +45,7 @@ class AccessReport(msgspec.Struct, frozen=True):
     """What came of the check.
 
     Attributes:
-        identities: that were looked at: all but the routers, which hand everything on.
+        identities: that were looked at: all but the host's own routers, which hand everything on.
         keys: on which.
         pairs: of an identity and a key, each looked at for all that Zenoh can refuse.
         let_through: pairs in which the identity may publish.
@@ -72,7 +72,7 @@ def check_access(layout: Layout, config: Mapping[str, Any]) -> AccessReport:
     """Compare what a router lets through with what is declared.
 
     Args:
-        layout: of the system, on one host.
+        layout: of the system, as the host of the router has it.
         config: Zenoh's `access_control`; the names in certificates are those of the identities,
             `operator` and `viewer` those of people.
     """
@@ -80,7 +80,7 @@ def check_access(layout: Layout, config: Mapping[str, Any]) -> AccessReport:
     keys = list(declared.keys())
     wrong: list[str] = []
     speakers: dict[str, list[str]] = {}
-    identities = [*layout.members, *PEOPLE]
+    identities = declared.identities
     for name in identities:
         claims = [(claim, _let_through(config, name, *claim[:2])) for claim in _CLAIMS]
         for key in keys:
@@ -95,6 +95,32 @@ def check_access(layout: Layout, config: Mapping[str, Any]) -> AccessReport:
     return AccessReport(
         len(identities), len(keys), len(identities) * len(keys),
         sum(map(len, speakers.values())), len(wrong), tuple(wrong[:MOST_SHOWN]),
+        {key: tuple(those) for key, those in sorted(speakers.items())})
+
+
+def check_each_host(layout: Layout, rules: Callable[[Layout], Mapping[str, Any]]) -> AccessReport:
+    """Compare what the routers of each host let through with what is declared; all in one report.
+
+    Args:
+        layout: of the system.
+        rules: returns the rules of the routers of the host that a layout is of.
+    """
+    found: dict[str, AccessReport] = {}
+    for host in layout.hosts.supervisors:
+        there = Layout(msgspec.structs.replace(layout.plan, host=host), layout.spec)
+        found[host] = check_access(there, rules(there))
+    reports = list(found.values())
+    if len(reports) == 1:
+        return reports[0]
+    speakers: dict[str, dict[str, None]] = {}
+    for report in reports:
+        for key, those in report.speakers.items():
+            speakers.setdefault(key, {}).update(dict.fromkeys(those))
+    return AccessReport(
+        reports[0].identities, reports[0].keys, sum(one.pairs for one in reports),
+        sum(one.let_through for one in reports), sum(one.wrong for one in reports),
+        tuple(f"host {host or 'the first'}: {line}" for host, report in found.items()
+              for line in report.examples)[:MOST_SHOWN],
         {key: tuple(those) for key, those in sorted(speakers.items())})
 
 
@@ -146,12 +172,20 @@ class _Declared:
     """What the classes of a system declare, asked key by key."""
 
     def __init__(self, layout: Layout) -> None:
-        self._members = layout.members
+        hosts = layout.hosts
+        self._own = layout.plan.host
+        routers = {name: host for host in hosts.supervisors for name in hosts.routers_of(host)}
+        self._members = {**layout.members, **{name: router(name) for name in routers}}
+        self._may_run = {host: {*hosts.may_run(host, layout.members), *hosts.routers_of(host)}
+                         for host in hosts.supervisors}
+        self._hosts_of_supervisors = {name: host for host, name in hosts.supervisors.items()}
+        self._far = {name: host for name, host in routers.items() if host != self._own}
+        self.identities = (*layout.members, *self._far, *PEOPLE)
         self._pages = [m for m in layout.members.values() if shows_panels(m.actor)]
-        self._names = [*layout.routers, *layout.members]
+        self._names = [*routers, *layout.members]
         every = (*declared_topics(layout.spec), *BASE_OUTPUTS, *BASE_INPUTS,
                  *layout.topics.values(),
-                 *(t for m in (*layout.members.values(), *map(router, layout.routers))
+                 *(t for m in (*layout.members.values(), *map(router, routers))
                    for t in (*m.actor.outputs, *m.actor.inputs())))
         self._topics = {topic.key: topic for topic in every}
 
@@ -168,7 +202,18 @@ class _Declared:
         yield from _FOREIGN
 
     def may(self, identity: str, what: str, key: str) -> bool:
-        """Return whether an identity declares that it says, hears, ... on a key."""
+        """Return whether an identity declares that it says, hears, ... on a key.
+
+        The routers of another host do for all that may run there, and for people; who runs
+        elsewhere has no link to a router of this host.
+        """
+        if identity in self._far:
+            return any(self._may(one, what, key)
+                       for one in (*self._may_run[self._far[identity]], *PEOPLE))
+        return (identity in self._may_run[self._own] or identity in PEOPLE) and (
+            self._may(identity, what, key))
+
+    def _may(self, identity: str, what: str, key: str) -> bool:
         if what == "is there":
             return key == f"alive/{identity}/{_INCARNATION}"
         if what == "never":
@@ -184,8 +229,8 @@ class _Declared:
         if identity in PEOPLE:
             return identity == "operator" and self._is_operated(key)
         member = self._members[identity]
-        if _gone(key):
-            return identity == SUPERVISOR
+        if node := _gone(key):
+            return node in self._may_run.get(self._hosts_of_supervisors.get(identity, "?"), ())
         return (key in member.actor.own_keys(member.parameters) or _says(member, key)
                 or (identity == OBSERVER and self._is_operated(key)))
 

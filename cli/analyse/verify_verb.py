@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.access.checking import AccessReport, check_access
+from rampart.actors.access.checking import AccessReport, check_each_host
 from rampart.actors.access.rules import rules_as_declared
 from rampart.cli import systems
 from rampart.cli.output import UsageError, print_json, print_table, progress, refusing, say
@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
     start = time.monotonic()
     with progress() as show, refusing(TooLargeError, UnknownStrategyError):
         report = verify(spec, options.strategy, options.together, show)
-    access = check_access(layout, rules_as_declared(layout))
+    access = check_each_host(layout, rules_as_declared)
     if options.json:
         print_json({**msgspec.to_builtins(report), "access": msgspec.to_builtins(access)})
     else:

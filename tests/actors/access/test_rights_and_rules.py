@@ -9,13 +9,16 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.actors.access.checking import check_access, includes
+from rampart.actors.access.checking import check_access, check_each_host, includes
 from rampart.actors.access.register import Register
 from rampart.actors.access.rights import rights_of_all
 from rampart.actors.access.rules import Host, rules_as_declared, rules_of
 from rampart.actors.bus.zenoh_session import session_config
+from rampart.actors.layout.layout import Layout
+from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.sim.virtual.virtual_bus import VirtualBus
 from rampart.testing import virtual_run
+from tests import two_hosts as systems
 from tests.actors.access.keyed import layout_of
 
 LAYOUT = layout_of("osmosis")
@@ -225,3 +228,35 @@ def test_expressions_include_each_other_as_for_zenoh(first, second):
     if "**" in second and "*" in first:
         return  # `**` within a key is looked at as one chunk; no rule is written so
     assert includes(str(one), str(other)) == one.includes(other)
+
+
+def two_hosts_layout(tmp_path):
+    file = tmp_path / "two.toml"
+    file.write_text(systems.two_hosts({"robot": "192.168.7.1", "ground": "192.168.7.2"}), encoding="utf-8")
+    plan = RunPlan(system_file=str(file))
+    return Layout(plan, load_system(plan))
+
+
+def test_of_two_hosts_each_lets_through_what_may_run_on_the_other_and_no_more(tmp_path):
+    layout = two_hosts_layout(tmp_path)
+    report = check_each_host(layout, rules_as_declared)
+    assert report.examples == ()
+    assert report.speakers["control/command"] == ("osmosis_control", "router_a", "router_b")
+    assert report.speakers["detection/DM10"] == (
+        "DM10", "router_a_ground", "router_b_ground", "router_a", "router_b")
+    assert report.speakers["supervisor/supervisor_ground/nodes"] == (
+        "router_a_ground", "router_b_ground", "supervisor_ground")
+
+
+def test_rules_by_which_the_other_host_may_command_the_wheels_are_found(tmp_path):
+    def tampered(layout):
+        config = copy.deepcopy(rules_as_declared(layout))
+        for rule in config["rules"]:
+            if rule["id"].startswith("router_a_ground ") and "put" in rule["messages"]:
+                rule["key_exprs"].append("rampart/summit_xl/command")
+        return config
+
+    report = check_each_host(two_hosts_layout(tmp_path), tampered)
+    assert not report.holds
+    assert ("host the first: router_a_ground: put of 'summit_xl/command' (ingress) is let "
+            "through, and not declared") in report.examples

@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import shutil
 import socket
 from contextlib import asynccontextmanager
 
 import msgspec
 import pytest
 
-from rampart.actors.hosts.meeting import Attendance, Meeting, MeetingError, contents_of, joined
+from rampart.actors.access import key_folder
+from rampart.actors.bus.zenoh_session import credentials_in
+from rampart.actors.hosts.meeting import (
+    DOOR,
+    Attendance,
+    Meeting,
+    MeetingError,
+    contents_of,
+    joined,
+)
 from rampart.actors.run.run_plan import RunPlan
 from rampart.systems import DEFAULT
 from rampart.testing import eventually
@@ -186,3 +196,61 @@ def test_contents_do_not_depend_on_where_the_files_are(tmp_path):
     hashes = [contents_of(RunPlan(system_file=str(file))) for file in (DEFAULT, here, changed)]
     assert hashes[0] == hashes[1]
     assert {name for name in hashes[0] if hashes[0][name] != hashes[2][name]} == {"specification"}
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("meeting") / "keys"
+    key_folder.init(folder)
+    key_folder.issue(folder, ["router_a"], "router")
+    key_folder.issue(folder, ["observer", "observer_ground", "DM5"], "node")
+    return folder
+
+
+@asynccontextmanager
+async def meeting_with(keys):
+    made, where = Meeting(PLAN, ("ground",), CONTENTS, dict), ("127.0.0.1", free_port())
+    await made.open(*where, credentials_in(str(keys), DOOR))
+    try:
+        yield where
+    finally:
+        await made.close()
+
+
+async def test_with_keys_the_launchers_know_each_other(keys):
+    async with meeting_with(keys) as where:
+        ground = Attendance("ground", where, FIRST, credentials_in(str(keys), "observer_ground"))
+        assert (await ground.ask())[0].plan.run_id == "r1"
+        await ground.close()
+
+
+@pytest.mark.parametrize("name", ["DM5", "observer", ""])
+async def test_with_another_s_key_or_none_nobody_is_told_anything(keys, name):
+    async with meeting_with(keys) as where:
+        stranger = Attendance(
+            "ground", where, FIRST, credentials_in(str(keys), name) if name else None)
+        with pytest.raises(OSError):  # noqa: PT011 of the connection, whatever it is
+            await stranger.ask()
+        await stranger.close()
+
+
+async def test_a_revoked_key_is_no_key(keys, tmp_path):
+    copy = tmp_path / "keys"
+    shutil.copytree(keys, copy)
+    shown = credentials_in(str(keys), "observer_ground")
+    key_folder.revoke(copy, ["observer_ground"])
+    async with meeting_with(copy) as where:
+        with pytest.raises(OSError):  # noqa: PT011 likewise
+            await Attendance("ground", where, FIRST, shown).ask()
+
+
+async def test_who_answers_in_the_first_host_s_place_with_a_node_s_key_is_not_believed(keys):
+    made, port = Meeting(PLAN, ("ground",), CONTENTS, dict), free_port()
+    key_folder.issue(keys, ["router_b"], "router")
+    await made.open("127.0.0.1", port, credentials_in(str(keys), "router_b"))
+    ground = Attendance("ground", ("127.0.0.1", port), FIRST,
+                        credentials_in(str(keys), "observer_ground"))
+    with pytest.raises(MeetingError, match="somebody else answers in the first host's place"):
+        await ground.ask()
+    await ground.close()
+    await made.close()
