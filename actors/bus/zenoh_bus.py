@@ -49,10 +49,12 @@ _ANSWER_S = 1.0
 _LOOK_S = 0.002
 
 _ALIVE, _GONE = f"{ROOT}/alive", f"{ROOT}/gone"
-_DELIVERY = {
-    Qos.SENSOR: (zenoh.Priority.DATA, zenoh.CongestionControl.DROP),
-    Qos.STATE: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP),
-    Qos.COMMAND: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK)}
+_DELIVERY = {Qos.SENSOR: zenoh.Priority.DATA, Qos.STATE: zenoh.Priority.INTERACTIVE_HIGH,
+             Qos.COMMAND: zenoh.Priority.INTERACTIVE_HIGH}
+_DROP = zenoh.CongestionControl.DROP
+"""Of all that is sent, commands too. With BLOCK a router waits for a reader that is stopped, or
+behind a slow link, before it hands anything on to anybody: for 5 s by default. What is left out is
+what does not fit into two batches of 64 kB of its priority and the socket, a millisecond long."""
 
 
 def _direct(call: Callable[[Any], None], end: Callable[[], None] = lambda: None) -> Callback[Any]:
@@ -176,9 +178,8 @@ class ZenohBus:
         publisher = self._publishers.get(key)
         is_new = publisher is None
         if publisher is None:
-            priority, congestion_control = _DELIVERY[topic.qos]
             publisher = self._publishers[key] = self._require().declare_publisher(
-                key, priority=priority, express=True, congestion_control=congestion_control)
+                key, priority=_DELIVERY[topic.qos], express=True, congestion_control=_DROP)
         publisher.put(payload)
         if topic.qos is not Qos.COMMAND:
             self._latest[key] = payload
@@ -213,12 +214,12 @@ class ZenohBus:
                 key, payload = str(sample.key_expr), sample.payload.to_bytes()
                 self._hand_over(lambda: deliver(key, payload))
 
-        priority, _ = _DELIVERY[Qos.STATE]
         self._require().get(
             key_expression, _direct(arrived, lambda: self._hand_over(answered)),
             target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
-            allowed_destination=zenoh.Locality.REMOTE, timeout=_ANSWER_S, priority=priority,
-            congestion_control=zenoh.CongestionControl.DROP, express=True)
+            allowed_destination=zenoh.Locality.REMOTE, timeout=_ANSWER_S,
+            priority=_DELIVERY[Qos.STATE],
+            congestion_control=_DROP, express=True)
 
     def _answer(self, query: zenoh.Query, key: str) -> None:  # runs on a Zenoh thread
         payload = self._latest.get(key)
@@ -264,7 +265,7 @@ class ZenohBus:
         """Tell those who watch a node that a process of it has ended."""
         self._require().put(
             f"{_GONE}/{node}/{incarnation}", b"", priority=zenoh.Priority.INTERACTIVE_HIGH,
-            congestion_control=zenoh.CongestionControl.BLOCK, express=True)
+            congestion_control=_DROP, express=True)
 
     def moved(self) -> bool:
         """Whether it has lost its router since this was last asked; less than a microsecond."""

@@ -31,9 +31,9 @@ FAR_HANDSHAKE_MS = 2000
 _NOT_FATAL = "exit_on_failure=false"
 
 FULL_US = 20_000
-"""A link that takes nothing for so long is closed, microseconds: its reader is stopped, or cut off.
-By default a session waits for 5 s when it has something to send that may not be left out, and while
-a router waits for one reader, no other hears anything."""
+"""A link that takes nothing for so long is closed, microseconds, when there is something to be sent
+that may not be left out: declarations of who is new. While a router waits for one reader, which is
+stopped or cut off, no other hears anything, and by default it waits for 5 s."""
 
 _RUNTIME = "ZENOH_RUNTIME"
 _THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "

@@ -232,7 +232,8 @@ def test_expressions_include_each_other_as_for_zenoh(first, second):
 
 def two_hosts_layout(tmp_path):
     file = tmp_path / "two.toml"
-    file.write_text(systems.two_hosts({"robot": "192.168.7.1", "ground": "192.168.7.2"}), encoding="utf-8")
+    text = systems.two_hosts({"robot": "192.168.7.1", "ground": "192.168.7.2"})
+    file.write_text(text, encoding="utf-8")
     plan = RunPlan(system_file=str(file))
     return Layout(plan, load_system(plan))
 
