@@ -47,8 +47,10 @@ class HostRun:
     """
 
     def __init__(self, options: argparse.Namespace, plan: RunPlan, directory: Path) -> None:
-        refuse(options, _LEFT_TO_THE_FIRST,
-               f"on host {plan.host} the first host's command line decides that")
+        why = f"on host {plan.host} the first host's command line decides that"
+        refuse(options, _LEFT_TO_THE_FIRST, why)
+        for name, value in plan.options.items():
+            raise UsageError(f"--{name.replace('_', '-')} {value}: {why}")
         kept = directory.resolve()
         self._json = options.json
         self._failure = ""

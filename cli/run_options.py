@@ -123,6 +123,8 @@ _OPTIONS = (
     word("--record", "FILE", "keep everything that is sent in an MCAP file, for `rampart bag "
          "info`, `rampart replay` and Foxglove-compatible viewers"),
     flag("--overwrite", "--record may replace an existing file"),
+    flag("--no-keys", "run on several hosts without --keys: whoever is on that network may do "
+         "everything"),
     word("--host", "NAME", "which of the system's [[host]]s this machine is; each runs its own "
          "part, and all start when all are there (default: the first)"),
     word("--report", "DIR", f"where the report goes, checkpoints, and in {ERROR_LOG} the "
@@ -213,6 +215,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
         waits=options.wait, virtual=options.virtual, host=host)
     spec = load_system(plan)
     layout = Layout(plan, spec)
+    _check_network(options, spec)
     if options.keys:
         plan = msgspec.structs.replace(plan, keys=_checked_keys(options, layout))
     if not options.no_hmi:
@@ -238,6 +241,17 @@ def _host(options: argparse.Namespace, spec: SystemSpec) -> str:
     if options.virtual:
         raise UsageError(f"--host {options.host}: virtual time is on one machine")
     return "" if options.host == names[0] else str(options.host)
+
+
+def _check_network(options: argparse.Namespace, spec: SystemSpec) -> None:
+    """Refuse to open a port to a network by oversight."""
+    if options.no_keys and (options.keys or not spec.hosts):
+        raise UsageError("--no-keys: " + ("either that or --keys" if options.keys else
+                                          f"{spec.name} runs on one machine, and opens no port"))
+    if spec.hosts and not (options.keys or options.no_keys or options.virtual):
+        raise UsageError(f"{spec.name} runs on {len(spec.hosts)} hosts: say --keys DIR (`rampart "
+                         "keys init` makes one), or --no-keys if whoever is on their network may "
+                         "do everything")
 
 
 def _checked_keys(options: argparse.Namespace, layout: Layout) -> str:

@@ -62,7 +62,7 @@ def with_keys(folder: Path, spec: Path) -> dict[str, tuple[str, ...]]:
 def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_back(
         net, tmp_path, keyed):
     spec = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1)
-    own = with_keys(tmp_path, spec) if keyed else {"robot": (), "ground": ()}
+    own = with_keys(tmp_path, spec) if keyed else dict.fromkeys(net.addresses, ("--no-keys",))
     with (host(net, "ground", tmp_path / "g", spec, *own["ground"]) as ground,
           host(net, "robot", tmp_path / "r", spec, *own["robot"]) as robot):
         ground.wait_for("takes part in run")
@@ -104,8 +104,8 @@ def test_another_program_or_system_is_refused_before_anything_starts(net, tmp_pa
     spec, other = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1), tmp_path / "other.toml"
     other.write_text(spec.read_text().replace("intensity", "# intensity").replace(
         "Pick and place", "Pick or place"), encoding="utf-8")
-    with (host(net, "robot", tmp_path / "r", spec) as robot,
-          host(net, "ground", tmp_path / "g", other) as ground):
+    with (host(net, "robot", tmp_path / "r", spec, "--no-keys") as robot,
+          host(net, "ground", tmp_path / "g", other, "--no-keys") as ground):
         assert ground.process.wait(30) == 2
         assert "--host ground: specification: not the same as on the first host" in ground.story
         robot.wait_for("waiting for ground: rampart run --host ground there")
@@ -117,8 +117,8 @@ def test_another_program_or_system_is_refused_before_anything_starts(net, tmp_pa
 def test_the_mission_goes_on_over_a_bad_line_a_partition_and_the_end_of_the_other_host(
         net, tmp_path):
     spec = specification(net, tmp_path)
-    with (host(net, "ground", tmp_path / "g", spec) as ground,
-          host(net, "robot", tmp_path / "r", spec, "--mission", "AB") as robot):
+    with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as ground,
+          host(net, "robot", tmp_path / "r", spec, "--no-keys", "--mission", "AB") as robot):
         robot.wait_for("goal 1/", 60)
         net.line = Line(**BAD)
         robot.wait_for("goal 2/", 120)
