@@ -75,7 +75,8 @@ class Run:
             reports / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind(run).name}")
         kept = self._directory.resolve()
         plan = msgspec.structs.replace(
-            plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"))
+            plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"),
+            audit_log=str(kept / f"audit-{plan.run_id}.jsonl") if plan.hmi_port else "")
         self._kind, self._context = kind, replace(run, plan=plan)
         self._trial = self._made(plan, sys.stderr)
         self._plan = plan
@@ -114,7 +115,8 @@ class Run:
         """Take the rate with which this machine keeps up."""
         def trial(rate: float, run_id: str) -> Trial:
             plan = msgspec.structs.replace(
-                self._plan, rate=rate, run_id=run_id, checkpoints="", hmi_port=0, waits=False)
+                self._plan, rate=rate, run_id=run_id, checkpoints="", hmi_port=0, audit_log="",
+                waits=False)
             return self._made(plan, None)
 
         rate = await find_rate(partial(probe_run, trial), _say, first_rate())
@@ -291,7 +293,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
         options, kind = parse(arguments, program)
-        plan, spec = plan_of(options, kind)
+        plan, spec = plan_of(options, kind, _say)
         if plan.host:
             return _on_another_host(options, plan, reports)
         return Run(options, plan, spec, reports).run()

@@ -17,10 +17,8 @@ from __future__ import annotations
 
 import argparse
 import datetime as dt
-import os
-import socket
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +32,7 @@ from rampart.actors.recording.bag_writer import check_target
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_plan import DEFAULT_PORT, RunPlan, load_system
 from rampart.actors.supervision.launcher import LAST_PORT
-from rampart.actors.web.access import Access, AccessError, is_loopback, new_token
-from rampart.actors.web.token_file import SecretError, read_secret
-from rampart.cli import application_options
+from rampart.cli import application_options, page_options
 from rampart.cli.output import UsageError, between, positive, refusing, using, warn
 from rampart.cli.verbs import (
     PORT_VARIABLE,
@@ -59,7 +55,6 @@ from rampart.sim.runs.rate_search import LEAST, MOST
 from rampart.sim.virtual.network import NETWORKS
 
 ERROR_LOG = "errors.log"
-TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
 HMI = "rampart.actors.operator.hmi:Hmi"
 
 MAX_RATE = "max"
@@ -79,8 +74,8 @@ def _rate(text: str) -> float | str:
 _EXAMPLES = (
     ("", "the shipped system, as its spec says"),
     ("--rate 4 --no-hmi --json", "four times real time, result as JSON"),
-    ("--hmi-host 0.0.0.0", "the page for other machines too, with a token"),
-    ("--hmi-token-file FILE", "the page for others, with a token of yours"),
+    ("--hmi-host 0.0.0.0 --hmi-cert FILE --hmi-key FILE", "the page for other machines too"),
+    ("--hmi-token-file FILE", "the page for others, with tokens of yours"),
     ("--record run.mcap", "keep everything that is said; `rampart replay`"),
     ("--no-ftm", "the baseline, without fault tolerance"),
     ("--virtual --seed 7", "in seconds, and every time the same"),
@@ -102,14 +97,7 @@ _OPTIONS = (
            "(default: 1)"),
     whole("--seed", "N", "for sensor noise (default: 1)", 1),
     flag("--no-hmi", "no operator's page (its node still runs)"),
-    whole("--hmi-port", "PORT", "port of the operator's page (default: 8080)", 8080),
-    word("--hmi-host", "HOST", "address of the operator's page (default: 127.0.0.1, this machine "
-         "only). Any other makes it need a token, which is printed with the page's address when "
-         "the run starts", "127.0.0.1"),
-    word("--hmi-token-file", "FILE", "a file of yours, of mode 0600, with that token, 16 "
-         f"characters or more, to keep it over several runs; or set {TOKEN_VARIABLE} to it "
-         "(default: a random one; for yourself on this machine none is needed)", ""),
-    option("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS),  # refused
+    *page_options.OPTIONS,
     port_option("--port", "number that tells runs on this machine apart; no port is opened "
                 f"(default: that of {PORT_VARIABLE}, else {DEFAULT_PORT})", DEFAULT_PORT,
                 metavar="PORT"),
@@ -194,8 +182,14 @@ def _system_file(system: str) -> Path:
     return found
 
 
-def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPlan, SystemSpec]:
+def plan_of(options: argparse.Namespace, kind: type[Application],
+            note: Callable[[str], None] = warn) -> tuple[RunPlan, SystemSpec]:
     """Return the plan that the options ask for, and the system they name.
+
+    Args:
+        options: of the command line.
+        kind: the application of the system.
+        note: is told what is odd, and no error.
 
     Raises:
         UsageError: an option makes no sense, or not in this system.
@@ -204,15 +198,13 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
     _check(options)
     system_file = _system_file(options.system)
     host = _host(options, load_system(RunPlan(system_file=str(system_file))))
-    token, token_is_new = _token(options)
+    page = page_options.page_of(options, note)
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port,
         rate=1.0 if options.rate == MAX_RATE else options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
-        hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
-        hmi_host=options.hmi_host, hmi_token=token, hmi_token_is_new=token_is_new,
-        waits=options.wait, virtual=options.virtual, host=host)
+        shadow=options.shadow, waits=options.wait, virtual=options.virtual, host=host, **page)
     spec = load_system(plan)
     layout = Layout(plan, spec)
     _check_network(options, spec)
@@ -223,7 +215,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
     if not any(issubclass(member.actor, load_class(HMI)) and layout.hosts.home_of[name] == host
                for name, member in layout.members.items()):
         where = f" on host {host or 'the first'}" if layout.hosts.several else ""
-        refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token_file"),
+        refuse(options, ("wait", *page_options.NAMES),
                f"no node of {spec.name}{where} serves an operator's page")
         plan = msgspec.structs.replace(plan, hmi_port=0)
     return plan, spec
@@ -310,40 +302,3 @@ def _check(options: argparse.Namespace) -> None:
     for role, name in (("--strategy", options.strategy), ("--shadow", options.shadow)):
         if name and name not in STRATEGIES:
             raise UsageError(f"{role} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")
-
-
-def _token(options: argparse.Namespace) -> tuple[str, bool]:
-    """Return what the operator's page asks for, and whether it is new and has to be printed.
-
-    It comes from a file or the environment, which other users cannot read as they can read a
-    command line; where none is given and one is needed it is made.
-    """
-    host: str = options.hmi_host
-    own = os.environ.pop(TOKEN_VARIABLE, "")  # not for whatever is started
-    if options.hmi_token is not None:
-        raise UsageError("--hmi-token: a command line is read by every user of this machine; put "
-                         "another token into a file of mode 0600 for --hmi-token-file FILE, or "
-                         f"into the variable {TOKEN_VARIABLE}")
-    if options.no_hmi or options.virtual:
-        if options.wait:
-            raise UsageError("--wait: the mission is started from the operator's page, which there "
-                             f"is not with --{'no-hmi' if options.no_hmi else 'virtual'}")
-        return "", False
-    source = TOKEN_VARIABLE
-    try:
-        if options.hmi_token_file:
-            source = f"--hmi-token-file {options.hmi_token_file}"
-            own = read_secret(Path(options.hmi_token_file))
-        token = own or ("" if is_loopback(host) else new_token())
-        Access(host, options.hmi_port, token)
-    except (AccessError, SecretError) as error:
-        raise UsageError(f"{source}: {error}") from None
-    try:
-        family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, number) as probe:
-            probe.bind(address)
-    except (OSError, UnicodeError) as error:
-        why = getattr(error, "strerror", None) or str(error)
-        raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
-                         "for all it has") from None
-    return token, bool(token) and not own

@@ -258,8 +258,8 @@ class Attendance:
             await _closed(ends[1])
 
 
-_OWN = ("base_port", "hmi_port", "hmi_host", "hmi_token", "hmi_token_is_new", "launcher_pid",
-        "folder", "error_log", "origin_s", "checkpoints", "system_file", "host", "incarnations",
+_OWN = (*(name for name in RunPlan.__struct_fields__ if name.startswith("hmi_")),
+        "base_port", "launcher_pid", "folder", "error_log", "origin_s", "checkpoints", "system_file", "host", "incarnations",
         "keys", "ports")
 """Of a plan, what is each host's own."""
 

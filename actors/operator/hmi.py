@@ -7,7 +7,12 @@ is derived from it. What is shown is collected in `state`, the page is served by
 
 from __future__ import annotations
 
+import asyncio
 import math
+import os
+import pwd
+import secrets
+import socket
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -32,12 +37,19 @@ from rampart.actors.operator.system import draw_system
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import Panels, TopicsPublished
-from rampart.actors.web.access import AccessError
+from rampart.actors.web.access import Access, AccessError, is_loopback
+from rampart.actors.web.audit import AuditLog
+from rampart.actors.web.gate import Gate
+from rampart.actors.web.tls import Tls, TlsError
+from rampart.actors.web.visitors import Register, Role, Visitor, digest
 from rampart.manager.spec.panels import MAX_PANELS, Panel
 from rampart.manager.spec.specification import SystemSpec, check_document
 
 REPEAT_S = 0.5
 """Simulated seconds between repetitions of what was not answered."""
+
+TOKEN_HOLDER = "operator"  # noqa: S105 it is a name
+"""Who has the one token of a run that lists no visitors by name."""
 
 _PANELS = Bounds(text=200, items=max(MAX_PANELS, 40), room=40_000)
 
@@ -169,16 +181,38 @@ class Hmi(Actor):
         self._operating.start()
         for why in self._unheard:
             self.report_diagnostic("panel", why, self.name)
-        plan, operating = self.context.run.plan, self._operating
         try:
-            self._server = PageServer(
-                self._port, Feed(self._state, self.clock.now, self._hello, self._look),
-                Handlers(self.requests, operating.introduction, self._fulfil, operating.left),
-                plan.hmi_host, plan.hmi_token, camera=self._camera, files=self.files)
+            self._server = self._serve()
         except Exception as error:
-            known = isinstance(error, (AccessError, PortError))
+            known = isinstance(error, (AccessError, PortError, TlsError))
             why = str(error) if known else f"{type(error).__name__}: {error}"
             self.report_diagnostic("operator's page", why, f"port {self._port}")
+        else:
+            self._operating.drove = self._server.drove
+
+    def _serve(self) -> PageServer:
+        plan, complain = self.context.run.plan, self._complain
+        tls = Tls(Path(plan.hmi_cert), Path(plan.hmi_key), complain) if plan.hmi_cert else None
+        asks = bool(plan.hmi_token or plan.hmi_token_file)
+        owner = None if asks else Visitor(_user(), Role.INJECT)
+        holder = Visitor(TOKEN_HOLDER, Role.INJECT, digest(plan.hmi_token))
+        register = Register([holder] if plan.hmi_token else [],
+                            Path(plan.hmi_token_file) if plan.hmi_token_file else None, complain)
+        secret = plan.hmi_secret or secrets.token_hex(32)
+        names = () if is_loopback(plan.hmi_host) else (socket.gethostname(),)
+        access = Access(plan.hmi_host, self._port, asks, tls is not None, plan.hmi_unencrypted,
+                        (*names, *(tls.says.names if tls else ())))
+        audit = AuditLog(Path(plan.audit_log) if plan.audit_log else None, self.clock.now, complain,
+                         asyncio.get_running_loop().time)
+        operating = self._operating
+        return PageServer(
+            access, Feed(self._state, self.clock.now, self._hello, self._look),
+            Handlers(self.requests, operating.introduction, self._fulfil, operating.left),
+            lambda port: Gate(register, secret, port, tls=tls is not None, owner=owner), audit,
+            tls=tls, camera=self._camera, files=self.files)
+
+    def _complain(self, why: str) -> None:
+        self.report_diagnostic("operator's page", clip(why), f"port {self._port}")
 
     def on_stop(self) -> None:
         """Close the page."""
@@ -241,3 +275,11 @@ class Hmi(Actor):
     @on(bus_topics.INJECTION_REPORT)
     def _injection(self, message: bm.InjectionReport, _header: Header) -> None:
         self._operating.injected(message)
+
+
+def _user() -> str:
+    """Return the name of the user whose page it is."""
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:  # one that has no name
+        return f"user {os.getuid()}"

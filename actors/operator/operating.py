@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -43,11 +43,15 @@ class Operating:
         actor: the page's node.
         panels: of the page; among them are its sticks.
         state: what its pages are shown; the section "operating" is this one's.
+
+    Attributes:
+        drove: is told when a page has taken the stick of a panel, or let go of it, and why.
     """
 
     def __init__(self, actor: Actor, state: HmiState, panels: Sequence[Panel]) -> None:
         run = actor.context.run
         prefix = f"{run.plan.run_id}/{actor.name}.{actor.context.incarnation}"
+        self.drove: Callable[[int, str, bool, str], None] = lambda *_: None
         self._actor = actor
         self._state = state
         overhead_s = OVERHEAD_S * actor.clock.rate
@@ -118,7 +122,8 @@ class Operating:
                                f"{', '.join(self._sticks) or 'none'}")
         return self._sticks[panel]
 
-    def _stick_changed(self, panel: str, why: str) -> None:
+    def _stick_changed(self, panel: str, page: int, held: bool, why: str) -> None:
+        self.drove(page, panel, held, why)
         if why:
             self._state.log(self._now(), "note", f"{panel}: stick released: {why}")
         self.show()

@@ -7,11 +7,12 @@ that JSON cannot hold. Whether a request makes sense now is not decided here.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Generic, TypeVar, Union
+from typing import Annotated, ClassVar, Generic, TypeVar, Union
 
 import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.web.visitors import Role
 
 Name = Annotated[str, msgspec.Meta(max_length=200)]
 _Seconds = Annotated[float, msgspec.Meta(ge=0, le=86_400)]
@@ -19,17 +20,24 @@ R = TypeVar("R")
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a page asks for; the tag of a derived class is the `type` of its JSON."""
+    """What a page asks for; the tag of a derived class is the `type` of its JSON.
+
+    Class attributes:
+        role: who may; what declares none is for those who may do everything.
+    """
+
+    role: ClassVar[Role] = Role.INJECT
 
 
 class ResetRequest(Request, frozen=True, tag="reset"):
     """A latched recovery is to be released."""
 
+    role = Role.DRIVE
     recovery: Name
 
 
 class StrategyRequest(Request, frozen=True, tag="strategy"):
-    """Another strategy is to be set."""
+    """Another strategy is to be set: it changes what is done about faults, as injecting does."""
 
     name: Name
 
@@ -66,6 +74,7 @@ class StickRequest(Request, frozen=True, tag="stick"):
     `ticket` is the newest that the page was given (`stick`). Forward and left are in [-1, 1].
     """
 
+    role = Role.DRIVE
     panel: Name
     held: bool
     ticket: int = 0

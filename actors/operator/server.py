@@ -3,9 +3,9 @@
 It runs on the actor's own event loop and costs nothing while no page is open
 (`rampart.actors.web.server`, where connections are also let in and seen out).
 
-Who may do what is decided in `rampart.actors.web.access`, how much one may say in `limits`, and
-what may be said in `requests`. The files are the same for everybody; everything else needs the
-token where there is one. Where there is none, only this process's user is let in at all.
+Who is let in is decided in `rampart.actors.web.door` and what is behind it, how much one may say in
+`limits`, and what may be said in `requests`, which say the role that each needs: here it is held
+against that of whoever asks, and what came of it is written down.
 """
 
 from __future__ import annotations
@@ -21,22 +21,31 @@ from typing import Any
 import msgspec
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import HTTPConnection
 from starlette.requests import Request as HttpRequest
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
-from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rampart.actors.operator.camera_eye import CameraError, CameraEye
 from rampart.actors.operator.feed import SEND_TIMEOUT_S, Feed, PageFeed
 from rampart.actors.operator.limits import MessageBudget, Verdict
-from rampart.actors.operator.requests import RefusedError, Request, RequestError, RequestReader
-from rampart.actors.web.access import SUBPROTOCOL, Access, is_loopback, shown_token
-from rampart.actors.web.server import WebServer, is_known, served
+from rampart.actors.operator.requests import (
+    RefusedError,
+    Request,
+    RequestError,
+    RequestReader,
+    StickRequest,
+)
+from rampart.actors.web.access import SUBPROTOCOL, Access
+from rampart.actors.web.audit import AuditLog
+from rampart.actors.web.door import Door, address_of, login_routes, visitor_of
+from rampart.actors.web.gate import Gate
+from rampart.actors.web.server import WebServer, served
+from rampart.actors.web.tls import Tls
+from rampart.actors.web.visitors import Visitor
 
-NO_TOKEN = 4401
-"""Close code of a WebSocket without the token; its page asks for it."""
+NOT_LOGGED_IN = 4401
+"""Close code of a WebSocket of nobody who is known, or not any more; its page asks for a token."""
 
 MAX_PAGES = 16
 MAX_MESSAGE_BYTES = 4096
@@ -52,6 +61,8 @@ _LINKS = "<!-- links -->\n"
 _CAMERA = "/camera.jpg"
 _REFUSAL = ("This page is for the user who runs the robot; you are another one of this machine. "
             "With a token others get in too: launch.py --hmi-token-file FILE.")
+_LOOK_S = 1.0
+"""Real seconds after which a page that says nothing is closed when its token is withdrawn."""
 _HEADERS = {
     "cache-control": "no-cache",
     "content-security-policy": (
@@ -98,54 +109,81 @@ def page_files(robot: Path | None) -> dict[str, _File]:
     return {_INDEX: _File(index.encode(), "text/html"), **found}
 
 
+class _Page(msgspec.Struct, frozen=True):
+    """An open page: its number, who looks at it, and where."""
+
+    number: int
+    visitor: Visitor
+    address: str
+
+
 class PageServer:
     """Serves the operator's page, from when it is made, on the running loop.
 
     Args:
-        port: TCP port; 0 lets the system choose one.
+        access: where, and under which rules; port 0 lets the system choose one.
         feed: what pages are shown.
         handlers: what deals with the pages.
-        host: address to bind to.
-        token: what everybody has to show; "" for nothing, on loopback only.
+        gate: returns who is let in to a page on a port.
+        audit: where it is written down who does what.
+        tls: what it is encrypted with, or None.
         camera: where pictures come from, or None.
         files: folder of the robot's own JavaScript and CSS, or None.
 
     Raises:
         PortError: the address cannot be bound.
-        AccessError: it must not without a token.
     """
 
-    def __init__(self, port: int, feed: Feed, handlers: Handlers, host: str, token: str, *,
-                 camera: CameraEye | None, files: Path | None = None) -> None:
+    def __init__(self, access: Access, feed: Feed, handlers: Handlers,
+                 gate: Callable[[int], Gate], audit: AuditLog, *, tls: Tls | None = None,
+                 camera: CameraEye | None = None, files: Path | None = None) -> None:
         self._feed = feed
         self._camera = camera
         self._handlers = handlers
+        self._audit = audit
         self._reader = RequestReader(handlers.requests)
         self._count = 0
-        Access(host, port, token)  # refused before anything is bound
-        listening = _listen(host, port)
+        self._open: dict[int, _Page] = {}
+        listening = _listen(access.host, access.port)
         self.port: int = listening.getsockname()[1]
-        names = () if is_loopback(host) else (socket.gethostname(),)
-        self._access = Access(host, self.port, token, names)
-        self.pages = 0
+        access = msgspec.structs.replace(access, port=self.port)
+        self._gate = gate(self.port)
         public = page_files(files)
 
         async def file(request: HttpRequest) -> Response:
             asked = public[request.url.path]
             return Response(asked.content, media_type=asked.kind, headers=_HEADERS)
 
+        asks = self._gate.asks
         routes = [*(Route(path, file) for path in public), Route(_CAMERA, self._picture),
-                  WebSocketRoute("/ws", self._page)]
+                  *login_routes(self._gate, audit), WebSocketRoute("/ws", self._page)]
         self._server = WebServer(
             Starlette(routes=routes, middleware=[Middleware(
-                _Door, access=self._access, public=frozenset(public))]),
-            listening, refusal="" if token else _REFUSAL, known=not token,
-            ws_max_size=MAX_MESSAGE_BYTES)
+                Door, access=access, gate=self._gate, public=frozenset(public))]),
+            listening, refusal="" if asks else _REFUSAL, known=not asks,
+            tls=tls.context if tls else None,
+            not_plain=f"This page is encrypted: {access.url}", ws_max_size=MAX_MESSAGE_BYTES)
         self._server.start()
+
+    @property
+    def pages(self) -> int:
+        """How many are open."""
+        return len(self._open)
 
     def stop(self) -> None:
         """Stop listening and say goodbye to the pages."""
         self._server.stop()
+        self._audit.close()
+
+    def drove(self, number: int, panel: str, held: bool, why: str) -> None:
+        """Write down that a page has taken the stick of a panel, or let go of it."""
+        self._note(self._open.get(number), "take the stick" if held else "let go",
+                   asked={"panel": panel}, why=why)
+
+    def _note(self, page: _Page | None, what: str, **more: Any) -> None:
+        if page is not None:
+            self._audit.write(what, who=page.visitor.name, role=page.visitor.role,
+                              address=page.address, page=page.number, **more)
 
     async def _picture(self, request: HttpRequest) -> Response:
         if request.headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
@@ -162,25 +200,37 @@ class PageServer:
     async def _page(self, socket_: WebSocket) -> None:
         offered = socket_.scope.get("subprotocols", ())
         await socket_.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
-        if not _has_token(socket_, self._access):
-            await socket_.close(NO_TOKEN, "the token is missing or wrong")
+        visitor = visitor_of(socket_.scope)
+        if visitor is None:
+            await socket_.close(NOT_LOGGED_IN, "log in with your token")
             return
         if self.pages >= MAX_PAGES:
             await socket_.close(1013, f"more than {MAX_PAGES} pages")
             return
-        self.pages += 1
-        self._count = number = self._count + 1
+        self._count += 1
+        page = self._open[self._count] = _Page(self._count, visitor, address_of(socket_.scope))
+        self._note(page, "open")
         try:
-            with served(socket_.scope), self._feed.page() as page:
-                await _send(socket_, self._handlers.came(number))
-                await _until_one_ends(self._talk(socket_, page, number), self._push(socket_, page))
+            with served(socket_.scope), self._feed.page() as fed:
+                await _send(socket_, self._introduction(visitor))
+                await _send(socket_, self._handlers.came(page.number))
+                await _until_one_ends(self._talk(socket_, fed, page), self._push(socket_, fed),
+                                      self._watch(socket_, page))
         except (WebSocketDisconnect, RuntimeError, TimeoutError):
             return  # the page has gone while it was being answered
         finally:
-            self.pages -= 1
-            self._handlers.left(number)
+            self._handlers.left(page.number)
+            self._note(self._open.pop(page.number), "close")
 
-    async def _talk(self, socket_: WebSocket, page: PageFeed, number: int) -> None:
+    def _introduction(self, visitor: Visitor) -> dict[str, Any]:
+        """Return who the page's visitor is, and what that keeps it from."""
+        return {"type": "visitor", "name": visitor.name, "role": visitor.role,
+                "logs_out": self._gate.asks,
+                "barred": {str(kind.__struct_config__.tag): _bars(kind, visitor)
+                           for kind in self._handlers.requests
+                           if not visitor.role.may(kind.role)}}
+
+    async def _talk(self, socket_: WebSocket, fed: PageFeed, page: _Page) -> None:
         loop = asyncio.get_running_loop()
         budget = MessageBudget(loop.time())
         while True:
@@ -190,14 +240,20 @@ class PageServer:
             verdict = budget.spend(loop.time())
             text = message.get("text") or message.get("bytes")
             if verdict is Verdict.READ:
-                if not self._feed.heard(page, text):
-                    await _send(socket_, self._answer(text, number))
+                if not self._feed.heard(fed, text):
+                    await _send(socket_, self._answer(text, page))
             elif verdict is Verdict.TELL:
                 await _send(socket_, {"type": "error", "text": "too many messages from this page; "
                                       "those beyond the limit are not read"})
             elif verdict is Verdict.CLOSE:
                 await _close(socket_, 1008, "flooding: far too many messages")
                 return
+
+    async def _watch(self, socket_: WebSocket, page: _Page) -> None:
+        """Close the page of a visitor whose token is withdrawn, or whose role is another now."""
+        while self._gate.still(page.visitor):  # noqa: ASYNC110 it is a file that changes
+            await asyncio.sleep(_LOOK_S)
+        await _close(socket_, NOT_LOGGED_IN, "your token is withdrawn, or your role was changed")
 
     async def _push(self, socket_: WebSocket, page: PageFeed) -> None:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
@@ -206,47 +262,31 @@ class PageServer:
             except TimeoutError:
                 await _close(socket_, 1013, "this page does not keep up")
 
-    def _answer(self, text: str | bytes | None, number: int) -> dict[str, Any]:
+    def _answer(self, text: str | bytes | None, page: _Page) -> dict[str, Any]:
+        request: Request | None = None
         try:
-            told = self._handlers.fulfil(self._reader.read(text), number)
+            request = self._reader.read(text)
+            if not self._gate.still(page.visitor):
+                raise RefusedError("your token is withdrawn, or your role was changed")
+            if why := _bars(type(request), page.visitor):
+                raise RefusedError(why)
+            told = self._handlers.fulfil(request, page.number)
         except (RequestError, RefusedError) as error:
+            self._heard(page, request, why=str(error), refused=True)
             return {"type": "error", "text": str(error)}
+        if not isinstance(request, StickRequest):  # it comes twenty times a second; see `drove`
+            self._heard(page, request, why=told if isinstance(told, str) else "")
         return {"type": "done", "text": told} if isinstance(told, str) else told
 
-
-class _Door:
-    """Turns away foreign hosts and origins, and requests without the token, before all else."""
-
-    def __init__(self, app: ASGIApp, access: Access, public: frozenset[str]) -> None:
-        self._app = app
-        self._public = public
-        self._access = access
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        connection = HTTPConnection(scope)
-        hosts = connection.headers.getlist("host")
-        known = len(hosts) == 1 and self._access.own_host(hosts[0])
-        if scope["type"] == "websocket":
-            origin = connection.headers.get("origin")
-            if not (known and self._access.own_origin(origin)):
-                await send({"type": "websocket.close", "code": 1008})  # before it was accepted: 403
-                return
-        elif not known:
-            await PlainTextResponse("Invalid host header", 400)(scope, receive, send)
-            return
-        elif scope["path"] not in self._public and not _has_token(connection, self._access):
-            await PlainTextResponse("The token is missing or wrong", 401)(scope, receive, send)
-            return
-        await self._app(scope, receive, send)
+    def _heard(self, page: _Page, request: Request | None, **more: Any) -> None:
+        asked = {} if request is None else msgspec.to_builtins(request)
+        self._note(page, asked.pop("type", "message"), asked=asked, **more)
 
 
-def _has_token(connection: HTTPConnection, access: Access) -> bool:
-    permitted = access.permits(shown_token(
-        connection.headers.get("authorization"), connection.query_params.get("token"),
-        connection.scope.get("subprotocols", ())))
-    if permitted:
-        is_known(connection.scope)
-    return permitted
+def _bars(kind: type[Request], visitor: Visitor) -> str:
+    """Return why a visitor may not ask for something; "" if it may."""
+    return "" if visitor.role.may(kind.role) else (
+        f"Needs the role {kind.role}: you are {visitor.name}, with the role {visitor.role}")
 
 
 async def _until_one_ends(*parts: Coroutine[Any, Any, None]) -> None:

@@ -146,7 +146,8 @@ class Stick:
     Args:
         actor: the page's node.
         panel: that declares it.
-        changed: called when it is held or let go, with the reason if nobody meant it.
+        changed: called with a page when that holds it or lets go, whether it holds it, and the
+            reason if nobody meant it.
 
     Attributes:
         desk: who has it.
@@ -156,7 +157,8 @@ class Stick:
         ValueError: the node knows no such topic.
     """
 
-    def __init__(self, actor: Actor, panel: Panel, changed: Callable[[str], None]) -> None:
+    def __init__(self, actor: Actor, panel: Panel,
+                 changed: Callable[[int, bool, str], None]) -> None:
         self.desk = StickDesk()
         self.note = ""
         self._actor = actor
@@ -188,16 +190,16 @@ class Stick:
             self._drive()
             if before != page:
                 self.note = ""
-                self._changed("")
+                self._changed(page, True, "")
         elif before is not None and self.desk.holder is None:
-            self._release(answer.text)
+            self._release(before, answer.text)
         return {"type": "stick", "panel": request.panel, "grip": answer.grip, "text": answer.text,
                 "ticket": answer.ticket}
 
     def left(self, page: int) -> None:
         """Take note that a page was closed; if it drove, the robot stops."""
         if self.desk.gone(page):
-            self._release("the page that drove was closed")
+            self._release(page, "the page that drove was closed")
 
     def _say(self, position: tuple[float, float] | None) -> None:
         self._actor.publish(self._topic, self._message(position), name=self._name)
@@ -221,14 +223,14 @@ class Stick:
         self._ticking = None
         lapsed = self.desk.expire(loop.time())
         if lapsed is not None:
-            self._release(f"page {lapsed} was silent for {SILENCE_S:g} s")
+            self._release(lapsed, f"page {lapsed} was silent for {SILENCE_S:g} s")
         if self.desk.holder is not None:
             if self._actor.clock.now() - self._sent_s >= self._period_s:
                 self._drive()
             self._tick_later(loop)
 
-    def _release(self, why: str) -> None:
+    def _release(self, page: int, why: str) -> None:
         """Tell the robot that it was let go, and the pages why if nobody meant it."""
         self._say(None)
         self.note = why
-        self._changed(why)
+        self._changed(page, False, why)

@@ -50,8 +50,16 @@ class RunPlan(msgspec.Struct, frozen=True):
         origin_s: reading of the monotonic clock at simulated time 0; set when all is loaded.
         checkpoints: directory for the nodes' checkpoints; "" keeps none, whatever the spec says.
         hmi_host: address at which the operator's page is served.
-        hmi_token: what every browser has to show there; "" for nothing, on loopback.
+        hmi_token: what everybody has to show there; "" for nothing, on loopback, or for tokens that
+            a file lists.
         hmi_token_is_new: it was made for this run, so the operator has yet to be told.
+        hmi_token_file: path of the list of those who have tokens; "" for none.
+        hmi_cert: path of the certificate with which the page is encrypted; "" for plain HTTP.
+        hmi_key: path of its key.
+        hmi_unencrypted: it need not be, though other machines reach it.
+        hmi_secret: key of the page's cookies; its node makes one for itself where there is none.
+        hmi_shown: address or name under which the page is shown; "" for the one it is served at.
+        audit_log: file that keeps who did what on the page; "" for none.
         faults: what the page offers to inject by name.
         waits: True has the mission wait until the operator starts it from the page.
         virtual: whether time is virtual: nothing outside of the process is used.
@@ -79,6 +87,13 @@ class RunPlan(msgspec.Struct, frozen=True):
     hmi_host: str = "127.0.0.1"
     hmi_token: str = ""
     hmi_token_is_new: bool = False
+    hmi_token_file: str = ""
+    hmi_cert: str = ""
+    hmi_key: str = ""
+    hmi_unencrypted: bool = False
+    hmi_secret: str = ""
+    hmi_shown: str = ""
+    audit_log: str = ""
     faults: tuple[NamedFault, ...] = ()
     waits: bool = False
     virtual: bool = False
@@ -110,15 +125,18 @@ class RunPlan(msgspec.Struct, frozen=True):
 
     @property
     def hmi_page(self) -> str:
-        """Where the operator's page is, "" if there is none, for everybody: without the token."""
-        return page_url(self.hmi_host, self.hmi_port) if self.hmi_port else ""
+        """Where the operator's page is, "" if there is none; the token is no part of it."""
+        return page_url(self.hmi_shown or self.hmi_host, self.hmi_port, tls=bool(self.hmi_cert)
+                        ) if self.hmi_port else ""
 
     @property
     def hmi_page_to_open(self) -> str:
         """The same, once, for who has started the run: with the token, if it is new."""
-        if self.hmi_token and not self.hmi_token_is_new:
-            return f"{self.hmi_page} (open it with #token= and your token behind)"
-        return page_url(self.hmi_host, self.hmi_port, self.hmi_token)
+        if self.hmi_token_is_new:
+            return f"{self.hmi_page} asks for the token {self.hmi_token}"
+        if self.hmi_token or self.hmi_token_file:
+            return f"{self.hmi_page} asks for your token"
+        return self.hmi_page
 
 
 def load_system(plan: RunPlan) -> SystemSpec:

@@ -1,33 +1,33 @@
-"""Who may talk to a web page that a node serves. Pure.
+"""Which requests may reach a web page that a node serves, whoever makes them. Pure.
 
 A user who reaches the operator's page can drive the robot, kill its nodes and release its emergency
 stop. So:
 
 * On loopback the user may whose process serves it; other users of this machine need a token
-  (`web_server` asks the kernel whose connection it is). Other people's *web pages* must not, in the
-  user's own browser: the `Host` header must name this page (against DNS rebinding), and a
-  WebSocket's `Origin` must be the page's own. Programs that are no browsers send no Origin.
+  (`server` asks the kernel whose connection it is). Other people's *web pages* must not, in the
+  user's own browser: the `Host` header must name this page (against DNS rebinding), and the
+  `Origin` of whatever changes something must be the page's own. Programs that are no browsers send
+  no Origin.
 * On any other address a token is needed as well, for everything but the files of the page, which
-  are the same for everybody. An address literal cannot be rebound, so it is a fine `Host`.
+  are the same for everybody; and the page is encrypted, unless somebody who knows the network says
+  that it need not be. An address literal cannot be rebound, so it is a fine `Host`; and so are the
+  names in the page's certificate.
 
-The token travels in clear text, like all of HTTP: outside of a network that you trust, leave the
-page on loopback and tunnel to it (`ssh -L`).
+Who somebody is and what they may do is decided in `gate` and `visitors`.
 """
 
 from __future__ import annotations
 
-import hmac
 import ipaddress
 import re
 import secrets
-from collections.abc import Iterable
-from urllib.parse import quote, urlsplit
+from urllib.parse import urlsplit
 
 import msgspec
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-TOKEN_PREFIX = "token."  # noqa: S105 it is not one
-"""A page cannot set headers of a WebSocket; it names its token as a subprotocol."""
+ANY = ("0.0.0.0", "::")  # noqa: S104 named, not bound
+"""Stand for all addresses of a machine."""
 
 SUBPROTOCOL = "rampart"
 _TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
@@ -40,6 +40,18 @@ class AccessError(ValueError):
 def new_token() -> str:
     """Return a token that cannot be guessed: 128 random bits, safe in a URL."""
     return secrets.token_urlsafe(16)
+
+
+def check_token(token: str) -> str:
+    """Return a token.
+
+    Raises:
+        AccessError: it is short, or no word; the line does not say what it is.
+    """
+    if not _TOKEN.fullmatch(token):
+        raise AccessError(f"token of {len(token)} characters: must be 16 or more of "
+                          "A to Z, a to z, 0 to 9, and - _ . ~")
+    return token
 
 
 def is_loopback(host: str) -> bool:
@@ -55,11 +67,11 @@ def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return None
 
 
-def page_url(host: str, port: int, token: str = "") -> str:
-    """Return where to open a page; the token is a fragment, which no browser sends or logs."""
-    host = "127.0.0.1" if host in ("0.0.0.0", "::") else host  # noqa: S104 it is shown, not bound
+def page_url(host: str, port: int, *, tls: bool = False) -> str:
+    """Return where to open a page."""
+    host = "127.0.0.1" if host in ANY else host
     host = f"[{host}]" if ":" in host else host
-    return f"http://{host}:{port}/" + (f"#token={quote(token)}" if token else "")
+    return f"http{'s' if tls else ''}://{host}:{port}/"
 
 
 class Access(msgspec.Struct, frozen=True):
@@ -68,29 +80,37 @@ class Access(msgspec.Struct, frozen=True):
     Args:
         host: address or name to bind to.
         port: TCP port.
-        token: what everybody has to show; "" for nothing, on loopback only.
-        names: other names of this machine under which the page may be asked for.
+        asks: whether visitors have to show a token.
+        tls: whether the page is encrypted.
+        plain: whether it need not be, for other machines.
+        names: other names under which the page may be asked for: of this machine, and of the
+            page's certificate.
 
     Raises:
-        AccessError: it would be open to the network without a token, or with one that is short.
+        AccessError: it would be open to the network without a token, or unencrypted.
     """
 
     host: str
     port: int
-    token: str = ""
+    asks: bool = False
+    tls: bool = False
+    plain: bool = False
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.token and not is_loopback(self.host):
+        if is_loopback(self.host):
+            return
+        if not self.asks:
             raise AccessError(f"page on {self.host}: needs a token, since other machines reach it")
-        if self.token and not _TOKEN.fullmatch(self.token):
-            raise AccessError(f"token of {len(self.token)} characters: must be 16 or more of "
-                              "A to Z, a to z, 0 to 9, and - _ . ~")
+        if not (self.tls or self.plain):
+            raise AccessError(f"page on {self.host}: other machines reach it, so it is encrypted: "
+                              "--hmi-cert FILE --hmi-key FILE; or say --hmi-unencrypted if nobody "
+                              "else is on that network")
 
     @property
     def url(self) -> str:
         """Where to open the page."""
-        return page_url(self.host, self.port, self.token)
+        return page_url(self.host, self.port, tls=self.tls)
 
     def own_host(self, header: str | None) -> bool:
         """Tell whether a `Host` header means this page."""
@@ -105,35 +125,16 @@ class Access(msgspec.Struct, frozen=True):
         """Tell whether a page of this `Origin` is this page; programs send none."""
         if origin is None:
             return True
+        scheme, port = ("https", 443) if self.tls else ("http", 80)
         try:
             parts = urlsplit(origin)
-            return (parts.scheme == "http" and "@" not in origin and not parts.path
-                    and self._own_name(parts.hostname or "") and (parts.port or 80) == self.port)
+            return (parts.scheme == scheme and "@" not in origin and not parts.path
+                    and self._own_name(parts.hostname or "") and (parts.port or port) == self.port)
         except ValueError:
             return False
 
-    def permits(self, shown: str | None) -> bool:
-        """Tell whether a token is the right one; takes as long for any wrong one."""
-        return not self.token or hmac.compare_digest(
-            (shown or "").encode(errors="replace"), self.token.encode())
-
     def _own_name(self, name: str) -> bool:
-        if name in LOOPBACK or name in (self.host.lower(), *(n.lower() for n in self.names)):
+        own = (self.host.lower(), *(n.lower() for n in self.names))
+        if name in LOOPBACK or name in own or f"*.{name.partition('.')[2]}" in own:
             return True
-        return bool(self.token) and _address(name) is not None  # without one, only loopback is here
-
-
-def shown_token(authorization: str | None, query: str | None,
-                subprotocols: Iterable[str] = ()) -> str | None:
-    """Return the token that a request shows, or None.
-
-    Args:
-        authorization: its header of that name, `Bearer TOKEN`.
-        query: its parameter `token`.
-        subprotocols: those of a WebSocket, `token.TOKEN` among them.
-    """
-    scheme, _, value = (authorization or "").partition(" ")
-    if scheme.lower() == "bearer":
-        return value.strip()
-    return next((name.removeprefix(TOKEN_PREFIX) for name in subprotocols
-                 if name.startswith(TOKEN_PREFIX)), query)
+        return self.asks and _address(name) is not None  # without a token, only loopback is here

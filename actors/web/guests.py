@@ -62,10 +62,19 @@ class Bucket:
 
     def take(self, count: float, now_s: float) -> float:
         """Take some, and return after how many seconds that will be allowed: 0 if it is now."""
+        self._fill(now_s)
+        self._left -= count
+        return max(-self._left / self._per_s, 0.0)
+
+    def has(self, count: float, now_s: float) -> bool:
+        """Tell whether so much could be taken now; nothing is."""
+        self._fill(now_s)
+        return self._left >= count
+
+    def _fill(self, now_s: float) -> None:
         gained = max(now_s - self._at_s, 0.0) * self._per_s
         self._at_s = now_s
-        self._left = min(self._left + gained, self._most) - count
-        return max(-self._left / self._per_s, 0.0)
+        self._left = min(self._left + gained, self._most)
 
 
 class Guest:

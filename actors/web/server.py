@@ -9,6 +9,9 @@ It runs on the caller's event loop, of uvicorn there are but the two protocols: 
 ten times a second, handles signals, and takes as many connections in one turn of the loop as come.
 Here it is one, so that those that are there have a turn after each; and a connection that is
 refused costs a tenth of one that is let in. Nothing is done without connections.
+
+Where it is encrypted, a connection counts from its first byte on, not from when hands are shaken:
+who never does is closed as who never asks. One that speaks plain HTTP is told where the page is.
 """
 
 from __future__ import annotations
@@ -17,9 +20,10 @@ import asyncio
 import contextlib
 import os
 import socket
-from collections.abc import Iterator
+import ssl
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import uvicorn
 from starlette.types import ASGIApp, Scope
@@ -44,8 +48,16 @@ KEEP_ALIVE_S = 3
 PING_S = 5.0
 """A WebSocket that does not answer a ping for so long is closed."""
 
+TLS_COST = 4.0
+"""What one that is encrypted counts among those that come: its handshake is some ms of work."""
+
 _SWEEP_S = 1.0
 _RETRY_S = 0.1
+_GOODBYE_S = 1.0
+_HANDSHAKE = 0x16
+"""First byte of a connection that speaks TLS; of HTTP it is a letter."""
+
+_CALLER = "caller"
 _GUEST = "guest"
 _RECEPTION = "reception"
 _SOURCE = "source"
@@ -53,6 +65,30 @@ _SOURCE = "source"
 _NOT_YOURS = (
     b"HTTP/1.1 403 Forbidden\r\ncontent-type: text/plain; charset=utf-8\r\nconnection: close\r\n"
     b"x-content-type-options: nosniff\r\ncontent-length: %d\r\n\r\n%b")
+_NOT_PLAIN = _NOT_YOURS.replace(b"403 Forbidden", b"400 Bad Request")
+
+
+class Caller(Protocol):
+    """A connection that can be made to go."""
+
+    def abort(self) -> None:
+        """Close it at once."""
+
+    def __hash__(self) -> int: ...
+
+
+class _Arrival:
+    """A connection that is not encrypted yet, then is."""
+
+    def __init__(self, task: asyncio.Task[Any] | None) -> None:
+        self._task = task
+        self.transport: asyncio.Transport | None = None
+
+    def abort(self) -> None:
+        if self.transport is not None:
+            self.transport.abort()
+        elif self._task is not None:
+            self._task.cancel()
 
 
 class Reception:
@@ -67,7 +103,7 @@ class Reception:
         text = refusal.encode() + b"\n"
         self._refusal = _NOT_YOURS % (len(text), text) if refusal else b""
         self._known = known
-        self._guests: Guests[asyncio.Transport] = Guests()
+        self._guests: Guests[Caller] = Guests()
         self._sweeper: asyncio.TimerHandle | None = None
 
     def __len__(self) -> int:
@@ -93,19 +129,19 @@ class Reception:
             return f"user {user}"
         return str(address) if address.version == 4 else address.packed[:8].hex()
 
-    def came(self, transport: asyncio.Transport, source: str) -> Guest:
+    def came(self, caller: Caller, source: str) -> Guest:
         """Let a connection in, at the cost of another if need be."""
         loop = asyncio.get_running_loop()
-        guest, go = self._guests.came(transport, source, known=self._known, now_s=loop.time())
+        guest, go = self._guests.came(caller, source, known=self._known, now_s=loop.time())
         for one in go:
             one.abort()
         if self._sweeper is None:
             self._sweeper = loop.call_later(_SWEEP_S, self._sweep)
         return guest
 
-    def left(self, transport: asyncio.Transport) -> None:
+    def left(self, caller: Caller) -> None:
         """Forget a connection that is closed."""
-        self._guests.left(transport)
+        self._guests.left(caller)
 
     def close(self) -> None:
         """Stop looking for connections that have waited too long."""
@@ -117,6 +153,11 @@ class Reception:
         for one in self._guests.overdue(loop.time()):
             one.abort()
         self._sweeper = loop.call_later(_SWEEP_S, self._sweep) if len(self._guests) else None
+
+
+def source_of(scope: Scope) -> str:
+    """Return whom the maker of a request is counted with."""
+    return str(scope["state"][_SOURCE])
 
 
 def is_known(scope: Scope) -> None:
@@ -141,13 +182,14 @@ class _Http(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        reception: Reception = self.app_state[_RECEPTION]
-        guest = reception.came(transport, self.app_state[_SOURCE])
-        self.app_state = {**self.app_state, _GUEST: guest}
+        if _GUEST not in self.app_state:
+            reception: Reception = self.app_state[_RECEPTION]
+            guest = reception.came(transport, self.app_state[_SOURCE])
+            self.app_state = {**self.app_state, _GUEST: guest, _CALLER: transport}
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
-        self.app_state[_RECEPTION].left(self.transport)
+        self.app_state[_RECEPTION].left(self.app_state[_CALLER])
 
     def data_received(self, data: bytes) -> None:
         if _may(self.app_state[_GUEST], data, self.transport):
@@ -169,7 +211,7 @@ class _WebSocket(WebSocketsSansIOProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
-        self.app_state[_RECEPTION].left(self.transport)
+        self.app_state[_RECEPTION].left(self.app_state[_CALLER])
 
     def data_received(self, data: bytes) -> None:
         if self.close_sent:  # all that is still of interest is its goodbye
@@ -197,13 +239,20 @@ class WebServer:
         listening: bound; it is closed by `stop`.
         refusal: see `Reception`.
         known: see `Reception`.
+        tls: returns what the next connection is encrypted with; None for plain HTTP.
+        not_plain: what who speaks plain HTTP is told then.
         settings: of `uvicorn.Config`.
     """
 
     def __init__(self, app: ASGIApp, listening: socket.socket, *, refusal: str = "",
-                 known: bool = False, **settings: Any) -> None:
+                 known: bool = False, tls: Callable[[], ssl.SSLContext] | None = None,
+                 not_plain: str = "", **settings: Any) -> None:
         self.reception = Reception(refusal, known=known)
         self._listening = listening
+        self._tls = tls
+        text = not_plain.encode() + b"\n"
+        self._not_plain = _NOT_PLAIN % (len(text), text)
+        self._arriving: set[asyncio.Task[None]] = set()
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)  # inherited
         self._config = uvicorn.Config(
             app, log_config=None, log_level="critical", access_log=False, lifespan="off",
@@ -227,6 +276,8 @@ class WebServer:
             asyncio.get_running_loop().remove_reader(self._listening)
             self._accepting.cancel()
         self._listening.close()
+        for arriving in self._arriving:
+            arriving.cancel()
         for connection in list(self._state.connections):
             connection.shutdown()
 
@@ -239,12 +290,48 @@ class WebServer:
             try:
                 connection, _ = await loop.sock_accept(self._listening)
                 source = self.reception.source(connection)
-                if source is not None:
+                if source is not None and self._tls is not None:
+                    cost = TLS_COST
+                    arriving = loop.create_task(self._encrypt(connection, source, self._tls()))
+                    self._arriving.add(arriving)
+                    arriving.add_done_callback(self._arriving.discard)
+                elif source is not None:
                     cost = 1.0
-                    await loop.connect_accepted_socket(partial(self._protocol, source), connection)
+                    await loop.connect_accepted_socket(
+                        partial(self._protocol, {_SOURCE: source}), connection)
             except OSError:  # no descriptor is left, for instance
                 await asyncio.sleep(_RETRY_S)
             await asyncio.sleep(coming.take(cost, loop.time()))  # others have their turn
 
-    def _protocol(self, source: str) -> _Http:
-        return _Http(self._config, self._state, {_RECEPTION: self.reception, _SOURCE: source})
+    async def _encrypt(self, connection: socket.socket, source: str, tls: ssl.SSLContext) -> None:
+        """Shake hands with who has come, unless it speaks plain HTTP."""
+        loop = asyncio.get_running_loop()
+        arrival = _Arrival(asyncio.current_task())
+        guest = self.reception.came(arrival, source)
+        state = {_SOURCE: source, _GUEST: guest, _CALLER: arrival}
+        try:
+            if await _first_byte(connection) != _HANDSHAKE:
+                await loop.sock_sendall(connection, self._not_plain)
+                await loop.sock_recv(connection, RECEIVE_BUFFER)  # else the answer may be lost
+                raise OSError("no TLS")
+            arrival.transport, _ = await loop.connect_accepted_socket(
+                partial(self._protocol, state), connection, ssl=tls,
+                ssl_handshake_timeout=guests.PATIENCE_S, ssl_shutdown_timeout=_GOODBYE_S)
+        except (OSError, asyncio.CancelledError):  # the latter is an abort: nobody waits for this
+            self.reception.left(arrival)
+            connection.close()
+
+    def _protocol(self, state: dict[str, Any]) -> _Http:
+        return _Http(self._config, self._state, {_RECEPTION: self.reception, **state})
+
+
+async def _first_byte(connection: socket.socket) -> int:
+    """Return the first byte that a connection sends, which stays there to be read; -1: none."""
+    loop = asyncio.get_running_loop()
+    readable = asyncio.Event()
+    loop.add_reader(connection, readable.set)
+    try:
+        await readable.wait()
+    finally:
+        loop.remove_reader(connection)
+    return next(iter(connection.recv(1, socket.MSG_PEEK)), -1)

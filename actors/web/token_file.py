@@ -1,4 +1,4 @@
-"""A secret in a file that only this user can read."""
+"""Secrets in files that only this user can read."""
 
 from __future__ import annotations
 
@@ -16,10 +16,23 @@ class SecretError(ValueError):
 def read_secret(file: Path) -> str:
     """Return the one line of a file that belongs to this user and that others cannot read.
 
+    Raises:
+        SecretError: as of `read_private`, or it is no line.
+    """
+    content = read_private(file, MAX_BYTES + 1)
+    lines = content.strip().splitlines()
+    if len(lines) != 1 or len(lines[0]) > MAX_BYTES or not lines[0].isascii():
+        raise SecretError(f"must hold one line of up to {MAX_BYTES} plain characters")
+    return lines[0].decode()
+
+
+def read_private(file: Path, most: int) -> bytes:
+    """Return the first bytes of a file that belongs to this user and that others cannot get at.
+
     What is looked at is what is then read: the file cannot be exchanged in between.
 
     Raises:
-        SecretError: it is not there, or others can read it, or have written it, or it is no line.
+        SecretError: it is not there, or others can read it, or have written it.
     """
     try:
         opened = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -28,12 +41,9 @@ def read_secret(file: Path) -> str:
         raise SecretError(f"cannot be read ({why})") from None
     try:
         _check(os.fstat(opened))
-        lines = os.read(opened, MAX_BYTES + 1).strip().splitlines()
+        return os.read(opened, most)
     finally:
         os.close(opened)
-    if len(lines) != 1 or len(lines[0]) > MAX_BYTES or not lines[0].isascii():
-        raise SecretError(f"must hold one line of up to {MAX_BYTES} plain characters")
-    return lines[0].decode()
 
 
 def _check(found: os.stat_result) -> None:

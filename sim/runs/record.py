@@ -16,6 +16,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
+from rampart.actors.web.audit import AuditLine
 from rampart.manager.strategies.registry import decision_in_words
 from rampart.sim.faults.scenario import FaultOutcome
 from rampart.sim.runs.keeping_up import KeptUp
@@ -91,6 +92,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         rate: simulated seconds per second.
         faults: that were planned, and what became of them.
         keeping_up: whether the machine kept up with the rate; None in virtual time.
+        audit: who did what on the operator's page.
     """
 
     run_id: str
@@ -109,6 +111,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     rate: float
     faults: tuple[FaultOutcome, ...] = ()
     keeping_up: KeptUp | None = None
+    audit: tuple[AuditLine, ...] = ()
 
 
 _SOON_S = 1.0

@@ -27,13 +27,14 @@ from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.web.audit import read_audit
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import INJECTOR, Injector, ProcessControl
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.console import Console
 from rampart.sim.runs.judge import Judge, Verdict
-from rampart.sim.runs.keeping_up import KeepingUp, KeptUp
+from rampart.sim.runs.keeping_up import KeepingUp
 from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord, RunRecorder, Safety
 from rampart.sim.runs.report import Written, margin_text, render, try_report
@@ -167,15 +168,18 @@ class Trial:
             why: it is over.
         """
         del why
-        return self.recorder.record(now_s, faults=self.outcomes(), keeping_up=self._kept_up(now_s))
+        return self.recorder.record(now_s, **self._seen_to(now_s))
 
-    def _kept_up(self, now_s: float) -> KeptUp | None:
-        return self._keeping_up.result(now_s) if self._keeping_up else None
+    def _seen_to(self, now_s: float) -> dict[str, Any]:
+        """Return the fields of a record that come from elsewhere than messages."""
+        log = self.run.plan.audit_log
+        return {"faults": self.outcomes(), "audit": read_audit(Path(log)) if log else (),
+                "keeping_up": self._keeping_up.result(now_s) if self._keeping_up else None}
 
     def concluded(self, verdict: Verdict, now_s: float, why: str) -> RunRecord:
         """Return the record of a run that has ended for a reason, and was judged."""
         return self.recorder.record(
-            now_s, faults=self.outcomes(), keeping_up=self._kept_up(now_s),
+            now_s, **self._seen_to(now_s),
             mission="success" if verdict.success else "fail",
             safety=_SAFETY[verdict.safe],
             reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))

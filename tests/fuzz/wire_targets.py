@@ -26,7 +26,9 @@ from rampart.actors.runtime.checkpoint import StateError
 from rampart.actors.runtime.process_usage import parse_stat
 from rampart.actors.supervision.process_title import parse_title
 from rampart.actors.supervision.spawner import Adapt, ForkRequest, Ping, Reply, Request, SetOrigin
-from rampart.actors.web.access import Access, page_url, shown_token
+from rampart.actors.web.access import Access
+from rampart.actors.web.gate import Gate
+from rampart.actors.web.visitors import Register, Role, Visitor, VisitorError, digest, parse
 from rampart.manager.actor import MANAGER_STATE
 from tests.fuzz.samples import sample
 from tests.fuzz.target import target
@@ -127,22 +129,31 @@ def page_request(data: bytes) -> None:
     _READER.read(data.decode(errors="replace"))
 
 
-_ACCESS = (Access("127.0.0.1", 8080), Access("0.0.0.0", 8080, "t" * 20, ("robot",)))
+_ACCESS = (Access("127.0.0.1", 8080),
+           Access("0.0.0.0", 8080, asks=True, tls=True, names=("robot", "*.robot")))
+_GATE = Gate(Register([Visitor("anna", Role.DRIVE, digest("t" * 20))]), "", 8080, tls=False)
 
 
 @target("page-headers", refuses=(), kind="text",
-        words=("@", "[::1]", ":", "http://", "token=", "Bearer ", "localhost", "127.0.0.1"),
+        words=("@", "[::1]", ":", "http://", "rampart-8080=", "Bearer ", "localhost", "127.0.0.1"),
         samples=lambda: [b"127.0.0.1:8080", b"http://localhost:8080", b"[::1]:8080",
-                         b"Bearer tttttttttttttttttttt", b"token.tttttttttttttttttttt"])
+                         b"Bearer tttttttttttttttttttt", b"rampart-8080=anna|1|ab; a=b"])
 def page_headers(data: bytes) -> None:
-    """Host, origin, authorization, query and subprotocol, as HTTP hands them over: latin-1."""
+    """Host, origin, authorization and cookie, as HTTP hands them over: latin-1."""
     text = data.decode("latin-1")
     for access in _ACCESS:
         access.own_host(text)
         access.own_origin(text)
-        access.permits(shown_token(text, text, text.split(",")))
-        access.permits(shown_token(None, text))
-    page_url("127.0.0.1", 8080, data.decode(errors="replace"))
+    _GATE.visitor(text, None)
+    _GATE.visitor(None, text)
+    _GATE.log_in(text, text)
+
+
+@target("page-tokens", refuses=(VisitorError,), kind="text", words=("look", "drive", "#", "\n"),
+        samples=lambda: [b"anna drive " + b"a" * 64 + b"\n# all\n"])
+def page_tokens(data: bytes) -> None:
+    """The file of those who have tokens."""
+    parse(data.decode("latin-1").splitlines())
 
 
 # -- a node's own past -----------------------------------------------------------------------------

@@ -1,25 +1,96 @@
-// The token of a page that other machines can reach: taken from the address once, kept by this tab.
-// Other fragments are places on the page.
+// Who looks at the page: logging in and out, and what the visitor's role lacks.
+//
+// The token is typed once and kept nowhere here: the HMI answers with a cookie that no script can read.
 
-const KEY = "rampart-token";
+import { $, element, say } from "./dom.js";
 
-function fromAddress() {
-  const found = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (!found) return false;
-  sessionStorage.setItem(KEY, found);
-  history.replaceState(null, "", location.pathname + location.search);  // not to be read over a shoulder
-  return true;
+export const NOT_LOGGED_IN = 4401;
+const tabs = new BroadcastChannel("rampart-login");  // the other tabs of this browser
+
+let why = {};               // kind of request: why the visitor may not make it
+const notes = new WeakMap();
+
+export const barred = (kind) => why[kind] || "";
+
+/** Take a part of the page out of use if the visitor's role lacks what it is for, and say so. */
+export function bar(part, kind) {
+  const text = barred(kind);
+  part.inert = Boolean(text);
+  part.classList.toggle("barred", Boolean(text));
+  if (text && !notes.has(part)) {
+    const note = element("p", "quiet why-barred");
+    notes.set(part, note);
+    part.after(note);
+  }
+  const note = notes.get(part);
+  if (!note) return;
+  note.hidden = !text;
+  say(note, text);
 }
 
-fromAddress();
-addEventListener("hashchange", () => { if (fromAddress()) location.reload(); });
+export class Visitor {
+  /** `entered` is called when somebody has logged in, here or in another tab, `left` when out. */
+  constructor(entered, left) {
+    this.entered = entered;
+    this.left = left;
+    $("login-form").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.enter($("login-token").value.trim());
+    });
+    $("login").addEventListener("cancel", (event) => event.preventDefault());  // nothing is behind it
+    $("logout").addEventListener("click", () => this.leave());
+    tabs.addEventListener("message", (event) => (event.data === "in" ? this.close() : this.left()));
+  }
 
-export const token = () => sessionStorage.getItem(KEY) || "";
+  /** Ask for a token, and say what was wrong with what there was. */
+  ask(text) {
+    say($("login-text"), text);
+    if (!$("login").open) $("login").showModal();
+    $("login-token").focus();
+  }
 
-/** Subprotocols of the WebSocket: a browser sends no header of ours, but these. */
-export const protocols = () => (token() ? ["rampart", `token.${token()}`] : ["rampart"]);
+  close() {
+    if (!$("login").open) return;
+    $("login").close();
+    $("login-token").value = "";
+    this.entered();
+  }
 
-/** Headers with which to ask the HMI for what is not one of its files: no address holds the token. */
-export const headers = () => (token() ? { authorization: `Bearer ${token()}` } : {});
+  async enter(token) {
+    try {
+      const answer = await fetch("login", { method: "POST", body: JSON.stringify({ token }) });
+      if (!answer.ok) {
+        this.ask(`${await answer.text()}.`);
+        return;
+      }
+    } catch {
+      this.ask("The HMI is not reachable; try again.");
+      return;
+    }
+    this.close();
+    tabs.postMessage("in");
+  }
 
-export const NO_TOKEN = 4401;
+  async leave() {
+    try {
+      await fetch("logout", { method: "POST" });
+    } finally {
+      tabs.postMessage("out");
+      this.left();
+    }
+  }
+
+  /** Take a message of the HMI; tell whether it said who the visitor is. */
+  receive(message) {
+    if (message.type !== "visitor") return false;
+    why = message.barred;
+    document.body.dataset.barred = Object.keys(why).join(" ");
+    $("visitor").hidden = $("logout").hidden = !message.logs_out;
+    say($("visitor"), `${message.name} · ${message.role}`);
+    for (const [part, kind] of [["resets", "reset"], ["strategy", "strategy"], ["inject", "inject"]]) {
+      bar($(part), kind);
+    }
+    say($("signals-barred"), barred("signal"));
+    return true;
+  }
+}

@@ -1,7 +1,7 @@
 // The operator's page: shows the picture that the HMI pushes, asks for what the operator wants.
 
 import { $, Memory, clock, element, pill, say } from "./dom.js";
-import { NO_TOKEN, protocols } from "./access.js";
+import { NOT_LOGGED_IN, Visitor, bar, barred } from "./access.js";
 import { Arrangement } from "./arrange.js";
 import { Camera } from "./camera.js";
 import { DecisionLog, EventLog, LINES } from "./log.js";
@@ -11,7 +11,7 @@ import { Panels } from "./panels.js";
 import { FaultTree, Order } from "./tree.js";
 
 const LOGS = ["decisions", "events"];
-const panels = new Panels(new Arrangement($("main")), { send, toast });
+const panels = new Panels(new Arrangement($("main")), { send, toast, bar, barred });
 const tree = new FaultTree($("tree"));
 const order = new Order($("order"));
 const processes = new ProcessTable($("nodes"));
@@ -22,6 +22,7 @@ const logs = {
 const operating = new Operating((wish) => send(wish));
 const camera = new Camera();
 const memory = new Memory();
+const visitor = new Visitor(connect, () => { if (socket) lost("logged out"); });
 let picture = {};            // all that was heard, by section
 let fresh = { decisions: [], events: [] };  // lines of the logs that are not shown yet
 const changed = new Set();   // sections that are not shown yet
@@ -32,6 +33,7 @@ let tooMuch = {};            // what the HMI had no room for when it began, and 
 let introduction = null;     // what the HMI offers this page: it comes before the panels are there
 let socket = null;           // null between two attempts
 let retryMs = 500;
+let retry = 0;
 let lastHeard = 0;
 let toastTimer = 0;
 
@@ -42,12 +44,19 @@ const OPENING_MS = 10000;
 
 function connect() {
   lastHeard = Date.now();
-  socket = new WebSocket(`ws://${location.host}/ws`, protocols());
+  socket = new WebSocket(`${location.protocol.replace("http", "ws")}//${location.host}/ws`, "rampart");
   socket.onmessage = (event) => { lastHeard = Date.now(); receive(JSON.parse(event.data)); };
-  socket.onclose = (event) => lost(
-    event.code === NO_TOKEN ? "token missing: open the address that the run has printed, or #token=… with yours"
-      : event.reason ? `closed by the HMI: ${event.reason}; reconnecting`
-        : "HMI not reachable, reconnecting");
+  socket.onclose = (event) => {
+    if (event.code === NOT_LOGGED_IN) turnedAway(event.reason);
+    else lost(event.reason ? `closed by the HMI: ${event.reason}; reconnecting` : "HMI not reachable, reconnecting");
+  };
+}
+
+/** Wait for a token: what was shown last, if anything, opens nothing any more. */
+function turnedAway(reason) {
+  lost("not logged in");
+  clearTimeout(retry);
+  visitor.ask(`${reason[0].toUpperCase()}${reason.slice(1)}.`);
 }
 
 /** Take the connection for lost now: a browser waits a minute for a server that does not say goodbye. */
@@ -58,7 +67,7 @@ function lost(why) {
   ready = false;
   panels.offline();
   link("bad", why);
-  setTimeout(connect, retryMs);
+  retry = setTimeout(connect, retryMs);
   retryMs = Math.min(retryMs * 1.5, 4000);
 }
 
@@ -83,6 +92,7 @@ function send(wish) {
 function receive(message) {
   if (message.type === "hello") hello(message);
   else if (message.type === "state") take(message);
+  else if (visitor.receive(message)) return;
   else if (operating.receive(message)) introduction = message;
   else if (panels.receive(message)) return;
   else if (message.text) toast(message.text);

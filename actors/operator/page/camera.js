@@ -1,7 +1,6 @@
 // A picture of the robot, rendered while somebody looks. The next one is asked for when the last
 // one is shown, so a slow page or renderer gets fewer pictures and no backlog.
 
-import { headers } from "./access.js";
 import { $, say } from "./dom.js";
 
 const PAUSE_MS = 200;
@@ -37,7 +36,7 @@ export class Camera {
   async take() {
     let delayMs = RETRY_MS;
     try {
-      const answer = await fetch("camera.jpg", { cache: "no-store", headers: headers() });
+      const answer = await fetch("camera.jpg", { cache: "no-store" });
       if (answer.ok) {
         await this.draw(await createImageBitmap(await answer.blob()));
         delayMs = PAUSE_MS;

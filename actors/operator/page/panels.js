@@ -1,7 +1,9 @@
 // The panels that robot and specification contribute: drawn by widgets, or by scripts of the robot.
 //
 // A script's default export is a class `(room, page)`. `room` has the panel's `section`, `title` and
-// `body`; `page` has `send(wish)`, `toast(text)` and the declaration, `declared`. It may have
+// `body`; `page` has `send(wish)`, `toast(text)`, the declaration, `declared`, `barred(kind)`, why the
+// visitor may not make requests of that type ("" if it may), and `bar(part, kind)`, which takes a part
+// of the panel out of use then and says why; call it from `begin`. It may have
 // `begin(hello)` for each connection, `take(state)` for each message of the picture, also while the
 // page is hidden, `show(picture, changed)` for each frame, `receive(message)` for other messages of
 // the HMI (true if it was its own), and `offline()`.

@@ -26,6 +26,7 @@ export class Stick {
 
   constructor(room, page) {
     this.send = page.send;
+    this.visitor = page;
     this.panel = page.declared.title;
     this.axes = page.declared.stick.length;  // forward alone, or left as well
     this.gamepads = false;  // a gamepad is for the first stick of a page
@@ -72,9 +73,9 @@ export class Stick {
     this.words.setAttribute("role", "status");
     this.pad.setAttribute("aria-describedby", `${this.how.id} ${this.words.id}`);
     words.append(this.how, speed, this.words);
-    const row = element("div", "stick-row");
-    row.append(this.pad, words);
-    room.body.append(row);
+    this.row = element("div", "stick-row");
+    this.row.append(this.pad, words);
+    room.body.append(this.row);
   }
 
   listen() {
@@ -151,6 +152,7 @@ export class Stick {
 
   /** Where the stick is: [forward, left] in [-1, 1], or null if nothing is held. */
   position() {
+    if (this.visitor.barred("stick")) return null;
     const share = this.share.valueAsNumber / 100;
     const pad = this.gamepad();
     if (this.dragged || pad) return (this.dragged || pad).map((value) => clip(value * share));
@@ -221,6 +223,7 @@ export class Stick {
 
   introduced(page) {
     this.page = page;
+    this.visitor.bar(this.row, "stick");
     this.ticket = 0;
     this.barred = this.position() !== null;
     this.draw();
@@ -275,6 +278,7 @@ export class Stick {
     const status = this.status;
     const other = status && status.holder !== null && status.holder !== this.page;
     if (this.page === null || !status) pill(this.state, "warn", "not connected");
+    else if (this.visitor.barred("stick")) pill(this.state, "", "not for your role");
     else if (other) pill(this.state, "warn", `page ${status.holder} drives`);
     else if (!status.works) pill(this.state, "warn", "no effect now");
     else if (driving && status.note) pill(this.state, "warn", "not followed");

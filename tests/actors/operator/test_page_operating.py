@@ -369,18 +369,3 @@ async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
             await tab.until("document.querySelector('#faults li').textContent"
                             ".includes('over, 12 messages changed')")
         assert tab.errors == []
-
-
-async def test_the_token_of_the_address_is_kept_by_the_tab_and_hidden(world):
-    async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi):
-        at = await served(hmi)
-        await tab.show(f"http://{at}/")
-        await tab.until("document.getElementById('link').textContent.includes('token missing')")
-        await tab.call("Page.navigate", url=f"http://{at}/#token={TOKEN}")
-        await tab.until(LIVE)
-        assert await tab.value("location.hash") == ""
-        await tab.value("window.before = true")
-        await tab.call("Page.reload")
-        await tab.until(f"{LIVE} && window.before === undefined")
-        assert [url for url in tab.requests if TOKEN in url.partition("#")[0]] == []

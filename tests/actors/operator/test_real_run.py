@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import ssl
 import subprocess
 import sys
 from pathlib import Path
@@ -10,11 +12,14 @@ from pathlib import Path
 import httpx
 import pytest
 from mcap.reader import make_reader
+from websockets.sync.client import connect
 
 from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.web.visitors import Role, issue
 from rampart.testing import RealRun, free_base_port
 from tests import ROOT
 from tests.actors.operator.browser import browser
+from tests.actors.web.pems import pair
 
 pytestmark = pytest.mark.processes
 TOKEN = "secret-of-the-hangar-7"
@@ -94,31 +99,122 @@ async def key(tab, name: str, *, down: bool) -> None:
                    code=name)
 
 
+ELSEWHERE = ["--hmi-host", "0.0.0.0"]
+
+
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["--hmi-host", "192.0.2.1"], "--hmi-host 192.0.2.1: no address of this machine"),
-    (["--hmi-host", "no such host"], "--hmi-host no such host: no address of this machine"),
+    (["--hmi-host", "192.0.2.1", "--hmi-unencrypted"],
+     "--hmi-host 192.0.2.1: no address of this machine"),
+    (["--hmi-host", "no such host", "--hmi-unencrypted"],
+     "--hmi-host no such host: no address of this machine"),
+    (ELSEWHERE, "--hmi-host 0.0.0.0: page on 0.0.0.0: other machines reach it, so it is encrypted: "
+                "--hmi-cert FILE --hmi-key FILE; or say --hmi-unencrypted"),
+    ([*ELSEWHERE, "--hmi-cert", "robot.crt"],
+     "--hmi-cert robot.crt: holds no key; --hmi-key FILE is needed as well"),
+    ([*ELSEWHERE, "--hmi-cert", "nothing"], "--hmi-cert, --hmi-key: key nothing: cannot be read"),
+    ([*ELSEWHERE, "--hmi-key", "robot.key"], "--hmi-key robot.key: --hmi-cert FILE is needed"),
+    ([*ELSEWHERE, "--hmi-cert", "robot.crt", "--hmi-key", "other.key"],
+     "--hmi-cert, --hmi-key: key other.key: is not that of certificate robot.crt"),
+    ([*ELSEWHERE, "--hmi-cert", "old.crt", "--hmi-key", "old.key"],
+     "--hmi-cert, --hmi-key: certificate old.crt: certificate has expired"),
+    ([*ELSEWHERE, "--hmi-cert", "no", "--hmi-key", "other.key"],
+     "--hmi-cert, --hmi-key: certificate no: cannot be read (No such file or directory)"),
+    ([*ELSEWHERE, "--hmi-cert", "robot.crt", "--hmi-key", "robot.key", "--hmi-unencrypted"],
+     "--hmi-unencrypted: with --hmi-cert robot.crt the page is encrypted; leave one of them out"),
+    (["--hmi-token-file", "twice"], "--hmi-token-file twice: line 2: name 'anna': there already"),
+    (["--hmi-token-file", "captain"], "--hmi-token-file captain: line 1: role 'captain': unknown; "
+                                      "there are: look, drive, inject"),
+    (["--hmi-token-file", "nobody"], "--hmi-token-file nobody: lists nobody; rampart tokens issue"),
 ])
-def test_an_address_that_cannot_be_served_is_one_clear_line(tmp_path, arguments, words):
+def test_a_page_that_cannot_be_served_like_this_is_one_clear_line(tmp_path, arguments, words):
+    for name in ("robot", "other", "old"):
+        pair(tmp_path, name)
+    for name, text in (("twice", f"anna look {'a' * 64}\nanna look {'b' * 64}\n"),
+                       ("captain", f"anna captain {'a' * 64}\n"), ("nobody", "# nobody\n")):
+        (tmp_path / name).touch(0o600)
+        (tmp_path / name).write_text(text)
     done = subprocess.run(
-        [sys.executable, str(ROOT / "launch.py"), "--report", str(tmp_path), *arguments],
+        [sys.executable, str(ROOT / "launch.py"), "--report", str(tmp_path / "r"), *arguments],
         check=False, capture_output=True, text=True, timeout=60, cwd=tmp_path)
     assert done.returncode == 2
-    assert words in done.stderr
+    assert done.stderr.startswith(f"launch.py: {words}")
     assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_a_page_for_the_network_prints_its_new_token_once_and_tools_are_not_told_it(tmp_path):
     port = free_base_port()
-    with RealRun(tmp_path, "paper", "--mission", "A", "--hmi-port", str(port),
-                 "--hmi-host", "0.0.0.0", hmi=True) as run:
-        run.wait_for("#token=")
-        address = next(w for w in run.story.split() if "#token=" in w)
-        assert address.startswith(f"http://127.0.0.1:{port}/#token=")
-        assert run.info.page == f"http://127.0.0.1:{port}/"
-        token = address.partition("#token=")[2]
+    certificate, key = pair(tmp_path)
+    with RealRun(tmp_path, "paper", "--mission", "A", "--hmi-port", str(port), *ELSEWHERE,
+                 "--hmi-cert", str(certificate), "--hmi-key", str(key), hmi=True) as run:
+        run.wait_for("asks for the token")
+        line = next(line for line in run.story.splitlines() if "asks for the token" in line)
+        assert f"https://robot.local:{port}/ asks for the token " in line
+        assert run.info.page == f"https://robot.local:{port}/"
+        token = line.split()[-1]
+        assert len(token) == 22
         titles = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True)
         assert token not in titles.stdout
         assert run.story.count(token) == 1
+
+
+def answers(port: int, trusting: ssl.SSLContext) -> bool:
+    try:
+        return httpx.get(f"https://127.0.0.1:{port}/", verify=trusting).status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def test_what_visitors_do_over_tls_is_in_the_report_though_the_node_of_the_page_is_killed(
+        tmp_path):
+    port, tokens = free_base_port(), tmp_path / "page.tokens"
+    certificate, key = pair(tmp_path)
+    anna, bob = issue(tokens, "anna", Role.INJECT), issue(tokens, "bob", Role.LOOK)
+    short = tmp_path / "SHORT.miss"
+    short.write_text("x=-27,y=-8,taxi=1\n")
+    trusting = ssl.create_default_context(cafile=str(certificate))
+    with RealRun(tmp_path, "paper", "--mission", str(short), "--hmi-port", str(port),
+                 *ELSEWHERE, "--hmi-cert", str(certificate), "--hmi-key", str(key),
+                 "--hmi-token-file", str(tokens), hmi=True) as run:
+        run.sleep_until(2.0)
+        told: list[str] = []
+
+        def ask(token: str, **wish: object) -> None:
+            with httpx.Client(verify=trusting, base_url=f"https://127.0.0.1:{port}") as client:
+                assert client.post("/login", json={"token": token}).status_code == 200
+                cookie = "; ".join(f"{k}={v}" for k, v in client.cookies.items())
+            with connect(f"wss://127.0.0.1:{port}/ws", ssl=trusting,
+                         additional_headers={"Cookie": cookie}) as page:
+                page.send(json.dumps(wish))
+                while (message := json.loads(page.recv(10)))["type"] not in ("done", "error"):
+                    pass
+                told.append(message["type"])
+
+        ask(bob, type="signal", node="localization", signal="KILL")
+        ask(anna, type="signal", node="localization", signal="KILL")
+        before = run.pid("hmi")
+        run.kill("hmi")
+        run.wait_until(lambda: run.pid("hmi") not in (None, before), 20, "no other HMI")
+        run.wait_until(lambda: answers(port, trusting), 10, "the page did not come back")
+        ask(anna, type="strategy", name="mission-first")
+        code, result = run.result()
+    assert (code, told) == (0, ["error", "done", "done"])
+    record = json.loads(Path(result["record"]).read_text())
+    page = Path(result["report"]).read_text()
+    kept = [(line["who"], line["what"], line["outcome"])
+            for line in record["audit"]]
+    assert [line for line in kept if line[1] in ("signal", "strategy")] == [
+        ("bob", "signal", "refused"), ("anna", "signal", "accepted"),
+        ("anna", "strategy", "accepted")]
+    assert kept.count(("anna", "log in", "accepted")) == 2
+    assert all(line["utc"] and line["address"] == "127.0.0.1" for line in record["audit"])
+    assert "On the operator&#39;s page" in page or "On the operator's page" in page
+    assert "Needs the role inject: you are bob, with the role look" in page
+    (log,) = Path(result["report"]).parent.glob("audit-*.jsonl")
+    assert len(log.read_text().splitlines()) == len(record["audit"])
+    for file in tmp_path.rglob("*"):
+        content = file.read_bytes() if file.is_file() else b""
+        assert anna.encode() not in content
+        assert bob.encode() not in content
 
 
 def test_the_operators_own_token_opens_the_page_and_turns_up_nowhere(tmp_path, monkeypatch):
@@ -144,7 +240,7 @@ def test_the_operators_own_token_opens_the_page_and_turns_up_nowhere(tmp_path, m
         assert TOKEN not in said
         code, _ = run.result()
     assert code == 0
-    assert f"http://127.0.0.1:{port}/ (open it with #token= and your token behind)" in run.story
+    assert f"http://127.0.0.1:{port}/ asks for your token" in run.story
     with bag.open("rb") as recorded:
         reader = make_reader(recorded)
         parts = [*(message.data for _, _, message in reader.iter_messages()),

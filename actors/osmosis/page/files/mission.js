@@ -40,10 +40,14 @@ export default class Mission {
       event.preventDefault();
       this.send({ type: "mission", name: this.choice.value });
     });
-    room.body.append(this.reason, this.progress, this.steps, this.count, this.orders, this.start);
+    this.hands = element("div");
+    this.hands.append(this.orders, this.start);
+    this.bar = () => page.bar(this.hands, "order");
+    room.body.append(this.reason, this.progress, this.steps, this.count, this.hands);
   }
 
   begin(hello) {
+    this.bar();
     this.memory.forget();
     this.lights = hello.map ? hello.map.lights.length : 0;
     this.choice.replaceChildren(...(hello.missions || []).map((name) => new Option(name, name)));

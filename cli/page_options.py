@@ -1,0 +1,159 @@
+"""What can be said on the command line of the operator's page: where it is, for whom, how safe.
+
+All of it is checked before anything is started, so that a page that could not be served, or would
+be open to strangers, is one line and no surprise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import secrets
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rampart.actors.web.access import ANY, Access, AccessError, check_token, is_loopback, new_token
+from rampart.actors.web.tls import Certificate, TlsError, days_left, holds_key, load
+from rampart.actors.web.token_file import SecretError, read_secret
+from rampart.actors.web.visitors import VisitorError, lists_visitors, read_visitors
+from rampart.cli.output import UsageError
+from rampart.cli.verbs import flag, option, whole, word
+
+TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
+
+NAMES = ("hmi_port", "hmi_host", "hmi_token_file", "hmi_cert", "hmi_key", "hmi_unencrypted")
+
+_SOON_DAYS = 7.0
+"""A certificate that ends within so many days is told."""
+
+OPTIONS = (
+    whole("--hmi-port", "PORT", "port of the operator's page (default: 8080)", 8080),
+    word("--hmi-host", "HOST", "address of the operator's page (default: 127.0.0.1, this machine "
+         "only). Any other needs a certificate, and makes the page ask for a token, which is "
+         "printed with the page's address when the run starts", "127.0.0.1"),
+    word("--hmi-cert", "FILE", "certificate (PEM) with which the page is encrypted, and those that "
+         "lead to its authority", ""),
+    word("--hmi-key", "FILE", "its key (PEM), a file of yours, of mode 0600 (default: in the file "
+         "of the certificate)", ""),
+    flag("--hmi-unencrypted", "serve the page to other machines without a certificate: whoever "
+         "hears that network may then read the token and everything else"),
+    word("--hmi-token-file", "FILE", "a file of yours, of mode 0600: a token, 16 characters or "
+         "more, to keep it over several runs; or the names, roles and tokens that `rampart tokens` "
+         f"keeps. Or set {TOKEN_VARIABLE} to a token (default: a random one; for yourself on this "
+         "machine none is needed)", ""),
+    option("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS))  # refused
+
+
+def page_of(options: argparse.Namespace, note: Callable[[str], None]) -> dict[str, Any]:
+    """Return the fields of the plan that say where the page is, for whom, encrypted how.
+
+    Tokens come from a file or the environment, which other users cannot read as they can read a
+    command line; where none is given and one is needed it is made.
+
+    Args:
+        options: of the command line.
+        note: is told what is odd, and no error.
+
+    Raises:
+        UsageError: an option makes no sense, or the page could not be served like this.
+    """
+    own = os.environ.pop(TOKEN_VARIABLE, "")  # not for whatever is started
+    if options.hmi_token is not None:
+        raise UsageError("--hmi-token: a command line is read by every user of this machine; put "
+                         "another token into a file of mode 0600 for --hmi-token-file FILE, or "
+                         f"into the variable {TOKEN_VARIABLE}")
+    if options.no_hmi or options.virtual:
+        if options.wait:
+            raise UsageError("--wait: the mission is started from the operator's page, which there "
+                             f"is not with --{'no-hmi' if options.no_hmi else 'virtual'}")
+        return {"hmi_port": 0 if options.no_hmi else options.hmi_port}
+    host: str = options.hmi_host
+    token, listed = _tokens(options, own)
+    is_new = not (token or listed or is_loopback(host))
+    if is_new:
+        token = new_token()
+    certificate = _certificate(options, note)
+    try:
+        Access(host, options.hmi_port, bool(token or listed), certificate is not None,
+               options.hmi_unencrypted)
+    except AccessError as error:
+        raise UsageError(f"--hmi-host {host}: {error}") from None
+    _check_address(host)
+    return {
+        "hmi_port": options.hmi_port, "hmi_host": host, "hmi_token": token,
+        "hmi_token_is_new": is_new, "hmi_token_file": listed,
+        "hmi_cert": str(Path(options.hmi_cert).resolve()) if certificate else "",
+        "hmi_key": str(Path(options.hmi_key).resolve()) if certificate else "",
+        "hmi_unencrypted": options.hmi_unencrypted, "hmi_secret": secrets.token_hex(32),
+        "hmi_shown": _shown(host, certificate)}
+
+
+def _tokens(options: argparse.Namespace, own: str) -> tuple[str, str]:
+    """Return the token that everybody shows, or the path of the list of those who have one."""
+    source = TOKEN_VARIABLE
+    try:
+        if options.hmi_token_file:
+            source = f"--hmi-token-file {options.hmi_token_file}"
+            file = Path(options.hmi_token_file)
+            if lists_visitors(file):
+                if not read_visitors(file):
+                    raise VisitorError("lists nobody; rampart tokens issue NAME --role ROLE --file "
+                                       f"{file}")
+                return "", str(file.resolve())
+            own = read_secret(file)
+        return (check_token(own) if own else ""), ""
+    except (AccessError, SecretError, VisitorError) as error:
+        raise UsageError(f"{source}: {error}") from None
+
+
+def _certificate(options: argparse.Namespace, note: Callable[[str], None]
+                 ) -> Certificate | None:
+    """Return the certificate that is given, if any."""
+    cert, key = options.hmi_cert, options.hmi_key
+    if not (cert or key):
+        return None
+    if not cert:
+        raise UsageError(f"--hmi-key {key}: --hmi-cert FILE is needed as well")
+    if not key and Path(cert).is_file() and not holds_key(Path(cert)):
+        raise UsageError(f"--hmi-cert {cert}: holds no key; --hmi-key FILE is needed as well")
+    key = options.hmi_key = key or cert
+    if options.hmi_unencrypted:
+        raise UsageError(f"--hmi-unencrypted: with --hmi-cert {cert} the page is encrypted; leave "
+                         "one of them out")
+    try:
+        _, found = load(Path(cert), Path(key))
+    except TlsError as error:
+        raise UsageError(f"--hmi-cert, --hmi-key: {error}") from None
+    host = options.hmi_host
+    if not found.names:
+        note(f"--hmi-cert {cert}: is for no name or address (no subjectAltName): browsers will "
+             "refuse it")
+    elif host not in ANY and not found.covers(host):
+        note(f"--hmi-cert {cert}: is for {', '.join(found.names)}, not for {host}: browsers that "
+             f"open the page at {host} will refuse it")
+    if (days := days_left(found)) < _SOON_DAYS:
+        note(f"--hmi-cert {cert}: ends in {days:.1f} days; a new one in its place is taken while "
+             "the page is served")
+    return found
+
+
+def _shown(host: str, certificate: Certificate | None) -> str:
+    """Return under which name the page is shown: one that browsers accept, if there is one."""
+    names = certificate.plain_names if certificate else ()
+    if host in ANY:
+        others = (name for name in names if not is_loopback(name))
+        return next(others, next(iter(names), socket.gethostname() if certificate else ""))
+    return host
+
+
+def _check_address(host: str) -> None:
+    try:
+        family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, number) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
+                         "for all it has") from None

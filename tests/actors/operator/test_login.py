@@ -1,0 +1,331 @@
+"""Who may use the page: logging in, cookies, TLS, withdrawn tokens, and what is kept of it all."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+
+import httpx
+import msgspec
+import pytest
+import websockets
+
+from rampart.actors.web.audit import read_audit
+from rampart.actors.web.gate import GUESSES_AT_ONCE
+from rampart.actors.web.visitors import Role, issue, revoke
+from rampart.testing import eventually, free_port
+from tests.actors.operator.test_operating import RELEASED, TOKEN, Hand, ask, open_page
+from tests.actors.operator.world import hear, served
+from tests.actors.web.pems import pair, pem
+
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+
+async def post(client: httpx.AsyncClient, url: str, token: object, **headers: str):
+    return await client.post(f"{url}/login", json={"token": token}, headers=headers)
+
+
+async def turned_away(page) -> str:
+    """Wait until a page is closed for want of a token, and return the reason."""
+    with pytest.raises(websockets.ConnectionClosedError) as closed:
+        await hear(page, "never")
+    assert closed.value.rcvd.code == 4401
+    return closed.value.rcvd.reason
+
+
+def cookie_of(client: httpx.AsyncClient) -> dict[str, str]:
+    return {"Cookie": "; ".join(f"{name}={value}" for name, value in client.cookies.items())}
+
+
+async def test_with_a_token_the_files_are_open_and_everything_else_is_not(world):
+    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi:
+        at = await served(hmi)
+        async with open_page(at) as page:
+            assert await turned_away(page) == "log in with your token"
+        async with open_page(at, additional_headers={"Authorization": "Bearer wrong"}) as page:
+            await turned_away(page)
+        async with open_page(at, additional_headers=BEARER) as page:
+            assert (await hear(page, "operating"))["page"] == 1
+        async with httpx.AsyncClient() as client:
+            assert (await client.get(f"http://{at}/")).status_code == 200
+            assert (await client.get(f"http://{at}/app.js")).status_code == 200
+            for path in ("other", "camera.jpg", "logout", "ws"):
+                refused = await client.get(f"http://{at}/{path}")
+                assert refused.status_code == 401
+                assert "Authorization: Bearer TOKEN" in refused.text
+            assert (await client.get(f"http://{at}/other", headers=BEARER)).status_code == 404
+        with pytest.raises(websockets.InvalidStatus, match="403"):
+            await open_page(at, origin="http://evil.example", additional_headers=BEARER)
+    assert set(world.others.stick) <= {RELEASED}
+
+
+@pytest.mark.parametrize("shown", ["?token={}", "#token={}", "token={}"])
+async def test_a_token_in_an_address_or_a_subprotocol_opens_nothing(world, shown):
+    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi:
+        at = await served(hmi)
+        async with websockets.connect(
+                f"ws://{at}/ws{shown.format(TOKEN) if shown[0] in '?' else ''}",
+                subprotocols=["rampart", f"token.{TOKEN}"]) as page:
+            await turned_away(page)
+        async with httpx.AsyncClient() as client:
+            assert (await client.get(f"http://{at}/camera.jpg{shown.format(TOKEN)}"
+                                     )).status_code in (401, 404)
+
+
+@pytest.mark.usefixtures("patient")
+async def test_who_logs_in_gets_a_cookie_drives_and_logs_out(world):
+    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi:
+        at = await served(hmi)
+        async with httpx.AsyncClient() as client:
+            answer = await post(client, f"http://{at}", TOKEN)
+            assert (answer.status_code, answer.json()) == (
+                200, {"name": "operator", "role": "inject"})
+            set_cookie = answer.headers["set-cookie"]
+            assert "HttpOnly; SameSite=Strict" in set_cookie
+            assert "Secure" not in set_cookie  # plain HTTP: it would never be sent
+            assert TOKEN not in set_cookie
+            assert (await client.get(f"http://{at}/camera.jpg")).status_code == 503  # there is none
+            cookie = cookie_of(client)
+            async with open_page(at, additional_headers=cookie) as page:
+                told = await hear(page, "visitor")
+                assert (told["name"], told["role"], told["barred"]) == ("operator", "inject", {})
+                await Hand(page).take()
+            answer = await client.post(f"http://{at}/logout")
+            assert answer.status_code == 204
+            assert (await client.get(f"http://{at}/camera.jpg")).status_code == 401
+
+
+async def test_the_next_incarnation_knows_a_visitor_and_another_run_does_not(world):
+    port = free_port()
+    async with httpx.AsyncClient() as client:
+        for incarnation, secret, status in ((1, "of the run", 401), (2, "of the run", 503),
+                                            (3, "of another", 401)):
+            async with world.hmi(incarnation, hmi_port=port, hmi_token=TOKEN, hmi_secret=secret
+                                 ) as hmi:
+                at = await served(hmi)
+                assert (await client.get(f"http://{at}/camera.jpg")).status_code == status
+                if incarnation == 1:
+                    await post(client, f"http://{at}", TOKEN)
+
+
+async def test_what_is_no_login_is_refused(world, tmp_path):
+    log = tmp_path / "audit.jsonl"
+    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN, audit_log=str(log)) as hmi:
+        at = await served(hmi)
+        async with httpx.AsyncClient() as client:
+            for body in (b"", b"{", b'{"token": 3}', b'{"token": "a", "more": 1}', b"[]",
+                         b'{"token": "' + b"x" * 2000 + b'"}', TOKEN.encode()):
+                answer = await client.post(f"http://{at}/login", content=body)
+                assert answer.status_code == 400
+            evil = await post(client, f"http://{at}", TOKEN, Origin="http://evil.example")
+            assert evil.status_code == 403
+            assert "set-cookie" not in evil.headers
+            assert (await client.get(f"http://{at}/login")).status_code == 405
+            for i in range(GUESSES_AT_ONCE):
+                answer = await post(client, f"http://{at}", f"wrong-token-{i:010}")
+                assert (answer.status_code, answer.text) == (403, "that token opens nothing")
+            answer = await post(client, f"http://{at}", TOKEN)
+            assert answer.text == "too many wrong tokens; wait some seconds"
+            assert client.cookies == {}
+            assert (await client.get(f"http://{at}/camera.jpg", headers=BEARER)).status_code == 503
+    lines = read_audit(log)
+    assert {(line.what, line.who, line.address, line.outcome) for line in lines} == {
+        ("log in", "", "127.0.0.1", "refused")}
+    assert len(lines) == GUESSES_AT_ONCE + 1
+    assert "wrong-token" not in log.read_text()
+    assert TOKEN not in log.read_text()
+
+
+async def test_where_no_token_is_asked_for_there_is_nothing_to_log_in_to(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with httpx.AsyncClient() as client:
+            assert (await post(client, f"http://{at}", TOKEN)).status_code == 404
+        async with open_page(at) as page:
+            told = await hear(page, "visitor")
+            assert (told["role"], told["logs_out"], told["barred"]) == ("inject", False, {})
+
+
+# ---- several visitors ---------------------------------------------------------------------------
+
+
+async def test_a_withdrawn_token_closes_its_pages_and_a_changed_role_has_them_come_again(
+        world, tmp_path):
+    file = tmp_path / "page.tokens"
+    anna, bob = issue(file, "anna", Role.DRIVE), issue(file, "bob", Role.LOOK)
+    async with world.hmi(hmi_port=free_port(), hmi_token_file=str(file)) as hmi:
+        at = await served(hmi)
+        of_anna = {"Authorization": f"Bearer {anna}"}
+        async with open_page(at, additional_headers=of_anna) as page, \
+                open_page(at, additional_headers={"Authorization": f"Bearer {bob}"}) as other:
+            assert (await hear(page, "visitor"))["name"] == "anna"
+            file.write_text(file.read_text().replace("anna drive", "anna inject"))
+            assert await turned_away(page) == "your token is withdrawn, or your role was changed"
+            async with open_page(at, additional_headers=of_anna) as again:
+                assert (await hear(again, "visitor"))["role"] == "inject"
+                revoke(file, "anna")
+                await turned_away(again)
+            async with open_page(at, additional_headers=of_anna) as again:
+                await turned_away(again)
+            assert (await hear(other, "visitor"))["name"] == "bob"
+            file.unlink()
+            await turned_away(other)
+        await eventually(lambda: bool(world.others.diagnostics))
+        assert "it lets nobody in" in world.others.diagnostics[0].reason
+
+
+async def test_a_request_is_refused_as_soon_as_the_token_is_withdrawn(
+        world, tmp_path, monkeypatch):
+    monkeypatch.setattr("rampart.actors.operator.server._LOOK_S", 60.0)
+    file = tmp_path / "page.tokens"
+    anna = issue(file, "anna", Role.DRIVE)
+    async with world.hmi(hmi_port=free_port(), hmi_token_file=str(file)) as hmi:
+        async with open_page(await served(hmi), additional_headers={
+                "Authorization": f"Bearer {anna}"}) as page:
+            await hear(page, "hello")
+            revoke(file, "anna")
+            told = await ask(page, type="reset", recovery="RM1")
+            assert told == {"type": "error",
+                            "text": "your token is withdrawn, or your role was changed"}
+    assert world.others.resets == []
+
+
+@pytest.mark.usefixtures("patient")
+async def test_what_is_done_on_pages_is_written_down(world, tmp_path):
+    file, log = tmp_path / "page.tokens", tmp_path / "audit.jsonl"
+    anna, bob = issue(file, "anna", Role.DRIVE), issue(file, "bob", Role.LOOK)
+    async with world.hmi(hmi_port=free_port(), hmi_token_file=str(file), audit_log=str(log)) as hmi:
+        at = await served(hmi)
+        async with httpx.AsyncClient() as client:
+            await post(client, f"http://{at}", anna)
+            async with open_page(at, additional_headers=cookie_of(client)) as page:
+                await hear(page, "operating")
+                await ask(page, type="reset", recovery="RM1")
+                await ask(page, type="order", action="pause", reason="look")
+                await ask(page, type="inject", fault="gps-bias")
+                await ask(page, type="nonsense")
+                hand = Hand(page)
+                await hand.take()
+                await hand.hold(0.5)
+                await ask(page, type="stick", panel="Drive", held=False)
+                await hand.hold(0.5)
+            await eventually(lambda: hmi._server.pages == 0)
+        async with open_page(at, additional_headers={"Authorization": f"Bearer {bob}"}) as page:
+            await hear(page, "operating")
+            await ask(page, type="stick", panel="Drive", held=True)
+        await eventually(lambda: hmi._server.pages == 0)
+    found = read_audit(log)
+    assert [(line.who, line.role, line.page, line.what, line.outcome) for line in found] == [
+        ("anna", "drive", 0, "log in", "accepted"), ("anna", "drive", 1, "open", "accepted"),
+        ("anna", "drive", 1, "reset", "refused"), ("anna", "drive", 1, "order", "refused"),
+        ("anna", "drive", 1, "inject", "refused"), ("anna", "drive", 1, "message", "refused"),
+        ("anna", "drive", 1, "take the stick", "accepted"),
+        ("anna", "drive", 1, "let go", "accepted"),
+        ("anna", "drive", 1, "take the stick", "accepted"),
+        ("anna", "drive", 1, "let go", "accepted"), ("anna", "drive", 1, "close", "accepted"),
+        ("bob", "look", 2, "open", "accepted"), ("bob", "look", 2, "stick", "refused"),
+        ("bob", "look", 2, "close", "accepted")]
+    assert found[2].asked == {"recovery": "RM1"}
+    assert found[2].why == "'RM1' does not wait for a reset; waiting: none"
+    assert found[3].asked == {"action": "pause", "reason": "look"}
+    assert found[4].why == "Needs the role inject: you are anna, with the role drive"
+    assert found[9].why == "the page that drove was closed"
+    assert {line.address for line in found} == {"127.0.0.1"}
+    assert [line.t_s for line in found] == sorted(line.t_s for line in found)
+    assert anna not in log.read_text()
+    assert bob not in log.read_text()
+
+
+async def test_an_action_that_is_accepted_is_written_down_before_its_page_is_told(world, tmp_path):
+    log = tmp_path / "audit.jsonl"
+    async with world.hmi(hmi_port=free_port(), audit_log=str(log)) as hmi:
+        async with open_page(await served(hmi)) as page:
+            assert (await ask(page, type="strategy", name="mission-first"))["type"] == "done"
+            line = read_audit(log)[-1]
+    assert (line.what, line.asked, line.outcome) == (
+        "strategy", {"name": "mission-first"}, "accepted")
+    assert line.why == "strategy mission-first asked for"
+
+
+async def test_a_log_that_cannot_be_written_is_reported_and_bars_nobody(world, tmp_path):
+    async with world.hmi(hmi_port=free_port(), audit_log=str(tmp_path / "no" / "log")) as hmi:
+        async with open_page(await served(hmi)) as page:
+            assert (await ask(page, type="strategy", name="mission-first"))["type"] == "done"
+        await eventually(lambda: bool(world.others.diagnostics))
+    assert "who does what is not kept" in world.others.diagnostics[0].reason
+
+
+# ---- off loopback -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("fields", "why"), [
+    ({}, "needs a token"), ({"hmi_token": TOKEN}, "other machines reach it, so it is encrypted"),
+    ({"hmi_token": TOKEN, "hmi_cert": "/no/cert", "hmi_key": "/no/key"}, "key /no/key: cannot be")])
+async def test_a_page_that_must_not_be_served_is_not_and_the_reason_reported(world, fields, why):
+    async with world.hmi(hmi_port=free_port(), hmi_host="0.0.0.0", **fields) as hmi:
+        await eventually(lambda: bool(world.others.diagnostics))
+        assert hmi._server is None
+    assert why in world.others.diagnostics[0].reason
+
+
+async def test_on_another_address_a_foreign_host_is_refused_also_with_the_token(world):
+    async with world.hmi(hmi_port=free_port(), hmi_host="127.0.0.2", hmi_token=TOKEN) as hmi:
+        await served(hmi)
+        at = f"127.0.0.2:{hmi._server.port}"
+        async with httpx.AsyncClient(headers=BEARER) as client:
+            assert (await client.get(f"http://{at}/")).status_code == 200
+            for host in ("evil.example", ""):
+                refused = await client.get(f"http://{at}/", headers={"host": host})
+                assert refused.status_code == 400
+
+
+@pytest.mark.usefixtures("patient")
+async def test_over_tls_one_logs_in_and_drives_with_a_cookie_for_tls_alone(world, tmp_path):
+    certificate, key = pair(tmp_path)
+    trusting = ssl.create_default_context(cafile=str(pem(tmp_path, "robot.crt")))
+    async with world.hmi(hmi_port=free_port(), hmi_host="0.0.0.0", hmi_token=TOKEN,
+                         hmi_cert=str(certificate), hmi_key=str(key)) as hmi:
+        at = await served(hmi)
+        async with httpx.AsyncClient(verify=trusting) as client:
+            assert (await client.get(f"https://{at}/")).status_code == 200
+            for host, status in (("robot.local", 200), ("one.robots.example", 200),
+                                 ("evil.example", 400)):
+                answer = await client.get(f"https://{at}/", headers={"host": host})
+                assert answer.status_code == status
+            wrong = await post(client, f"https://{at}", TOKEN, Origin=f"http://{at}")
+            assert wrong.status_code == 403
+            answer = await post(client, f"https://{at}", TOKEN, Origin=f"https://{at}")
+            assert answer.headers["set-cookie"].startswith("__Host-rampart-")
+            assert answer.headers["set-cookie"].endswith("; Secure")
+            async with websockets.connect(
+                    f"wss://{at}/ws", ssl=trusting, origin=f"https://{at}",
+                    additional_headers=cookie_of(client)) as page:
+                await Hand(page).take()
+                await eventually(lambda: world.others.stick[-1].dead_man)
+            await eventually(lambda: world.others.stick[-1] == RELEASED)
+        async with httpx.AsyncClient() as client:
+            answer = await client.get(f"http://{at}/")
+            assert (answer.status_code, answer.text) == (
+                400, f"This page is encrypted: https://127.0.0.1:{hmi._server.port}/\n")
+
+
+async def test_an_expired_cookie_does_not_end_an_open_page_but_opens_no_other(world, monkeypatch):
+    monkeypatch.setattr("rampart.actors.web.gate.LASTS_S", 1)
+    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi:
+        at = await served(hmi)
+        async with httpx.AsyncClient() as client:
+            await post(client, f"http://{at}", TOKEN)
+            cookie = cookie_of(client)
+        async with open_page(at, additional_headers=cookie) as page:
+            await hear(page, "operating")
+            await asyncio.sleep(2.1)  # whole seconds of the monotonic clock
+            assert (await ask(page, type="strategy", name="luck"))["type"] == "error"
+            async with open_page(at, additional_headers=cookie) as later:
+                await turned_away(later)
+
+
+def test_lines_of_the_audit_are_part_of_a_record_and_back():
+    from rampart.actors.web.audit import AuditLine
+    line = AuditLine(utc="2026-01-01T00:00:00.000+00:00", t_s=1.5, who="anna", what="reset",
+                     outcome="accepted")
+    assert msgspec.json.decode(msgspec.json.encode(line), type=AuditLine) == line

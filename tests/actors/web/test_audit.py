@@ -1,0 +1,173 @@
+"""The file that says who did what: whole after any death, bounded, and never in the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from rampart.actors.web import audit
+from rampart.actors.web.audit import LINES_AT_ONCE, LINES_PER_S, AuditLine, AuditLog, read_audit
+
+
+class World:
+    def __init__(self) -> None:
+        self.now_s = 12.3456
+        self.real_s = 1000.0
+        self.told: list[str] = []
+
+    def log(self, file) -> AuditLog:
+        return AuditLog(file, lambda: self.now_s, self.told.append, lambda: self.real_s)
+
+
+@pytest.fixture
+def made() -> World:
+    return World()
+
+
+def test_a_line_says_who_when_what_and_what_came_of_it(tmp_path, made):
+    file = tmp_path / "audit.jsonl"
+    log = made.log(file)
+    log.write("reset", who="anna", address="10.0.0.7", role="drive", page=3,
+              asked={"recovery": "RM1"}, why="reset of RM1 asked for")
+    log.write("log in", address="10.0.0.8", refused=True, why="that token opens nothing")
+    first, second = (json.loads(line) for line in file.read_text().splitlines())
+    utc = first.pop("utc")
+    assert (len(utc), utc[10], utc[-6:]) == (29, "T", "+00:00")
+    assert first == {"t_s": 12.346, "who": "anna", "address": "10.0.0.7", "role": "drive",
+                     "page": 3, "what": "reset", "asked": {"recovery": "RM1"},
+                     "outcome": "accepted",
+                     "why": "reset of RM1 asked for"}
+    assert second["outcome"] == "refused"
+    assert [line.outcome for line in read_audit(file)] == ["accepted", "refused"]
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+def test_without_a_file_nothing_is_kept_and_without_one_there_nothing_read(tmp_path, made):
+    log = made.log(None)
+    log.write("reset")
+    log.close()
+    assert read_audit(tmp_path / "nothing") == ()
+    assert made.told == []
+
+
+def test_lines_of_a_process_that_is_killed_are_there_and_its_successor_goes_on(tmp_path, made):
+    file = tmp_path / "audit.jsonl"
+    code = ("import sys, time; from pathlib import Path\n"
+            "from rampart.actors.web.audit import AuditLog\n"
+            "log = AuditLog(Path(sys.argv[1]), lambda: 1.0, print, time.monotonic)\n"
+            "for i in range(50): log.write('reset', who='anna', asked={'n': i})\n"
+            "print('written', flush=True); time.sleep(60)")
+    with subprocess.Popen([sys.executable, "-c", code, str(file)], stdout=subprocess.PIPE,
+                          text=True) as writer:
+        assert writer.stdout.readline() == "written\n"
+        writer.send_signal(signal.SIGKILL)
+    made.log(file).write("close", who="anna")
+    lines = read_audit(file)
+    assert [line.asked["n"] for line in lines[:-1]] == list(range(50))
+    assert lines[-1].what == "close"
+
+
+def test_a_line_that_was_cut_in_two_spoils_no_other(tmp_path, made):
+    file = tmp_path / "audit.jsonl"
+    made.log(file).write("open", who="anna")
+    with file.open("ab") as torn:
+        torn.write(b'{"utc":"2026-01-01T00:00:00","t_s":1,"wh')
+    made.log(file).write("close", who="anna")
+    assert [(line.what, line.why) for line in read_audit(file)] == [
+        ("open", ""), ("audit", "a line that cannot be read"), ("close", "")]
+
+
+def test_who_writes_too_much_is_counted_and_keeps_no_other_from_writing(tmp_path, made):
+    file = tmp_path / "audit.jsonl"
+    log = made.log(file)
+    for _ in range(LINES_AT_ONCE + 70):
+        log.write("signal", who="eve", refused=True)
+    log.write("reset", who="anna")
+    assert [line.who for line in read_audit(file)] == [*["eve"] * LINES_AT_ONCE, "anna"]
+    made.real_s += 1 / LINES_PER_S
+    log.write("signal", who="eve", refused=True)
+    log.write("signal", who="eve", refused=True)
+    last = read_audit(file)[-1]
+    assert (last.who, last.left_out) == ("eve", 70)
+    made.real_s += 1 / LINES_PER_S
+    log.write("close", who="eve")
+    assert read_audit(file)[-1].left_out == 1
+
+
+def test_all_strangers_together_write_as_much_as_one_visitor(tmp_path, made):
+    file = tmp_path / "audit.jsonl"
+    log = made.log(file)
+    for i in range(3 * LINES_AT_ONCE):
+        log.write("log in", address=f"10.0.{i // 250}.{i % 250}", refused=True)
+    assert len(read_audit(file)) == LINES_AT_ONCE
+
+
+def test_a_full_file_says_so_in_its_last_line_and_grows_no_more(tmp_path, made, monkeypatch):
+    monkeypatch.setattr(audit, "MAX_BYTES", 5000)
+    file = tmp_path / "audit.jsonl"
+    log = made.log(file)
+    for i in range(300):
+        made.real_s += 10
+        log.write("reset", who="anna", asked={"n": i})
+    size = file.stat().st_size
+    assert 4000 < size < 5400
+    last = read_audit(file)[-1]
+    assert (last.who, last.why) == ("page", "full: what follows is not kept")
+    assert made.told == [f"{file}: full: 5000 bytes are the most; what follows is not kept"]
+
+
+def test_a_file_that_cannot_be_written_keeps_nobody_from_acting_and_is_told_once(tmp_path, made):
+    file = tmp_path / "gone" / "audit.jsonl"
+    log = made.log(file)
+    for _ in range(3):
+        log.write("reset", who="anna")
+    assert made.told == [
+        f"{file}: cannot be written (No such file or directory): who does what is not kept"]
+    file.parent.mkdir()
+    log.write("reset", who="anna")
+    assert [(line.who, line.why) for line in read_audit(file)] == [
+        ("page", "3 lines were not written"), ("anna", "")]
+
+
+def test_a_disk_that_takes_half_a_line_loses_that_line_alone(tmp_path, made, monkeypatch):
+    file = tmp_path / "audit.jsonl"
+    log = made.log(file)
+    log.write("open", who="anna")
+    real = os.write
+    monkeypatch.setattr(audit.os, "write", lambda handle, data: real(handle, data[:20]))
+    log.write("reset", who="anna")
+    monkeypatch.setattr(audit.os, "write", real)
+    log.write("close", who="anna")
+    assert [(line.what, line.why) for line in read_audit(file)] == [
+        ("open", ""), ("audit", "a line that cannot be read"),
+        ("audit", "1 lines were not written"), ("close", "")]
+    assert "No space left on device" in made.told[0]
+
+
+def test_a_link_in_the_place_of_the_file_is_not_followed(tmp_path, made):
+    (tmp_path / "elsewhere").write_text("mine")
+    (tmp_path / "audit.jsonl").symlink_to(tmp_path / "elsewhere")
+    made.log(tmp_path / "audit.jsonl").write("reset", who="anna")
+    assert (tmp_path / "elsewhere").read_text() == "mine"
+    assert len(made.told) == 1
+
+
+def test_a_long_request_is_kept_without_what_it_asked(tmp_path, made):
+    file = tmp_path / "audit.jsonl"
+    made.log(file).write("order", who="anna", asked={"reason": "x" * 5000}, why="y" * 5000)
+    (line,) = read_audit(file)
+    assert (line.what, line.asked, len(line.why)) == ("order", {}, 500)
+
+
+def test_lines_read_are_those_written(tmp_path, made):
+    file = tmp_path / "audit.jsonl"
+    made.log(file).write("inject", who="anna", asked={"fault": "freeze:a/b\n\x1b[2J\u202e"})
+    (line,) = read_audit(file)
+    assert isinstance(line, AuditLine)
+    assert line.asked == {"fault": "freeze:a/b\n\x1b[2J\u202e"}
+    assert len(file.read_bytes().splitlines()) == 1

@@ -1,0 +1,212 @@
+"""A page that is encrypted: its certificate and key, and who connects to it how."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import socket
+import ssl
+from pathlib import Path
+
+import pytest
+from starlette.applications import Starlette
+from starlette.responses import PlainTextResponse
+from starlette.routing import Route
+
+from rampart.actors.web import guests as web_guests
+from rampart.actors.web import server as web_server
+from rampart.actors.web.server import WebServer
+from rampart.actors.web.tls import Certificate, Tls, TlsError, holds_key, load
+from rampart.testing import eventually
+from tests.actors.web.pems import PEMS, pair, pem
+
+NOT_PLAIN = "This page is encrypted: https://robot.local:8080/"
+
+
+# ---- the files ----------------------------------------------------------------------------------
+
+
+def test_a_certificate_says_for_which_names_it_is(tmp_path):
+    _, found = load(*pair(tmp_path))
+    assert found.names == ("robot.local", "*.robots.example", "127.0.0.1", "::1")
+    assert found.plain_names == ("robot.local", "127.0.0.1", "::1")
+    assert found.covers("ROBOT.local")
+    assert found.covers("one.robots.example")
+    assert not found.covers("one.two.robots.example")
+    assert not found.covers("192.168.0.7")
+    assert Certificate((), 0.0).covers("robot.local") is False
+
+
+def test_one_file_may_hold_both(tmp_path):
+    both = pem(tmp_path, "robot.key")
+    assert holds_key(both)
+    both.write_text(PEMS["robot.key"] + PEMS["robot.crt"])
+    assert load(both, both)[1].covers("robot.local")
+    assert not holds_key(pem(tmp_path, "robot.crt"))
+    assert not holds_key(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize(("certificate", "key", "why"), [
+    ("robot.crt", "other.key", "key {key}: is not that of certificate {certificate}"),
+    ("old.crt", "old.key", "certificate {certificate}: certificate has expired"),
+    ("client.crt", "client.key", "certificate {certificate}: unsuitable certificate purpose"),
+    ("robot.crt", "locked.key", "key {key}: needs a passphrase; one without is right, in a file "
+                                "of mode 0600"),
+    ("robot.key", "robot.key", "certificate {certificate}: no certificate in PEM"),
+    ("robot.crt", "other.crt", "key {key}: no private key in PEM")])
+def test_what_cannot_encrypt_a_page_is_one_line_that_names_the_file(tmp_path, certificate, key,
+                                                                    why):
+    files = pem(tmp_path, certificate), pem(tmp_path, key)
+    with pytest.raises(TlsError) as error:
+        load(*files)
+    assert str(error.value) == why.format(certificate=files[0], key=files[1])
+
+
+def test_files_that_are_not_there_torn_or_open_to_others_are_refused(tmp_path):
+    certificate, key = pair(tmp_path)
+    for files, why in (((tmp_path / "no", key), "cannot be read (No such file or directory)"),
+                       ((certificate, tmp_path / "no"), "cannot be read (No such file"),
+                       ((tmp_path, key), "cannot be read (Is a directory)")):
+        with pytest.raises(TlsError) as error:
+            load(*files)
+        assert why in str(error.value)
+    key.chmod(0o640)
+    with pytest.raises(TlsError, match="mode 0640: others may get at it; chmod 600 it"):
+        load(certificate, key)
+    key.chmod(0o600)
+    certificate.write_text(PEMS["robot.crt"][:300])
+    with pytest.raises(TlsError) as torn:
+        load(certificate, key)
+    assert str(torn.value).startswith(f"certificate {certificate}, key {key}: not taken (")
+    assert len(str(torn.value).splitlines()) == 1
+    key.write_text(PEMS["robot.key"][:100])
+    with pytest.raises(TlsError):
+        load(pem(tmp_path, "robot.crt"), key)
+
+
+def test_a_renewed_certificate_is_taken_and_one_that_does_not_fit_is_not(tmp_path):
+    certificate, key = pair(tmp_path)
+    told: list[str] = []
+    tls = Tls(certificate, key, told.append)
+    before = tls.context()
+    assert tls.context() is before
+
+    certificate.write_text(PEMS["other.crt"])  # its key is not there yet
+    assert tls.context() is before
+    assert told == [f"key {key}: is not that of certificate {certificate}; the one before stays in "
+                    "force"]
+    tls.context()
+    assert len(told) == 1
+    key.write_text(PEMS["other.key"])
+    after = tls.context()
+    assert after is not before
+    assert tls.says.names == ("other.local",)
+    key.unlink()
+    assert tls.context() is after
+    assert len(told) == 2
+
+
+# ---- connections --------------------------------------------------------------------------------
+
+
+@contextlib.asynccontextmanager
+async def served(tmp_path, **settings):
+    """A server with one page, over TLS, on a port of loopback."""
+    async def front(_request):
+        return PlainTextResponse("here")
+
+    listening = socket.create_server(("127.0.0.1", 0))
+    port = listening.getsockname()[1]
+    server = WebServer(Starlette(routes=[Route("/", front)]), listening,
+                       tls=Tls(*pair(tmp_path)).context, not_plain=NOT_PLAIN, **settings)
+    server.start()
+    try:
+        yield server, port
+    finally:
+        server.stop()
+        await eventually(lambda: not server._arriving)
+
+
+def trusting(tmp_path) -> ssl.SSLContext:
+    return ssl.create_default_context(cafile=str(pem(tmp_path, "robot.crt")))
+
+
+async def ask(port: int, tls: ssl.SSLContext | None) -> bytes:
+    reader, writer = await asyncio.open_connection(
+        "127.0.0.1", port, ssl=tls, server_hostname="robot.local" if tls else None)
+    writer.write(b"GET / HTTP/1.1\r\nHost: robot.local\r\nConnection: close\r\n\r\n")
+    answer = await asyncio.wait_for(reader.read(), 5)
+    writer.close()
+    with contextlib.suppress(OSError, ssl.SSLError):
+        await writer.wait_closed()
+    return answer
+
+
+async def test_a_page_is_served_over_tls_1_3(tmp_path):
+    async with served(tmp_path) as (server, port):
+        assert (await ask(port, trusting(tmp_path))).endswith(b"here")
+        old = trusting(tmp_path)
+        old.maximum_version = ssl.TLSVersion.TLSv1_2
+        with pytest.raises((ssl.SSLError, ConnectionError)):
+            await ask(port, old)
+        with pytest.raises(ssl.SSLCertVerificationError):
+            await ask(port, ssl.create_default_context())
+        await eventually(lambda: len(server.reception) == 0)
+
+
+async def test_who_speaks_plain_http_is_told_where_the_page_is(tmp_path):
+    async with served(tmp_path) as (server, port):
+        answer = await ask(port, None)
+        assert answer.startswith(b"HTTP/1.1 400 Bad Request\r\n")
+        assert answer.endswith(NOT_PLAIN.encode() + b"\n")
+        await eventually(lambda: len(server.reception) == 0)
+
+
+@pytest.mark.parametrize("say", [b"", b"\x16\x03\x01", b"\x16\x03\x01\x02\x00\x01" + bytes(40)],
+                         ids=["nothing", "half a hello", "nonsense"])
+async def test_who_never_shakes_hands_is_closed_and_keeps_nobody_out(tmp_path, monkeypatch, say):
+    monkeypatch.setattr(web_guests, "PATIENCE_S", 0.4)
+    monkeypatch.setattr(web_server, "_SWEEP_S", 0.05)
+    loop = asyncio.get_running_loop()
+    async with served(tmp_path) as (server, port):
+        with contextlib.ExitStack() as held:
+            for _ in range(2 * web_guests.ROOM):
+                one = held.enter_context(socket.socket())
+                one.setblocking(False)
+                await loop.sock_connect(one, ("127.0.0.1", port))
+                with contextlib.suppress(OSError):
+                    await loop.sock_sendall(one, say)
+            assert (await ask(port, trusting(tmp_path))).endswith(b"here")
+            assert len(server.reception) <= web_guests.ROOM
+            await eventually(lambda: len(server.reception) == 0)
+            with contextlib.suppress(ConnectionError):
+                assert await asyncio.wait_for(loop.sock_recv(one, 10_000), 5) is not None
+
+
+def open_files() -> int:
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
+async def test_a_client_that_vanishes_in_the_middle_leaves_nothing(tmp_path):
+    async with served(tmp_path) as (server, port):
+        before = open_files()
+        for say in (b"", b"\x16", b"GET / HTTP/1.1\r\n"):
+            for _ in range(5):
+                _, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.write(say)
+                writer.transport.abort()
+        await eventually(lambda: len(server.reception) == 0 and not server._arriving)
+        await eventually(lambda: open_files() <= before)
+
+
+async def test_a_connection_made_after_the_certificate_was_renewed_gets_the_new_one(tmp_path):
+    files, others = tmp_path / "served", tmp_path / "other"
+    files.mkdir()
+    others.mkdir()
+    async with served(files) as (_, port):
+        assert (await ask(port, trusting(tmp_path))).endswith(b"here")
+        for kind in ("crt", "key"):
+            shutil.copy2(pem(others, f"other.{kind}"), files / f"robot.{kind}")
+        with pytest.raises(ssl.SSLCertVerificationError):
+            await ask(port, trusting(tmp_path))

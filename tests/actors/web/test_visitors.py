@@ -1,0 +1,184 @@
+"""Who may use a page: their file, its verbs, and what is made of a file that changes."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rampart.actors.web.token_file import SecretError
+from rampart.actors.web.visitors import (
+    MOST,
+    Register,
+    Role,
+    Visitor,
+    VisitorError,
+    check_role,
+    digest,
+    issue,
+    lists_visitors,
+    parse,
+    read_visitors,
+    revoke,
+)
+from rampart.cli.main import main
+
+ANNA = f"anna drive {'a' * 64}"
+
+
+@pytest.mark.parametrize(("has", "needs", "may"), [
+    ("look", "look", True), ("look", "drive", False), ("look", "inject", False),
+    ("drive", "look", True), ("drive", "drive", True), ("drive", "inject", False),
+    ("inject", "look", True), ("inject", "drive", True), ("inject", "inject", True)])
+def test_each_role_may_do_what_those_before_it_may(has, needs, may):
+    assert Role(has).may(Role(needs)) is may
+
+
+def test_a_file_is_read_with_comments_and_blank_lines():
+    assert parse(["# who", "", f"  {ANNA}  # the first", f"b.o-b@x look {'b' * 64}"]) == {
+        "anna": Visitor("anna", Role.DRIVE, "a" * 64),
+        "b.o-b@x": Visitor("b.o-b@x", Role.LOOK, "b" * 64)}
+
+
+@pytest.mark.parametrize(("lines", "why"), [
+    (["anna drive"], "line 1: NAME ROLE SHA256 is right"),
+    (["", "anna captain " + "a" * 64], "line 2: role 'captain': unknown; there are: look, drive, "
+                                       "inject"),
+    ([ANNA, f"anna look {'b' * 64}"], "line 2: name 'anna': there already; each name once"),
+    ([ANNA, f"bob look {'a' * 64}"], "line 2: 'bob' has the token of another; each has its own"),
+    (["an|na drive " + "a" * 64], "line 1: name 'an|na': up to 40 of"),
+    (["anna drive " + "A" * 64], "line 1: anna: no SHA-256 of a token in 64 hexadecimal digits"),
+    ([f"v{i} look {i:064x}" for i in range(MOST + 1)], f"{MOST + 1} names: {MOST} are the most")])
+def test_what_is_no_list_of_visitors_is_one_line(lines, why):
+    with pytest.raises(VisitorError) as error:
+        parse(lines)
+    assert str(error.value).startswith(why)
+    assert "\n" not in str(error.value)
+
+
+@given(st.lists(st.text(max_size=90), max_size=4))
+def test_whatever_is_in_a_file_is_read_or_refused_in_one_line(lines):
+    told, found = "one line", {}
+    try:
+        found = parse(lines)
+    except VisitorError as error:
+        told = str(error)
+    assert len(told.splitlines()) == 1
+    assert {v.role for v in found.values()} <= set(Role)
+
+
+def test_a_token_is_issued_once_kept_as_a_digest_and_revoked(tmp_path):
+    file = tmp_path / "page.tokens"
+    anna, bob = issue(file, "anna", Role.DRIVE), issue(file, "bob", Role.LOOK)
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert anna not in file.read_text()
+    assert bob not in file.read_text()
+    assert read_visitors(file) == {"anna": Visitor("anna", Role.DRIVE, digest(anna)),
+                                   "bob": Visitor("bob", Role.LOOK, digest(bob))}
+    with pytest.raises(VisitorError, match="anna has a token already; revoke it first"):
+        issue(file, "anna", Role.LOOK)
+    revoke(file, "anna")
+    assert list(read_visitors(file)) == ["bob"]
+    with pytest.raises(VisitorError, match="no 'anna'; there are: bob"):
+        revoke(file, "anna")
+
+
+def test_a_file_of_one_word_is_a_bare_token_and_all_else_a_list(tmp_path):
+    file = tmp_path / "file"
+    file.touch(0o600)
+    for text, is_list in (("secret-of-the-hangar-7\n", False), (f"{ANNA}\n", True), ("", True),
+                          ("# nobody yet\n", True), (f"# all\n{ANNA}\n", True)):
+        file.write_text(text)
+        assert lists_visitors(file) is is_list
+
+
+def test_a_file_that_changes_is_read_anew_and_one_that_breaks_lets_nobody_in(tmp_path):
+    file = tmp_path / "page.tokens"
+    told: list[str] = []
+    anna = issue(file, "anna", Role.DRIVE)
+    register = Register((), file, told.append)
+    visitor = register.by_token(anna)
+    assert visitor == Visitor("anna", Role.DRIVE, digest(anna))
+    assert register.still(visitor)
+    for wrong in ("", anna[:-1], anna + "a", "ä", "\ud800", digest(anna)):
+        assert register.by_token(wrong) is None
+
+    file.write_text(file.read_text().replace("anna drive", "anna look"))
+    assert not register.still(visitor)
+    assert register.by_token(anna).role is Role.LOOK
+
+    file.write_text("what is")
+    assert register.by_token(anna) is None
+    assert register.visitors() == {}
+    assert told == [f"{file}: line 1: NAME ROLE SHA256 is right, as `rampart tokens issue` writes "
+                    "it; it lets nobody in"]
+    file.unlink()
+    assert register.visitors() == {}
+    bob = issue(file, "bob", Role.INJECT)
+    assert register.by_token(bob).name == "bob"
+    file.chmod(0o644)
+    assert register.by_token(bob) is None
+    assert told[1:] == [f"{file}: cannot be read (No such file or directory); it lets nobody in",
+                        f"{file}: mode 0644: others may get at it; chmod 600 it; it lets nobody in"]
+
+
+def test_of_a_fixed_visitor_the_token_opens_and_an_empty_one_never():
+    register = Register([Visitor("operator", Role.INJECT, digest("secret-of-the-hangar-7"))])
+    assert register.by_token("secret-of-the-hangar-7").name == "operator"
+    assert Register([Visitor("root", Role.INJECT)]).by_token("") is None
+
+
+# ---- the verbs ----------------------------------------------------------------------------------
+
+
+def test_the_verbs_issue_show_and_revoke(tmp_path, capsys):
+    file = tmp_path / "page.tokens"
+    assert main(["tokens", "issue", "anna", "--role", "drive", "--file", str(file)]) == 0
+    token = capsys.readouterr().out.strip()
+    assert Register((), file).by_token(token) == Visitor("anna", Role.DRIVE, digest(token))
+    assert main(["tokens", "show", "--json", "--file", str(file)]) == 0
+    assert json.loads(capsys.readouterr().out) == [{"name": "anna", "role": "drive"}]
+    assert main(["tokens", "show", "--file", str(file)]) == 0
+    assert capsys.readouterr().out.split() == ["name", "role", "anna", "drive"]
+    assert main(["tokens", "revoke", "anna", "--file", str(file)]) == 0
+    assert capsys.readouterr().out == "anna has no token any more\n"
+    assert read_visitors(file) == {}
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["issue", "bob", "--role", "captain"], "--role: role 'captain': unknown; there are: look, "
+                                            "drive, inject"),
+    (["issue", "b b", "--role", "look"], "page.tokens: name 'b b': up to 40 of"),
+    (["issue", "anna", "--role", "look"], "page.tokens: anna has a token already; revoke it first"),
+    (["revoke", "bob"], "page.tokens: no 'bob'; there are: anna"),
+    (["show", "--file", "nowhere"], "nowhere: cannot be read (No such file or directory)"),
+    (["issue", "bob", "--role", "look", "--file", "no/where"], "no/where: cannot be written"),
+    (["show", "--file", "open"], "open: mode 0644: others may get at it; chmod 600 it")])
+def test_what_a_verb_cannot_do_is_one_line_and_code_2(tmp_path, monkeypatch, capsys, arguments,
+                                                      words):
+    monkeypatch.chdir(tmp_path)
+    issue(tmp_path / "page.tokens", "anna", Role.DRIVE)
+    (tmp_path / "open").write_text("")
+    (tmp_path / "open").chmod(0o644)
+    assert main(["tokens", *arguments]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith(f"rampart: {words}")
+    assert len(told.err.splitlines()) == 1
+
+
+def test_an_unknown_role_is_refused_by_name():
+    with pytest.raises(VisitorError, match="role 'LOOK': unknown"):
+        check_role("LOOK")
+
+
+def test_a_file_that_others_can_get_at_is_no_list(tmp_path):
+    file = tmp_path / "page.tokens"
+    issue(file, "anna", Role.LOOK)
+    file.chmod(0o640)
+    with pytest.raises(SecretError, match="mode 0640"):
+        read_visitors(file)
+    with pytest.raises(SecretError, match="mode 0640"):
+        issue(file, "bob", Role.LOOK)

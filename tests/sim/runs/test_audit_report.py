@@ -1,0 +1,57 @@
+"""Who did what on the operator's page, in the report of any run."""
+
+from __future__ import annotations
+
+import json
+
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.web.audit import AuditLine, AuditLog
+from rampart.sim.runs.record import RunRecord
+from rampart.sim.runs.report import render, try_report
+from rampart.sim.runs.trial import Trial
+from tests.osmosis_system import run_context, shipped_system
+
+
+def record(*lines: AuditLine) -> RunRecord:
+    return RunRecord(run_id="r1", duration_s=60.0, events=(), intervals=(), decisions=(),
+                     restarts={}, strategy="", seed=1, rate=1.0, audit=lines)
+
+
+def line(number: int, **fields: object) -> AuditLine:
+    return AuditLine(**{"utc": "2026-01-01T10:20:30.000+00:00", "t_s": float(number), "who": "anna",
+                        "what": "reset", "outcome": "accepted", **fields})
+
+
+def test_what_was_done_is_in_both_reports_and_its_text_is_no_markup(tmp_path):
+    run = record(line(1, asked={"recovery": "<b>RM1</b>"}, role="drive", address="10.0.0.7"),
+                 line(2, who="", outcome="refused", why="that token opens nothing", left_out=7))
+    written = try_report(run, lambda r: render(r, "Tank"), tmp_path)
+    page = written.html.read_text()
+    for text in ("anna (drive)", "10:20:30", "recovery: &lt;b&gt;RM1&lt;/b&gt;", "not known",
+                 "refused: that token opens nothing", "7 lines before this one were too many"):
+        assert text in page
+    assert "<b>RM1" not in page
+    kept = json.loads(written.data.read_text())["audit"]
+    assert [(k.get("who", ""), k["outcome"]) for k in kept] == [
+        ("anna", "accepted"), ("", "refused")]
+
+
+def test_a_long_audit_is_cut_on_the_page_and_whole_as_data(tmp_path):
+    run = record(*(line(i) for i in range(1200)))
+    page = render(run, "Tank")
+    assert "The last 1000 of 1200 lines" in page
+    assert page.count("anna<br>") == 1000
+
+
+def test_without_a_page_there_is_no_section():
+    assert "operator's page" not in render(record(), "Tank")
+
+
+def test_a_run_reads_what_its_page_has_written_down(tmp_path):
+    file = tmp_path / "audit-r1.jsonl"
+    log = AuditLog(file, lambda: 3.0, lambda _: None, lambda: 0.0)
+    log.write("reset", who="anna")
+    context = run_context(system=shipped_system(), audit_log=str(file), run_id="r1")
+    assert [(x.who, x.what) for x in Trial(context, 10.0).conclude(5.0, "over").audit] == [
+        ("anna", "reset")]
+    assert RunPlan().audit_log == ""
