@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow lint campaign bench bench-peers chaos chaos-pairs fuzz soak setup clean requirements
+.PHONY: run test test-slow lint campaign bench bench-peers chaos chaos-pairs overload fuzz soak setup clean requirements
 
 run: setup
 	$(BIN)/python launch.py
@@ -54,6 +54,10 @@ chaos: setup
 # more. Interrupted, it goes on where it was: reports/chaos-pairs.jsonl says what is done.
 chaos-pairs: setup
 	$(BIN)/python -m tests.whole.chaos_pair_runs
+
+# Missions that have an overload of the machine on the way, 20 of each kind; an hour and a half.
+overload: setup
+	$(BIN)/python -m tests.whole.overload_runs
 
 # Missions without end, a random fault every five seconds, for so many hours: figures, a plot and a
 # page in reports/soak.*. Interrupted, it goes on where it was: the same command.

@@ -46,7 +46,7 @@ PER_S = 40_000
 _POINT = load_airport("vallombre").prohibited_polygon().representative_point()
 _GRASS = (_POINT.x, _POINT.y)
 
-_FLOOD = """
+FLOOD = """
 import sys, time, zenoh
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm, topics as ftm_topics
@@ -67,6 +67,7 @@ def ask():
     session.get(ftm_topics.DETECTION.pattern, lambda reply: None, timeout=0.1)
 with zenoh.open(session_config((), dial)) as session:
     time.sleep(1)
+    print("here", flush=True)
     publishers, begun, sent = {}, time.monotonic(), 0
     while (passed := time.monotonic() - begun) < seconds:
         due = int(passed * per_s)
@@ -160,7 +161,7 @@ async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
             flood = None
             if kind != "none":
                 flood = await asyncio.create_subprocess_exec(
-                    sys.executable, "-c", _FLOOD, kind, str(options.per_s), "100000",
+                    sys.executable, "-c", FLOOD, kind, str(options.per_s), "100000",
                     *session.run.endpoints, cwd=ROOT)
                 await asyncio.sleep(3.0)
             samples = []

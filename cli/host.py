@@ -55,7 +55,8 @@ class HostRun:
         self._json = options.json
         self._failure = ""
         self._plan = msgspec.structs.replace(
-            plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"))
+            plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"),
+            audit_log=str(kept / f"audit-{plan.host}.jsonl") if plan.hmi_port else "")
 
     async def run(self) -> int:
         """Take part until the run is over, and return the exit code.

@@ -103,7 +103,7 @@ class FtmManager(Actor):
     def remember(self) -> None:
         """Keep what a successor cannot find out."""
         self._remembered = self.arbiter_state.number, self.arbiter_state.latched
-        self.keep(MANAGER_STATE, remember(self.arbiter_state))
+        self.keep(MANAGER_STATE, remember(self.arbiter_state, self._arbiter))
 
     # -- what it hears --------------------------------------------------------------------------
 
@@ -223,7 +223,12 @@ class FtmManager(Actor):
             self.remember()
 
     def _replace_the_overdue(self) -> None:
-        """Ask for a restart of a detection module that is not heard, once for each incarnation."""
+        """Ask for a restart of a detection module that is not heard, once for each incarnation.
+
+        Not while something explains why it is late.
+        """
+        if not set(self._arbiter.mechanisms.explaining).isdisjoint(self.arbiter_state.active):
+            return
         silent = overdue(self.arbiter_state.detections, self._arbiter.rules, self.clock.now())
         if silent is not None and self._replaced.get(silent.name) != silent.incarnation:
             self._replaced[silent.name] = silent.incarnation

@@ -188,7 +188,7 @@ class NodeState(StrEnum):
 class NodeInfo(Message, frozen=True, omit_defaults=True):
     """One row of the supervisor's table.
 
-    `late_s` is how late a timer of its loop was at most in the last half or whole second, simulated
+    `late_s` is how late its loop was at most in the last half or whole second, simulated
     seconds; left out if none was. `host` is where it runs; "" is the first.
     """
 

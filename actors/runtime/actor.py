@@ -13,6 +13,7 @@ process and its liveliness token are still there.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -38,8 +39,7 @@ from rampart.actors.runtime.timer import Timer, Timers
 
 __all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
 
-_LATE_DIGITS = 3
-"""Of the lateness of timers: milliseconds."""
+_LATE_DIGITS = 3  # milliseconds
 
 
 def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any, Header], None]:
@@ -86,6 +86,7 @@ class Actor(Declared):
             context.bus, lambda: self._dispatcher.put("go to work", self._go_to_work))
         self._is_at_work = False
         self._sequence = 0
+        self._beat_due_s = math.inf
         self._rejected = 0
         self._abandoned = False
         self._reports = ReportLimit()
@@ -287,7 +288,7 @@ class Actor(Declared):
         self.on_start()
         self._beat()
         self._timers.every(self.context.heartbeat_period_s, "_beat", self._beat)
-        if self._incarnation == 1 or not self._questions.open:  # there is nothing to be heard yet
+        if self._incarnation == 1 or not self._questions.open:  # nothing is to be heard yet
             self._go_to_work()
         else:
             self.call_later(PATIENCE_S, self._go_to_work)
@@ -375,15 +376,15 @@ class Actor(Declared):
             self._bus.publish(topic, key, payload)
 
     def _beat(self) -> None:
+        context, now_s = self.context, self.clock.now()
+        late_s = max(self._timers.lateness_s(), now_s - self._beat_due_s)  # it waits for mail, too
+        self._beat_due_s = now_s + context.heartbeat_period_s
         if not self.is_well():
             return
-        context = self.context
-        late_s = round(self._timers.lateness_s(), _LATE_DIGITS) or ON_TIME
         self.publish(HEARTBEAT, Heartbeat(
             context.pid, self._dispatcher.progress, context.heartbeat_period_s, self._rejected,
-            self._dispatcher.overflowed, late_s))
-        left_out = self._reports.left_out(self.clock.now())
-        if left_out:
+            self._dispatcher.overflowed, round(late_s, _LATE_DIGITS) or ON_TIME))
+        if left_out := self._reports.left_out(now_s):
             self.report_diagnostic(
                 "diagnostics", f"{left_out} more reports were left out", self.name)
 

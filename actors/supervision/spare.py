@@ -175,8 +175,18 @@ class Spares:
             spare.end()
 
     def _fork(self) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        pid = os.fork()
+        try:
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        except OSError:  # no descriptor left: perhaps later
+            self._wait_longer()
+            return
+        try:
+            pid = os.fork()
+        except OSError:  # no process may be added, or there is no memory for one
+            ours.close()
+            theirs.close()
+            self._wait_longer()
+            return
         if pid == 0:
             ours.close()
             self._be_spare(theirs)
@@ -189,9 +199,12 @@ class Spares:
         if spare.heard():
             self._pause_s = _PAUSE_S
         else:
-            self._pause_s = min(2 * self._pause_s, _PAUSE_MAX_S)
+            self._wait_longer()
             self._forget(spare)
             spare.control.close()
+
+    def _wait_longer(self) -> None:
+        self._pause_s = min(2 * self._pause_s, _PAUSE_MAX_S)
 
     def _forget(self, spare: Spare) -> None:
         self._selector.unregister(spare.control)

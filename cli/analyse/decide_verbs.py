@@ -36,7 +36,8 @@ def show_decision(options: argparse.Namespace) -> int:
     """Print one decision.
 
     Show the decision for a set of active mechanisms, with its certificate: the
-    block (rule) that applies, the path of dominance, what was rejected and why.
+    block (rule) that applies, the path of dominance, what was rejected and why. What
+    one of them explains does not act, and is named as such.
 
     Examples:
       rampart decide FTM3 FTM4
@@ -45,14 +46,21 @@ def show_decision(options: argparse.Namespace) -> int:
     """
     spec = systems.load(options.system)
     strategy = options.strategy or spec.strategy
-    decision = _arbiter(spec, strategy)(options.ftm)
+    arbiter, mechanisms = _arbiter(spec, strategy), spec.build_mechanisms()
+    decision = arbiter(options.ftm)
+    acting = mechanisms.unexplained(decision.active, frozenset(mechanisms.detections))
+    explained = [name for name in decision.active if name not in acting]
+    if explained:
+        decision = arbiter(acting)
     if options.json:
         print_json({
             **_row(decision), "path": decision.path,
             "rejected": [{"name": name, "reason": why} for name, why in decision.rejected],
-            "strategy": strategy})
+            "explained": explained, "strategy": strategy})
         return 0
     say(decision_in_words(decision.active, decision.rule, decision.recoveries, strategy))
+    if explained:
+        say(f"  explained {', '.join(explained)}")
     for chain in decision.path:
         say(f"  path      {chain}")
     for name, why in decision.rejected:

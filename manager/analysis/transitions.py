@@ -48,6 +48,8 @@ Violations = dict[str, tuple[str, ...]]
 _OVER = -1e9
 _OLD, _CURRENT = 5, 10
 _NUMBER = 100
+_EXCUSE, _EXCUSED = "D_excuse", "F_excuse"
+"""What excuses a latch, whatever that is in the system: detected, and the mechanism for it."""
 
 
 class Module(msgspec.Struct, frozen=True):
@@ -83,7 +85,8 @@ class AsTold:
 
     def choose(self, active: tuple[str, ...], arrangement: Arrangement, late: Late  # noqa: ARG002
                ) -> Decision:
-        """Run the recovery of every active mechanism."""
+        """Run the recovery of every active mechanism; an excuse asks for nothing."""
+        active = tuple(name for name in active if name != _EXCUSED)
         return Decision(active, 1, arrangement.demanded(active), active)
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:  # noqa: ARG002
@@ -109,7 +112,8 @@ class Transitions:
                  exclusive: bool, with_modules: bool = False, deaths: bool = True) -> None:
         inside = {c.name: c for c in contracts}
         self.contracts = {n: replace(c, needs=frozenset(), escalate_to=(
-            c.escalate_to if c.escalate_to in inside else "")) for n, c in inside.items()}
+            c.escalate_to if c.escalate_to in inside else ""), excused_by=(
+            frozenset({_EXCUSE}) if c.excused_by else frozenset())) for n, c in inside.items()}
         self.names = tuple(self.contracts)
         self.asked = sorted({frozenset(), *asked}, key=lambda s: (len(s), sorted(s)))
         self.urgent = frozenset(urgent)
@@ -119,9 +123,12 @@ class Transitions:
         local = PartialOrder(self.names, {
             name: [o for o in self.names if order.is_above(name, o)] for name in self.names})
         top = local.names[0]
-        mechanisms = Mechanisms([Mechanism(f"F_{n}", f"D_{n}", n) for n in self.names],
+        answers = {f"F_{n}": (f"D_{n}", n) for n in self.names}
+        if any(c.excused_by for c in self.contracts.values()):
+            answers[_EXCUSED] = _EXCUSE, top
+        mechanisms = Mechanisms([Mechanism(f, d, n) for f, (d, n) in answers.items()],
                                 list(self.contracts.values()))
-        tree = Tree({f"F_{n}": None if n == top else f"F_{top}" for n in self.names})
+        tree = Tree({f: None if f == f"F_{top}" else f"F_{top}" for f in answers})
         self.arbiter = Arbiter(Arrangement(mechanisms, tree, local), AsTold(exclusive=exclusive),
                                DetectionRules(1.0, 0.0, 0.0, 0.0))
 
@@ -142,6 +149,10 @@ class Transitions:
             if changes:
                 yield (f"asked for: {', '.join(sorted(asked)) or 'nothing'}",
                        self._detect(now, changes))
+        for t in now.state.detections:
+            if t.name == _EXCUSE:
+                yield ("the excuse ends" if t.active else "what excuses is found",
+                       self._detect(now, {_EXCUSE: not t.active}))
         for index, name in enumerate(self.names):
             if f"D_{name}" in active and self.contracts[name].kind.repairs:
                 yield f"{name}'s cause comes back", self._detect(now, {f"D_{name}": True})

@@ -226,7 +226,8 @@ def _profile(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: f
     mechanisms, order = arrangement.mechanisms, arrangement.order
     number = {name: i for i, name in enumerate(names)}
     alone = tuple(
-        (c.kind.repairs, c.interruptible, c.latched, number.get(c.escalate_to, -1), n in urgent)
+        (c.kind.repairs, c.interruptible, c.latched, bool(c.excused_by),
+         number.get(c.escalate_to, -1), n in urgent)
         for n in names for c in [mechanisms.contracts[n]])
     pairs = tuple((order.is_above(a, b), mechanisms.overlap(a, b), bool(mechanisms.harms(a, b)))
                   for a, b in permutations(names, 2))

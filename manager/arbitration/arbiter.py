@@ -15,7 +15,9 @@ states can be explored. The strategy decides *which* recovery; the arbiter sees 
   that shares no claim with it starts at once. So an emergency stop never waits for a respawn.
 * A recovery whose cause has cleared is released, and hands control back. A latched one stays
   until it is reset; only a safer one takes its place meanwhile. A reset is refused while the
-  cause persists.
+  cause persists. What a detection explains for a while, as an overload of the machine does many,
+  neither counts meanwhile nor latches (`Mechanism.explains`, `Contract.excused_by`); what outlasts
+  it does both.
 * A recovery that fails, is not done by its deadline, or needs a node that is reported failed is
   followed by the one it escalates to, else by that of the mechanism above. A repair also fails if
   it is done but its cause persists. One that is late but still acting is let be as long as no
@@ -48,6 +50,7 @@ from rampart.manager.arbitration.detection_track import (
     DetectionHeard,
     DetectionRules,
     DetectionTrack,
+    said,
 )
 from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, RecoveryTrack
 from rampart.manager.model.mechanisms import RecoveryPhase
@@ -214,8 +217,10 @@ class Arbiter:
         believed = {track.name: track for track in detections}
         active = self._active(detections)
         contracts, users = self.mechanisms.contracts, self.mechanisms.users
-        recoveries = tuple(recovery_track.judge(
-            t, contracts[t.name], users[t.name], believed, active, now) for t in state.recoveries)
+        reported = said(detections)
+        recoveries = tuple(recovery_track.excuse(
+            recovery_track.judge(t, contracts[t.name], users[t.name], believed, active, now),
+            contracts[t.name], reported, believed) for t in state.recoveries)
         oriented = state.oriented or (
             all(t.ever_heard or t.silent for t in detections) and (
                 all(t.heard for t in recoveries)
@@ -226,8 +231,9 @@ class Arbiter:
         return with_late(state, active, self.arrangement, now) if self._patient else state
 
     def _active(self, detections: tuple[DetectionTrack, ...]) -> tuple[str, ...]:
-        return self.mechanisms.detected_by(
+        active = self.mechanisms.detected_by(
             (t.name for t in detections if t.active), (t.name for t in detections if t.silent))
+        return self.mechanisms.unexplained(active, said(detections))
 
     def _choose(self, state: State) -> tuple[Decision, Decision, Decision]:
         """Return the strategy's decision, that after escalation, and that after latching too."""
@@ -327,7 +333,8 @@ class Arbiter:
         ordered_s = now
         if track.wanted:
             if not self._has_new_cause(state, track):
-                return replace(track, draining=False)
+                return replace(
+                    track, draining=False, latched=track.latched or self._latches(state, track))
             if not track.acknowledged or not self._is_news(state, track, _without_incarnation):
                 # It has been deaf since then; or its detection has not cleared and blames one
                 # incarnation of a node after the other: it has not ended the error.
@@ -343,7 +350,16 @@ class Arbiter:
             track, command=Command(track.name, True, state.number, nodes, reason),
             ordered_s=ordered_s, cause=frozenset((cause.name, cause.rises) for cause in causes),
             acknowledged=False, draining=False, letting_go=False, adopted=False,
-            latched=track.latched or self.mechanisms.contracts[track.name].latched)
+            latched=track.latched or self._latches(state, track))
+
+    def _latches(self, state: State, track: RecoveryTrack) -> bool:
+        """Tell whether a recovery that is chosen stays until it is reset.
+
+        One that was excused when it was taken up does if its cause outlasts the excuse.
+        """
+        contract = self.mechanisms.contracts[track.name]
+        return contract.latched and contract.excused_by.isdisjoint(said(state.detections)) and (
+            not track.wanted or any(c.asserted for c in self._causes(state, track.name)))
 
     def _blocks(self, other: RecoveryTrack, name: str, chosen: tuple[str, ...]) -> bool:
         """Tell whether a recovery has to wait for another to drain, or to let go."""

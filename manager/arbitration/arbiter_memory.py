@@ -1,15 +1,17 @@
 """What of the arbiter's state must survive the FTM Manager's death, and how it is taken up again.
 
 Little: an arbiter that starts hears from the modules what is detected and what is in force, adopts
-it, and releases nothing before it has heard them all. Three things only the arbiter knows:
+it, and releases nothing before it has heard them all. Four things only the arbiter knows:
 
 * *Latches.* Whether an operator has reset an emergency stop is the arbiter's knowledge. If it dies
   together with a recovery module that cannot find out from the world what it has done (RM1 can, by
   the brakes), no process is left that knows, and the plant would go on.
+* *That one of these does not latch*, because what it is for is explained for a while.
 * *How much a detection module has flapped*, by which its all-clear is believed sooner or later.
 * *The number of the last decision*, so that none is given twice.
 
-What a memory says that is wrong can only stop the robot: it can latch, and never release.
+What a memory says that is wrong can only stop the robot: it can latch, and release nothing whose
+cause is still there.
 """
 
 from __future__ import annotations
@@ -42,18 +44,25 @@ class Memory(msgspec.Struct, frozen=True):
         latches: the latched recoveries.
         buckets: of detection modules that have flapped: name, content, and when that was true;
             see `rampart.manager.arbitration.detection_track`.
+        excused: recoveries in force that would be latched, but for what explains their causes.
     """
 
     number: int
     latches: tuple[Latch, ...] = ()
     buckets: tuple[tuple[str, float, float], ...] = ()
+    excused: tuple[Latch, ...] = ()
 
 
-def remember(state: State) -> Memory:
+def remember(state: State, arbiter: Arbiter) -> Memory:
     """Return what of a state must not be forgotten."""
-    latches = (Latch(t.command, tuple(sorted(t.cause))) for t in state.recoveries if t.latched)
+    contracts = arbiter.mechanisms.contracts
+    kept = {t.name: Latch(t.command, tuple(sorted(t.cause))) for t in state.recoveries}
+    latched = [t.name for t in state.recoveries if t.latched]
+    excused = [t.name for t in state.recoveries
+               if t.wanted and not t.latched and contracts[t.name].excused_by]
     buckets = ((t.name, t.bucket_s, t.bucket_at_s) for t in state.detections if t.bucket_s > 0)
-    return Memory(state.number, tuple(latches), tuple(buckets))
+    return Memory(state.number, tuple(map(kept.__getitem__, latched)),
+                  tuple(buckets), tuple(map(kept.__getitem__, excused)))
 
 
 def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
@@ -66,17 +75,22 @@ def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
         number: decisions are numbered from here on, or from the memory's number if that is higher.
     """
     state = arbiter.initial(now, max(number, memory.number))
-    latches = {latch.command.recovery: latch for latch in memory.latches}
+    latches = {latch.command.recovery: (latch, is_latched) for kept, is_latched in (
+        (memory.excused, False), (memory.latches, True)) for latch in kept}
     buckets = {name: (bucket_s, at_s) for name, bucket_s, at_s in memory.buckets}
     detections = list(state.detections)
     for index, detection in enumerate(detections):
         if detection.name in buckets:
             bucket_s, at_s = buckets[detection.name]
             detections[index] = replace(detection, bucket_s=bucket_s, bucket_at_s=min(at_s, now))
-    recoveries = tuple(
-        RecoveryTrack(latch.command, ordered_s=now, cause=frozenset(latch.cause), latched=True)
-        if (latch := latches.get(track.name)) else track for track in state.recoveries)
-    return replace(state, detections=tuple(detections), recoveries=recoveries)
+    recoveries = list(state.recoveries)
+    for index, recovery in enumerate(recoveries):
+        if recovery.name in latches:
+            latch, is_latched = latches[recovery.name]
+            recoveries[index] = RecoveryTrack(
+                latch.command, ordered_s=now, cause=frozenset(latch.cause), adopted=not is_latched,
+                latched=is_latched)
+    return replace(state, detections=tuple(detections), recoveries=tuple(recoveries))
 
 
 def take_over(arbiter: Arbiter, state: State, now: float) -> State:

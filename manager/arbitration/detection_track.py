@@ -110,6 +110,21 @@ class DetectionTrack(msgspec.Struct, frozen=True):
         return not self.active and now - self.heard_s <= silence_timeout_s
 
 
+MANY_SHARE = 1 / 3
+"""Of the detection modules: so many are not silent by chance, each for a reason of its own."""
+
+
+def said(tracks: tuple[DetectionTrack, ...]) -> frozenset[str]:
+    """Return the modules that are active by what they reported, not only because they are silent.
+
+    Where many are silent at once it is what they have in common, and the silence of each means
+    what it would report if it could.
+    """
+    many_are_silent = sum(track.silent for track in tracks) >= MANY_SHARE * len(tracks)
+    return frozenset(track.name for track in tracks if track.active and (
+        track.reported or not track.silent or many_are_silent))
+
+
 OVERDUE_SHARE = 0.6
 """Of the silence timeout: older news of a module, and it is overdue; half of that is late. Three
 reports fit in before, and its successor has time to be heard after."""

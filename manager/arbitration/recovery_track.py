@@ -159,6 +159,27 @@ def judge(track: RecoveryTrack, contract: Contract, own: Set[str],  # noqa: PLR0
     return replace(track, failure=failure, failed_for=sakes(own, active)) if failure else track
 
 
+EXCUSE_S = 5.0
+"""So long before what excuses it was detected may a latch have come: an overload begins before it
+is noticed."""
+
+
+def excuse(track: RecoveryTrack, contract: Contract, reported: Set[str],
+           believed: Mapping[str, DetectionTrack]) -> RecoveryTrack:
+    """Undo a latch that is excused, unless it came long before what excuses it.
+
+    Args:
+        track: Of the recovery.
+        contract: Its promises.
+        reported: See `rampart.manager.arbitration.detection_track.said`.
+        believed: Belief about all detection modules.
+    """
+    if track.latched and any(track.ordered_s >= believed[name].since_s - EXCUSE_S
+                             for name in contract.excused_by & reported):
+        return replace(track, latched=False)
+    return track
+
+
 def _failure(track: RecoveryTrack, contract: Contract, believed: Mapping[str, DetectionTrack]
              ) -> str:
     """Say why a recovery has failed whose deadline is over; "" if it has not."""

@@ -9,7 +9,7 @@ robot with RM2.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from enum import StrEnum
 from itertools import chain
 
@@ -55,6 +55,8 @@ class Contract(msgspec.Struct, frozen=True):
             the same time.
         interruptible: May be released while it is acting. False: it is left to finish.
         latched: Stays in force until an operator resets it, even when the cause is gone.
+        excused_by: Detection modules of what explains its causes for a while, as an overload of
+            the machine does: taken up meanwhile it is not latched.
         deadline_s: From command to done (and, for a repair, to the cause being gone).
         escalate_to: Recovery to take when this one fails; "" for that of the mechanism above.
         needs: Preconditions: nodes or resources without which it is of no use. While a node
@@ -71,18 +73,23 @@ class Contract(msgspec.Struct, frozen=True):
     escalate_to: str = ""
     needs: frozenset[str] = frozenset()
     disables: frozenset[str] = frozenset()
+    excused_by: frozenset[str] = frozenset()
 
 
 class Mechanism(msgspec.Struct, frozen=True):
     """FTMx(DMy, RMz); `detect` and `recover` are gates in text (`rampart.manager.model.gates`).
 
-    `patience_s` is how long its recovery may take before the error has gone too far.
+    Attributes:
+        patience_s: How long its recovery may take before the error has gone too far.
+        explains: Mechanisms whose detections are its consequences: while it is detected they do not
+            count. Not while its detection modules are merely silent.
     """
 
     name: str
     detect: str
     recover: str
     patience_s: float = math.inf
+    explains: frozenset[str] = frozenset()
 
 
 class Mechanisms:
@@ -98,6 +105,7 @@ class Mechanisms:
         users: The mechanisms that may run each recovery.
         causes: The detection modules that each recovery answers to.
         repairs: What is run for a detection module, where all of it repairs.
+        explaining: The mechanisms that explain others.
 
     Raises:
         ValueError: Two of one name, or a recovery without a contract.
@@ -129,6 +137,7 @@ class Mechanisms:
                 self.causes[recovery].update(self.detect[name])
             for detection in self.detect[name]:
                 run_for[detection] += self.recover[name]
+        self.explaining = tuple(m.name for m in mechanisms if m.explains)
         self.repairs = {detection: run for detection, run in run_for.items()
                         if all(self.contracts[recovery].kind.repairs for recovery in run)}
 
@@ -156,6 +165,20 @@ class Mechanisms:
         if not active:
             return ()
         return tuple(name for name, gate in self._gates.items() if gate.holds(active, mute))
+
+    def unexplained(self, active: tuple[str, ...], reported: Set[str]) -> tuple[str, ...]:
+        """Return the active mechanisms that no other one explains.
+
+        Args:
+            active: Mechanisms.
+            reported: Detection modules that are active, and not only because they are silent.
+        """
+        if not self.explaining:
+            return active
+        explained = frozenset().union(*(
+            self.by_name[name].explains for name in self.explaining
+            if name in active and self._gates[name].holds(reported)))
+        return tuple(name for name in active if name not in explained) if explained else active
 
     def alternatives(self, mechanism: str) -> tuple[tuple[str, ...], ...]:
         """Return the sets of recoveries that would do for a mechanism, preferred ones first."""

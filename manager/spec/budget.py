@@ -158,6 +158,16 @@ def find_false_alarms(timing: Timing) -> Iterator[Finding]:
             yield Finding(f"$.timing.{field}", problem, (value,))
 
 
+def allowed_late_s(timing: Timing) -> float:
+    """Return how late a loop may be, s: half the shortest slack of a timeout.
+
+    A message may be late twice, at its sender and at its reader.
+    """
+    slacks_s: list[float] = [getattr(timing, field) - getattr(timing, period)
+                             for field, period in PERIODS.items()]
+    return min(slacks_s) / 2
+
+
 def find_false_alarm(timing: Timing, timeout_s: float, period_field: str) -> str:
     """Say what is wrong with a timeout on what comes with a period of `[timing]`; "" if nothing."""
     period_s = getattr(timing, period_field)

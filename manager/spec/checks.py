@@ -18,7 +18,7 @@ from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
 from rampart.manager.spec.host_checks import find_wrong_hosts
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
 from rampart.manager.spec.panels import problem_of
-from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.schema import MechanismSpec, SystemSpec
 from rampart.manager.spec.tables import Finding, find_wrong_names, numbered, unknown
 from rampart.manager.strategies.registry import STRATEGIES
 
@@ -171,14 +171,27 @@ def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
                     yield unknown(f"{path}.{field}", name, what, known)
         if mechanism.event not in events:
             yield unknown(f"{path}.event", mechanism.event, "event", events)
+        yield from _explanations(spec, path, mechanism)
     if not spec.mechanisms and (spec.detections or spec.recoveries):
         yield Finding("$.mechanism", "missing; no mechanism joins detection to recovery")
+
+
+def _explanations(spec: SystemSpec, path: str, mechanism: MechanismSpec) -> Iterator[Finding]:
+    """What a mechanism explains is another one, that itself explains nothing."""
+    others = {other.name: other.explains for other in spec.mechanisms}
+    explains = sorted(mechanism.explains)
+    yield from find_wrong_names(f"{path}.explains", explains, "mechanism", others, "listed twice")
+    for name in explains:
+        if name == mechanism.name or others.get(name):
+            yield Finding(f"{path}.explains", f"{name} itself explains others; leave it out of one "
+                          "of the two", (explains,))
 
 
 def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
     names = [recovery.name for recovery in spec.recoveries]
     nodes = dict.fromkeys(node.name for node in spec.nodes)
     there = nodes.keys() | set().union(*(r.claims | r.disables for r in spec.recoveries))
+    detections = [detection.name for detection in spec.detections]
     for path, recovery in numbered("recovery", spec.recoveries):
         for need in sorted(recovery.needs):
             if need not in there:
@@ -188,6 +201,11 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
             if need in recovery.disables:
                 yield Finding(f"{path}.disables", f"{recovery.name} itself needs {need!r}; leave "
                               "it out of one of the two", (sorted(recovery.disables),))
+        yield from find_wrong_names(f"{path}.excused_by", sorted(recovery.excused_by),
+                                    "detection module", detections, "listed twice")
+        if recovery.excused_by and not recovery.latched:
+            yield Finding(f"{path}.excused_by", "only what is latched is excused; leave it out, or "
+                          "say latched = true", (sorted(recovery.excused_by),))
         if recovery.escalate_to and recovery.escalate_to not in names:
             yield unknown(f"{path}.escalate_to", recovery.escalate_to, "recovery module", names)
         if "nodes" in recovery.parameters:
@@ -344,6 +362,10 @@ def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
     own = {name: order.mask(names) for name, names in recover.items()}
     under = {name: reduce(or_, (order.below[order.number[r]] for r in names))
              for name, names in recover.items()}
+    for path, mechanism in numbered("mechanism", spec.mechanisms):
+        if tree.root in mechanism.explains:
+            yield Finding(f"{path}.explains", f"{tree.root} is the root of the FTMTree; the last "
+                          "barrier acts whatever explains it", (sorted(mechanism.explains),))
     for upper in tree.names:
         for lower in tree.members(tree.below[tree.number[upper]]):
             if not under[lower] & own[upper]:

@@ -103,6 +103,7 @@ class RecoverySpec(Table, frozen=True):
     disables: frozenset[Name] = frozenset()
     interruptible: bool = False
     latched: bool = False
+    excused_by: frozenset[Name] = frozenset()
     deadline_s: Positive = 2.0
     escalate_to: OptionalName = ""
     process: OptionalName = ""
@@ -128,6 +129,8 @@ class MechanismSpec(Table, frozen=True):
         recover: A recovery module, or a gate over several.
         event: Of the fault tree, on which it is a barrier.
         against: What it races.
+        explains: Mechanisms whose detections are its consequences, as many are of an overload of
+            the machine: while it is detected they do not act.
         enabled: False leaves it out. One with a disabled module is left out as well.
     """
 
@@ -136,6 +139,7 @@ class MechanismSpec(Table, frozen=True):
     recover: str
     event: Name
     against: Hazard | Within = Hazard.DRIFT
+    explains: frozenset[Name] = frozenset()
     enabled: bool = True
 
     @property
@@ -305,10 +309,10 @@ class SystemSpec(Table, frozen=True):
                 (`rampart.manager.spec.budget.patience_s`).
         """
         return Mechanisms(
-            [Mechanism(m.name, m.detect, m.recover, patience_s.get(m.name, math.inf))
+            [Mechanism(m.name, m.detect, m.recover, patience_s.get(m.name, math.inf), m.explains)
              for m in self.mechanisms],
             [Contract(r.name, r.kind, r.claims, r.interruptible, r.latched, r.deadline_s,
-                      r.escalate_to, r.needs, r.disables) for r in self.recoveries])
+                      r.escalate_to, r.needs, r.disables, r.excused_by) for r in self.recoveries])
 
     def build_fault_tree(self) -> FaultTree:
         """Build the fault tree."""

@@ -211,7 +211,7 @@ class Injector(Actor):
             self.carry_out(fault)
 
     def _hit(self, fault: PlannedAction, action: OnProcess) -> None:
-        if not self._control(action.what, action.node, action.pace_s):
+        if not self._do(action.what, action, action.pace_s):
             fault.reason = f"{action.node} had no running process"
             return
         fault.hit = 1
@@ -219,4 +219,9 @@ class Injector(Actor):
             self.call_later(action.duration_s, lambda: self._release(action))
 
     def _release(self, action: OnProcess) -> None:
-        self._control(_ENDS[action.what], action.node, 0.0)
+        self._do(_ENDS[action.what], action, 0.0)
+
+    def _do(self, what: str, action: OnProcess, pace_s: float) -> bool:
+        """Do something to one process, or to all; tell whether there was any."""
+        nodes = (action.node,) if action.node else self._nodes
+        return sum(self._control(what, node, pace_s) for node in nodes) > 0  # each of them

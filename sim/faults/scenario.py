@@ -3,8 +3,9 @@
 A planned fault is written `FAULT[@WHEN][+DURATION]`:
 
 * FAULT is a name of the catalogue (`rampart inject --list`), `MODE:TOPIC` for any topic,
-  `kill:NODE`, `stop:NODE`, `wedge:NODE` or `slow:NODE[:SECONDS]` for any process, or one that
-  the robot declares (`Faults.own`), which may have details behind a colon, too.
+  `kill:NODE`, `stop:NODE`, `wedge:NODE` or `slow:NODE[:SECONDS]` for any process, `slow:all` for
+  every one at once, as on a machine that is overloaded, or one that the robot declares
+  (`Faults.own`), which may have details behind a colon, too.
 * WHEN is simulated seconds, or `goalN` for the moment in which goal N of the mission begins,
   or `goalN:SECONDS` for so long after it. Left out it is 10 s.
 * DURATION is simulated seconds, or `inf` for the rest of the run. Left out it is the fault's own.
@@ -27,6 +28,8 @@ DEFAULT_AT_S = 10.0
 
 _MAX_DIGITS = 9
 _SLOW_S = 0.1
+ALL = "all"
+"""In place of a node, of `slow`: all of them."""
 _LASTS_S = {"kill": 0.0, "wedge": math.inf, "stop": 5.0, "slow": 10.0}
 
 
@@ -70,7 +73,7 @@ class PlannedFault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OnProcess(msgspec.Struct, frozen=True):
-    """Something done to the process of a node; `pace_s` is for slow."""
+    """Something done to the process of a node, "" for those of all; `pace_s` is for slow."""
 
     what: str
     node: str
@@ -128,7 +131,9 @@ def action_of(planned: PlannedFault, injection: str, nodes: Collection[str],
     lasts_s = planned.duration_s
     if kind in PROCESS_FAULTS:
         node = details[0] if details else ""
-        if node not in nodes:
+        if kind == "slow" and node == ALL:
+            node = ""
+        elif node not in nodes:
             raise ScenarioError(f"fault {planned.fault!r}: no node {node!r}; there are: "
                                 f"{', '.join(nodes)}")
         pace_s = number(planned.fault, details[1:], _SLOW_S, most=60.0) if kind == "slow" else 0.0

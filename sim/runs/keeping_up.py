@@ -23,7 +23,8 @@ from collections.abc import Collection
 import msgspec
 
 from rampart.actors.ftm.messages import NodeTable
-from rampart.manager.spec.tables import PERIODS, Timing
+from rampart.manager.spec.budget import allowed_late_s
+from rampart.manager.spec.tables import Timing
 
 WINDOW_S = 2.0
 """Real seconds over which the largest lateness is taken."""
@@ -35,13 +36,6 @@ _SHARE = 0.9
 """Of the windows, by whose lateness a rate is judged: a single hiccup does not count."""
 
 _MOST = 10_000
-
-
-def allowed_s(timing: Timing) -> float:
-    """Return how late a loop may be, simulated seconds: half the shortest slack of a timeout."""
-    slacks_s: list[float] = [getattr(timing, field) - getattr(timing, period)
-                             for field, period in PERIODS.items()]
-    return min(slacks_s) / 2
 
 
 class KeptUp(msgspec.Struct, frozen=True):
@@ -82,7 +76,7 @@ class KeepingUp:
     """
 
     def __init__(self, timing: Timing, world: Collection[str], rate: float) -> None:
-        self._allowed_s = allowed_s(timing)
+        self._allowed_s = allowed_late_s(timing)
         self._world = world
         self._rate = rate
         self._until_s = self._said_s = -math.inf

@@ -194,7 +194,7 @@ def braked(arbiter):
 
 def test_a_latch_survives_the_manager_and_its_recovery_module_together():
     arbiter = build_arbiter(SPEC)
-    memory = remember(braked(arbiter))
+    memory = remember(braked(arbiter), arbiter)
     assert [latch.command.recovery for latch in memory.latches] == ["RM1"]
     without = heard_all(arbiter, arbiter.initial(1.0, 10_000), 1.1)
     assert without.activated == ()  # nobody knows of it any more
@@ -206,7 +206,7 @@ def test_a_latch_survives_the_manager_and_its_recovery_module_together():
         assert (state.activated, state.latched) == (("RM1",), ("RM1",))
     state, _ = arbiter.step(state, ResetAsked("RM1", "operator"), 21.2)
     assert state.latched == state.activated == ()
-    assert remember(state).latches == ()
+    assert remember(state, arbiter).latches == ()
 
 
 def test_decisions_are_numbered_on_and_flapping_is_not_forgotten():
@@ -215,7 +215,7 @@ def test_decisions_are_numbered_on_and_flapping_is_not_forgotten():
     for flap in range(6):
         state = heard_all(arbiter, state, 1.0 + flap, active=("DM6",))
         state = heard_all(arbiter, state, 1.5 + flap)
-    memory = remember(state)
+    memory = remember(state, arbiter)
     back = recall(arbiter, memory, 8.0, 10)
     assert back.number == max(state.number, 10)
     buckets = {t.name: t.bucket_s for t in back.detections if t.bucket_s}

@@ -191,6 +191,29 @@ def test_a_slow_process_is_slow():
     assert len(slow.decisions) > len(usual.decisions)  # its heart beats too seldom
 
 
+def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_afterwards():
+    record = run_virtually(job("slow:all:0.03@20+30", system="osmosis")).record
+    assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
+    assert [(d.active, d.recoveries) for d in record.decisions] == [
+        (("FTM14",), ("RM2",)), ((), ())]
+
+
+@pytest.mark.parametrize(("faults", "restarts"), [
+    (("drop:detection/DM2@25+8",), {"DM2": 1}),
+    (("slow:all:0.03@20+30", "drop:detection/DM2@25+8"), {})])
+def test_a_module_that_is_not_heard_is_restarted_but_not_for_being_late(faults, restarts):
+    record = run_virtually(job(*faults, system="osmosis")).record
+    assert (record.mission, record.safety, record.restarts) == ("success", "safe", restarts)
+
+
+def test_an_overload_in_which_nearly_nothing_arrives_leaves_no_latch_behind():
+    record = run_virtually(job("slow:all:0.2@20+30", system="osmosis")).record
+    assert (record.mission, record.safety) == ("success", "safe")
+    assert ("FTM1", "RM1") in {(f, rm) for d in record.decisions
+                               for f in d.active for rm in d.recoveries}
+    assert record.decisions[-1].active == ()
+
+
 def test_killed_guards_come_back_and_the_mission_goes_on():
     record = run_virtually(job("kill:supervisor@12", "kill:ftm_manager@14", "kill:safety_pilot@16",
                                "kill:supervisor@18", "kill:graph_planner@18.01")).record

@@ -27,7 +27,8 @@ STANDING_MPS, STANDING_RADPS = 0.05, 0.1
 
 LOST_AFTER_S = 3.0
 ACCEPT_WITHIN_S = 30.0
-WORLD_SILENT_S = 3.0
+WORLD_SILENT_S = 10.0
+"""A machine that is overloaded may keep the ground truth away for some seconds."""
 _STEP_TOWARDS_GOAL_M = 0.5
 _WAYS = 10
 """So many ways round something are followed patiently; who finds more goes to and fro."""

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import re
+import selectors
 import signal
+import socket
 import time
 from pathlib import Path
 
@@ -19,6 +22,7 @@ from rampart.actors.layout.layout import Layout
 from rampart.actors.osmosis import topics as robot
 from rampart.actors.run.run_plan import load_system
 from rampart.actors.runtime.actor import Actor, on
+from rampart.actors.supervision import spare
 from rampart.actors.supervision.process_title import find_processes
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually
@@ -218,3 +222,24 @@ def test_a_hot_spare_may_not_touch_the_checkpoints_of_the_node(tmp_path):
         "a", 2, base.Clock(0.0), VirtualBus(Hub(), "a", 2), waits="hot"))
     with pytest.raises(RuntimeError, match="Keeping keeps checkpoints: its class has to say most"):
         actor.kept(None)
+
+
+@pytest.mark.parametrize("what", ["socketpair", "fork"])
+def test_a_spare_that_cannot_be_made_is_tried_again_and_ends_no_spawner(what, monkeypatch):
+    module = {"socketpair": socket, "fork": os}[what]
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(spare, "_PAUSE_S", 0.0)
+    with selectors.DefaultSelector() as selector:
+        spares = spare.Spares(1, selector, lambda _control: os._exit(0))
+        with monkeypatch.context() as without:
+            without.setattr(module, what, fail)
+            assert [spares.look_after() for _ in range(2)] == [0.0, 0.0]
+        assert not selector.get_map()
+        spares.look_after()
+        ((key, _),) = selector.select(5.0)
+        key.data(key.fileobj)  # it has ended at once
+        assert not selector.get_map()
+    os.wait()

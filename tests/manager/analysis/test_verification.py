@@ -228,6 +228,21 @@ def two(*names: str, with_modules: bool = False, deaths: bool = True) -> Transit
                        exclusive=True, with_modules=with_modules, deaths=deaths)
 
 
+def test_a_latch_is_explored_with_what_excuses_it_and_without():
+    plain = ARRANGEMENT.mechanisms.contracts
+    contracts = [msgspec.structs.replace(plain["RM1"], excused_by=frozenset({"DM5"})), plain["RM2"]]
+    asked = [frozenset({"RM1"}), frozenset({"RM2"})]
+    system = Transitions(contracts, ARRANGEMENT.order, asked, ["RM1"], exclusive=True)
+    states, found = explore(system)
+    assert found == {}
+    assert states > explore(two("RM1", "RM2"))[0]
+    stopped = dict(system.successors(system.initial()))["asked for: RM1"]
+    assert stopped.state.latched == ("RM1",)
+    excused = dict(system.successors(stopped))["what excuses is found"]
+    assert excused.state.latched == ()
+    assert dict(system.successors(excused))["the excuse ends"].state.latched == ("RM1",)
+
+
 def test_a_release_that_is_forgotten_has_the_shortest_trace(monkeypatch):
     monkeypatch.setattr(transitions, "Arbiter", ForgetsReleases)
     _, found = explore(two("RM2", "RM5"))

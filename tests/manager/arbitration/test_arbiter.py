@@ -3,9 +3,11 @@
 import msgspec
 import pytest
 
+from rampart.manager.arbitration.arbiter_memory import recall, remember
 from rampart.manager.arbitration.arbiter_state import State, Tick
 from rampart.manager.arbitration.recovery_track import Command
 from rampart.manager.model.mechanisms import RecoveryPhase as Phase
+from rampart.manager.spec.schema import SystemSpec
 from tests.manager.bench import DMS, Bench, commands, edited
 
 ACTING, DONE, IDLE, DEGRADED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.DEGRADED
@@ -233,6 +235,63 @@ def test_a_reset_of_what_is_not_latched_is_refused_with_the_reason(rm, why):
     assert (answer.granted, answer.reason) == (False, why)
 
 
+EXCUSED = edited(RM1={"excused_by": frozenset({"DM5"})})
+"""RM1 is not latched by what DM5 explains."""
+
+
+def stopped(bench: Bench) -> None:
+    bench.report("RM1", ACTING)
+    bench.report("RM1", DONE)
+
+
+@pytest.mark.parametrize("first", ["DM5", "DM1"])
+def test_what_is_explained_meanwhile_is_not_latched(first):
+    bench = Bench(EXCUSED)
+    bench.active(first)
+    bench.wait(1.0)
+    bench.active("DM1" if first == "DM5" else "DM5")
+    stopped(bench)
+    assert "RM1" in bench.orders.split()
+    assert bench.state.latched == ()
+    bench.idle("DM1")
+    bench.wait(1.0)
+    bench.idle("DM5")
+    bench.wait(1.0)
+    assert "RM1" not in bench.orders
+
+
+def test_what_outlasts_its_explanation_is_latched():
+    bench = Bench(EXCUSED)
+    bench.active("DM5")
+    bench.active("DM1")
+    stopped(bench)
+    bench.idle("DM5")
+    bench.wait(0.3)
+    assert bench.state.latched == ()  # the explanation is held
+    bench.wait(1.0)
+    assert bench.state.latched == ("RM1",)
+    bench.idle("DM1")
+    bench.wait(30.0)
+    assert bench.orders == "RM1"
+
+
+def test_an_old_latch_is_not_excused_by_what_comes_later():
+    bench = Bench(EXCUSED)
+    bench.active("DM1")
+    stopped(bench)
+    bench.wait(6.0)
+    bench.active("DM5")
+    assert bench.state.latched == ("RM1",)
+
+
+def test_what_nothing_explains_is_latched():
+    bench = Bench(EXCUSED)
+    bench.active("DM6")
+    bench.active("DM1")
+    stopped(bench)
+    assert bench.state.latched == ("RM1",)
+
+
 def test_a_less_safe_recovery_does_not_replace_a_latched_one():
     bench = Bench()
     bench.active("DM1")
@@ -404,3 +463,82 @@ def test_every_decision_has_a_number_of_its_own_and_commands_refer_to_them():
     assert {o.decision for o in bench.log if isinstance(o, Command)} <= set(numbers)
 
 
+
+
+# ---- one cause of many symptoms ---------------------------------------------------------------
+
+
+def explained_by_dm5() -> SystemSpec:
+    """FTM5 stops the robot and explains FTM2, FTM4 and FTM6; RM1 is excused by its DM5."""
+    spec = edited(RM1={"excused_by": frozenset({"DM5"})})
+    return msgspec.structs.replace(spec, mechanisms=tuple(
+        msgspec.structs.replace(m, recover="RM2", explains=frozenset({"FTM2", "FTM4", "FTM6"}))
+        if m.name == "FTM5" else m for m in spec.mechanisms))
+
+
+def test_what_is_explained_is_not_acted_on_and_counts_again_afterwards():
+    bench = Bench(explained_by_dm5())
+    bench.active("DM5")
+    assert bench.orders == "RM2"
+    bench.report("RM2", DONE)
+    bench.active("DM4", "osmosis_control")
+    bench.active("DM6")
+    assert (bench.orders, bench.state.active) == ("RM2", ("FTM5",))
+    assert len(bench.decisions) == 1
+    bench.idle("DM6")
+    bench.idle("DM5")
+    bench.wait(1.0)
+    assert (bench.orders, bench.state.active) == ("RM3", ("FTM4",))
+
+
+def test_what_was_under_way_when_it_was_explained_is_left_to_finish():
+    bench = Bench(explained_by_dm5())
+    bench.active("DM4", "osmosis_control")
+    bench.report("RM3", ACTING)
+    bench.active("DM5")
+    assert bench.orders == "RM2 (RM3)"
+    bench.report("RM3", DONE)
+    assert bench.orders == "RM2"
+
+
+def test_an_arbiter_that_takes_over_does_not_latch_what_was_excused():
+    bench = Bench(explained_by_dm5())
+    bench.active("DM5")
+    bench.active("DM1")
+    stopped(bench)
+    memory = remember(bench.state, bench.arbiter)
+    for cause, expected in (("", ()), ("DM1", ("RM1",))):
+        after = Bench(explained_by_dm5(), oriented=False)
+        after.state = recall(after.arbiter, memory, 0.0, 10_000)
+        for dm in DMS:
+            (after.active if dm == cause else after.idle)(dm)
+        assert "RM1" in after.orders  # until all have been heard
+        for rm in ("RM2", "RM3", "RM4", "RM5"):
+            after.report(rm, IDLE)
+        after.report("RM1", DONE)
+        after.wait(1.0)
+        assert after.state.latched == expected
+        assert ("RM1" in after.orders) == bool(cause)
+
+
+def test_the_last_barrier_acts_whatever_explains_the_rest():
+    bench = Bench(explained_by_dm5())
+    bench.active("DM5")
+    assert ("RM1", True) in commands(bench.active("DM1"))
+
+
+def test_silence_explains_nothing_unless_many_are_silent():
+    for silent, expected in ((("DM5",), ("FTM4", "FTM5")),
+                             (("DM5", "DM6", "DM3"), ("FTM3", "FTM5"))):
+        bench = Bench(explained_by_dm5())
+        bench.active("DM4", "osmosis_control")
+        bench.wait(1.5, hearing=tuple(dm for dm in DMS if dm not in silent))
+        assert bench.state.active == expected
+
+
+def test_what_was_reported_before_it_fell_silent_explains_on():
+    bench = Bench(explained_by_dm5())
+    bench.active("DM5")
+    bench.active("DM4", "osmosis_control")
+    bench.wait(1.5, hearing=tuple(dm for dm in DMS if dm != "DM5"))
+    assert (bench.state.silent, bench.state.active) == (("DM5",), ("FTM5",))

@@ -349,7 +349,7 @@ def test_a_latch_beneath_a_safer_recovery_survives_the_manager():
     bench.report("RM2", DONE)
     bench.active("DM1")
     assert bench.orders == "RM1"
-    memory = remember(bench.state)
+    memory = remember(bench.state, bench.arbiter)
     assert {latch.command.recovery for latch in memory.latches} == {"RM1", "RM2"}
     assert objection(memory) == ""
     state = recall(bench.arbiter, memory, 100.0, 0)

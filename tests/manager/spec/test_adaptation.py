@@ -85,7 +85,7 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
     ("retune", "FTM3", {}, "retune FTM3: nothing to change; name fields and values"),
     ("retune", "FTM3", {"name": "X"}, "name = 'X': a name cannot be changed"),
     ("retune", "FTM3", {"margin_m": 1}, "margin_m = 1: unknown field of a mechanism; known: detect,"
-                                        " recover, event, against, enabled"),
+                                        " recover, event, against, explains, enabled"),
     ("replace", "FTM3", {"name": "X"}, "name = 'X': a replacement keeps the name, 'FTM3'"),
     ("set", "airport", {"value": "x"}, "unknown setting 'airport'; known: strategy, shadow, order"),
     ("set", "strategy", {}, "set strategy: the value is missing"),

@@ -409,6 +409,26 @@ REFUSED = {
     "a last resort that has to wait": (
         [('claims = ["brakes"]', 'claims = ["brakes", "control_nodes"]')],
         ["RM1, the last resort, would have to wait for RM3", "claims control_nodes"]),
+    # what explains, and what is excused
+    "excused by no detection module": (
+        [("latched = true ", 'excused_by = ["DM77"]\nlatched = true ')],
+        ["recovery RM1: excused_by[0] = 'DM77': unknown detection module; known: DM1"]),
+    "excused, though it does not latch": (
+        [("latched = true ", 'excused_by = ["DM5"]\n# ')],
+        ["recovery RM1: excused_by = ['DM5']: only what is latched is excused"]),
+    "explaining no mechanism": (
+        [('detect = "DM2"', 'detect = "DM2"\nexplains = ["FTM77"]')],
+        ["mechanism FTM2: explains[0] = 'FTM77': unknown mechanism; known: FTM1"]),
+    "explaining itself": (
+        [('detect = "DM2"', 'detect = "DM2"\nexplains = ["FTM2"]')],
+        ["mechanism FTM2: explains = ['FTM2']: FTM2 itself explains others"]),
+    "explaining each other": (
+        [('detect = "DM2"', 'detect = "DM2"\nexplains = ["FTM4"]'),
+         ('detect = "DM4"', 'detect = "DM4"\nexplains = ["FTM5"]')],
+        ["mechanism FTM2: explains = ['FTM4']: FTM4 itself explains others"]),
+    "explaining the last barrier": (
+        [('detect = "DM2"', 'detect = "DM2"\nexplains = ["FTM1"]')],
+        ["mechanism FTM2: explains = ['FTM1']: FTM1 is the root of the FTMTree; the last barrier"]),
     # time
     "bounds that are too slow": ([('within_s = "control_period_s"', "within_s = 0.5")],
                                  ["$.timing: the time budget does not fit: FTM3 needs 0.650 s",

@@ -89,6 +89,13 @@ def test_a_wheel_and_its_strength_are_named():
         ActuatorFaultKind.WEAK_WHEEL, "rear left", 0.3, 4.0)
 
 
+def test_all_processes_are_slow_at_once_and_none_is_killed_by_a_name_that_means_all():
+    assert action_of(PlannedFault("slow:all:0.03", duration_s=5.0)) == OnProcess(
+        "slow", "", 0.03, 5.0)
+    with pytest.raises(ScenarioError, match="no node 'all'"):
+        action_of(PlannedFault("kill:all"))
+
+
 @pytest.mark.parametrize(("fault", "words"), [
     ("kill:nobody", "no node 'nobody'; there are: supervisor, "),
     ("kill", "no node ''"), ("kill:simulator", "no node 'simulator'"),

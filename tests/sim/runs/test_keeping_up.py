@@ -7,8 +7,9 @@ import pytest
 
 from rampart.actors.bus.messages import ON_TIME
 from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable
+from rampart.manager.spec.budget import allowed_late_s
 from rampart.manager.spec.tables import Timing
-from rampart.sim.runs.keeping_up import LINE_S, WINDOW_S, KeepingUp, KeptUp, allowed_s
+from rampart.sim.runs.keeping_up import LINE_S, WINDOW_S, KeepingUp, KeptUp
 
 TIMING = Timing(
     heartbeat_period_s=0.1, heartbeat_timeout_s=0.4, command_timeout_s=1.0,
@@ -31,7 +32,7 @@ def run(late_s: list[float], rate: float = 1.0, world_s: float = 0.0) -> tuple[K
 
 
 def test_a_loop_may_be_late_by_half_the_shortest_slack_of_a_timeout():
-    assert allowed_s(TIMING) == pytest.approx((0.4 - 0.1) / 2)
+    assert allowed_late_s(TIMING) == pytest.approx((0.4 - 0.1) / 2)
 
 
 def test_a_machine_that_keeps_up_is_told_nothing():
@@ -73,7 +74,7 @@ def test_a_run_that_is_over_before_a_window_is_full_has_a_figure_too():
 def test_while_the_system_starts_nothing_is_measured():
     keeping = KeepingUp(TIMING, [], 1.0)
     assert keeping.take(table(a=2.0), -0.5) == ""
-    assert keeping.result(1.0) == KeptUp(1.0, 1.0, 0.0, "", 0.0, allowed_s(TIMING), 0.0)
+    assert keeping.result(1.0) == KeptUp(1.0, 1.0, 0.0, "", 0.0, allowed_late_s(TIMING), 0.0)
 
 
 def test_a_row_of_a_node_that_is_on_time_is_as_short_as_before():

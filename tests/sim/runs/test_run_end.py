@@ -36,8 +36,9 @@ def test_what_nobody_could_hear_does_not_count_as_silence():
     end = RunEnd(patience_s=60.0, waits=True)
     end.truth(Twist(0.0, 0.0), 10.0)
     end.excuse(40.0)
-    assert end.ended(52.9) is None
-    assert end.ended(53.1) == "the world is gone: no ground truth from the simulator"
+    assert end.ended(49.9 + WORLD_SILENT_S) is None
+    assert end.ended(50.1 + WORLD_SILENT_S) == (
+        "the world is gone: no ground truth from the simulator")
 
 
 def test_a_mission_that_succeeded_ends_the_run_once_the_robot_has_settled():

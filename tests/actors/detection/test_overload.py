@@ -1,0 +1,112 @@
+"""Many nodes that are late at once: what they have in common is the machine."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+
+import pytest
+
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.detection.overload import Overload, RunQueue
+from rampart.actors.ftm.patience import Usage
+from rampart.manager.spec.budget import allowed_late_s
+from rampart.testing import Ear, VirtualSystem, run
+
+NODES = ("a", "b", "c", "d", "e", "f")
+
+
+def states(script: list[tuple[float, str, float]], *, under_way_s: float = 0.0,
+           until_s: float = 6.0, waits_until_s: float = 0.0, incarnation: int = 1
+           ) -> list[tuple[float, str]]:
+    """When DM14 changed its state: heartbeats at a time, from nodes, that were so late.
+
+    Until `waits_until_s` their processes wait for a processor for a fifth of the time.
+    """
+
+    async def scenario() -> list[tuple[float, str]]:
+        async with VirtualSystem() as system:
+            ear = system.start("ear", Ear)
+            system.incarnations["D"] = incarnation - 1
+            context = replace(
+                system.context("D", {"watch": list(NODES), "late_s": 0.15, "clear_s": 1.0,
+                                     "wait_s": 4.0}),
+                incarnation=incarnation, scheduled=lambda _pid: Usage(
+                    "S", 1.0, 0.2 * min(system.clock.now(), waits_until_s)))
+            task = asyncio.create_task(Overload(context).run())
+            for at_s, nodes, late_s in script:
+                await asyncio.sleep(max(0.0, at_s - system.clock.now()))
+                for node in nodes:
+                    beat = bm.Heartbeat(ord(node), 1, 0.1, 0, 0, late_s)
+                    system.say(bus_topics.HEARTBEAT, beat, node,
+                               stamp_s=system.clock.now() - under_way_s)
+            await asyncio.sleep(until_s - system.clock.now())
+            found: list[tuple[float, str]] = []
+            for at_s, report in ear.heard:
+                if not found or found[-1][1] != report.state.value:
+                    found.append((round(at_s, 1), report.state.value))
+            task.cancel()
+            return found
+
+    return run(scenario)
+
+
+def test_many_that_are_late_at_once_are_an_overload_until_they_have_not_been_for_a_while():
+    late_s = 0.2
+    script = [(1.0 + 0.2 * i, "abc", late_s) for i in range(5)]
+    assert states(script)[1:] == [(1.0, "active"), (3.3, "idle")]
+
+
+@pytest.mark.parametrize("script", [
+    [(1.0 + 0.1 * i, "a", 3.0) for i in range(20)],  # one is a fault of its own
+    [(1.0, "a", 0.2), (2.0, "b", 0.2), (3.0, "c", 0.2)],  # not at once
+    [(1.0 + 0.1 * i, NODES, 0.05) for i in range(20)],  # not late enough
+])
+def test_few_or_a_little_late_are_no_overload(script):
+    assert {state for _, state in states(script)} == {"idle"}
+
+
+def test_one_that_was_late_for_long_counts_for_as_long():
+    """A loop that turns every 0.9 s says so every 0.9 s; another one says so in between."""
+    script = [(1.0 + 0.45 * i, "ab"[i % 2], 0.9) for i in range(8)]
+    assert [state for _, state in states(script, until_s=4.0)] == ["idle", "active"]
+
+
+def test_what_is_long_under_way_is_late_as_well():
+    script = [(1.0 + 0.1 * i, "abcd", 0.0) for i in range(5)]
+    assert [s for _, s in states(script, under_way_s=0.4, until_s=1.5)] == ["idle", "active"]
+
+
+@pytest.mark.parametrize(("waits_until_s", "idle_s"), [(0.0, 2.5), (3.2, 4.7), (99.0, 6.5)])
+def test_it_lasts_while_many_wait_for_a_processor_but_not_for_ever(waits_until_s, idle_s):
+    script = [(1.0, "abc", 0.2)]
+    ((active_s, active), (found_s, idle)) = states(
+        script, until_s=9.0, waits_until_s=waits_until_s)[1:]
+    assert (active_s, active, idle) == (1.0, "active", "idle")
+    assert found_s == pytest.approx(idle_s, abs=0.4)
+
+
+def test_a_successor_says_nothing_before_it_knows():
+    assert states([], until_s=0.9, incarnation=2) == []
+    assert states([], until_s=2.0, incarnation=2) == [(1.0, "idle")]
+    assert states([(0.5, "abc", 0.2)], until_s=0.9, incarnation=2) == [(0.5, "active")]
+
+
+def test_a_process_waits_that_has_spent_enough_of_the_time_in_the_run_queue():
+    waited_s = {1: 5.0, 2: 0.0}
+    queue = RunQueue(lambda pid: Usage("S", 0.0, waited_s[pid]), 0.1)
+    assert queue.count([1, 2], 10.0) == 0  # nothing to compare with
+    waited_s |= {1: 5.11, 2: 0.09, 3: 9.0}
+    assert queue.count([1, 2, 3], 11.0) == 1
+    assert queue.count([1, 2, 3], 12.0) == 0
+
+
+def test_by_default_late_is_half_the_slack_of_the_systems_shortest_timeout():
+    async def scenario() -> tuple[float, float]:
+        async with VirtualSystem.load("osmosis") as system:
+            module = Overload(system.context("D", {"watch": ["safety_pilot", "hmi"]}))
+            return module._too_late_s, allowed_late_s(module.context.run.system.timing)
+
+    told, expected = run(scenario)
+    assert told == expected > 0
