@@ -259,8 +259,8 @@ class Attendance:
 
 
 _OWN = (*(name for name in RunPlan.__struct_fields__ if name.startswith("hmi_")),
-        "base_port", "launcher_pid", "folder", "audit_log", "error_log", "origin_s", "checkpoints", "system_file", "host", "incarnations",
-        "keys", "ports")
+        "base_port", "launcher_pid", "folder", "audit_log", "error_log", "origin_s", "checkpoints",
+        "system_file", "host", "incarnations", "keys", "ports")
 """Of a plan, what is each host's own."""
 
 

@@ -69,9 +69,8 @@ class Actor(Declared):
         self.parameters = read_parameters(
             self.Parameters, context.parameters, context.name, "parameters")
         self._bus = context.bus
-        self._guard = ArrivalGuard(
-            context.clock.now, context.members, self._crowded, context.register,
-            context.command_age_s)
+        self._guard = ArrivalGuard(context.clock.now, context.members, self._crowded,
+                                   context.register, context.command_age_s)
         self._injections = InjectedFaults(self)
         self._in_force = self._injections.gate.in_force
         self._last_sent = self._injections.gate.last
