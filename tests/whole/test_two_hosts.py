@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -98,6 +99,41 @@ def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_ba
             assert again.result(20)[0] == 0
     assert code == 0
     assert not [line for line in robot.story.splitlines() if "failed" in line]
+
+
+def test_the_manager_survives_its_machine_and_never_are_two_obeyed(net, tmp_path):
+    spec = specification(net, tmp_path, ("cell_manager",), "cell", 0.07)
+
+    def trigger(run: RealRun, module: str) -> None:
+        command = net.command("robot", sys.executable, "-m", "rampart.cli.main", "trigger", module,
+                              "--for", "1", "--port", str(run.port))
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+        assert done.returncode == 0, done.stderr
+
+    with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as ground,
+          host(net, "robot", tmp_path / "r", spec, "--no-keys") as robot):
+        ground.wait_for("takes part in run")
+        robot.wait_for("ctrl-C ends it")
+        time.sleep(3.0)
+        trigger(robot, "D_CURTAIN")
+        robot.wait_for("decision 1: R_SAFE_TORQUE_OFF, rule 1 for M_CURTAIN")
+        net.line = Line(is_cut=True)
+        robot.wait_for("cell_manager respawned, incarnation 1000001")
+        assert ground.pid("cell_manager") is not None  # it goes on, and nobody here hears it
+        before = len(robot.story)
+        trigger(robot, "D_CURTAIN")
+        robot.wait_until(lambda: "rule 1 for M_CURTAIN" in robot.story[before:], 10, "no manager")
+        net.line = Line()
+        ground.wait_for("cell_manager handed over")
+        ground.wait_for("cell_manager respawned", 20)
+        robot.wait_until(lambda: robot.pid("cell_manager") is None, 10, "not given back")
+        robot.process.send_signal(signal.SIGINT)
+        code, result = robot.result(20)
+    assert code == 0
+    numbers = [decision["number"] for decision in result["decisions"]]
+    assert numbers == sorted(set(numbers))  # one after the other, and none given twice
+    refused = [line for line in robot.story.splitlines() if "incarnation 1 of cell_manager" in line]
+    assert all("was superseded by 1000001" in line for line in refused)
 
 
 def test_another_program_or_system_is_refused_before_anything_starts(net, tmp_path):
