@@ -46,7 +46,22 @@ OPTIONS = (
     option("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS))  # refused
 
 
-def page_of(options: argparse.Namespace, note: Callable[[str], None]) -> dict[str, Any]:
+def own_token(options: argparse.Namespace) -> str:
+    """Return the token of the environment, and take it from there: nothing that is started has it.
+
+    Raises:
+        UsageError: there is one on the command line.
+    """
+    own = os.environ.pop(TOKEN_VARIABLE, "")
+    if options.hmi_token is not None:
+        raise UsageError("--hmi-token: a command line is read by every user of this machine; put "
+                         "another token into a file of mode 0600 for --hmi-token-file FILE, or "
+                         f"into the variable {TOKEN_VARIABLE}")
+    return own
+
+
+def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
+            ) -> dict[str, Any]:
     """Return the fields of the plan that say where the page is, for whom, encrypted how.
 
     Tokens come from a file or the environment, which other users cannot read as they can read a
@@ -54,16 +69,12 @@ def page_of(options: argparse.Namespace, note: Callable[[str], None]) -> dict[st
 
     Args:
         options: of the command line.
+        own: token of the environment, "" for none.
         note: is told what is odd, and no error.
 
     Raises:
         UsageError: an option makes no sense, or the page could not be served like this.
     """
-    own = os.environ.pop(TOKEN_VARIABLE, "")  # not for whatever is started
-    if options.hmi_token is not None:
-        raise UsageError("--hmi-token: a command line is read by every user of this machine; put "
-                         "another token into a file of mode 0600 for --hmi-token-file FILE, or "
-                         f"into the variable {TOKEN_VARIABLE}")
     if options.no_hmi or options.virtual:
         if options.wait:
             raise UsageError("--wait: the mission is started from the operator's page, which there "

@@ -45,7 +45,7 @@ STARTED_S = 5.0
 LOOK_S = 0.1
 BACK_WITHIN_S = 20.0
 END_WITHIN_S = 60.0
-LONGEST_S = 1800.0
+LONGEST_S = 3600.0
 """Simulated seconds for which faults are planned: of one mission."""
 
 
@@ -297,9 +297,9 @@ def main(arguments: list[str] | None = None) -> int:
                         help="how long the soak in the file is to last in all (default: 1)")
     parser.add_argument("--seed", type=int, default=1, help="of the faults (default: 1)")
     parser.add_argument("--rate", type=float, default=1.0, help="simulated seconds per second")
-    parser.add_argument("--laps", type=int, default=5, metavar="N",
-                        help="rounds of a mission after the lights, three minutes each (default: "
-                        "5)")
+    parser.add_argument("--laps", type=int, default=8, metavar="N",
+                        help="rounds of a mission after the lights, some three minutes each "
+                        "(default: 8)")
     parser.add_argument("--file", type=Path, default=Path("reports/soak.jsonl"),
                         help="JSON lines of all that was done (default: %(default)s)")
     parser.add_argument("--summary", action="store_true", help="read the file only, and draw")

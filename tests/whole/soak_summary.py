@@ -18,8 +18,12 @@ TOTALS = (("memory of their own, all", "MB", OWN, 1e-3, 30.0),
           ("threads, all", "", THREADS, 1.0, 20.0))
 """Figure, unit, its place in a sample, its scale, and how much in an hour counts."""
 
-SINGLE = (("memory of its own", "MB", OWN, 1e-3, 3.0), ("descriptors", "", DESCRIPTORS, 1.0, 6.0),
+SINGLE = (("memory of its own", "MB", OWN, 1e-3, 5.0), ("descriptors", "", DESCRIPTORS, 1.0, 6.0),
           ("threads", "", THREADS, 1.0, 2.0))
+RECORD_MB = 15.0
+"""In an hour, of the launcher: it keeps the record of the run until its report, some 5 MB an hour
+under faults, and 10,000 entries of a kind at most."""
+
 WORST = 6
 """Processes that are shown one by one, of all but the launcher."""
 
@@ -49,7 +53,8 @@ def growths(records: Sequence[Record]) -> list[Growth]:
     """
     found = [growth(what, unit, totals(records, place, scale), counts)
              for what, unit, place, scale, counts in TOTALS]
-    found += [growth(f"{what}, {LAUNCHER}", unit, of_one(records, LAUNCHER, place, scale), counts)
+    found += [growth(f"{what}, {LAUNCHER}", unit, of_one(records, LAUNCHER, place, scale),
+                     RECORD_MB if place == OWN else counts)
               for what, unit, place, scale, counts in SINGLE]
     names = {name for r in of_kind(records, "sample") for name in r["used"]} - {LAUNCHER}
     what, unit, place, scale, counts = SINGLE[0]

@@ -48,8 +48,8 @@ def test_of_a_hundred_figures_that_do_not_grow_few_seem_to():
     assert seem <= 8  # 2.5 of them are expected
 
 
-def test_what_is_loaded_in_the_first_minute_is_no_growth():
-    loading = [replace(s, value=s.value - (300 if s.into_s < 60 else 0)) for s in samples(0.0)]
+def test_what_becomes_a_process_s_own_in_its_first_minutes_is_no_growth():
+    loading = [replace(s, value=s.value - max(0.0, 300 - s.into_s)) for s in samples(0.0)]
     assert growth("memory", "MB", loading, 1.0).verdict == "within noise"
 
 
