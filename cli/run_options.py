@@ -197,22 +197,14 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
     """
     _check(options)
     system_file = _system_file(options.system)
-<<<<<<< ours
     host = _host(options, load_system(RunPlan(system_file=str(system_file))))
-    page = page_options.page_of(options, note)
-=======
     token = page_options.own_token(options)
->>>>>>> theirs
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port,
         rate=1.0 if options.rate == MAX_RATE else options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
-<<<<<<< ours
-        shadow=options.shadow, waits=options.wait, virtual=options.virtual, host=host, **page)
-=======
-        shadow=options.shadow, waits=options.wait, virtual=options.virtual)
->>>>>>> theirs
+        shadow=options.shadow, waits=options.wait, virtual=options.virtual, host=host)
     spec = load_system(plan)
     layout = Layout(plan, spec)
     _check_network(options, spec)
@@ -224,15 +216,9 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
                for name, member in layout.members.items()):
         where = f" on host {host or 'the first'}" if layout.hosts.several else ""
         refuse(options, ("wait", *page_options.NAMES),
-<<<<<<< ours
                f"no node of {spec.name}{where} serves an operator's page")
-        plan = msgspec.structs.replace(plan, hmi_port=0)
-    return plan, spec
-=======
-               f"no node of {spec.name} serves an operator's page")
         return plan, spec
     return msgspec.structs.replace(plan, **page_options.page_of(options, token, note)), spec
->>>>>>> theirs
 
 
 def _host(options: argparse.Namespace, spec: SystemSpec) -> str:

@@ -164,7 +164,9 @@ class ZenohBus:
             except zenoh.ZError:  # it ended in this moment
                 pass
             if loop.time() > until_s:
-                raise BusError(f"no router at {' or '.join(self._dial)} "
+                shown = self._credentials
+                taking = f" that takes the certificate in {shown.own}" if shown and found else ""
+                raise BusError(f"no router at {' or '.join(self._dial)}{taking} "
                                f"({f'node {self._node}' if self._node else 'tool'})")
             await asyncio.sleep(_LOOK_S)
 

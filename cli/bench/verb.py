@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
     machine that does other work, say little. Ctrl-C ends all that was started.
 
     Examples:
-      rampart bench                                  all, some ten minutes
+      rampart bench                                  all, a quarter of an hour
       rampart bench --only peers --kills 30          the peers alone, more kills
       rampart bench --only peers --peer dora --peer rampart-actor
       rampart bench --only restart --system my.toml --node planner

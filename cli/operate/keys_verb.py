@@ -168,9 +168,8 @@ def rotate(options: argparse.Namespace) -> int:
     """Issue new keys.
 
     Issue a new private key and certificate to who has some, of all kinds and
-    with the same addresses. A process takes them when it starts the next time,
-    and who is cut off because his has expired is restarted; the old ones are
-    good until they expire.
+    with the same addresses. A process takes them when it starts the next time:
+    kill-node each, one after the other. The old ones are good until they expire.
 
     Examples:
       rampart keys rotate

@@ -16,6 +16,7 @@ from rampart.actors.foreign.channel import MAX_PACKET
 from rampart.manager.spec.nodes import COMMAND_FIELDS, ChildLimits
 from rampart.testing import RealRun, VirtualSystem, run
 from tests import ROOT
+from tests.actors.access.keyed import layout_of, make_keys
 
 TEXT = (ROOT / "docs/foreign_nodes.md").read_text(encoding="utf-8")
 
@@ -75,13 +76,17 @@ def test_the_c_program_is_a_node_and_faults_can_be_put_into_what_it_says(tmp_pat
 
 
 @pytest.mark.processes
-def test_the_plain_zenoh_program_is_a_node(tmp_path):
+@pytest.mark.parametrize("with_keys", [False, True])
+def test_the_plain_zenoh_program_is_a_node(tmp_path, monkeypatch, with_keys):
     write_tug(tmp_path, compiled=False)
     (tmp_path / "wheels.py").write_text(block("python", "import json"))
     (tmp_path / "tug.toml").write_text(TUG.replace(
         '["./wheels"]', f'[{json.dumps(sys.executable)}, "wheels.py"]').replace(
         "notify = true", 'key = "wheels/alive"'))
-    with RealRun(tmp_path, "tug.toml") as tug:
+    monkeypatch.syspath_prepend(tmp_path)  # for its driver, when keys are made for it
+    more = ("--keys", str(make_keys(tmp_path / "keys", layout_of(str(tmp_path / "tug.toml"))))
+            ) if with_keys else ()
+    with RealRun(tmp_path, "tug.toml", *more) as tug:
         tug.sleep_until(3)
         assert heard(tug) == [5.0, 5.0]
         assert [n["state"] for n in nodes(tug) if n["name"] == "wheels"] == ["running"]

@@ -175,6 +175,14 @@ def test_it_asks_for_what_it_hears_only(keyed):
         held.undeclare()
 
 
+def test_nobody_looks_into_the_router_itself(keyed):
+    for name in ("bob", "ada", "DM4", "supervisor"):
+        with keyed.joined(name) as session:
+            own = f"@/{session.info.zid()}/"
+            told = [r.ok.key_expr for r in session.get("@/**", timeout=0.5) if r.ok is not None]
+            assert not [key for key in told if own not in str(key)], name
+
+
 def test_a_token_is_its_owners(keyed):
     seen: list[str] = []
     with keyed.joined("bob") as viewer:

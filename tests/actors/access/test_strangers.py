@@ -20,6 +20,8 @@ import zenoh
 from rampart.actors.access import key_folder
 from rampart.actors.access.certificates import new_authority, new_certificate, public_part
 from rampart.actors.bus import run_folder
+from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, session_config
 from tests import ROOT
 from tests.actors.access.keyed import Keyed, every_key, layout_of, make_keys, opened, wait_for
@@ -278,3 +280,12 @@ def test_nobody_poses_as_a_router_with_a_nodes_key(keyed, folder, tmp_path):
         victim = keyed.shown("safety_pilot")
         with pytest.raises(zenoh.ZError):
             zenoh.open(session_config((), ["tls/127.0.0.1:9499"], victim))
+
+
+async def test_who_is_refused_is_told_which_certificate_was_not_taken(keyed, monkeypatch):
+    monkeypatch.setattr("rampart.actors.bus.zenoh_bus.PATIENCE_S", 0.5)
+    other = written(keyed, new_certificate(
+        new_authority(NOW, 9), "safety_pilot", "node", addresses=(), now=NOW, days=8))
+    bus = ZenohBus("", 0, [keyed.socket], credentials=other)
+    with pytest.raises(BusError, match=r"no router at .* that takes the certificate in .*own\.pem"):
+        await bus.open()
