@@ -3,7 +3,7 @@
 A run ends when the mission has ended, when it was lost (the Mission Manager forgot it), or when
 nothing has progressed for the patience of the person who started it; and then when the robot
 stands. One that drives on is looked at for a minute: it may be on its way into the grass. A run
-without a world ends at once.
+without a world ends after half a minute.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ STANDING_MPS, STANDING_RADPS = 0.05, 0.1
 
 LOST_AFTER_S = 3.0
 ACCEPT_WITHIN_S = 30.0
-WORLD_SILENT_S = 10.0
-"""A machine that is overloaded may keep the ground truth away for some seconds."""
+WORLD_SILENT_S = 30.0
+"""A machine that is overloaded may keep the ground truth away for ten seconds."""
 _STEP_TOWARDS_GOAL_M = 0.5
 _WAYS = 10
 """So many ways round something are followed patiently; who finds more goes to and fro."""
