@@ -15,7 +15,7 @@ from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
-from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder, severity
@@ -117,7 +117,9 @@ class MissionTrial(Trial):
         self.goals = len(known.mission.goals)
         self.title = f"{self.name} on {known.airport.name}"
         self.about = f"mission {self.name} ({self.goals} goals) on {known.airport.name}"
-        self._end = RunEnd(_PATIENCE_S if limit_s is None else limit_s, run.plan.waits)
+        self._end = RunEnd(
+            _PATIENCE_S if limit_s is None else limit_s, run.plan.waits,
+            [node.name for node in run.system.nodes if node.kind is Kind.WORLD])
         self.recorder = MissionRecorder(run.plan, self.strategy, known.airport, known.mission)
 
     def sinks(self, clock: Clock) -> list[Sink]:

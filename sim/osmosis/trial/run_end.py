@@ -3,15 +3,17 @@
 A run ends when the mission has ended, when it was lost (the Mission Manager forgot it), or when
 nothing has progressed for the patience of the person who started it; and then when the robot
 stands. One that drives on is looked at for a minute: it may be on its way into the grass. A run
-without a world ends after half a minute.
+without a world ends at once, one with a world that is not heard after half a minute.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
+from rampart.actors.ftm.messages import ProcessEvent
 from rampart.actors.osmosis import messages as m
 
 _ENDED = (m.MissionPhase.SUCCEEDED, m.MissionPhase.FAILED, m.MissionPhase.CANCELLED)
@@ -27,8 +29,10 @@ STANDING_MPS, STANDING_RADPS = 0.05, 0.1
 
 LOST_AFTER_S = 3.0
 ACCEPT_WITHIN_S = 30.0
-WORLD_SILENT_S = 30.0
-"""A machine that is overloaded may keep the ground truth away for ten seconds."""
+WORLD_SILENT_S = 3.0
+WORLD_LATE_S = 30.0
+"""A machine that is overloaded may keep the ground truth away for ten seconds, of a world whose
+process is there."""
 _STEP_TOWARDS_GOAL_M = 0.5
 _WAYS = 10
 """So many ways round something are followed patiently; who finds more goes to and fro."""
@@ -42,10 +46,12 @@ class RunEnd:
         patience_s: longest time without progress: no new step, no light measured, not half
             a metre nearer to the goal, and no way round something that is on the way.
         waits: whether the mission comes when the operator wants it, however late.
+        worlds: names of the nodes that simulate the world.
     """
 
     patience_s: float
     waits: bool = False
+    worlds: Collection[str] = ()
     _mission_id: str = ""
     _progress: tuple[int, int] = (-1, -1)
     _nearest_m: float = math.inf
@@ -56,6 +62,7 @@ class RunEnd:
     _lost_at_s: float = math.inf
     _truth_at_s: float = math.inf
     _moves: bool = False
+    _is_gone: bool = False
 
     def take(self, message: Any, now_s: float) -> None:
         """Take what the observer hears; what says nothing of the end does not matter."""
@@ -65,6 +72,8 @@ class RunEnd:
             self.control(message, now_s)
         elif isinstance(message, m.GroundTruth):
             self.truth(message.twist, now_s)
+        elif isinstance(message, ProcessEvent) and message.node in self.worlds:
+            self._is_gone = message.event not in {"running", "resumed", "adopted"}
 
     def mission(self, status: m.MissionStatus, now_s: float) -> None:
         """Take the mission's state."""
@@ -107,7 +116,7 @@ class RunEnd:
 
     def ended(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
-        if now_s - self._truth_at_s > WORLD_SILENT_S:
+        if now_s - self._truth_at_s > (WORLD_SILENT_S if self._is_gone else WORLD_LATE_S):
             return "the world is gone: no ground truth from the simulator"
         why, since_s = self._outcome(now_s)
         if not why or (self._moves and now_s - since_s < WATCH_S):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rampart.actors.ftm.messages import ProcessEvent
 from rampart.actors.osmosis.messages import (
     ControlPhase,
     ControlStatus,
@@ -16,6 +17,7 @@ from rampart.sim.osmosis.trial.run_end import (
     LOST_AFTER_S,
     SETTLE_S,
     WATCH_S,
+    WORLD_LATE_S,
     WORLD_SILENT_S,
     RunEnd,
 )
@@ -36,8 +38,8 @@ def test_what_nobody_could_hear_does_not_count_as_silence():
     end = RunEnd(patience_s=60.0, waits=True)
     end.truth(Twist(0.0, 0.0), 10.0)
     end.excuse(40.0)
-    assert end.ended(49.9 + WORLD_SILENT_S) is None
-    assert end.ended(50.1 + WORLD_SILENT_S) == (
+    assert end.ended(49.9 + WORLD_LATE_S) is None
+    assert end.ended(50.1 + WORLD_LATE_S) == (
         "the world is gone: no ground truth from the simulator")
 
 
@@ -112,10 +114,10 @@ def test_a_run_whose_mission_the_operator_starts_waits_for_it_and_then_is_like_a
 def test_a_mission_nobody_takes_and_a_world_that_is_gone_end_the_run():
     assert RunEnd(100.0).ended(ACCEPT_WITHIN_S) is None
     assert "no mission was accepted" in (RunEnd(100.0).ended(ACCEPT_WITHIN_S + 0.1) or "")
-    end = RunEnd(100.0)
+    end = RunEnd(100.0, waits=True)
     end.truth(STANDS, 2.0)
-    assert end.ended(2.0 + WORLD_SILENT_S) is None
-    assert "the world is gone" in (end.ended(2.1 + WORLD_SILENT_S) or "")
+    assert end.ended(2.0 + WORLD_LATE_S) is None
+    assert "the world is gone" in (end.ended(2.1 + WORLD_LATE_S) or "")
 
 
 def test_a_way_round_something_is_progress_once_and_the_longer_way_is_measured_anew():
@@ -145,3 +147,14 @@ def test_who_has_no_route_yet_or_has_arrived_does_not_say_how_near_it_came():
     end.control(going(20.0), 35.0)
     assert end.ended(60.0) is None
     assert end.ended(76.0) == "no progress for 40 s"
+
+
+def test_a_world_whose_process_has_ended_is_not_waited_for():
+    end = RunEnd(100.0, waits=True, worlds=["simulator"])
+    end.truth(STANDS, 2.0)
+    for node, event in (("simulator", "running"), ("localization", "crashed")):
+        end.take(ProcessEvent(node, event, 1, 1, "supervisor", ""), 2.0)
+    assert end.ended(2.1 + WORLD_SILENT_S) is None
+    end.take(ProcessEvent("simulator", "crashed", 1, 1, "supervisor", ""), 2.0)
+    assert end.ended(2.0 + WORLD_SILENT_S) is None
+    assert "the world is gone" in (end.ended(2.1 + WORLD_SILENT_S) or "")
