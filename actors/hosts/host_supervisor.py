@@ -57,6 +57,9 @@ class HostSupervisor(Supervisor):
                         any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
              for name, unit in units.items()},
             hosts.link, self._loop.time())
+        if self._plan.incarnations and self._incarnation == self._plan.incarnations + 1:
+            for unit in self._placement.waits():
+                del self._processes[unit]
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Supervisor.Parameters) -> Members:

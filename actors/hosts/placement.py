@@ -16,6 +16,7 @@ So a recovery module obeys one manager at any time: that of the highest incarnat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -112,10 +113,20 @@ class Placement:
         """Whether a host is lost."""
         return host != self._own and self._others[host].is_lost
 
+    def waits(self) -> list[str]:
+        """Begin without what the first host may be running, and return what that is.
+
+        Of a host that was started anew: it is given back what is its own.
+        """
+        waiting = [unit for unit in self._homed(self._own) if not self._homes[unit].is_fixed]
+        self.held.difference_update(waiting)
+        return waiting
+
     def adopted(self, unit: str) -> None:
         """Note that a unit of another host runs here already: so that is lost."""
         self.held.add(unit)
-        self._others[self._homes[unit].host].is_lost = True
+        other = self._others[self._homes[unit].host]
+        other.is_lost, other.heard_s = True, -math.inf
 
     def heard(self, host: str, now_s: float) -> None:
         """Note that a guard of another host was heard."""
@@ -173,7 +184,7 @@ class Placement:
                 back.append(host)
                 if self._own == FIRST:
                     drop += [unit for unit in self._homed(host) if unit in self.held]
-            if other.is_lost and self._own == FIRST:
+            if other.is_lost and is_silent and self._own == FIRST:
                 take += [(unit, self._next_epoch(unit, mine)) for unit in self._homed(host)
                          if unit not in self.held and not self._homes[unit].is_fixed]
         if self._own != FIRST:

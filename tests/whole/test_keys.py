@@ -147,6 +147,7 @@ def test_there_are_no_links_in_virtual_time(keys, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_the_full_mission_with_keys_and_kills(tmp_path):
     keys = make_keys(tmp_path / "keys", layout_of("osmosis"))
     with RealRun(tmp_path, "osmosis", "--keys", str(keys)) as run:

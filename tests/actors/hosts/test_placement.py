@@ -82,6 +82,25 @@ def test_who_hears_of_a_higher_incarnation_lets_go_of_its_own_and_starts_it_when
     assert ground.held == {"page", "modules", "world"}
 
 
+def test_what_another_runs_already_is_not_taken_back_while_that_host_is_heard():
+    made = robot()
+    made.look(LOST_S, {})
+    made.heard("ground", 2.0)
+    made.told("ground", [row("hmi", 2 * EPOCH)], {"hmi": EPOCH + 1}, 2.0)
+    assert made.held == {"pilot", "modules"}
+    assert made.look(2.1, {}) == Changes()
+
+
+def test_a_host_that_was_started_anew_waits_until_it_is_given_what_is_its_own():
+    ground = Placement("ground", [""], HOMES, LINK, 0.0)
+    assert ground.waits() == ["page", "modules"]
+    assert ground.held == {"world"}
+    ground.told("", [row("hmi", EPOCH + 1), row("DM1", EPOCH + 1), row("DM2", 1)], {}, 1.0)
+    assert ground.look(1.1, {}).take == ()
+    ground.told("", [row("DM1", EPOCH + 1), row("DM2", 1)], {}, 1.2)
+    assert ground.look(1.3, {"hmi": EPOCH + 1}).take == (("page", EPOCH + 1),)
+
+
 def test_of_an_old_table_nothing_follows():
     ground = Placement("ground", [""], HOMES, LINK, 0.0)
     ground.told("", [row("hmi", EPOCH + 1)], {}, 1.0)

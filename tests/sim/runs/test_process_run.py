@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rampart.actors.osmosis.messages import Twist
-from rampart.sim.osmosis.trial.run_end import WORLD_SILENT_S, RunEnd
+from rampart.sim.osmosis.trial.run_end import WORLD_LATE_S, RunEnd
 from rampart.sim.runs.process_run import _RELINK_S, excused_s
 
 
@@ -22,4 +22,4 @@ def test_a_launcher_that_was_stopped_dials_its_partners_again_before_the_world_c
     end.excuse(excused_s(7.0) * rate)
     relinked_s = awake_s + _RELINK_S * rate
     assert end.ended(relinked_s) is None
-    assert "the world is gone" in end.ended(relinked_s + WORLD_SILENT_S + 0.1)
+    assert "the world is gone" in end.ended(relinked_s + WORLD_LATE_S + 0.1)
