@@ -35,11 +35,13 @@ class FirstLauncher(Launcher):
 
     Attributes:
         say: is told for whom it waits.
+        is_unwanted: whether the user has had enough of that.
     """
 
     def __init__(self, run: RunContext, title: str) -> None:
         super().__init__(run.plan, title)
         self.say: Callable[[str], None] = lambda _line: None
+        self.is_unwanted: Callable[[], bool] = lambda: False
         self._run = run
         self._meeting: Meeting | None = None
 
@@ -55,7 +57,12 @@ class FirstLauncher(Launcher):
                 *hosts.meeting_place(), self.plan.credentials(DOOR))
         except (MeetingError, OSError) as error:
             raise LaunchError(str(error)) from None
-        await self._meeting.all_ready(self.say)
+        ready = asyncio.create_task(self._meeting.all_ready(self.say))
+        while not ready.done():
+            await asyncio.wait({ready}, timeout=_RETRY_S)
+            if self.is_unwanted():
+                ready.cancel()
+                raise LaunchError("interrupted while it waited for the other hosts")
         await super().start()
         self._meeting.begin(self.plan.origin_s)
 

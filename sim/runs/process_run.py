@@ -90,8 +90,10 @@ class ProcessRun:
             self.launcher.begin()
         try:
             await self.launcher.load()
-            if isinstance(self.launcher, FirstLauncher) and self._trial.console:
-                self.launcher.say = self._trial.console.say
+            if isinstance(self.launcher, FirstLauncher):
+                self.launcher.is_unwanted = lambda: bool(self.interrupted)
+                if self._trial.console:
+                    self.launcher.say = self._trial.console.say
             await self.launcher.start()
             return await self._observe()
         finally:
