@@ -14,6 +14,7 @@ import heapq
 import os
 import random
 import select
+import shutil
 import struct
 import subprocess
 import threading
@@ -32,8 +33,8 @@ _NUMBERS = count()
 
 def why_not() -> str:
     """Return why there can be no networks here; "" if there can."""
-    if not _TUN.exists():
-        return f"no {_TUN}"
+    if not _TUN.exists() or shutil.which("ip") is None:
+        return f"no {_TUN}, or no command ip (package iproute2)"
     made = subprocess.run(["ip", "netns", "add", name := f"rampart-probe-{os.getpid()}"],
                           capture_output=True, text=True, check=False)
     if made.returncode:
