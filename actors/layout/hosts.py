@@ -89,11 +89,14 @@ class Hosts:
         """
         return [_endpoint(self._specs[self._own], place, protocol)] if self.several else []
 
-    def dials(self, protocol: str) -> list[str]:
-        """Return where the routers are that those of this host dial: of the hosts before it."""
+    def dials(self, place: int, protocol: str) -> list[str]:
+        """Return where the routers are that one of this host dials: of the hosts before it.
+
+        Each its like: with every router linked to both of the other host, Zenoh (1.10) hands
+        nothing on between the two of a host any more when that host is lost.
+        """
         before = list(self._specs)[:list(self._specs).index(self._own)] if self.several else []
-        return [_endpoint(self._specs[host], place, protocol) for host in before
-                for place in range(len(ROUTERS))]
+        return [_endpoint(self._specs[host], place, protocol) for host in before]
 
     def meeting_place(self) -> tuple[str, int]:
         """Return address and port at which the first host's launcher is asked."""

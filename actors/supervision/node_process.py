@@ -109,13 +109,12 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
 def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:
     """Return what an actor's session dials, and where it listens, which a router's does."""
     folder, place = layout.plan.folder, layout.plan.routers.get(name)
-    protocol = "tls" if layout.plan.keys else "tcp"
     if place is None:
         return endpoints(folder), []
+    number, protocol = ROUTERS.index(place), "tls" if layout.plan.keys else "tcp"
     own, hosts = endpoint(folder, place), layout.hosts
     beside = [one for one in endpoints(folder) if one != own]
-    return [*beside, *hosts.dials(protocol)], [
-        own, *hosts.listens(ROUTERS.index(place), protocol)]
+    return [*beside, *hosts.dials(number, protocol)], [own, *hosts.listens(number, protocol)]
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:

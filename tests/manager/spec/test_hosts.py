@@ -27,9 +27,9 @@ def test_the_first_host_s_names_are_those_of_a_system_of_one_machine():
     assert hosts.guards_of("") == ("supervisor", "router_a", "router_b")
     assert hosts.home_of["hmi"] == "ground"
     assert hosts.home_of["DM1"] == ""
-    assert hosts.dials("tcp") == []
+    assert hosts.dials(0, "tcp") == []
     assert hosts.listens(1, "tcp") == ["tcp/192.168.7.1:7461"]
-    assert Hosts(SPEC, "ground").dials("tls") == ["tls/192.168.7.1:7460", "tls/192.168.7.1:7461"]
+    assert Hosts(SPEC, "ground").dials(1, "tls") == ["tls/192.168.7.1:7461"]
     assert hosts.meeting_place() == ("192.168.7.1", 7462)
 
 
