@@ -92,7 +92,7 @@ class Hosts:
     def dials(self, place: int, protocol: str) -> list[str]:
         """Return where the routers are that one of this host dials: of the hosts before it.
 
-        Each its like: with every router linked to both of the other host, Zenoh (1.10) hands
+        Each its like: with every router linked to both of another host, Zenoh (1.10) hands
         nothing on between the two of a host any more when that host is lost.
         """
         before = list(self._specs)[:list(self._specs).index(self._own)] if self.several else []

@@ -121,7 +121,7 @@ def test_the_manager_survives_its_machine_and_never_are_two_obeyed(net, tmp_path
         robot.wait_for("cell_manager respawned, incarnation 1000001")
         assert ground.pid("cell_manager") is not None  # it goes on, and nobody here hears it
         before = len(robot.story)
-        trigger(robot, "D_CURTAIN")  # and it is heard after the links were closed, 2 s after the cut
+        trigger(robot, "D_CURTAIN")  # heard, too, after the links were closed: 2 s after the cut
         robot.wait_until(lambda: "rule 1 for M_CURTAIN" in robot.story[before:], 10, "no manager")
         net.line = Line()
         ground.wait_for("cell_manager handed over")
