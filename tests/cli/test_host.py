@@ -50,6 +50,7 @@ def test_a_system_of_one_machine_has_no_hosts(arguments, message):
     assert message in done.stderr
 
 
+@pytest.mark.slow
 def test_in_virtual_time_a_system_of_two_hosts_runs_on_one(tmp_path):
     spec = tmp_path / "two.toml"
     spec.write_text(two_hosts({"robot": "192.0.2.1", "ground": "192.0.2.2"}), encoding="utf-8")

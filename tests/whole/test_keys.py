@@ -48,6 +48,7 @@ def rampart(run, *words, key=None):
                           env=environment, check=False)
 
 
+@pytest.mark.slow
 def test_nodes_and_routers_that_are_killed_come_back_with_their_keys(tmp_path, keys):
     with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2", "--keys", str(keys)) as run:
         run.wait_for("goal 1/3", 60)

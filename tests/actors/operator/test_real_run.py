@@ -164,6 +164,7 @@ def answers(port: int, trusting: ssl.SSLContext) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_what_visitors_do_over_tls_is_in_the_report_though_the_node_of_the_page_is_killed(
         tmp_path):
     port, tokens = free_base_port(), tmp_path / "page.tokens"
