@@ -70,13 +70,13 @@ class HostRun:
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, host.interrupted.set)
         try:
-            plan = await host.join()
+            await host.join()
             launcher = host.launcher
             if launcher is None or host.interrupted.is_set():
                 return EXIT_FAILED
             launcher.begin()
             await host.start()
-            why = await self._stay(host, launcher, plan) if not host.interrupted.is_set() else ""
+            why = await self._stay(host, launcher) if not host.interrupted.is_set() else ""
         except MeetingError as error:
             raise UsageError(f"--host {self._plan.host}: {error}") from None
         finally:
@@ -88,7 +88,7 @@ class HostRun:
             print(json.dumps({"format": FORMAT, "host": self._plan.host, "over": why}), flush=True)
         return EXIT_OVER if why else EXIT_FAILED
 
-    async def _stay(self, host: OtherHost, launcher: OtherLauncher, plan: RunPlan) -> str:
+    async def _stay(self, host: OtherHost, launcher: OtherLauncher) -> str:
         plan = launcher.plan
         clock = clock_of(plan)
 

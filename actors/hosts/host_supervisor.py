@@ -17,6 +17,7 @@ from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.hosts.placement import Changes, Home, Placement
+from rampart.actors.run.run_plan import SUPERVISOR, on_host
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.supervision.processes import Processes
 from rampart.actors.supervision.supervised_process import Event
@@ -66,8 +67,7 @@ class HostSupervisor(Supervisor):
         """Hear the other supervisors, too."""
         if topic is topics.HOST_NODES:
             assert isinstance(parameters, HostSupervisor.Parameters)  # noqa: S101 for the type checker
-            return tuple(f"supervisor_{host}" if host else "supervisor"
-                         for host in parameters.others)
+            return tuple(on_host(SUPERVISOR, host) for host in parameters.others)
         return super().names(topic, name, parameters)
 
     @classmethod

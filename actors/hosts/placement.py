@@ -198,10 +198,6 @@ class Placement:
         return [row for other in self._others.values() for row in other.runs.values()
                 if self._unit_of.get(row.name, "") not in self.held]
 
-    def lost_hosts(self) -> list[str]:
-        """Return the names of the hosts that are lost."""
-        return [host for host, other in self._others.items() if other.is_lost]
-
     def _may_run(self, host: str, node: str) -> bool:
         """Whether a host may speak of a node: the first of those of all, another of its own."""
         unit = self._unit_of.get(node)

@@ -173,8 +173,7 @@ def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(st
 @pytest.mark.parametrize("host", ["", "ground"])
 def test_what_is_lost_is_known_by_name(host):
     made = Placement(host, [other for other in ("", "ground") if other != host], HOMES, LINK, 0.0)
-    made.look(20.0, {})
-    assert made.lost_hosts() == [other for other in ("", "ground") if other != host]
+    assert made.look(20.0, {}).lost == tuple(o for o in ("", "ground") if o != host)
 
 
 @pytest.mark.parametrize(("incarnation", "restarts"), [
