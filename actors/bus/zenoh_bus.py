@@ -54,7 +54,7 @@ _DELIVERY = {Qos.SENSOR: zenoh.Priority.DATA, Qos.STATE: zenoh.Priority.INTERACT
 _DROP = zenoh.CongestionControl.DROP
 """Of all that is sent, commands too. With BLOCK a router waits for a reader that is stopped, or
 behind a slow link, before it hands anything on to anybody: for 5 s by default. What is left out is
-what does not fit into two batches of 64 kB of its priority and the socket, a millisecond long."""
+what finds no room in the queue of a link, which `session_config` makes long enough for a burst."""
 
 
 def _direct(call: Callable[[Any], None], end: Callable[[], None] = lambda: None) -> Callback[Any]:

@@ -35,6 +35,14 @@ FULL_US = 20_000
 that may not be left out: declarations of who is new. While a router waits for one reader, which is
 stopped or cut off, no other hears anything, and by default it waits for 5 s."""
 
+_ROOM = {"interactive_high": 16, "data": 16}
+_ROOM_US = 5_000
+"""How much may wait for a link, in batches of 64 kB, and how long what finds no room waits before
+it is left out. A message is a batch of its own, so that it goes at once: with the two batches that
+Zenoh has by default, 51 of 720 answers of 24 nodes to the same message were lost, now none. Once a
+link is full nobody waits for it until it has taken something.
+"""
+
 _RUNTIME = "ZENOH_RUNTIME"
 _THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "
             "acc: (handover: app), net: (handover: app))")
@@ -146,6 +154,8 @@ def session_config(listen: Sequence[str], dial: Sequence[str],
         "transport/unicast/accept_timeout": handshake_ms,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": FULL_US,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _ROOM_US,
+        **{f"transport/link/tx/queue/size/{kind}": room for kind, room in _ROOM.items()},
         **(credentials.settings() if credentials is not None else {}),
         **({"access_control": access} if access is not None else {})}
     for key, value in settings.items():
