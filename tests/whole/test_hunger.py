@@ -37,7 +37,7 @@ HEARS_ALL = """
 import sys, time, zenoh
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.bus.zenoh_session import session_config
-with zenoh.open(session_config(None, sys.argv[1:])) as session:
+with zenoh.open(session_config((), sys.argv[1:])) as session:
     session.declare_subscriber(ROOT + "/**", lambda sample: None)
     time.sleep(1)
     print("here", flush=True)
