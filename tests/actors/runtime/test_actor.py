@@ -207,6 +207,26 @@ def test_an_incarnation_that_was_not_issued_last_makes_nobody_deaf_to_the_real_o
     assert len(refused) == 2
 
 
+@pytest.mark.parametrize(("given_s", "obeyed"), [(10.0, True), (9.31, True), (9.29, False),
+                                                 (-1.0, False)])
+def test_a_command_that_was_under_way_for_too_long_is_not_obeyed(given_s, obeyed):
+    taken, refused = [], []
+    receive = ArrivalGuard(lambda: 10.0, command_age_s=0.7).receiver(
+        ftm_topics.RESPAWN, lambda _key, message: taken.append(message.stamp),
+        lambda _key, reason: refused.append(reason))
+    receive("k", encode(Header("RM3", 1, 1, given_s), fm.RespawnRequest(1, "DM1", 1, "RM3")))
+    assert (taken == [given_s]) is obeyed
+    assert refused == ([] if obeyed else [f"a command, given {10.0 - given_s:.2f} s ago"])
+
+
+def test_a_state_may_be_of_any_age_where_commands_may_not():
+    taken = []
+    receive = ArrivalGuard(lambda: 10.0, command_age_s=0.7).receiver(
+        topics.POSE, lambda _key, message: taken.append(message.stamp), lambda *_: None)
+    receive("k", encode(Header("talker", 1, 1, 0.5), m.Pose(0.0, 0.0, 0.0)))
+    assert taken == [0.5]
+
+
 async def test_a_command_that_comes_twice_is_handled_once(make_bus):
     async with running(Listener, "listener", make_bus) as listener:
         async with running(Talker, "talker", make_bus) as talker:
