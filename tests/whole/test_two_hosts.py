@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import os
 import signal
 import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 
 import pytest
 
+from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
 from tests.two_hosts import two_hosts
 from tests.whole.network import Line, Network, network, why_not
@@ -147,6 +151,29 @@ def test_another_program_or_system_is_refused_before_anything_starts(net, tmp_pa
         robot.wait_for("waiting for ground: rampart run --host ground there")
         robot.process.send_signal(signal.SIGINT)
         robot.process.wait(10)
+
+
+@pytest.mark.slow
+def test_the_robot_brakes_when_the_host_that_drives_it_ends_as_a_whole(net, tmp_path):
+    spec = specification(net, tmp_path, ("simulator",), "paper", 0.02)
+    with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as base,
+          host(net, "robot", tmp_path / "r", spec, "--no-keys", "--mission", "A") as robot):
+        robot.wait_for("goal 1/", 60)
+        command = net.command("ground", sys.executable, "-u", "-m", "rampart.cli.main", "topic",
+                              "echo", "summit_xl/status", "--json", "--port", str(base.port))
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as echo:
+            try:
+                heard = (json.loads(line)["message"] for line in echo.stdout)
+                driving = next(one for one in heard if max(one["wheel_speeds_radps"]) > 1.0)
+                assert not driving["dead_man_tripped"]
+                for one in (*find_processes(robot.port), robot.process):
+                    os.kill(one.pid, signal.SIGKILL)
+                stands = next(one for one in islice(heard, 50)
+                              if max(map(abs, one["wheel_speeds_radps"])) < 1e-3)
+                assert stands["dead_man_tripped"]
+                assert all(one["dead_man_tripped"] for one in islice(heard, 20))  # nobody else's
+            finally:
+                echo.kill()
 
 
 @pytest.mark.slow
