@@ -27,7 +27,7 @@ from tests.cli.pseudo_terminal import PseudoTerminal
 parser = pytest.importorskip("prometheus_client.parser")
 pytest.importorskip("foxglove")
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 UP, LEFT = "\x1b[A", "\x1b[D"
 

@@ -70,6 +70,7 @@ def test_the_plan_can_be_read_without_doing_anything(capsys):
 
 @pytest.mark.slow
 @pytest.mark.processes
+@pytest.mark.alone
 @pytest.mark.timeout(300)
 def test_a_mission_survives_a_dozen_pairs(tmp_path, capsys):
     among = ("supervisor", "spawner_a", "launcher", "ftm_manager", "osmosis_control",

@@ -387,6 +387,7 @@ def noise(file: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.processes
+@pytest.mark.alone
 @pytest.mark.timeout(180)
 def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path):
     files = tmp_path / "report" / "checkpoints"
@@ -410,6 +411,7 @@ def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path)
 
 @pytest.mark.slow
 @pytest.mark.processes
+@pytest.mark.alone
 @pytest.mark.timeout(180)
 def test_real_control_nodes_are_killed_and_nothing_is_lost_or_doubled(tmp_path):
     dice = random.Random(os.getpid())

@@ -13,7 +13,7 @@ import pytest
 
 from rampart.testing import RealRun
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 NODES = '''
 import ctypes

@@ -28,7 +28,7 @@ from tests.whole.hunger import (
     small_disk,
 )
 
-pytestmark = [pytest.mark.slow, pytest.mark.processes, pytest.mark.timeout(500)]
+pytestmark = [pytest.mark.slow, pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(500)]
 
 MORE_MB = 60.0
 """By how much a process may grow meanwhile: mailboxes, queues of the bus, allocators."""

@@ -19,7 +19,7 @@ from tests import ROOT
 from tests.actors.access.keyed import every_key, layout_of, make_keys
 from tests.other_user import needs_root
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 
 @pytest.fixture

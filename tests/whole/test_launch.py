@@ -17,7 +17,7 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun, free_base_port
 from tests import CELL, ROOT
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(240)]
 
 BROKEN_A = {"A03": "out", "A06": "dim", "A10": "out"}
 EVERYBODY_BUT_THE_MISSION_MANAGER = (

@@ -10,6 +10,7 @@ from tests.whole.overload_runs import Outcome, row
 
 @pytest.mark.slow
 @pytest.mark.processes
+@pytest.mark.alone
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize("kind", LOADS)
 def test_the_mission_goes_on_after_an_overload(tmp_path, kind):

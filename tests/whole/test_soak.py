@@ -179,6 +179,7 @@ def test_what_a_process_uses_is_read_and_one_that_is_gone_uses_nothing():
 
 @pytest.mark.slow
 @pytest.mark.processes
+@pytest.mark.alone
 @pytest.mark.timeout(300)
 def test_a_short_soak_is_safe_and_goes_on_where_it_was(tmp_path):
     file = tmp_path / "soak.jsonl"

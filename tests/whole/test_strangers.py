@@ -15,7 +15,7 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
 from tests import ROOT
 
-pytestmark = [pytest.mark.processes, pytest.mark.skipif(
+pytestmark = [pytest.mark.processes, pytest.mark.alone, pytest.mark.skipif(
     os.getuid() != 0, reason="only root can become another user")]
 
 

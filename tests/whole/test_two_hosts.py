@@ -19,7 +19,7 @@ from rampart.testing import RealRun
 from tests.two_hosts import two_hosts
 from tests.whole.network import Line, Network, network, why_not
 
-pytestmark = [pytest.mark.processes,
+pytestmark = [pytest.mark.processes, pytest.mark.alone,
               pytest.mark.skipif(bool(why_not()), reason=f"no two hosts here: {why_not()}")]
 
 BAD = {"delay_s": 0.05, "jitter_s": 0.01, "loss": 0.05}

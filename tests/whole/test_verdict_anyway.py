@@ -227,6 +227,7 @@ def test_a_recording_that_is_taken_away_is_not_said_to_be_there(tmp_path):
 
 
 @pytest.mark.processes
+@pytest.mark.alone
 def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listens(tmp_path):
     with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "3", "--patience", "35",
                  "--no-ftm") as run:
@@ -246,6 +247,7 @@ def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listen
 
 @pytest.mark.slow
 @pytest.mark.processes
+@pytest.mark.alone
 @pytest.mark.timeout(180)
 def test_a_real_mission_succeeds_though_its_folder_goes_and_its_recording_stops(tmp_path):
     with RealRun(tmp_path, with_checkpoints(tmp_path), "--mission",
@@ -265,6 +267,7 @@ def test_a_real_mission_succeeds_though_its_folder_goes_and_its_recording_stops(
 
 
 @pytest.mark.processes
+@pytest.mark.alone
 def test_a_terminal_that_goes_away_ends_a_run_with_its_verdict(tmp_path):
     """All of its processes get the SIGHUP, and stderr takes nothing any more."""
     with (tmp_path / "out").open("w") as out:

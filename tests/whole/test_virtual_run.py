@@ -283,6 +283,7 @@ def test_a_job_survives_the_way_to_another_process_and_back():
 
 
 @pytest.mark.processes
+@pytest.mark.alone
 @pytest.mark.timeout(180)
 def test_virtual_and_real_runs_take_the_same_decisions_and_come_to_the_same_verdict(tmp_path):
     faults = ("kill:osmosis_control@4", "command-out-of-bounds@7+2", "wedge:graph_planner@12",

@@ -21,7 +21,7 @@ from tests import ROOT
 from tests.actors.operator.browser import browser
 from tests.actors.web.pems import pair
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 TOKEN = "secret-of-the-hangar-7"
 
 

@@ -456,6 +456,7 @@ def test_a_run_whose_recording_cannot_begin_does_not_begin(tmp_path, arguments, 
 
 
 @pytest.mark.processes
+@pytest.mark.alone
 def test_a_real_run_is_recorded_whole_with_a_node_killed_on_the_way(tmp_path):
     path = tmp_path / "run.mcap"
     with RealRun(tmp_path, "paper", "--record", str(path), "--rate", "2") as run:

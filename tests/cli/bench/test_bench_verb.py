@@ -148,6 +148,7 @@ def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
 
 
 @pytest.mark.processes
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_benchmark_that_is_interrupted_leaves_nothing(tmp_path, number):
     with subprocess.Popen(
