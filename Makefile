@@ -8,13 +8,12 @@ run: setup
 	$(BIN)/python launch.py
 
 # What has a mission of the real robot against the clock needs the machine for itself, and comes
-# last. Of the others many wait more than they compute, so there is one worker more than cores.
+# last.
 # Without Chromium the operator's page is not tested, which the last line says.
-WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 1)))
 test: setup
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
-	$(BIN)/python -m pytest -m "not slow and not alone" --numprocesses $(WORKERS)
+	$(BIN)/python -m pytest -m "not slow and not alone" --numprocesses logical
 	$(BIN)/python -m pytest -m "not slow and alone"
 
 # Long missions on real processes that the suite has shorter relatives of; three minutes.

@@ -21,7 +21,8 @@ def test_there_are_some():
 
 
 @pytest.mark.parametrize(("name", "system"), [
-    (name, system) for name, job in FOUND.items() for system in sorted({job.system, "osmosis"})])
+    pytest.param(name, system, marks=[pytest.mark.slow] * (system != "osmosis"))
+    for name, job in FOUND.items() for system in sorted({job.system, "osmosis"})])
 def test_what_was_unsafe_once_is_safe_now(name, system):
     result = run_job(msgspec.structs.replace(FOUND[name], system=system))
     assert result.effective, [outcome.reason for outcome in result.outcomes]

@@ -101,6 +101,7 @@ def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
         assert run.process.poll() is None
 
 
+@pytest.mark.slow  # tests/actors/access/test_strangers.py has the same without a mission
 @needs_root
 def test_another_user_at_the_ports_of_a_run_hears_nothing_and_is_not_heard(tmp_path, keys):
     with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2", "--keys", str(keys)) as run:

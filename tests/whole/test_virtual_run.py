@@ -130,8 +130,10 @@ def test_a_second_signal_ends_a_run_at_once_and_what_was_recorded_can_be_read(tm
 
 
 @pytest.mark.parametrize("fault", [
-    "drop:detection/DM1@20+inf", "freeze:detection/DM1@20+inf", "slow:DM1@20",
-    "delay:detection/DM2@20+inf", "drop:manager/status@20+inf", "freeze:manager/status@20+inf"])
+    "drop:detection/DM1@20+inf", "slow:DM1@20", "freeze:manager/status@20+inf",
+    *(pytest.param(fault, marks=pytest.mark.slow) for fault in (
+        "freeze:detection/DM1@20+inf", "delay:detection/DM2@20+inf",
+        "drop:manager/status@20+inf"))])
 def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing(fault):
     result = run_job(job(fault))
     assert (result.success, result.safe, result.decisions) == (True, True, ())
@@ -200,12 +202,13 @@ def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_after
 
 @pytest.mark.parametrize(("faults", "restarts"), [
     (("drop:detection/DM2@25+8",), {"DM2": 1}),
-    (("slow:all:0.03@20+30", "drop:detection/DM2@25+8"), {})])
+    pytest.param(("slow:all:0.03@20+30", "drop:detection/DM2@25+8"), {}, marks=pytest.mark.slow)])
 def test_a_module_that_is_not_heard_is_restarted_but_not_for_being_late(faults, restarts):
     record = run_virtually(job(*faults, system="osmosis")).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", restarts)
 
 
+@pytest.mark.slow
 def test_an_overload_in_which_nearly_nothing_arrives_leaves_no_latch_behind():
     record = run_virtually(job("slow:all:0.2@20+30", system="osmosis")).record
     assert (record.mission, record.safety) == ("success", "safe")

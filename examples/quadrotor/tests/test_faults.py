@@ -81,6 +81,7 @@ def test_a_page_orders_them_of_the_world(file):
     run(scenario)
 
 
+@pytest.mark.slow
 @pytest.mark.processes
 def test_on_processes_they_come_by_hand_and_as_planned(file, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(SYSTEM.parent))

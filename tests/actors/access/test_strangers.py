@@ -27,7 +27,7 @@ from tests import ROOT
 from tests.actors.access.keyed import Keyed, every_key, layout_of, make_keys, opened, wait_for
 from tests.other_user import needs_root
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 LAYOUT = layout_of("osmosis")
 KEYS = every_key(LAYOUT)

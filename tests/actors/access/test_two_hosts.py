@@ -16,7 +16,7 @@ from rampart.actors.bus.zenoh_session import Credentials, credentials_in, sessio
 from rampart.actors.supervision.launcher import kept_ports
 from tests.actors.access.keyed import layout_of, make_keys, opened, wait_for
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 LAYOUT = layout_of("osmosis")
 GROUND = frozenset({"hmi", "teleoperation", "DM5"})

@@ -97,6 +97,7 @@ async def test_however_many_connections_idle_an_operator_gets_in_and_drives(worl
         await all_gone(hmi)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("patient")
 async def test_strangers_who_come_again_and_again_take_no_stick_and_close_no_page(world):
     async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi:

@@ -81,8 +81,8 @@ def untimed(made: Attempt) -> Attempt:
 @pytest.mark.parametrize(("system", "faults"), [
     ("paper", [("kill:mission_manager@3",), ("gps-bias@1+2", "kill:localization@2.5"),
                ("wrong-graph@goal1:1",), ("obstacle-ahead:1@3.05",)]),
-    ("paper", [("localization-not-updated@0",), ("kill:supervisor@2",), ("stuck-wheel@2",),
-               ("gps-noise@500",)]),
+    pytest.param("paper", [("localization-not-updated@0",), ("kill:supervisor@2",),
+                           ("stuck-wheel@2",), ("gps-noise@500",)], marks=pytest.mark.slow),
     ("osmosis", [("stop:DM2@3",), ("kill:ftm_manager@goal1",),
                  ("drop:control/command@3+1", "slow:hmi@1+2")]),
     (TUG, [("kill:controller@2",), ("drop:controller/motion@3+1",), ("wedge:supervisor@2.5",)])])

@@ -331,6 +331,7 @@ def test_a_campaign_without_a_place_is_refused_in_one_line(tmp_path, capsys):
         "(Not a directory)\n")
 
 
+@pytest.mark.slow
 def test_the_same_jobs_run_on_a_dask_cluster(tmp_path):
     distributed = pytest.importorskip("distributed")
     jobs = cross(BASES[:1], [SHORT], range(1, 4))
