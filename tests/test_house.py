@@ -24,7 +24,8 @@ ROOMS = (
     "manager.model", "manager.strategies", "manager.spec", "manager.arbitration",
     "manager.analysis", "manager.drawing",
     "actors.bus", "actors.ftm", "actors.web", "actors.run", "actors.runtime",
-    "actors.detection", "actors.recovery", "actors.foreign", "actors.layout", "manager.actor",
+    "actors.detection", "actors.recovery", "actors.foreign",
+    "actors.ros2.translation", "actors.ros2", "actors.layout", "manager.actor",
     "actors.access", "actors.supervision", "actors.hosts", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
     "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.bench",
@@ -179,7 +180,7 @@ def the_map() -> str:
 def named(text: str) -> list[str]:
     """Return the rooms that a text names as folders and files, as names of modules."""
     return [name.removeprefix("rampart/").removesuffix(".py").replace("/", ".")
-            for name in re.findall(r"[a-z]+(?:/[a-z]+)*(?:\.py)?", text)]
+            for name in re.findall(r"[a-z]\w*(?:/[a-z]\w*)*(?:\.py)?", text)]
 
 
 def test_the_map_of_the_house_names_every_room():

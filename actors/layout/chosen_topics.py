@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -48,6 +49,10 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
     for member in everyone:
         for topic in (*member.actor.outputs, *BASE_OUTPUTS, *member.actor.inputs()):
             every.setdefault(topic.key, topic)
+    for member in everyone:
+        with _of(member, file):
+            for topic in member.actor.own_topics(member.parameters):
+                every.setdefault(topic.key, topic)
     found: dict[str, Topic[Any]] = {}
     chosen: dict[str, Member] = {}
     for member in everyone:
@@ -66,6 +71,8 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
                 name = topic.member(key)
                 there = ways[way].get(topic.key, ())
                 ways[way][topic.key] = (*(there or ()), name) if name else None
+        with _of(member, file):
+            member.actor.check_topics(member.parameters, found)
         _check_messages(member, found, file)
         _check_sticks(member, found, file)
         chosen[member.name] = replace(member, hears=ways["heard"], publishes=ways["published"])
@@ -129,6 +136,15 @@ def _kind(topic: Topic[Any], path: str) -> str:
         return Field(topic.type, path).kind
     except ValueError:
         return ""  # a list, or what has fields itself
+
+
+@contextlib.contextmanager
+def _of(member: Member, file: str) -> Iterator[None]:
+    """Name the node in what is wrong with its parameters."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{file}: {member.name}: {error}") from None
 
 
 def _topic(key: str, known: Mapping[str, Topic[Any]], where: str) -> Topic[Any]:

@@ -108,7 +108,9 @@ class Layout:
         ordered = dict.fromkeys(o.topic for fault in plan.faults for o in fault.orders)
         self.members, self.topics = choose_topics(
             with_pages(own, spec, ordered, file), (*known, *judged), file)
-        self._check(judge, (*ftm_topics.ALL, *known), file)
+        made = {topic.key for member in own for topic in member.actor.own_topics(member.parameters)}
+        self._check(judge, (*ftm_topics.ALL, *known, *(
+            topic for key, topic in self.topics.items() if key in made)), file)
 
     def _supervisors(self) -> Iterator[Member]:
         for host, name in self.hosts.supervisors.items():

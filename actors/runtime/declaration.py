@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, TypeVar
 
 import msgspec
@@ -180,6 +180,23 @@ class Declared(Handlers):
     def own_keys(cls, parameters: Any) -> tuple[str, ...]:  # noqa: ARG003
         """Keys below `rampart/` that are no topics, between the node and what it has started."""
         return ()
+
+    @classmethod
+    def own_topics(cls, parameters: Any) -> tuple[Topic[Any], ...]:  # noqa: ARG003
+        """Topics that there are because its parameters say so, unless another class has them.
+
+        Raises:
+            ValueError: they make no sense.
+        """
+        return ()
+
+    @classmethod
+    def check_topics(cls, parameters: Any, topics: Mapping[str, Topic[Any]]) -> None:
+        """Refuse parameters that do not fit the topics that they name, which are given by key.
+
+        Raises:
+            ValueError: they do not.
+        """
 
     @classmethod
     def published(cls, key: str, name: str, parameters: Any) -> Topic[Any] | None:

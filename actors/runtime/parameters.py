@@ -16,6 +16,7 @@ from msgspec import inspect
 
 from rampart.manager.spec.budget import find_false_alarm
 from rampart.manager.spec.panels import ANYTHING, Panel
+from rampart.manager.spec.ros2 import Ros2Link
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Name, SpecificationError
 
@@ -47,6 +48,8 @@ FieldNames = Annotated[tuple[FieldName, ...], msgspec.Meta(min_length=1, extra={
     "names": "field", "way": "heard"})]
 Panels = Annotated[tuple[Panel, ...], msgspec.Meta(extra={"panels": True, "way": "heard"})]
 """Panels of the operator's page; the node hears what they show, and publishes what they say."""
+RosLinks = Annotated[tuple[Ros2Link, ...], msgspec.Meta(extra={"ros2": True})]
+"""What is passed on between ROS 2 and the system, both ways."""
 
 MessageOf = Annotated[dict[str, Any], msgspec.Meta(extra={"message_of": "topic"})]
 """Fields of a message on the topic that the parameter `topic` names."""
@@ -121,6 +124,12 @@ def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
                 for shown in panel.fields():
                     found["published" if shown.is_said else "heard"].append(Named(
                         shown.key, *_parts(shown.field), shown.kinds, f"panel {panel.title!r}: "))
+        elif marks.get("ros2"):
+            for link in said:
+                found["heard"] += [Named("from", link.from_, "", shown_by=f"ros2 {link.name}: ")
+                                   ] * bool(link.from_)
+                found["published"] += [Named("to", link.to, "", shown_by=f"ros2 {link.name}: ")
+                                       ] * bool(link.to)
         elif "way" in marks and said:
             nodes = getattr(parameters, marks["signs_of"]) if "signs_of" in marks else ()
             found[marks["way"]] += [Named(name, *_parts(text), signs_of=nodes)

@@ -18,6 +18,7 @@ from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
 from rampart.manager.spec.host_checks import find_wrong_hosts
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
 from rampart.manager.spec.panels import problem_of
+from rampart.manager.spec.ros2_checks import find_wrong_links
 from rampart.manager.spec.schema import MechanismSpec, SystemSpec
 from rampart.manager.spec.tables import Finding, find_wrong_names, numbered, unknown
 from rampart.manager.strategies.registry import STRATEGIES
@@ -392,6 +393,5 @@ def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
 
 VALIDATORS: tuple[Validator, ...] = (
     find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, find_wrong_hosts,
-    _mechanisms,
-    _reachability, _faults, _panels, _wrong_tree, _wrong_policy, _wrong_orders, _contradictions,
-    _wrong_compounds, _wrong_precedence, find_wrong_budget)
+    _mechanisms, _reachability, _faults, _panels, find_wrong_links, _wrong_tree, _wrong_policy,
+    _wrong_orders, _contradictions, _wrong_compounds, _wrong_precedence, find_wrong_budget)

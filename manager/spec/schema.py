@@ -23,6 +23,7 @@ from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.mobile_robot import Hazard, Robot
 from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits, ClassPath, Kind, NodeSpec
 from rampart.manager.spec.panels import Panel
+from rampart.manager.spec.ros2 import Ros2Link
 from rampart.manager.spec.tables import (
     DERIVED,
     End,
@@ -229,6 +230,7 @@ class SystemSpec(Table, frozen=True):
         order: Name of an order of the recoveries, or several: what the first leaves open the
             next decides. The first is the one that says what is safer.
         panels: Of the operator's page, besides those of its class.
+        ros2: What is passed on between ROS 2 and the system.
     """
 
     name: Name
@@ -253,6 +255,7 @@ class SystemSpec(Table, frozen=True):
     orders: dict[str, dict[str, tuple[str, ...]]] = {}
     faults: tuple[FaultSpec, ...] = msgspec.field(name="fault", default=())
     panels: tuple[Panel, ...] = msgspec.field(name="panel", default=())
+    ros2: tuple[Ros2Link, ...] = ()
 
     def without_disabled(self) -> SystemSpec:
         """Return the spec without the mechanisms that are disabled; itself if none is.

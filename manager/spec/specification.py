@@ -52,7 +52,7 @@ LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
 
 MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
-            "host": 16, "fault": 500, "orders": 16, "panel": MAX_PANELS}
+            "host": 16, "fault": 500, "orders": 16, "panel": MAX_PANELS, "ros2": 500}
 """Of each table; the shipped systems have 31 actors, and checks compare many with many."""
 
 

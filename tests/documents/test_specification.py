@@ -17,6 +17,7 @@ from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.layout.wiring import load_class
 from rampart.manager.model.gates import GateError, detection_gate
 from rampart.manager.spec.hosts import HostSpec, Link
+from rampart.manager.spec.ros2 import Ros2Link
 from rampart.manager.spec.schema import (
     DetectionSpec,
     EventSpec,
@@ -50,7 +51,7 @@ MODULES = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 @pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, Supervision, End, HostSpec,
                                    Link, NodeSpec,
                                    DetectionSpec, RecoverySpec, MechanismSpec, EventSpec, FaultSpec,
-                                   Within])
+                                   Within, Ros2Link])
 def test_every_field_is_described(table):
     missing = [f.encode_name for f in msgspec.structs.fields(table)
                if not re.search(rf"[`\[ ]{f.encode_name}\b", DOCUMENT)]

@@ -1,0 +1,142 @@
+"""The side of ROS 2 in virtual time: what passes there passes over the virtual bus.
+
+The nodes of ROS 2 are actors that stand in for them (`rampart.actors.ros2.stand_in`). Tokens go
+when the process does that declared them, as those of a real session.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from itertools import count
+from typing import Any
+
+import msgspec
+import xxhash
+
+from rampart.actors.bus import topic as bus_topic
+from rampart.actors.bus.bus import Bus
+from rampart.actors.bus.topic import Topic
+from rampart.actors.ros2.side import Answered, Deliver, Reply
+from rampart.actors.ros2.wire import Qos
+
+_ROOT = "ros2-side"
+_KEPT = Topic("", msgspec.Struct, bus_topic.Qos.STATE, 0.0, "", "What newcomers are told.")
+_PASSING = Topic("", msgspec.Struct, bus_topic.Qos.COMMAND, 0.0, "", "What they are not.")
+
+_pack, _unpack = msgspec.msgpack.encode, msgspec.msgpack.decode
+
+
+class BusSide:
+    """What a node of ROS 2 has of the network, over the bus of an actor.
+
+    Args:
+        bus: of the actor, open.
+        name: of the actor.
+        incarnation: of its process.
+    """
+
+    def __init__(self, bus: Bus, name: str, incarnation: int) -> None:
+        self.id = xxhash.xxh3_64_hexdigest(f"{name} {incarnation}".encode())
+        self._bus, self._name, self._incarnation = bus, name, incarnation
+        self._tokens: list[str] = []
+        self._seen: dict[str, tuple[int, set[str]]] = {}
+        self._numbers = count(1)
+        self._asked: dict[int, Answered] = {}
+        bus.subscribe(_PASSING, f"{_ROOT}/answer/{self.id}", self._answer)
+
+    def token(self, key: str) -> None:
+        """See `Side.token`."""
+        self._tokens.append(key)
+        self._bus.publish(_KEPT, f"{_ROOT}/tokens/{self._name}",
+                          _pack((self._name, self._incarnation, self._tokens)))
+
+    def tokens(self, pattern: str, changed: Callable[[str, bool], None]) -> None:
+        """See `Side.tokens`; all of one domain are told, whatever the pattern."""
+        above = pattern.removesuffix("**")
+
+        def heard(_key: str, payload: bytes) -> None:
+            name, incarnation, tokens = _unpack(payload)
+            before, there = self._seen.get(name, (0, set()))
+            if incarnation < before:
+                return
+            if not before:
+                self._bus.watch(name, lambda *what: gone(name, *what[1:]))
+            if incarnation > before:
+                tell(there, alive=False)
+                there = set()
+            new = {token for token in tokens if token.startswith(above)}
+            tell(new - there, alive=True)
+            self._seen[name] = incarnation, new
+
+        def gone(name: str, incarnation: int, alive: bool) -> None:
+            before, there = self._seen[name]
+            if not alive and incarnation == before:
+                tell(there, alive=False)
+                self._seen[name] = before, set()
+
+        def tell(tokens: set[str], *, alive: bool) -> None:
+            for token in sorted(tokens):
+                changed(token, alive)
+
+        where = f"{_ROOT}/tokens/*"
+        self._bus.subscribe(_KEPT, where, heard)
+        self._bus.latest(where, heard, lambda: None)
+        tell({token for token in self._tokens if token.startswith(above)}, alive=True)
+
+    def publisher(self, key: str, qos: Qos) -> Callable[[bytes, bytes], None]:
+        """See `Side.publisher`."""
+        topic = _KEPT if qos.transient_local else _PASSING
+        where = f"{_ROOT}/data/{_chunk(key)}"
+        return lambda payload, attachment: self._bus.publish(
+            topic, where, _pack((payload, attachment)))
+
+    def subscribe(self, key: str, qos: Qos, deliver: Deliver) -> None:
+        """See `Side.subscribe`."""
+        where = f"{_ROOT}/data/{_chunk(key)}"
+        self._bus.subscribe(_PASSING, where, lambda _key, packed: deliver(*_unpack(packed)))
+        if qos.transient_local:
+            self._bus.latest(
+                where, lambda _key, packed: deliver(*_unpack(packed)), lambda: None)
+
+    def serve(self, key: str, asked: Callable[[bytes, bytes | None, Reply], None]) -> None:
+        """See `Side.serve`."""
+
+        def heard(_key: str, packed: bytes) -> None:
+            who, number, payload, attachment = _unpack(packed)
+            asked(payload, attachment, lambda answer, attached: self._bus.publish(
+                _PASSING, f"{_ROOT}/answer/{who}", _pack((number, answer, attached))))
+
+        self._bus.subscribe(_PASSING, f"{_ROOT}/ask/{_chunk(key)}", heard)
+
+    def ask(self, key: str, payload: bytes, attachment: bytes, timeout_s: float,
+            answered: Answered) -> None:
+        """See `Side.ask`."""
+        number = next(self._numbers)
+        self._asked[number] = answered
+
+        def over() -> None:
+            late = self._asked.pop(number, None)
+            if late is not None and self._bus.is_open:
+                late(None, None, "nobody answers")
+
+        asyncio.get_running_loop().call_later(timeout_s, over)
+        self._bus.publish(_PASSING, f"{_ROOT}/ask/{_chunk(key)}",
+                          _pack((self.id, number, payload, attachment)))
+
+    def _answer(self, _key: str, packed: bytes) -> None:
+        number, payload, attachment = _unpack(packed)
+        waiting: Any = self._asked.pop(number, None)
+        if waiting is not None:
+            waiting(payload, attachment, "")
+
+    def is_linked(self) -> bool:
+        """See `Side.is_linked`."""
+        return True
+
+    def close(self) -> None:
+        """See `Side.close`; the bus is the actor's to close."""
+
+
+def _chunk(key: str) -> str:
+    return key.replace("/", "|")

@@ -1,0 +1,66 @@
+"""The router of ROS 2, where `rmw_zenohd` is not installed: nodes find each other by it.
+
+With the real one running leave this node out: `ros2 run rmw_zenoh_cpp rmw_zenohd`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any
+
+import zenoh
+
+from rampart.actors.runtime.actor import Actor
+
+LISTEN = "tcp/127.0.0.1:7447"
+
+
+class RosRouter(Actor):
+    """Listens where nodes of ROS 2 look for their router, and does nothing else."""
+
+    class Parameters(Actor.Parameters, frozen=True, kw_only=True):
+        """Where it listens.
+
+        Attributes:
+            listen: its endpoint.
+            dead_man, dead_man_timeout_s, seed: of a world, which it is one of; not heeded.
+        """
+
+        listen: str = LISTEN
+        dead_man: bool = True
+        dead_man_timeout_s: float = 0.0
+        seed: int = 0
+
+    parameters: Parameters
+    most_spare = "none"
+    _session: zenoh.Session | None = None
+
+    def on_start(self) -> None:
+        """Open the router; nothing in virtual time.
+
+        Raises:
+            ValueError: there is one already, or the endpoint makes no sense; one line.
+        """
+        if self.context.run.plan.virtual:
+            return
+        try:
+            self._session = zenoh.open(_configured(self.parameters.listen))
+        except zenoh.ZError as error:
+            raise ValueError(f"listen = {self.parameters.listen!r}: another router may be there "
+                             f"already; {' '.join(str(error).split())}") from None
+
+    def on_stop(self) -> None:
+        """Close it."""
+        if self._session is not None:
+            session: Any = self._session
+            asyncio.get_running_loop().run_in_executor(None, session.close)
+
+
+def _configured(listen: str) -> zenoh.Config:
+    config = zenoh.Config()
+    for name, value in {"mode": "router", "listen/endpoints": [listen],
+                        "scouting/multicast/enabled": False, "scouting/gossip/enabled": True,
+                        "timestamping/enabled": True}.items():
+        config.insert_json5(name, json.dumps(value))
+    return config

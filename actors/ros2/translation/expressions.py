@@ -1,0 +1,213 @@
+"""How a field is read of a message: a path, a function of paths, a factor. Pure.
+
+twist.twist.linear.x            a field of a field
+axes[1]                         an item of a list; the last is [-1]
+angle_deg * 0.017453292519943295
+yaw(pose.pose.orientation)      heading of a quaternion, rad, in (-pi, pi]
+quaternion(yaw_rad)             the quaternion of a heading
+sqrt(position_covariance[0])    of what is not negative; NaN of what is
+least(ranges), greatest(ranges) of a list, of which NaN does not count; NaN of none
+east(latitude, longitude)       m east of the datum, on a plane that touches the ellipsoid there
+north(latitude, longitude)      m north of it
+latitude(x_m, y_m), longitude(x_m, y_m)     the way back, degrees
+count(status)                   how many items a list has
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+Read = Callable[[Any], Any]
+
+_CALL = re.compile(r"\s*([a-z]+)\(([^()]*)\)\s*")
+_TEXT = re.compile(r"\s*'([^']*)'\s*")
+_PATH = re.compile(r"\s*([A-Za-z_][A-Za-z0-9_.\[\]\-]*)\s*")
+_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[-?\d{1,6}\])*)\Z")
+
+SEMI_MAJOR_M = 6_378_137.0
+"""Of the ellipsoid WGS 84, and its eccentricity squared (NIMA TR8350.2)."""
+ECCENTRICITY_2 = 6.694379990141316e-3
+
+
+class Quaternion(NamedTuple):
+    """A rotation, as messages have it."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+def yaw(rotation: Any) -> float:
+    """Return the heading of a quaternion, rad; NaN if it is none (REP-103)."""
+    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
+    norm = x * x + y * y + z * z + w * w
+    if not 0.9 < norm < 1.1:
+        return math.nan
+    return math.atan2(2 * (w * z + x * y), norm - 2 * (y * y + z * z))
+
+
+def quaternion(yaw_rad: float) -> Quaternion:
+    """Return the rotation by a heading, rad."""
+    return Quaternion(0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
+
+
+def sqrt(value: float) -> float:
+    """Return the square root; NaN of what is negative."""
+    return math.sqrt(value) if value >= 0 else math.nan
+
+
+def least(values: Sequence[float]) -> float:
+    """Return the least number of a list, NaN if it has none."""
+    return min((float(v) for v in values if not math.isnan(v)), default=math.nan)
+
+
+def greatest(values: Sequence[float]) -> float:
+    """Return the greatest number of a list, NaN if it has none."""
+    return max((float(v) for v in values if not math.isnan(v)), default=math.nan)
+
+
+class Plane:
+    """The plane that touches the ellipsoid at a point.
+
+    Args:
+        datum: latitude and longitude of the point, degrees.
+    """
+
+    def __init__(self, datum: tuple[float, float]) -> None:
+        self._latitude_deg, self._longitude_deg = datum
+        sine = math.sin(math.radians(self._latitude_deg))
+        bent = 1 - ECCENTRICITY_2 * sine * sine
+        self._north_m = math.radians(
+            SEMI_MAJOR_M * (1 - ECCENTRICITY_2) / (bent * math.sqrt(bent)))
+        self._east_m = math.radians(SEMI_MAJOR_M / math.sqrt(bent) * math.cos(
+            math.radians(self._latitude_deg)))
+
+    def east(self, _latitude_deg: float, longitude_deg: float) -> float:
+        """Return how far east a point is, m."""
+        return (longitude_deg - self._longitude_deg) * self._east_m
+
+    def north(self, latitude_deg: float, _longitude_deg: float) -> float:
+        """Return how far north a point is, m."""
+        return (latitude_deg - self._latitude_deg) * self._north_m
+
+    def latitude(self, _east_m: float, north_m: float) -> float:
+        """Return the latitude of a point, degrees."""
+        return self._latitude_deg + north_m / self._north_m
+
+    def longitude(self, east_m: float, _north_m: float) -> float:
+        """Return the longitude of a point, degrees."""
+        return self._longitude_deg + east_m / self._east_m
+
+
+_FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
+    "yaw": (yaw, 1), "quaternion": (quaternion, 1), "sqrt": (sqrt, 1), "least": (least, 1),
+    "greatest": (greatest, 1), "count": (len, 1)}
+_ON_PLANE = ("east", "north", "latitude", "longitude")
+FUNCTIONS = (*_FUNCTIONS, *_ON_PLANE)
+
+
+class Expression:
+    """What is said of a field that is written, read once.
+
+    Args:
+        text: as above.
+        plane: for what needs one; None for none.
+
+    Attributes:
+        paths: that it reads.
+        read: returns its value of a message.
+
+    Raises:
+        ValueError: it makes no sense; one line.
+    """
+
+    def __init__(self, text: str, plane: Plane | None = None) -> None:
+        self.paths: tuple[str, ...] = ()
+        if quoted := _TEXT.fullmatch(text):
+            words = quoted[1]
+            self.read: Read = lambda _message: words
+            return
+        body, star, factor = text.partition("*")
+        try:
+            self._factor = float(factor) if star else None
+        except ValueError:
+            raise ValueError(f"{text!r}: a number is right behind *") from None
+        called = _CALL.fullmatch(body)
+        if called:
+            name, inside = called.groups()
+            self.paths = tuple(part.strip() for part in inside.split(","))
+            function, count = self._function(name, text, plane)
+            if len(self.paths) != count:
+                raise ValueError(f"{text!r}: {name} takes {count} field{'s' * (count > 1)}")
+            reads = [reader(path, text) for path in self.paths]
+            whole = _called(function, reads)
+        elif found := _PATH.fullmatch(body):
+            self.paths = (found[1],)
+            whole = reader(found[1], text)
+        else:
+            raise ValueError(f"{text!r}: a field such as pose.position.x is right, or one of the "
+                             f"functions {', '.join(FUNCTIONS)} of one")
+        scale = self._factor
+        self.read = whole if scale is None else lambda message: whole(message) * scale
+
+    @staticmethod
+    def _function(name: str, text: str, plane: Plane | None) -> tuple[Callable[..., Any], int]:
+        if name in _ON_PLANE:
+            if plane is None:
+                raise ValueError(f"{text!r}: needs a datum = [latitude, longitude]")
+            return getattr(plane, name), 2
+        try:
+            return _FUNCTIONS[name]
+        except KeyError:
+            raise ValueError(f"{text!r}: no function {name!r}; known: {', '.join(FUNCTIONS)}"
+                             ) from None
+
+
+def _called(function: Callable[..., Any], reads: Sequence[Read]) -> Read:
+    """Return what calls a function with what one or two others read."""
+    one, two = reads[0], reads[-1]
+    if len(reads) == 1:
+        return lambda message: function(one(message))
+    return lambda message: function(one(message), two(message))
+
+
+def steps(path: str, text: str = "") -> list[str | int]:
+    """Return a path in steps: names, and places in a list.
+
+    Raises:
+        ValueError: it is none.
+    """
+    found: list[str | int] = []
+    for part in path.split("."):
+        step = _STEP.match(part)
+        if step is None:
+            raise ValueError(f"{text or path!r}: {path!r} is no field, such as pose.position.x")
+        found.append(step[1])
+        found += [int(number) for number in re.findall(r"-?\d+", step[2])]
+    return found
+
+
+def reader(path: str, text: str = "") -> Read:
+    """Return what reads a path of a message; an item that a list does not have is an error.
+
+    Raises:
+        ValueError: it is no path.
+    """
+    way = steps(path, text)
+
+    def read(message: Any) -> Any:
+        value = message
+        for step in way:
+            if isinstance(step, int):
+                if not -len(value) <= step < len(value):
+                    raise ValueError(f"{path}: has {len(value)} items")
+                value = value[step]
+            else:
+                value = getattr(value, step)
+        return value
+
+    return read

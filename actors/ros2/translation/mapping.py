@@ -1,0 +1,376 @@
+"""From messages of ROS 2 to messages of the system, and back, as a link says. Pure.
+
+Everything is looked up when a link is read, so that a field that does not exist is refused before
+a run; what is left for a message is to read and to write.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+import msgspec
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from rampart.actors.ros2.translation.expressions import Expression, Plane, Read, steps
+from rampart.actors.ros2.translation.forms import ON_PLANE, READY, WRITTEN
+from rampart.actors.ros2.translation.types import Types
+from rampart.manager.spec.ros2 import Ros2Link
+
+NS = 1_000_000_000
+
+TF = "tf2_msgs/msg/TFMessage"
+_TRANSFORM = "geometry_msgs/msg/TransformStamped"
+_HEADER = "std_msgs/msg/Header"
+_F32 = "_f32"
+
+BULK = ("uint8", "int8", "byte", "char")
+"""A list of these is an image, a point cloud or a map: how long it is is kept, no more."""
+
+LEN = "_len"
+"""Behind the name of such a list."""
+
+
+class Said(Protocol):
+    """Where a message of the system comes from: its header."""
+
+    @property
+    def source(self) -> str:
+        """Node that has published it."""
+
+
+class NotMeantError(Exception):
+    """A message that is none of a link's business, as a transform of another frame is."""
+
+
+class Inward:
+    """Makes messages of the system of those of ROS 2.
+
+    Args:
+        link: what is heard, and what becomes of it.
+        types: of ROS 2.
+        made: type of the messages of the system.
+
+    Raises:
+        ValueError: a field does not exist, or nothing says what it is to be; one line.
+    """
+
+    def __init__(self, link: Ros2Link, types: Types, made: type[msgspec.Struct]) -> None:
+        self._link = link
+        self._made = made
+        self._picks = link.type == TF
+        read = _TRANSFORM if self._picks else link.type
+        if self._picks and not (link.frame and link.child):
+            raise ValueError("frame and child are missing: which transform is meant")
+        fields = TypeFields(types, read)
+        self.has_stamp = fields.kind("header") == _HEADER
+        plane = Plane(link.datum) if link.datum else None
+        ready = {**READY.get(link.type, reads_of(link.type, types)), **(
+            ON_PLANE if plane and link.type == "sensor_msgs/msg/NavSatFix" else {})}
+        needed = dict(_leaves(made))
+        for path in link.fields:
+            if path not in needed:
+                raise ValueError(f"fields: {made.__name__} has no field {path!r}"
+                                 f"{_near(path, needed)}")
+        self._reads: list[tuple[list[str], Read]] = []
+        for path, is_needed in needed.items():
+            said = link.fields.get(path, ready.get(path, ready.get(path.rpartition(".")[2])))
+            if said is None:
+                if is_needed:
+                    raise ValueError(f"fields: nothing says what {path} of {made.__name__} is; "
+                                     f"{link.type} has {', '.join(fields.names)}")
+                continue
+            self._reads.append((path.split("."), self._read(path, said, fields, plane)))
+
+    def _read(self, path: str, said: str | float | bool, fields: TypeFields,
+              plane: Plane | None) -> Read:
+        if not isinstance(said, str):
+            return lambda _message: said
+        expression = Expression(said, plane)
+        for one in expression.paths:
+            fields.check(one, said)
+        if path.endswith(_F32):
+            return lambda message: np.asarray(expression.read(message), "<f4").tobytes()
+        return lambda message: _plain(expression.read(message))
+
+    def __call__(self, message: Any) -> tuple[msgspec.Struct, int | None]:
+        """Return the message of the system, and the stamp of the other's header, nanoseconds.
+
+        Raises:
+            NotMeantError: it is none of the link's business.
+            ValueError: it has a value that the message of the system does not take, or is in
+                another frame; one line.
+        """
+        if self._picks:
+            message = self._picked(message)
+        stamp_ns = None
+        if self.has_stamp:
+            header = message.header
+            stamp_ns = header.stamp.sec * NS + header.stamp.nanosec
+            if self._link.frame and header.frame_id.lstrip("/") != self._link.frame:
+                raise ValueError(f"its frame is {header.frame_id[:60]!r}; "
+                                 f"{self._link.frame!r} is right")
+        found: dict[str, Any] = {}
+        for path, read in self._reads:
+            inner = found
+            for step in path[:-1]:
+                inner = inner.setdefault(step, {})
+            inner[path[-1]] = read(message)
+        try:
+            return msgspec.convert(found, self._made), stamp_ns
+        except msgspec.ValidationError as error:
+            raise ValueError(str(error).replace("`", "")) from None
+
+    def _picked(self, message: Any) -> Any:
+        for transform in message.transforms:
+            if (transform.header.frame_id.lstrip("/") == self._link.frame
+                    and transform.child_frame_id.lstrip("/") == self._link.child):
+                return transform
+        raise NotMeantError
+
+
+class Outward:
+    """Makes messages of ROS 2 of those of the system.
+
+    Args:
+        link: what is said, and what of.
+        types: of ROS 2.
+        heard: type of the messages of the system.
+        lenient: whether it may be that nothing is said, as in a request without fields.
+
+    Raises:
+        ValueError: a field does not exist, or nothing would be said; one line.
+    """
+
+    def __init__(self, link: Ros2Link, types: Types, heard: type[msgspec.Struct], *,
+                 lenient: bool = False) -> None:
+        self._link, self._types = link, types
+        self._wraps = link.type == TF
+        self._name = _TRANSFORM if self._wraps else link.type
+        if self._wraps and not (link.frame and link.child):
+            raise ValueError("frame and child are missing: which transform is said")
+        fields = TypeFields(types, self._name)
+        self._has_header = fields.kind("header") == _HEADER
+        leaves = [path for path, _ in _leaves(heard)]
+        there = {path.rpartition(".")[2]: path for path in leaves}
+        said: dict[str, str | float | bool] = {} if link.type in WRITTEN else {
+            path: path for path in reads_of(self._name, types) if path in leaves}
+        for quantity, (where, text) in WRITTEN.get(link.type, {}).items():
+            if quantity in there:
+                said[where] = text.replace(quantity, there[quantity])
+        said |= link.fields
+        if not (said or lenient):
+            raise ValueError(f"fields: nothing says what {link.type} is to be; {heard.__name__} "
+                             f"has {', '.join(there.values()) or 'no fields'}")
+        plane = Plane(link.datum) if link.datum else None
+        self._heard, self._leaves = heard.__name__, leaves
+        self._writes = [(*_place(fields, where), self._read(where, one, plane, fields))
+                        for where, one in said.items()]
+
+    def _read(self, where: str, said: str | float | bool, plane: Plane | None, fields: TypeFields
+              ) -> Callable[[Any, Said | None], Any]:
+        if not isinstance(said, str):
+            return lambda _message, _said: said
+        if said == "@source":
+            return lambda _message, said: said.source if said else ""
+        expression = Expression(said, plane)
+        for path in expression.paths:
+            if path not in self._leaves:
+                raise ValueError(f"fields: {said!r}: {self._heard} has no field {path!r}"
+                                 f"{_near(path, self._leaves)}")
+        read, write = expression.read, fields.writer(where)
+        if "".join(expression.paths).endswith(_F32):
+            return lambda message, _said: np.frombuffer(read(message), "<f4")
+        return lambda message, _said: write(read(message))
+
+    def __call__(self, message: Any, stamp_ns: int, said: Said | None = None) -> bytes:
+        """Return the message of ROS 2 as it travels.
+
+        Args:
+            message: of the system.
+            stamp_ns: when its content was true, nanoseconds of the clock that ROS 2 has.
+            said: where it comes from.
+
+        Raises:
+            ValueError: it has a value that ROS 2 cannot say; one line.
+        """
+        made = self._types.blank(self._name)
+        for way, last, read in self._writes:
+            inner = made
+            for step in way:
+                inner = getattr(inner, step)
+            value = read(message, said)
+            if isinstance(last, int):
+                inner[last] = value
+            else:
+                setattr(inner, last, value)
+        return self._finish(made, stamp_ns)
+
+    def zero(self, stamp_ns: int) -> bytes:
+        """Return the message with all fields 0, as it travels."""
+        return self._finish(self._types.blank(self._name), stamp_ns)
+
+    def _finish(self, made: Any, stamp_ns: int) -> bytes:
+        if self._has_header:
+            made.header.stamp.sec, made.header.stamp.nanosec = divmod(max(stamp_ns, 0), NS)
+            made.header.frame_id = self._link.frame
+        if hasattr(made, "child_frame_id"):
+            made.child_frame_id = self._link.child
+        if self._wraps:
+            whole = self._types.blank(TF)
+            whole.transforms = [made]
+            made = whole
+        return self._types.encode(self._link.type, made)
+
+
+class TypeFields:
+    """The fields of a type of ROS 2, to be checked by path.
+
+    Args:
+        types: of ROS 2.
+        name: of the type.
+
+    Raises:
+        ValueError: it is not known.
+    """
+
+    def __init__(self, types: Types, name: str) -> None:
+        self._types, self._name = types, name
+        self.names = [field for field, _ in types.fields(name)]
+
+    def kind(self, path: str, said: str = "") -> str:
+        """Return the type of a field: of a message or number its name, of a list "[]" behind it.
+
+        "" if there is no such field at the top.
+
+        Raises:
+            ValueError: there is none further down.
+        """
+        what: Any = (Nodetype.NAME, self._name)
+        for step in steps(path, said):
+            kind, detail = what
+            if isinstance(step, int):
+                if kind not in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+                    raise ValueError(f"{said or path!r}: [{step}] of what is no list")
+                what = detail[0]
+                continue
+            if kind != Nodetype.NAME:
+                raise ValueError(f"{said or path!r}: {step} of what has no fields")
+            name = detail
+            known = dict(self._types.fields(name))
+            if step not in known:
+                if path == step == "header":
+                    return ""
+                raise ValueError(f"{said or path!r}: {name} has no field {step!r}"
+                                 f"{_near(step, known)}")
+            what = known[step]
+        kind, detail = what
+        if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+            return f"{detail[0][1] if detail[0][0] == Nodetype.NAME else detail[0][1][0]}[]"
+        return str(detail if kind == Nodetype.NAME else detail[0])
+
+    def check(self, path: str, said: str) -> None:
+        """Refuse a path that does not exist.
+
+        Raises:
+            ValueError: it does not.
+        """
+        self.kind(path, said)
+
+    def writer(self, where: str) -> Callable[[Any], Any]:
+        """Return what makes a value fit for a field.
+
+        Raises:
+            ValueError: there is no such field, or nothing is written into it.
+        """
+        kind = self.kind(where)
+        if kind == "geometry_msgs/msg/Quaternion":
+            return lambda value: self._types.like(kind, value)
+        if kind.endswith("[]"):
+            element = kind[:-2]
+            return list if "/" in element or element == "string" else (
+                lambda value: np.asarray(value, _NUMPY_OF.get(element, element)))
+        if "/" in kind:
+            raise ValueError(f"fields: {where} is a {kind}; one of its fields is right")
+        if kind.startswith("float"):
+            return _finite
+        return _ENCODED.get(kind, int)
+
+
+_NUMPY_OF = {"byte": "uint8", "char": "uint8"}
+_ENCODED: Mapping[str, Callable[[Any], Any]] = {"string": str, "bool": bool}
+
+
+def _place(fields: TypeFields, where: str) -> tuple[list[str], str | int]:
+    """Return the way to a field that is written, and its last step."""
+    fields.check(where, where)
+    way = steps(where)
+    if any(isinstance(step, int) for step in way[:-1]):
+        raise ValueError(f"fields: {where}: an item of a list that has fields is not written")
+    return [str(step) for step in way[:-1]], way[-1]
+
+
+def _leaves(made: type[msgspec.Struct], above: str = "") -> Iterator[tuple[str, bool]]:
+    """Yield the paths of the fields of a struct, each with whether it has to be given."""
+    for field in msgspec.structs.fields(made):
+        kind = field.type
+        path = f"{above}{field.name}"
+        if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+            yield from _leaves(kind, f"{path}.")
+        else:
+            yield path, field.required
+
+
+def _near(name: str, known: Any) -> str:
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known) or 'none'}"
+
+
+def _plain(value: Any) -> Any:
+    """Return a value of ROS 2 as one that messages of the system are made of."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    names = getattr(value, "__dataclass_fields__", None)
+    if names is None:
+        return value
+    found = {}
+    for name in names:
+        inner = getattr(value, name)
+        if isinstance(inner, np.ndarray) and inner.dtype in _ONE_BYTE:
+            found[f"{name}{LEN}"] = len(inner)
+        elif name != "__msgtype__":
+            found[name] = _plain(inner)
+    return found
+
+
+def _finite(value: float) -> float:
+    """Return a number that ROS 2 is told; what is none moves no wheel.
+
+    Raises:
+        ValueError: it is not finite.
+    """
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is no number")
+    return float(value)
+
+
+_ONE_BYTE = (np.uint8, np.int8)
+
+
+def reads_of(name: str, types: Types, above: str = "") -> dict[str, str]:
+    """Return field → expression by which a message is read field by field, its parts included."""
+    found: dict[str, str] = {}
+    for field, (kind, detail) in types.fields(name):
+        path = f"{above}{field}"
+        if kind == Nodetype.NAME:
+            found |= reads_of(detail, types, f"{path}.")
+        elif kind != Nodetype.BASE and detail[0][1][0] in BULK:
+            found[f"{path}{LEN}"] = f"count({path})"
+        else:
+            found[path] = path
+    return found

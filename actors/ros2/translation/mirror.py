@@ -1,0 +1,102 @@
+"""Topics of the system that are made of topics of ROS 2. Pure.
+
+A common type becomes its quantities (`forms`), any other what it is, field by field: so that a
+module which takes a topic's field takes one of a robot that nobody has described yet.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import msgspec
+from rosbags.interfaces import Nodetype
+
+from rampart.actors.bus.bounds import MOST, Count, Floats32, Meta, Text, Whole
+from rampart.actors.bus.messages import Message
+from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.ros2.translation.expressions import Expression, Plane
+from rampart.actors.ros2.translation.forms import ON_PLANE, READY, kind_of
+from rampart.actors.ros2.translation.mapping import BULK, LEN, TF, TypeFields
+from rampart.actors.ros2.translation.types import Types
+from rampart.manager.spec.ros2 import Ros2Link
+
+_BOUNDED: dict[Any, Any] = {
+    bytes: Floats32, str: Text, float: float, bool: bool,
+    int: Whole}
+
+def topic_of(link: Ros2Link, types: Types) -> Topic[Any]:
+    """Return the topic of the system that a link's `to` is, if nobody else declares it.
+
+    Raises:
+        ValueError: its type is not known, or a field makes no sense; one line.
+    """
+    qos = Qos.STATE if link.transient_local else Qos.SENSOR
+    return Topic(link.to, message_of(link, types), qos, link.rate_hz or 0.0, link.frame,
+                 f"{link.name} of ROS 2, {link.type}.")
+
+
+def message_of(link: Ros2Link, types: Types) -> type[msgspec.Struct]:
+    """Return the type of its messages; arguments and errors as of `topic_of`."""
+    ready = dict(READY.get(link.type, {}))
+    if link.datum and link.type == "sensor_msgs/msg/NavSatFix":
+        ready |= ON_PLANE
+    if not ready and not link.fields:
+        return _mirrored(link.type, types)
+    if link.type != TF:
+        fields = TypeFields(types, link.type)
+        plane = Plane(link.datum) if link.datum else None
+        kinds = {name: _kind_of(said, fields, plane) for name, said in link.fields.items()}
+    else:
+        kinds = dict.fromkeys(link.fields, float)
+    for name in kinds:
+        if not name.isidentifier():
+            raise ValueError(f"fields: {name!r}: a name such as speed_mps is right")
+    kinds = {name: kind_of(name) for name in ready} | kinds
+    return msgspec.defstruct(
+        link.type.rpartition("/")[2], [(name, _BOUNDED[kind]) for name, kind in kinds.items()],
+        bases=(Message,), frozen=True)
+
+
+def _kind_of(said: str | float | bool, fields: TypeFields, plane: Plane | None) -> type:
+    """Return of which type an expression is."""
+    if not isinstance(said, str):
+        return type(said)
+    expression = Expression(said, plane)
+    if not expression.paths:
+        return str
+    if said.strip() != expression.paths[0]:
+        return int if said.strip().startswith("count(") else float
+    kind = fields.kind(said.strip(), said)
+    found = _base(kind)
+    if found is None:
+        raise ValueError(f"fields: {said!r} is a {kind}; one of its fields is right")
+    return found
+
+
+def _base(kind: str) -> type | None:
+    if kind.endswith("[]") or "/" in kind:
+        return None
+    return {"string": str, "bool": bool}.get(kind, float if kind.startswith("float") else int)
+
+
+def _mirrored(name: str, types: Types) -> type[msgspec.Struct]:
+    """Return a struct with the fields of a type of ROS 2."""
+    fields = []
+    for field, what in types.fields(name):
+        kind, detail = what
+        if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE} and detail[0][1][0] in BULK:
+            fields.append((f"{field}{LEN}", Count))
+        else:
+            fields.append((field, _type_of(what, types)))
+    return msgspec.defstruct(name.rpartition("/")[2], fields, bases=(Message,), frozen=True)
+
+
+def _type_of(what: Any, types: Types) -> Any:
+    kind, detail = what
+    if kind == Nodetype.NAME:
+        return _mirrored(detail, types)
+    if kind == Nodetype.BASE:
+        return _BOUNDED[_base(detail[0])]
+    inner, _ = detail
+    items: Any = tuple[_type_of(inner, types), ...]  # type: ignore[misc]
+    return Annotated[items, Meta(max_length=MOST)]

@@ -1,0 +1,335 @@
+"""ROS 2 types: their definitions, hashes, and messages as bytes (CDR). Pure.
+
+`rosbags` knows the common types of each distribution and does the encoding. What it does not know
+is beside this module, in `interfaces/common` and `interfaces/DISTRIBUTION`, as
+`package/msg/Name.msg`, `package/srv/Name.srv` and `package/action/Name.action`; a robot's own lie
+in folders of the same shape.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from rampart.files.reading import read_text
+
+DISTRIBUTIONS: Final = {"humble": Stores.ROS2_HUMBLE, "iron": Stores.ROS2_IRON,
+                        "jazzy": Stores.ROS2_JAZZY, "kilted": Stores.ROS2_KILTED,
+                        "rolling": Stores.LATEST}
+"""Distributions of ROS 2 with `rmw_zenoh`."""
+
+SHIPPED = Path(__file__).with_name("interfaces")
+
+NO_HASH = "TypeHashNotSupported"
+"""In the place of a type's hash, on Humble."""
+
+MOST_BYTES = 8 << 20
+"""Longest message that is decoded."""
+
+_MOST_TEXT = 1_000_000
+"""Longest file of definitions, bytes."""
+
+_LITTLE, _BIG = b"\0\1", b"\0\0"
+_HEADER_BYTES = 4
+_PADDING_BYTES = 3
+_UNHASHED = ("humble",)
+
+_EMPTY = [("structure_needs_at_least_one_member", (Nodetype.BASE, ("uint8", 0)))]
+_PARTS = {"srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Feedback")}
+_QUATERNION = "geometry_msgs/msg/Quaternion"
+_UUID = "unique_identifier_msgs/msg/UUID"
+
+Fields = list[tuple[str, Any]]
+
+
+class Types:
+    """The types of a distribution, and those of a robot.
+
+    Args:
+        distribution: name of the distribution, one of `DISTRIBUTIONS`.
+        folders: with a robot's own definitions.
+
+    Raises:
+        ValueError: there is no such distribution or folder, or a definition makes no sense; one
+            line that names the file.
+    """
+
+    def __init__(self, distribution: str, folders: Iterable[Path] = ()) -> None:
+        if distribution not in DISTRIBUTIONS:
+            raise ValueError(f"distribution = {distribution!r}: known: {', '.join(DISTRIBUTIONS)}")
+        self.distribution = distribution
+        self._store = get_typestore(DISTRIBUTIONS[distribution])
+        self._described = Typestore()  # of it the hashes are made
+        for name, (constants, fields) in self._store.fielddefs.items():
+            self._described.fielddefs[name] = constants, _read_as_uint8(fields, "char")
+            self._store.fielddefs[name] = constants, _read_as_uint8(fields, "char", "byte")
+        self._hashes: dict[str, str] = {}
+        self._services: set[str] = set()
+        self._actions: set[str] = set()
+        for folder in (SHIPPED / "common", SHIPPED / distribution):
+            self._read(folder)
+        for folder in folders:
+            if not self._read(folder):
+                raise ValueError(f"interfaces: {folder}: no package/msg/Name.msg in it")
+
+    @cached_property
+    def known(self) -> frozenset[str]:
+        """Names of all messages, services and actions."""
+        return frozenset((*self._store.fielddefs, *self._services, *self._actions))
+
+    def is_message(self, name: str) -> bool:
+        """Whether it is the name of a message that is known."""
+        return name in self._store.fielddefs
+
+    def is_service(self, name: str) -> bool:
+        """Whether it is the name of a service that is known."""
+        return name in self._services
+
+    def is_action(self, name: str) -> bool:
+        """Whether it is the name of an action that is known."""
+        return name in self._actions
+
+    def fields(self, name: str) -> Fields:
+        """Return the fields of a message, each with the description that `rosbags` has of it.
+
+        Raises:
+            ValueError: it is not known.
+        """
+        return [(field, what) for field, what in self._definition(name) if field != _EMPTY[0][0]]
+
+    def hash(self, name: str) -> str:
+        """Return the hash of a type as keys have it (REP-2016).
+
+        Raises:
+            ValueError: it is not known.
+        """
+        if self.distribution in _UNHASHED:
+            return NO_HASH
+        if name not in self._hashes:
+            self._definition(name)
+            self._hashes[name] = self._described.hash_rihs01(name)
+        return self._hashes[name]
+
+    def blank(self, name: str) -> Any:
+        """Return a message as ROS 2 makes it: all fields 0, empty or false, no rotation."""
+        if name == _QUATERNION:
+            return self._store.types[name](x=0.0, y=0.0, z=0.0, w=1.0)
+        store = self._store
+        made: dict[str, Any] = {}
+        for field, what in self._definition(name):
+            made[field] = self._blank_field(what)
+        return store.types[name](**made)
+
+    def like(self, name: str, value: Any) -> Any:
+        """Return a message whose fields are the attributes of a value."""
+        return self._store.types[name](
+            **{field: getattr(value, field) for field, _ in self._definition(name)})
+
+    def _blank_field(self, what: Any) -> Any:
+        import numpy as np  # noqa: PLC0415 with the first message
+
+        kind, detail = what
+        if kind == Nodetype.NAME:
+            return self.blank(detail)
+        if kind == Nodetype.BASE:
+            return _ZERO[detail[0]]
+        (inner, of), count = detail
+        if inner == Nodetype.BASE and of[0] != "string":
+            return np.zeros(count if kind == Nodetype.ARRAY else 0, np.dtype(_NUMPY[of[0]]))
+        return [self._blank_field((inner, of)) for _ in range(count)
+                ] if kind == Nodetype.ARRAY else []
+
+    def encode(self, name: str, message: Any) -> bytes:
+        """Return a message as it travels.
+
+        Raises:
+            ValueError: a field has a value that its type does not take; one line.
+        """
+        try:
+            return bytes(self._store.serialize_cdr(message, name, little_endian=True))
+        except (struct.error, TypeError, ValueError, AttributeError, AssertionError,
+                OverflowError, UnicodeError) as error:
+            raise ValueError(f"{name}: {_line(error)}") from None
+
+    def decode(self, name: str, data: bytes) -> Any:
+        """Return the message that travelled so.
+
+        Raises:
+            ValueError: it is none of this type; one line.
+        """
+        return self.decoder(name)(data)
+
+    def decoder(self, name: str) -> Callable[[bytes], Any]:
+        """Return a function that does so for one type.
+
+        Raises:
+            ValueError: it is not known.
+        """
+        self._definition(name)
+        try:
+            definition = self._store.get_msgdef(name)
+        except Exception as error:  # a library's code generator; what it raises is not documented
+            raise ValueError(f"{name}: {_line(error)}") from None
+        kind, store = definition.cls, self._store
+        ways = {_LITTLE: definition.deserialize_cdr_le, _BIG: definition.deserialize_cdr_be}
+
+        def decode(data: bytes) -> Any:
+            way = ways.get(data[:2])
+            if way is None or len(data) < _HEADER_BYTES:
+                raise ValueError(f"{name}: begins with {data[:4].hex(' ') or 'nothing'}; CDR with "
+                                 "00 01 00 00 is right")
+            if len(data) > MOST_BYTES:
+                raise ValueError(f"{name}: {len(data)} bytes; at most {MOST_BYTES} are right")
+            try:
+                message, end = way(memoryview(data)[_HEADER_BYTES:], 0, kind, store)
+            except (struct.error, ValueError, IndexError, AssertionError, MemoryError,
+                    OverflowError, UnicodeError, TypeError) as error:
+                raise ValueError(f"{name}: {len(data)} bytes are no such message: "
+                                 f"{_line(error)}") from None
+            left = len(data) - _HEADER_BYTES - end
+            if not 0 <= left <= _PADDING_BYTES:
+                raise ValueError(f"{name}: {abs(left)} bytes too {'many' if left > 0 else 'few'}")
+            return message
+
+        return decode
+
+    # -- definitions ------------------------------------------------------------------------------
+
+    def _definition(self, name: str) -> Fields:
+        try:
+            return self._store.fielddefs[name][1]
+        except KeyError:
+            raise ValueError(f"type {name!r} is not known to {self.distribution}; a file "
+                             f"{name}.{name.split('/')[1] if name.count('/') == 2 else 'msg'} in "
+                             "a folder that the gateway's interfaces name makes it known") from None
+
+    def _read(self, folder: Path) -> bool:
+        """Make the definitions in a folder known; return whether there are any."""
+        if not folder.is_dir():
+            raise ValueError(f"interfaces: {folder}: no such folder")
+        found = [file for kind in ("msg", "srv", "action")
+                 for file in sorted(folder.glob(f"*/{kind}/*.{kind}"))]
+        definitions: dict[str, Any] = {}
+        for file in found:
+            package, kind, name = file.parts[-3], file.parts[-2], file.stem
+            try:
+                text = read_text(file, _MOST_TEXT)
+                definitions |= self._parsed(f"{package}/{kind}/{name}", kind, text)
+            except (ValueError, OSError) as error:
+                raise ValueError(f"{file}: {_line(error)}") from None
+        unknown = {n: name for name, (_, fields) in definitions.items() for _, what in fields
+                   for n in [_named(what)]
+                   if n and n not in definitions and n not in self._store.fielddefs}
+        for missing, where in unknown.items():
+            raise ValueError(f"{folder}: {where}: type {missing!r} is not known")
+        self._described.fielddefs |= {
+            name: (made, _read_as_uint8(fields, "char"))
+            for name, (made, fields) in definitions.items()}
+        definitions = {name: (made, _read_as_uint8(fields, "char", "byte"))
+                       for name, (made, fields) in definitions.items()}
+        try:
+            self._store.register(definitions)
+        except TypesysError as error:
+            raise ValueError(f"{folder}: {_line(error)}") from None
+        return bool(found)
+
+    def _parsed(self, name: str, kind: str, text: str) -> dict[str, Any]:
+        if kind == "msg":
+            return {name: ([], self._fields(name, text))}
+        parts = [""]
+        for line in text.splitlines():
+            if line.strip().startswith("---"):
+                parts.append("")
+            else:
+                parts[-1] += line + "\n"
+        names = _PARTS[kind]
+        if len(parts) != len(names):
+            raise ValueError(f"{len(parts)} parts; {len(names)} with --- between them are right")
+        made: dict[str, Any] = {f"{name}{part}": ([], self._fields(f"{name}{part}", body) or _EMPTY)
+                for part, body in zip(names, parts, strict=True)}
+        if kind == "srv":
+            self._services.add(name)
+            return made | self._service(name)
+        self._actions.add(name)
+        goal_id = ("goal_id", (Nodetype.NAME, _UUID))
+        sending, result = f"{name}_SendGoal", f"{name}_GetResult"
+        self._services |= {sending, result}
+        made |= {
+            f"{sending}_Request": ([], [goal_id, ("goal", (Nodetype.NAME, f"{name}_Goal"))]),
+            f"{sending}_Response": ([], [
+                ("accepted", (Nodetype.BASE, ("bool", 0))),
+                ("stamp", (Nodetype.NAME, "builtin_interfaces/msg/Time"))]),
+            f"{result}_Request": ([], [goal_id]),
+            f"{result}_Response": ([], [
+                ("status", (Nodetype.BASE, ("int8", 0))),
+                ("result", (Nodetype.NAME, f"{name}_Result"))]),
+            f"{name}_FeedbackMessage": ([], [
+                goal_id, ("feedback", (Nodetype.NAME, f"{name}_Feedback"))])}
+        return made | self._service(sending) | self._service(result)
+
+    def _service(self, name: str) -> dict[str, Any]:
+        """Return what a service's hash is made of: its parts, and the event that tells of it."""
+        if self.distribution in _UNHASHED:
+            return {}
+        request, response, event = (f"{name}_{part}" for part in ("Request", "Response", "Event"))
+
+        def at_most_one(what: str) -> Any:
+            return Nodetype.SEQUENCE, ((Nodetype.NAME, what), 1)
+
+        return {
+            event: ([], [("info", (Nodetype.NAME, "service_msgs/msg/ServiceEventInfo")),
+                         ("request", at_most_one(request)), ("response", at_most_one(response))]),
+            name: ([], [("request_message", (Nodetype.NAME, request)),
+                        ("response_message", (Nodetype.NAME, response)),
+                        ("event_message", (Nodetype.NAME, event))])}
+
+    @staticmethod
+    def _fields(name: str, text: str) -> Fields:
+        package, _, last = name.split("/")
+        try:
+            parsed = get_types_from_msg(text, f"{package}/msg/{last}")
+        except TypesysError as error:
+            raise ValueError(_line(error)) from None
+        (_, fields), = parsed.values()
+        return list(fields)
+
+
+def _read_as_uint8(fields: Iterable[tuple[str, Any]], *names: str) -> Fields:
+    """Return fields with uint8 for others of a byte.
+
+    In ROS 2 `char` is uint8, also in hashes, and `byte` is not signed; `rosbags` has it otherwise.
+    """
+    return [(field, _as_uint8(what, names)) for field, what in fields]
+
+
+def _as_uint8(what: Any, names: Sequence[str]) -> Any:
+    kind, detail = what
+    if kind == Nodetype.BASE:
+        return (kind, ("uint8", detail[1])) if detail[0] in names else what
+    return what if kind == Nodetype.NAME else (kind, (_as_uint8(detail[0], names), detail[1]))
+
+
+def _named(what: Any) -> str:
+    """Return the type that a field is of, or a list of it; "" if it is a number or a text."""
+    kind, detail = what
+    if kind == Nodetype.NAME:
+        return str(detail)
+    return "" if kind == Nodetype.BASE else _named(detail[0])
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+_NUMPY = {"bool": "bool", "byte": "uint8", "char": "uint8", "int8": "int8", "int16": "int16",
+          "int32": "int32", "int64": "int64", "uint8": "uint8", "uint16": "uint16",
+          "uint32": "uint32", "uint64": "uint64", "float32": "float32", "float64": "float64"}
+_ZERO: dict[str, Any] = {**dict.fromkeys(_NUMPY, 0), "float32": 0.0, "float64": 0.0,
+                         "bool": False, "string": ""}

@@ -1,0 +1,104 @@
+"""What passes between ROS 2 and the system: the tables `[[ros2]]`. Pure.
+
+Which types and fields there are is known to the gateway (`rampart.actors.ros2`).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from rampart.manager.spec.tables import OptionalName, Positive, Table
+
+RosName = Annotated[str, msgspec.Meta(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+\Z", max_length=200)]
+OptionalRosName = Annotated[
+    str, msgspec.Meta(pattern=r"^((/[A-Za-z_][A-Za-z0-9_]*)+)?\Z", max_length=200)]
+RosType = Annotated[str, msgspec.Meta(
+    pattern=r"^[a-z][a-z0-9_]*/(msg|srv|action)/[A-Z][A-Za-z0-9_]*\Z", max_length=200)]
+Written = dict[str, str | float | bool]
+
+WAYS = {"subscribe": ("to",), "publish": ("from",), "call": ("from", "to"), "serve": ("to",),
+         "goal": ("from", "to")}
+"""What can be had of ROS 2, each with the keys of the topics of the system that it takes."""
+
+
+class Ros2Link(Table, frozen=True, kw_only=True):
+    """Something of ROS 2 and topics of the system that it is passed on to, or made of.
+
+    One of `subscribe`, `publish`, `call`, `serve` and `goal` says what.
+
+    Attributes:
+        subscribe: Topic of ROS 2 that is heard, and published on `to`.
+        publish: Topic of ROS 2 on which is said what the system says on `from`.
+        call: Service of ROS 2 that is called with each message on `from`; the answer is on `to`.
+        serve: Service that is offered to ROS 2: what it is asked is published on `to`.
+        goal: Action of ROS 2 that is given each message on `from` as its goal; how it goes is on
+            `to`.
+        type: Of its messages in ROS 2; of a service or action its own.
+        to: Key of the topic of the system; if none has it, it is made of the fields of `type`.
+        from_: `from` in the file, likewise; that of `publish` has to be there.
+        fields: Field that is written → how it is read: a field of the other side, a number, a truth
+            value, or a function of fields (`rampart.actors.ros2.translation.expressions`). What is
+            not said is as the ready form of `type` has it.
+        answer: The same of the answer: that of a call or goal, on `to`, or that of `serve`, where
+            it says numbers, truth values and texts only.
+        frame: That messages to ROS 2 are in, and those from there have to be; "" for any.
+        child: Frame whose transform is meant, of a message of `tf`.
+        datum: Latitude and longitude, degrees, of the origin of `map`: for `east` and `north`.
+        rate_hz: No more messages pass in a second; None for all.
+        max_age_s: What is older is not said to ROS 2.
+        stop_after_s: When the system has been silent for so long, ROS 2 is told zeros; None for
+            never. Its own loss is not told: a driver has to stop by itself when commands cease.
+        within_s: How long the answer of a call may take, real seconds.
+        stamp: Where the time of what is heard is from: its header, or when it arrived.
+        publishers: Whether a second publisher is refused.
+        reliable: Whether it is asked for, or offered, reliably.
+        transient_local: Whether who joins late gets what was said last.
+        depth: How many messages wait.
+        gateway: Node that passes it on; "" for the only one.
+    """
+
+    type: RosType
+    subscribe: OptionalRosName = ""
+    publish: OptionalRosName = ""
+    call: OptionalRosName = ""
+    serve: OptionalRosName = ""
+    goal: OptionalRosName = ""
+    to: str = ""
+    from_: str = msgspec.field(name="from", default="")
+    fields: Written = {}
+    answer: Written = {}
+    frame: str = ""
+    child: str = ""
+    datum: tuple[float, float] | None = None
+    rate_hz: Positive | None = None
+    max_age_s: Positive = 0.5
+    stop_after_s: Positive | None = None
+    within_s: Positive = 1.0
+    stamp: Literal["header", "arrival"] = "header"
+    publishers: Literal["one", "any"] = "one"
+    reliable: bool = True
+    transient_local: bool = False
+    depth: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 10
+    gateway: OptionalName = ""
+
+    @property
+    def way(self) -> str:
+        """Which of the five it is."""
+        return next(way for way in WAYS if getattr(self, way))
+
+    @property
+    def name(self) -> str:
+        """Name of the topic, service or action of ROS 2."""
+        return str(getattr(self, self.way))
+
+    @property
+    def heard(self) -> str:
+        """Key of the topic of the system that is heard; "" for none."""
+        return self.from_
+
+    @property
+    def said(self) -> str:
+        """Key of the topic of the system that is published; "" for none."""
+        return self.to

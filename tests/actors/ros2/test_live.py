@@ -1,0 +1,103 @@
+"""A real run beside an implementation of ROS 2 over Zenoh that is not ours."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import threading
+
+import pytest
+
+from rampart.testing import RealRun, free_port, wait_until
+from tests import ROOT
+from tests.actors.ros2.test_against_ros import PYTHON, ROS
+from tests.actors.ros2.test_gateway import SYSTEM
+
+pytestmark = [pytest.mark.ros, pytest.mark.processes]
+
+PEER = ROOT / "tests/actors/ros2/sdk_peer.py"
+
+
+class Peer:
+    """The other implementation, and what it says."""
+
+    def __init__(self, port):
+        self.lines = []
+        self.process = subprocess.Popen(
+            [PYTHON, PEER, str(port), ROS / "share"], stdin=subprocess.PIPE, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        self.reader.start()
+
+    def _read(self):
+        for line in self.process.stdout:
+            self.lines.append(json.loads(line))
+
+    def said(self, key):
+        return [line[key] for line in self.lines if key in line]
+
+    def ask(self, line):
+        self.process.stdin.write(f"{line}\n")
+        self.process.stdin.flush()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        with self.process:
+            self.process.kill()
+        self.reader.join()
+
+
+MORE = """
+[[node]]
+name = "router"
+actor = "rampart.actors.ros2.router:RosRouter"
+kind = "world"
+parameters = {{ listen = "tcp/127.0.0.1:{port}" }}
+
+[[node]]
+name = "screen"
+actor = "tests.actors.ros2.robot:Screen"
+kind = "non-control"
+
+[[ros2]]
+call = "/base/shut"
+type = "std_srvs/srv/SetBool"
+from = "base/shut"
+to = "base/is_shut"
+
+[[ros2]]
+serve = "/rampart/stop"
+type = "std_srvs/srv/SetBool"
+to = "base/stop"
+answer = {{ success = true, message = "told" }}
+"""
+
+
+def test_topics_and_services_both_ways_and_a_killed_gateway_comes_back(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    port = free_port()
+    text = SYSTEM.replace('''actor = "tests.actors.ros2.robot:Base"
+kind = "world"
+''', '''actor = "tests.actors.ros2.robot:Asker"
+kind = "control"
+''').replace('''actor = "rampart.actors.ros2.gateway:Gateway"
+''', f'''actor = "rampart.actors.ros2.gateway:Gateway"
+parameters = {{ connect = ["tcp/127.0.0.1:{port}"], distribution = "kilted" }}
+''')
+    path = tmp_path / "guarded.toml"
+    path.write_text(text + MORE.format(port=port))
+    with RealRun(tmp_path, path) as run:
+        with Peer(port) as peer:
+            wait_until(lambda: len(peer.said("heard")) > 10, 20)
+            assert set(peer.said("heard")) <= {0.5}
+            wait_until(lambda: True in peer.said("shut"), 10)
+            peer.ask("stop")
+            wait_until(lambda: "told" in peer.said("answer"), 10)
+            wait_until(lambda: "passed on: 20" in run.story, 10)
+            before = run.pid("gateway")
+            run.kill("gateway")
+            wait_until(lambda: run.pid("gateway") not in {None, before}, 10)
+            heard = len(peer.said("heard"))
+            wait_until(lambda: len(peer.said("heard")) > heard + 20, 10)
