@@ -137,7 +137,6 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
         first = next(one.name for one in spec.nodes if one.actor == node.actor)
         given["ros2"] = tuple(
             link for link in spec.ros2 if (link.gateway or first) == node.name)
-        given["base"] = str(Path(file).parent)
     return Member(node.name, actor, read_parameters(
         actor.Parameters, given, file, f"{path}: parameters", spec), kind=node.kind,
         spare=_spare(node, actor, f"{file}: {path}"))

@@ -78,7 +78,6 @@ class Gateway(Actor):
             interfaces: folders with definitions of the robot's own, relative to the system's file.
             clock: "wall", or "ros" where nodes have use_sim_time.
             diagnostics: whether ROS 2 is told what is detected and decided.
-            base: folder of the system's file, given.
             ros2: the tables of the system, given.
         """
 
@@ -91,7 +90,6 @@ class Gateway(Actor):
         interfaces: tuple[str, ...] = ()
         clock: Literal["wall", "ros"] = "wall"
         diagnostics: bool = True
-        base: str = ""
         ros2: RosLinks = ()
 
     parameters: Parameters
@@ -110,6 +108,8 @@ class Gateway(Actor):
         self._graph_due = False
         self._was_linked = False
         self._diagnostics: Diagnostics | None = None
+        self._newest: dict[str, tuple[msgspec.Struct, float] | None] = {
+            link.beside: None for link in said.ros2 if link.beside}
         for link in said.ros2:
             if link.from_:
                 self.hear_topic(link.from_, self._passed_on(link))
@@ -150,7 +150,8 @@ class Gateway(Actor):
     def _check(link: Ros2Link, types: Types, topics: Mapping[str, Topic[Any]]) -> None:
         made: Any = {"subscribe": HeardTopic, "publish": SaidTopic, "call": Called,
                      "serve": Served, "goal": Goal}[link.way]
-        made(_Nobody(types), link, *(topics[key] for key in (link.from_, link.to) if key))
+        made(_Nobody(types), link,
+             *(topics[key] for key in (link.from_, link.to, link.beside) if key))
         if link.way == "serve":
             response_of(link, types)
 
@@ -169,7 +170,8 @@ class Gateway(Actor):
         for link in said.ros2:
             to, heard = (self.chosen_topic(key) if key else None for key in (link.to, link.from_))
             if link.way == "subscribe" and to is not None:
-                HeardTopic(self, link, to)
+                HeardTopic(self, link, to,
+                           self.chosen_topic(link.beside) if link.beside else None)
             elif link.way == "serve" and to is not None:
                 Served(self, link, to)
             elif link.way == "publish" and heard is not None:
@@ -201,8 +203,14 @@ class Gateway(Actor):
         """Return simulated time."""
         return self.clock.now()
 
+    def newest(self, key: str) -> tuple[msgspec.Struct, float] | None:
+        """Return what was said last on a topic of the system, and its stamp."""
+        return self._newest.get(key)
+
     def say(self, topic: Topic[Any], body: msgspec.Struct, stamp_s: float | None) -> None:
         """Publish to the system."""
+        if topic.key in self._newest:
+            self._newest[topic.key] = body, self.clock.now() if stamp_s is None else stamp_s
         self.publish(topic, body, stamp_s)
 
     def refuse(self, where: str, why: str) -> None:
@@ -319,6 +327,9 @@ class _Nobody:
     def refuse(self, where: str, why: str) -> None:
         """Nobody is told."""
 
+    def newest(self, key: str) -> tuple[msgspec.Struct, float] | None:
+        """Return that nothing was said."""
+
     def say(self, topic: Topic[Any], body: msgspec.Struct, stamp_s: float | None) -> None:
         """Nobody hears."""
 
@@ -330,9 +341,8 @@ class _Nobody:
 
 
 def _types(said: Gateway.Parameters) -> Types:
-    folders = tuple(str(Path(said.base, folder)) for folder in said.interfaces)
     try:
-        return types_of(said.distribution, folders)
+        return types_of(said.distribution, said.interfaces)
     except ValueError as error:
         raise ValueError(f"parameters.interfaces: {error}") from None
 

@@ -44,6 +44,9 @@ class Host(Protocol):
     def now_s(self) -> float:
         """Return simulated time."""
 
+    def newest(self, key: str) -> tuple[msgspec.Struct, float] | None:
+        """Return what was said last on a topic of the system, and its stamp."""
+
     def say(self, topic: Topic[Any], body: msgspec.Struct, stamp_s: float | None) -> None:
         """Publish to the system."""
 
@@ -64,13 +67,15 @@ class HeardTopic:
         host: the gateway.
         link: which, and what becomes of it.
         topic: of the system.
+        beside: topic of the system that is read beside; None for none.
     """
 
-    def __init__(self, host: Host, link: Ros2Link, topic: Topic[Any]) -> None:
+    def __init__(self, host: Host, link: Ros2Link, topic: Topic[Any],
+                 beside: Topic[Any] | None = None) -> None:
         types = host.node.types
         self._host, self._link, self._topic = host, link, topic
         self._decode = types.decoder(link.type)
-        self._made = Inward(link, types, topic.type)
+        self._made = Inward(link, types, topic.type, beside.type if beside else None)
         self._period_s = 1 / link.rate_hz * _ROUNDING if link.rate_hz else 0.0
         self._passed_s = -math.inf
         self._who = b""
@@ -92,7 +97,7 @@ class HeardTopic:
                 return
             if now_s - self._passed_s < self._period_s:
                 return
-            body, stamp_ns = self._made(self._decode(payload))
+            body, stamp_ns = self._made(self._decode(payload), self._beside(now_s))
             stamp_s = (None if stamp_ns is None or link.stamp == "arrival"
                        else host.time.at_s(stamp_ns))
         except NotMeantError:
@@ -102,6 +107,21 @@ class HeardTopic:
             return
         self._passed_s = now_s
         host.say(self._topic, body, stamp_s)
+
+    def _beside(self, now_s: float) -> Any:
+        """Return the message that is read beside.
+
+        Raises:
+            ValueError: it has not come, or is too old.
+        """
+        link = self._link
+        if not link.beside:
+            return None
+        newest = self._host.newest(link.beside)
+        if newest is None or now_s - newest[1] > link.max_age_s:
+            raise ValueError(f"no message of {link.beside}, which is read beside, in the last "
+                             f"{link.max_age_s:g} s")
+        return newest[0]
 
     def _is_heard(self, attachment: Attachment, now_s: float) -> bool:
         """Whether a message is of the publisher that is heard, and was not heard already.

@@ -18,6 +18,10 @@ RosType = Annotated[str, msgspec.Meta(
     pattern=r"^[a-z][a-z0-9_]*/(msg|srv|action)/[A-Z][A-Za-z0-9_]*\Z", max_length=200)]
 Written = dict[str, str | float | bool]
 
+GATEWAY = "rampart.actors.ros2.gateway:Gateway"
+INTERFACES = "interfaces"
+"""Its parameter with folders, relative to the file of the system."""
+
 WAYS = {"subscribe": ("to",), "publish": ("from",), "call": ("from", "to"), "serve": ("to",),
          "goal": ("from", "to")}
 """What can be had of ROS 2, each with the keys of the topics of the system that it takes."""
@@ -45,9 +49,11 @@ class Ros2Link(Table, frozen=True, kw_only=True):
             it says numbers, truth values and texts only.
         frame: That messages to ROS 2 are in, and those from there have to be; "" for any.
         child: Frame whose transform is meant, of a message of `tf`.
+        beside: Key of a topic of the system whose newest message may be read too, as
+            `beside.FIELD`, if it is not older than `max_age_s`: of what comes in two topics.
         datum: Latitude and longitude, degrees, of the origin of `map`: for `east` and `north`.
         rate_hz: No more messages pass in a second; None for all.
-        max_age_s: What is older is not said to ROS 2.
+        max_age_s: What is older is not said to ROS 2, nor read beside.
         stop_after_s: When the system has been silent for so long, ROS 2 is told zeros; None for
             never. Its own loss is not told: a driver has to stop by itself when commands cease.
         within_s: How long the answer of a call may take, real seconds.
@@ -71,6 +77,7 @@ class Ros2Link(Table, frozen=True, kw_only=True):
     answer: Written = {}
     frame: str = ""
     child: str = ""
+    beside: str = ""
     datum: tuple[float, float] | None = None
     rate_hz: Positive | None = None
     max_age_s: Positive = 0.5

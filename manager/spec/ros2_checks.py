@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rampart.manager.spec.ros2 import WAYS
+from rampart.manager.spec.ros2 import GATEWAY, WAYS
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Finding, unknown
-
-GATEWAY = "rampart.actors.ros2.gateway:Gateway"
 
 
 def find_wrong_links(spec: SystemSpec) -> Iterator[Finding]:
@@ -37,6 +35,10 @@ def find_wrong_links(spec: SystemSpec) -> Iterator[Finding]:
         for field, of in (("stop_after_s", "publish"), ("answer", "call, serve or goal")):
             if getattr(link, field) and way not in of:
                 yield Finding(f"{path}.{field}", f"is for {of}", (getattr(link, field),))
+        if link.beside and (way != "subscribe" or link.beside not in {
+                one.to for one in spec.ros2 if one.subscribe}):
+            yield Finding(f"{path}.beside", "the `to` of another subscription is right",
+                          (link.beside,))
         if link.gateway and link.gateway not in gateways:
             yield unknown(f"{path}.gateway", link.gateway, "gateway", gateways)
         for what in ((way, link.name), ("to", link.to)):

@@ -18,6 +18,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
 from itertools import chain
+from pathlib import PurePath
 from typing import Any
 
 import msgspec
@@ -30,6 +31,7 @@ from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
 from rampart.manager.spec.mobile_robot import Hazard, derive_timeouts
 from rampart.manager.spec.nodes import COMMAND_FIELDS, NODE_KINDS
 from rampart.manager.spec.panels import MAX_PANELS
+from rampart.manager.spec.ros2 import GATEWAY, INTERFACES
 from rampart.manager.spec.schema import (
     TABLES,
     DetectionSpec,
@@ -124,7 +126,7 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
     except msgspec.ValidationError as error:
         raise _refusal(file, _explain(error, document), document) from None
     spec = replace(spec, timing=derive_timeouts(spec.mobile, spec.timing))
-    spec = _resolve_timing_names(spec, file)
+    spec = _resolve_folders(_resolve_timing_names(spec, file), file)
     wrong = find_nonsense(spec)
     if wrong is None:
         enabled = spec.without_disabled()
@@ -217,6 +219,20 @@ def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
     recoveries = (replace(row, parameters=resolved("recovery", row)) for row in spec.recoveries)
     return replace(spec, nodes=tuple(nodes), detections=tuple(detections),
                    recoveries=tuple(recoveries))
+
+
+def _resolve_folders(spec: SystemSpec, file: str) -> SystemSpec:
+    """Put the folder of the file before those that a gateway to ROS 2 names."""
+
+    def resolved(node: NodeSpec) -> NodeSpec:
+        named = node.parameters.get(INTERFACES)
+        if node.actor != GATEWAY or not isinstance(named, list):
+            return node
+        above = PurePath(file).parent
+        return replace(node, parameters={**node.parameters, INTERFACES: [
+            str(above / one) if isinstance(one, str) else one for one in named]})
+
+    return replace(spec, nodes=tuple(map(resolved, spec.nodes))) if spec.ros2 else spec
 
 
 def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Finding:

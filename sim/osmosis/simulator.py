@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from heapq import heapreplace
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -65,7 +65,7 @@ class Simulator(Actor):
         upper_laser: bool = False
 
     parameters: Parameters
-    outputs = (*_JOBS, ftm_topics.HOLDS)
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (*_JOBS, ftm_topics.HOLDS)
     node_kind = "world"
 
     def __init__(self, context: Context) -> None:

@@ -26,6 +26,7 @@ TF = "tf2_msgs/msg/TFMessage"
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _HEADER = "std_msgs/msg/Header"
 _F32 = "_f32"
+BESIDE = "beside."
 
 BULK = ("uint8", "int8", "byte", "char")
 """A list of these is an image, a point cloud or a map: how long it is is kept, no more."""
@@ -53,12 +54,14 @@ class Inward:
         link: what is heard, and what becomes of it.
         types: of ROS 2.
         made: type of the messages of the system.
+        beside: type of the messages that are read beside; None for none.
 
     Raises:
         ValueError: a field does not exist, or nothing says what it is to be; one line.
     """
 
-    def __init__(self, link: Ros2Link, types: Types, made: type[msgspec.Struct]) -> None:
+    def __init__(self, link: Ros2Link, types: Types, made: type[msgspec.Struct],
+                 beside: type[msgspec.Struct] | None = None) -> None:
         self._link = link
         self._made = made
         self._picks = link.type == TF
@@ -76,12 +79,17 @@ class Inward:
                 raise ValueError(f"fields: {made.__name__} has no field {path!r}"
                                  f"{_near(path, needed)}")
         self._reads: list[tuple[list[str], Read]] = []
+        self._reads_beside: list[tuple[list[str], Read]] = []
         for path, is_needed in needed.items():
             said = link.fields.get(path, ready.get(path, ready.get(path.rpartition(".")[2])))
             if said is None:
                 if is_needed:
                     raise ValueError(f"fields: nothing says what {path} of {made.__name__} is; "
                                      f"{link.type} has {', '.join(fields.names)}")
+                continue
+            if isinstance(said, str) and said.startswith(BESIDE) and beside is not None:
+                self._reads_beside.append((path.split("."), _read_of(
+                    said.removeprefix(BESIDE), beside)))
                 continue
             self._reads.append((path.split("."), self._read(path, said, fields, plane)))
 
@@ -96,8 +104,12 @@ class Inward:
             return lambda message: np.asarray(expression.read(message), "<f4").tobytes()
         return lambda message: _plain(expression.read(message))
 
-    def __call__(self, message: Any) -> tuple[msgspec.Struct, int | None]:
+    def __call__(self, message: Any, beside: Any = None) -> tuple[msgspec.Struct, int | None]:
         """Return the message of the system, and the stamp of the other's header, nanoseconds.
+
+        Args:
+            message: of ROS 2.
+            beside: message of the system that is read beside.
 
         Raises:
             NotMeantError: it is none of the link's business.
@@ -114,11 +126,12 @@ class Inward:
                 raise ValueError(f"its frame is {header.frame_id[:60]!r}; "
                                  f"{self._link.frame!r} is right")
         found: dict[str, Any] = {}
-        for path, read in self._reads:
-            inner = found
-            for step in path[:-1]:
-                inner = inner.setdefault(step, {})
-            inner[path[-1]] = read(message)
+        for source, reads in ((message, self._reads), (beside, self._reads_beside)):
+            for path, read in reads:
+                inner = found
+                for step in path[:-1]:
+                    inner = inner.setdefault(step, {})
+                inner[path[-1]] = read(source)
         try:
             return msgspec.convert(found, self._made), stamp_ns
         except msgspec.ValidationError as error:
@@ -130,6 +143,17 @@ class Inward:
                     and transform.child_frame_id.lstrip("/") == self._link.child):
                 return transform
         raise NotMeantError
+
+
+def _read_of(said: str, beside: type[msgspec.Struct]) -> Read:
+    """Return what reads an expression of a message of the system."""
+    expression = Expression(said)
+    known = [path for path, _ in _leaves(beside)]
+    for path in expression.paths:
+        if path not in known:
+            raise ValueError(f"fields: {BESIDE}{said}: {beside.__name__} has no field {path!r}"
+                             f"{_near(path, known)}")
+    return expression.read
 
 
 class Outward:

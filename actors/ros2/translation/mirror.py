@@ -16,7 +16,7 @@ from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ros2.translation.expressions import Expression, Plane
 from rampart.actors.ros2.translation.forms import ON_PLANE, READY, kind_of
-from rampart.actors.ros2.translation.mapping import BULK, LEN, TF, TypeFields
+from rampart.actors.ros2.translation.mapping import BESIDE, BULK, LEN, TF, TypeFields
 from rampart.actors.ros2.translation.types import Types
 from rampart.manager.spec.ros2 import Ros2Link
 
@@ -53,24 +53,33 @@ def message_of(link: Ros2Link, types: Types) -> type[msgspec.Struct]:
             raise ValueError(f"fields: {name!r}: a name such as speed_mps is right")
     kinds = {name: kind_of(name) for name in ready} | kinds
     return msgspec.defstruct(
-        link.type.rpartition("/")[2], [(name, _BOUNDED[kind]) for name, kind in kinds.items()],
+        link.type.rpartition("/")[2], [
+            (name, _BOUNDED.get(kind, kind)) for name, kind in kinds.items()],
         bases=(Message,), frozen=True)
 
 
-def _kind_of(said: str | float | bool, fields: TypeFields, plane: Plane | None) -> type:
+def _kind_of(said: str | float | bool, fields: TypeFields, plane: Plane | None) -> Any:
     """Return of which type an expression is."""
     if not isinstance(said, str):
         return type(said)
+    if said.startswith(BESIDE):
+        return float
     expression = Expression(said, plane)
     if not expression.paths:
         return str
     if said.strip() != expression.paths[0]:
         return int if said.strip().startswith("count(") else float
     kind = fields.kind(said.strip(), said)
-    found = _base(kind)
+    found = _base(kind.removesuffix("[]"))
     if found is None:
         raise ValueError(f"fields: {said!r} is a {kind}; one of its fields is right")
-    return found
+    return _listed(found) if kind.endswith("[]") else found
+
+
+def _listed(item: Any) -> Any:
+    """Return the type of a bounded list."""
+    items: Any = tuple[item, ...]
+    return Annotated[items, Meta(max_length=MOST)]
 
 
 def _base(kind: str) -> type | None:
@@ -98,5 +107,4 @@ def _type_of(what: Any, types: Types) -> Any:
     if kind == Nodetype.BASE:
         return _BOUNDED[_base(detail[0])]
     inner, _ = detail
-    items: Any = tuple[_type_of(inner, types), ...]  # type: ignore[misc]
-    return Annotated[items, Meta(max_length=MOST)]
+    return _listed(_type_of(inner, types))
