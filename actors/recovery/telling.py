@@ -1,4 +1,4 @@
-"""`Hold`, `SwitchMode` and `Call`: recoveries that consist of telling a node something.
+"""`Hold`, `SwitchMode`, `Call`, `CallEach`: recoveries that consist of telling a node something.
 
 The message is data of the specification, checked against the topic's type before anything runs.
 """
@@ -16,6 +16,7 @@ from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import (
     FieldName,
     MessageOf,
+    MessagesOf,
     OptionalFieldName,
     TopicPublished,
 )
@@ -200,3 +201,76 @@ class Call(_Telling):
     def _answered(self, value: Any, header: Header) -> None:
         if self.unanswered and header.stamp >= self.ordered_s and value == self.parameters.equals:
             self.succeed(f"{self.parameters.answer} is {value}")
+
+
+class CallEach(RecoveryModule):
+    """Gives several commands, each when the one before was answered, and is done with the last.
+
+    As a node of ROS 2 with a life cycle is restarted: deactivate, clean up, configure, activate.
+    States: acting until the last answer, then done. An answer that refuses is a failure, unless the
+    command was one `that_may_fail`.
+    """
+
+    class Parameters(RecoveryModule.Parameters, frozen=True, kw_only=True):
+        """Which commands, and which answers.
+
+        Attributes:
+            topic: key of the topic of the commands.
+            messages: their fields, in order.
+            that_may_fail: places of those, from 0, after which it goes on whatever the answer is.
+            answer: where the answer shows, as "topic:field".
+            equals: value of that field when a command has been carried out.
+        """
+
+        topic: TopicPublished
+        messages: MessagesOf
+        that_may_fail: tuple[Annotated[int, msgspec.Meta(ge=0)], ...] = ()
+        answer: FieldName
+        equals: Annotated[Value, msgspec.Meta()]
+
+    parameters: Parameters
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self._topic = self.chosen_topic(self.parameters.topic)
+        self._at = -1
+        self._given_s = 0.0
+        self.hear_field(self.parameters.answer, self._answered)
+
+    def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
+        """Begin, once for each order."""
+        if renewed:
+            self.resume(command.reason)
+        if renewed or self._at < 0:
+            self._at = -1
+            self._next()
+
+    def let_go(self) -> None:
+        """Nothing is to be taken back."""
+        self._at = -1
+
+    def unfinished(self) -> str:
+        """Name the command that was not answered."""
+        count = len(self.parameters.messages)
+        return f"number {self._at + 1} of {count} on {self.parameters.topic} was not answered"
+
+    def _next(self) -> None:
+        self._at += 1
+        if self._at == len(self.parameters.messages):
+            self.succeed(f"{self._at} commands on {self.parameters.topic} were carried out")
+            return
+        self._given_s = self.clock.now()
+        made: msgspec.Struct = msgspec.convert(
+            self.parameters.messages[self._at], self._topic.type)
+        self.publish(self._topic, made, name=self._topic.member(self.parameters.topic) or None)
+
+    def _answered(self, value: Any, header: Header) -> None:
+        said = self.parameters
+        is_acting = self.activated and self.report.phase.value == "acting"
+        if not is_acting or header.stamp < self._given_s:
+            return
+        if value == said.equals or self._at in said.that_may_fail:
+            self._next()
+        else:
+            self.fail(f"number {self._at + 1} of {len(said.messages)} on {said.topic}: "
+                      f"{said.answer} is {value}")

@@ -53,6 +53,9 @@ RosLinks = Annotated[tuple[Ros2Link, ...], msgspec.Meta(extra={"ros2": True})]
 
 MessageOf = Annotated[dict[str, Any], msgspec.Meta(extra={"message_of": "topic"})]
 """Fields of a message on the topic that the parameter `topic` names."""
+MessagesOf = Annotated[tuple[dict[str, Any], ...], msgspec.Meta(
+    min_length=1, max_length=100, extra={"message_of": "topic"})]
+"""The same of several."""
 
 ControlTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "control_period_s"})]
 """How long, s, to wait for what comes as often as commands, poses and scans."""
@@ -151,9 +154,15 @@ class Said(NamedTuple):
 
 def messages_said(parameters: msgspec.Struct) -> dict[str, Said]:
     """Return the messages that a node's parameters say, by the name of the parameter."""
-    return {name: Said(getattr(parameters, marks["message_of"]), fields)
-            for name, marks in _marks(type(parameters)).items()
-            if "message_of" in marks and (fields := getattr(parameters, name)) is not None}
+    found: dict[str, Said] = {}
+    for name, marks in _marks(type(parameters)).items():
+        said = getattr(parameters, name)
+        if "message_of" in marks and said is not None:
+            topic = getattr(parameters, marks["message_of"])
+            each = {name: said} if isinstance(said, dict) else {
+                f"{name}[{place}]": one for place, one in enumerate(said)}
+            found |= {where: Said(topic, fields) for where, fields in each.items()}
+    return found
 
 
 def _explain(kind: type[msgspec.Struct], given: Mapping[str, Any], error: str) -> tuple[str, str]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosbags.interfaces import Nodetype
+from rosbags.serde.errors import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -40,6 +41,10 @@ _LITTLE, _BIG = b"\0\1", b"\0\0"
 _HEADER_BYTES = 4
 _PADDING_BYTES = 3
 _UNHASHED = ("humble",)
+
+_UNREADABLE = (SerdeError, struct.error, ValueError, TypeError, AttributeError, IndexError,
+               AssertionError, OverflowError, MemoryError)
+"""What `rosbags` raises when bytes are no message, or values do not fit; found by fuzzing."""
 
 _EMPTY = [("structure_needs_at_least_one_member", (Nodetype.BASE, ("uint8", 0)))]
 _PARTS = {"srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Feedback")}
@@ -154,8 +159,7 @@ class Types:
         """
         try:
             return bytes(self._store.serialize_cdr(message, name, little_endian=True))
-        except (struct.error, TypeError, ValueError, AttributeError, AssertionError,
-                OverflowError, UnicodeError) as error:
+        except _UNREADABLE as error:
             raise ValueError(f"{name}: {_line(error)}") from None
 
     def decode(self, name: str, data: bytes) -> Any:
@@ -189,8 +193,7 @@ class Types:
                 raise ValueError(f"{name}: {len(data)} bytes; at most {MOST_BYTES} are right")
             try:
                 message, end = way(memoryview(data)[_HEADER_BYTES:], 0, kind, store)
-            except (struct.error, ValueError, IndexError, AssertionError, MemoryError,
-                    OverflowError, UnicodeError, TypeError) as error:
+            except _UNREADABLE as error:
                 raise ValueError(f"{name}: {len(data)} bytes are no such message: "
                                  f"{_line(error)}") from None
             left = len(data) - _HEADER_BYTES - end

@@ -1,4 +1,4 @@
-"""Recovery modules that a specification alone makes: `Hold`, `SwitchMode`, `Call`."""
+"""Recovery modules that a specification alone makes: `Hold`, `SwitchMode`, `Call`, `CallEach`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout
-from rampart.actors.recovery.telling import Call, Hold, SwitchMode
+from rampart.actors.recovery.telling import Call, CallEach, Hold, SwitchMode
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor, Header, on
 from rampart.actors.runtime.parameters import read_parameters
@@ -160,6 +160,42 @@ def test_a_call_is_repeated_until_it_is_answered_and_then_never_again():
         assert (len(case.orders), case.phase) == (4, "acting")
 
     play(Call, script, **SHUT, **ANSWER)
+
+
+STEPS = {"topic": "tank/order", "messages": [{"shut": True}, {"shut": False}, {"shut": True}],
+         **ANSWER}
+
+
+def test_each_call_waits_for_the_answer_of_the_one_before():
+    async def script(system: VirtualSystem, case: Case) -> None:
+        case.command(1)
+        await system.settle()
+        for count in (1, 2, 3):
+            assert (len(case.orders), case.phase) == (count, "acting")
+            await asyncio.sleep(0.1)
+            system.say(VALVE, Valve(True))
+            await system.settle()
+        assert [order.shut for order in case.orders] == [True, False, True]
+        assert case.phase == "done"
+
+    play(CallEach, script, **STEPS)
+
+
+def test_a_refused_call_is_a_failure_unless_it_may_be_refused():
+    async def script(system: VirtualSystem, case: Case) -> None:
+        case.command(1)
+        await asyncio.sleep(0.1)
+        system.say(VALVE, Valve(False))  # the first may fail
+        await system.settle()
+        assert (len(case.orders), case.phase) == (2, "acting")
+        await asyncio.sleep(0.1)
+        system.say(VALVE, Valve(False))
+        await system.settle()
+        assert case.phase == "failed"
+        assert "number 2 of 3 on tank/order: tank/valve:shut is False" in (
+            case.reports[-1].message.reason)
+
+    play(CallEach, script, **STEPS, that_may_fail=[0])
 
 
 def test_a_call_that_is_not_answered_fails_and_names_the_answer():

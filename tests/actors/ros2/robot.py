@@ -13,6 +13,7 @@ from rampart.actors.runtime.actor import Actor, every
 from rampart.actors.runtime.parameters import TopicHeard, TopicPublished
 from rampart.files.streams import complain
 
+GOAL, GOAL_TYPE = "/navigate_to_pose", "nav2_msgs/action/NavigateToPose"
 ODOM_TYPE, TWIST_TYPE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist"
 
 
@@ -42,6 +43,7 @@ class Base(StandIn):
     """Drives as it is told, and says where it is."""
 
     node_name = "base"
+    offset_ns = 0
     namespace = "/robot"
 
     def declare(self) -> None:
@@ -51,6 +53,8 @@ class Base(StandIn):
         self.say_odometry = self.publisher("/odom", ODOM_TYPE)
         self.subscribe("/cmd_vel", TWIST_TYPE, self.command)
         self.serve("/base/shut", "std_srvs/srv/SetBool", self.set)
+        self.serve(f"{GOAL}/_action/send_goal", f"{GOAL_TYPE}_SendGoal", self.take_goal)
+        self.serve(f"{GOAL}/_action/get_result", f"{GOAL_TYPE}_GetResult", self.end_goal)
 
     def command(self, message) -> None:
         """Go as fast."""
@@ -63,6 +67,16 @@ class Base(StandIn):
         response.success = bool(request.data)
         response.message = "shut" if request.data else "it has to be open"
 
+    def take_goal(self, request, response) -> None:
+        """Take a goal that is ahead."""
+        self.goals.append(bytes(request.goal_id.uuid))
+        response.accepted = request.goal.pose.pose.position.x > 0
+
+    def end_goal(self, request, response) -> None:
+        """Say that it is reached."""
+        assert bytes(request.goal_id.uuid) == self.goals[-1]
+        response.status = 4
+
     @every(0.05)
     def step(self) -> None:
         """Drive on."""
@@ -72,6 +86,10 @@ class Base(StandIn):
         message.pose.pose.position.x = self.x_m
         message.twist.twist.linear.x = self.speed_mps
         self.say_odometry(message)
+
+    def wall_ns(self) -> int:
+        """Return what time it is, or what it lies."""
+        return super().wall_ns() + self.offset_ns
 
 
 

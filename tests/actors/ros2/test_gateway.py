@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import asyncio
 
+import msgspec
 import pytest
 
 from rampart.actors.bus.topics import DIAGNOSTIC
+from rampart.actors.layout.layout import Layout
 from rampart.actors.ros2.messages import GRAPH
-from rampart.testing import VirtualSystem, run
+from rampart.actors.ros2.wire import Qos
+from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.testing import Ear, VirtualSystem, run
 
 SYSTEM = """
 name = "guarded"
@@ -52,11 +56,19 @@ kind = "masking"
 name = "M_CRASH"
 detect = "D_CRASH"
 recover = "R_RESTART"
-event = "crash"
+event = "stands"
 against = { within_s = 5.0, hazard = "the robot stands" }
 
 [[event]]
+name = "stands"
+gate = "or"
+of = ["crash", "missing"]
+
+[[event]]
 name = "crash"
+
+[[event]]
+name = "missing"
 
 [orders.safer]
 
@@ -154,3 +166,295 @@ def test_a_second_publisher_is_refused_and_told(guarded):
             assert "two publishers, /robot/base and /robot/base" in told[0].message.reason
 
     run(scenario)
+
+
+def asked(system, gateway, key, **fields):
+    topic = gateway.chosen_topic(key)
+    system.say(topic, msgspec.convert(fields, topic.type), source="driver")
+
+
+CALL = """
+[[node]]
+name = "asker"
+actor = "tests.actors.ros2.robot:Asker"
+kind = "control"
+parameters = { topic = "base/shut" }
+
+[[ros2]]
+call = "/base/shut"
+type = "std_srvs/srv/SetBool"
+from = "base/shut"
+to = "base/is_shut"
+within_s = 0.5
+"""
+
+
+def test_a_service_is_called_and_its_answer_or_that_there_is_none_is_told(guarded):
+    async def scenario():
+        async with VirtualSystem.load(guarded(CALL)) as system:
+            base = system.start_node("base")
+            gateway = system.start_node("gateway")
+            answers = system.hear(gateway.chosen_topic("base/is_shut"))
+            await asyncio.sleep(0.1)
+            asked(system, gateway, "base/shut", data=True)
+            asked(system, gateway, "base/shut", data=True)  # while the first is under way
+            await asyncio.sleep(0.2)
+            asked(system, gateway, "base/shut", data=False)
+            await asyncio.sleep(0.2)
+            assert [(heard.message.done, heard.message.success, heard.message.message)
+                    for heard in answers] == [
+                        (True, True, "shut"), (True, False, "it has to be open")]
+            assert base.shut == 2
+            await system.kill("base")
+            asked(system, gateway, "base/shut", data=True)
+            await asyncio.sleep(0.6)
+            last = answers[-1].message
+            assert (last.done, last.success, last.why) == (False, None, "nobody answers")
+
+    run(scenario)
+
+
+GOAL = """
+[[node]]
+name = "asker"
+actor = "tests.actors.ros2.robot:Asker"
+kind = "control"
+parameters = { topic = "nav/goal" }
+
+[[ros2]]
+goal = "/navigate_to_pose"
+type = "nav2_msgs/action/NavigateToPose"
+from = "nav/goal"
+to = "nav/state"
+frame = "map"
+fields = { "pose.header.frame_id" = "'map'", "pose.pose.position.x" = "pose.pose.position.x" }
+"""
+
+
+def test_an_action_is_given_a_goal_and_says_how_it_goes(guarded):
+    async def scenario():
+        async with VirtualSystem.load(guarded(GOAL)) as system:
+            base = system.start_node("base")
+            gateway = system.start_node("gateway")
+            states = system.hear(gateway.chosen_topic("nav/state"))
+            await asyncio.sleep(0.1)
+            topic = gateway.chosen_topic("nav/goal")
+            goal = blank(topic.type)
+            for x in (2.0, -2.0):
+                goal["pose"]["pose"]["position"]["x"] = x
+                asked(system, gateway, "nav/goal", **goal)
+                await asyncio.sleep(0.3)
+            await system.kill("base")
+            asked(system, gateway, "nav/goal", **goal)
+            await asyncio.sleep(1.5)
+            assert [(heard.message.number, heard.message.phase) for heard in states] == [
+                (1, "sent"), (1, "accepted"), (1, "succeeded"), (2, "sent"), (2, "rejected"),
+                (3, "sent"), (3, "unanswered")]
+            assert len(set(base.goals)) == 2
+
+    run(scenario)
+
+
+def blank(made):
+    """Return a message with zeros, as a dictionary."""
+    return {f.name: blank(f.type) if issubclass(f.type, msgspec.Struct) else f.type()
+            for f in msgspec.structs.fields(made)
+            for f in [f] if isinstance(f.type, type)} | {
+                f.name: "" for f in msgspec.structs.fields(made) if not isinstance(f.type, type)
+                and "str" in str(f.type)} | {
+                f.name: 0 for f in msgspec.structs.fields(made) if not isinstance(f.type, type)
+                and "int" in str(f.type)}
+
+
+SERVE = """
+[[ros2]]
+serve = "/rampart/stop"
+type = "std_srvs/srv/SetBool"
+to = "base/stop"
+answer = { success = true, message = "told" }
+"""
+
+
+def test_a_service_is_offered(guarded):
+    async def scenario():
+        async with VirtualSystem.load(guarded(SERVE)) as system:
+            gateway = system.start_node("gateway")
+            base = system.start_node("base")
+            stops = system.hear(gateway.chosen_topic("base/stop"))
+            await asyncio.sleep(0.1)
+            client = base.ros.client("/rampart/stop", "std_srvs/srv/SetBool")
+            request = base.types.blank("std_srvs/srv/SetBool_Request")
+            request.data, answers = True, []
+            client.ask(base.types.encode("std_srvs/srv/SetBool_Request", request), 1.0,
+                       lambda answer, why: answers.append(answer))
+            client.ask(b"nonsense", 0.2, lambda answer, why: answers.append(why))
+            await asyncio.sleep(0.5)
+            assert [heard.message.data for heard in stops] == [True]
+            response = base.types.decode("std_srvs/srv/SetBool_Response", answers[0])
+            assert (response.success, response.message) == (True, "told")
+            assert answers[1] == "nobody answers"
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(("offset_s", "words"), [
+    (30.0, "its stamp is 30 s ahead of the wall clock"), (-7200.0, "is hours behind"),
+    (-1.7e9, "of simulated time? then the gateway needs clock = 'ros'")])
+def test_a_stamp_that_cannot_be_true_is_refused_and_told(guarded, offset_s, words):
+    async def scenario():
+        async with VirtualSystem.load(guarded()) as system:
+            gateway = system.start_node("gateway")
+            odometry = system.hear(gateway.chosen_topic("base/odometry"))
+            told = system.hear(DIAGNOSTIC, "gateway")
+            base = system.start_node("base")
+            base.offset_ns = int(offset_s * 1e9)
+            await asyncio.sleep(1.0)
+            assert odometry == []
+            assert words in told[0].message.reason
+            assert told[0].message.offender == "/odom"
+            base.offset_ns = -400_000_000
+            await asyncio.sleep(0.5)
+            last = odometry[-1]
+            assert last.header.stamp == pytest.approx(system.clock.now() - 0.4, abs=0.06)
+
+    run(scenario)
+
+
+def test_bytes_that_are_no_message_and_one_without_attachment_are_refused_and_told(guarded):
+    async def scenario():
+        async with VirtualSystem.load(guarded()) as system:
+            gateway = system.start_node("gateway")
+            odometry = system.hear(gateway.chosen_topic("base/odometry"))
+            told = system.hear(DIAGNOSTIC, "gateway")
+            base = system.start_node("base")
+            await asyncio.sleep(1.2)
+            heard = len(odometry)
+            await system.kill("base")
+            key = next(one.key for one in gateway.graph.of("MS") if one.topic == "/odom")
+            put = gateway._side.publisher(key, Qos())
+            put(b"\0\1\0\0nonsense", None)
+            await asyncio.sleep(1.1)
+            del base
+            reasons = [one.message.reason for one in told]
+            assert any("no attachment" in reason for reason in reasons), reasons
+            assert len(odometry) == pytest.approx(heard, abs=1)
+
+    run(scenario)
+
+
+CLOCK = SYSTEM.replace('actor = "rampart.actors.ros2.gateway:Gateway"\n',
+                       'actor = "rampart.actors.ros2.gateway:Gateway"\n'
+                       'parameters = { clock = "ros" }\n')
+
+
+def test_with_a_clock_of_ros_2_its_stamps_are_simulated_time(guarded):
+    async def scenario():
+        async with VirtualSystem.load(guarded(base=CLOCK)) as system:
+            gateway = system.start_node("gateway")
+            odometry = system.hear(gateway.chosen_topic("base/odometry"))
+            told = system.hear(DIAGNOSTIC, "gateway")
+            base = system.start_node("base")
+            system.start_node("driver")
+            await asyncio.sleep(1.0)
+            assert odometry == []
+            assert base.heard == []
+            assert "no message has come on /clock" in told[0].message.reason
+            tick = base.publisher("/clock", "rosgraph_msgs/msg/Clock", Qos(reliable=False))
+            message = base.types.blank("rosgraph_msgs/msg/Clock")
+            base.offset_ns = 100 * 10**9 - base.wall_ns()
+            for _ in range(20):
+                now_ns = base.wall_ns()
+                message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
+                tick(message)
+                await asyncio.sleep(0.05)
+            assert len(odometry) > 15
+            assert odometry[-1].header.stamp == pytest.approx(system.clock.now(), abs=0.15)
+            assert base.heard[-1] == 0.5
+
+    run(scenario)
+
+
+def test_who_publishes_past_the_gateway_is_counted_and_named(guarded):
+    async def scenario():
+        async with VirtualSystem.load(guarded(WATCH)) as system:
+            ear = system.start("ear", Ear)
+            system.start_node("gateway")
+            base = system.start_node("base")
+            system.start_node("D_ROS")
+            graph = system.hear(GRAPH, "gateway")
+            await asyncio.sleep(1.5)
+            assert ear.states[-1] == "idle"
+            base.publisher("/cmd_vel", "geometry_msgs/msg/Twist")
+            await asyncio.sleep(0.5)
+            assert graph[-1].message.bypassed == 1
+            assert graph[-1].message.problems[0] == (
+                "/cmd_vel: /robot/base publishes besides /rampart")
+            assert ear.states[-1] == "active"
+
+    run(scenario)
+
+
+WATCH = """
+[[detection]]
+name = "D_ROS"
+title = "A node of ROS 2 is missing, or the gateway is bypassed"
+actor = "rampart.actors.ros2.ros_nodes:RosNodes"
+within_s = 0.5
+parameters = { gateway = "gateway", nodes = ["/robot/base"], alone = true, suspects = ["base"] }
+
+[[mechanism]]
+name = "M_ROS"
+detect = "D_ROS"
+recover = "R_RESTART"
+event = "missing"
+against = { within_s = 5.0, hazard = "the robot stands" }
+"""
+
+
+def test_a_node_of_ros_2_whose_token_goes_is_detected_and_named(guarded):
+    async def scenario():
+        async with VirtualSystem.load(guarded(WATCH)) as system:
+            ear = system.start("ear", Ear)
+            system.start_node("gateway")
+            system.start_node("base")
+            module = system.start_node("D_ROS")
+            await asyncio.sleep(1.5)
+            assert ear.states[-1] == "idle"
+            await system.kill("base")
+            await asyncio.sleep(0.2)
+            assert ear.states[-1] == "active"
+            report = module._report
+            assert report.reason == "/robot/base: not in the graph of ROS 2"
+            assert report.nodes == ("base",)
+            system.start_node("base")
+            await asyncio.sleep(1.0)
+            assert ear.states[-1] == "idle"
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(("more", "why"), [
+    ('subscribe = "/a"\ntype = "std_msgs/msg/Bool"', "to = 'key' of a topic of the system"),
+    ('type = "std_msgs/msg/Bool"\nto = "a"', "one of subscribe, publish, call, serve, goal"),
+    ('subscribe = "/a"\npublish = "/b"\ntype = "std_msgs/msg/Bool"\nto = "a"',
+     "it has subscribe and publish"),
+    ('subscribe = "a"\ntype = "std_msgs/msg/Bool"\nto = "a"', "ros2[2].subscribe"),
+    ('subscribe = "/a"\ntype = "std_msgs/Bool"\nto = "a"', "ros2[2].type"),
+    ('call = "/a"\ntype = "std_msgs/msg/Bool"\nfrom = "a"\nto = "b"', "package/srv/Name"),
+    ('subscribe = "/odom"\ntype = "std_msgs/msg/Bool"\nto = "a"', "is in ros2[0] already"),
+    ('subscribe = "/a"\ntype = "std_msgs/msg/Bool"\nto = "a"\ngateway = "x"',
+     "unknown gateway; known: gateway"),
+    ('subscribe = "/a"\ntype = "std_msgs/msg/Boole"\nto = "a"',
+     "gateway: ros2 /a: type 'std_msgs/msg/Boole' is not known to jazzy"),
+    ('publish = "/a"\ntype = "std_msgs/msg/Bool"\nfrom = "a"', "no actor has a topic 'a'"),
+    ('publish = "/a"\ntype = "std_msgs/msg/Bool"\nfrom = "base/wanted"',
+     "ros2 /a: fields: nothing says what std_msgs/msg/Bool is to be"),
+    ('serve = "/a"\ntype = "std_srvs/srv/Trigger"\nto = "a"\nanswer = { sucess = true }',
+     "has no field 'sucess'"),
+    ('subscribe = "/a"\ntype = "std_msgs/msg/Bool"\nto = "a"\nbeside = "b"', "ros2[2].beside"),
+])
+def test_a_table_that_cannot_be_is_refused_before_anything_runs(guarded, more, why):
+    plan = RunPlan(system_file=str(guarded(f"[[ros2]]\n{more}\n")))
+    with pytest.raises(ValueError, match=r"guarded\.toml: [^\n]+\Z") as raised:
+        Layout(plan, load_system(plan))
+    assert why in str(raised.value)

@@ -1,0 +1,263 @@
+"""Messages of ROS 2 and of the system, each made of the other; definitions; what is refused."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import random
+
+import msgspec
+import numpy as np
+import pytest
+
+from rampart.actors.bus.bounds import Floats32
+from rampart.actors.bus.messages import Message
+from rampart.actors.ros2.translation.forms import READY, WRITTEN
+from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward
+from rampart.actors.ros2.translation.mirror import message_of, topic_of
+from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
+from rampart.manager.spec.ros2 import Ros2Link
+
+JAZZY = Types("jazzy")
+ODOMETRY, SCAN = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan"
+TWIST, JOY = "geometry_msgs/msg/Twist", "sensor_msgs/msg/Joy"
+TF = "tf2_msgs/msg/TFMessage"
+
+
+class Pose(Message, frozen=True):
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+
+class Twist(Message, frozen=True):
+    linear_mps: float
+    angular_radps: float
+
+
+class Odometry(Message, frozen=True):
+    pose: Pose
+    twist: Twist
+
+
+class Sweep(Message, frozen=True):
+    ranges_f32: Floats32
+    range_max_m: float
+    who: str = "laser"
+
+
+def heard(kind, made, **said):
+    return Inward(Ros2Link(type=kind, subscribe="/x", to="x", **said), JAZZY, made)
+
+
+def said(kind, made, **more):
+    return Outward(Ros2Link(type=kind, publish="/x", from_="x", **more), JAZZY, made)
+
+
+def odometry(yaw_rad=0.5):
+    message = JAZZY.blank(ODOMETRY)
+    message.header.stamp.sec, message.header.stamp.nanosec = 12, 5
+    message.header.frame_id = "odom"
+    message.pose.pose.position.x, message.pose.pose.position.y = 1.0, 2.0
+    message.pose.pose.orientation.z = math.sin(yaw_rad / 2)
+    message.pose.pose.orientation.w = math.cos(yaw_rad / 2)
+    message.twist.twist.linear.x, message.twist.twist.angular.z = 0.3, -0.1
+    return message
+
+
+def test_a_ready_form_fills_a_robot_s_own_message_by_the_names_of_its_fields():
+    made, stamp_ns = heard(ODOMETRY, Odometry)(odometry())
+    assert made == Odometry(Pose(1.0, 2.0, pytest.approx(0.5)), Twist(0.3, -0.1))
+    assert stamp_ns == 12_000_000_005
+
+
+def test_it_comes_back_as_it_went():
+    first = Odometry(Pose(1.0, -2.0, -3.0), Twist(0.3, 0.2))
+    there = said(ODOMETRY, Odometry, frame="odom", child="base_link")(first, 7_000_000_001)
+    message = JAZZY.decode(ODOMETRY, there)
+    assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
+    back, stamp_ns = heard(ODOMETRY, Odometry, frame="odom")(message)
+    assert stamp_ns == 7_000_000_001
+    assert back.pose.yaw_rad == pytest.approx(-3.0)
+    assert msgspec.structs.replace(back, pose=first.pose) == first
+
+
+def test_a_sweep_is_bytes_on_one_side_and_a_list_on_the_other():
+    there = JAZZY.decode(SCAN, said(SCAN, Sweep)(
+        Sweep(np.array([1, 2.5, math.inf], "<f4").tobytes(), 8.0), 0))
+    assert there.ranges.tolist() == [1.0, 2.5, math.inf]
+    back, _ = heard(SCAN, Sweep)(there)
+    assert np.frombuffer(back.ranges_f32, "<f4").tolist() == [1.0, 2.5, math.inf]
+    assert back.who == "laser"
+
+
+def test_what_is_said_in_the_table_comes_before_the_form():
+    made, _ = heard(ODOMETRY, Pose, fields={"x_m": "pose.pose.position.y * -0.001", "y_m": 4.0}
+                    )(odometry())
+    assert made == Pose(-0.002, 4.0, pytest.approx(0.5))
+
+
+def test_beside_it_a_message_of_the_system_is_read():
+    link = Ros2Link(type=ODOMETRY, subscribe="/x", to="x", beside="y",
+                    fields={"x_m": "beside.linear_mps * 2", "y_m": "beside.angular_radps"})
+    made, _ = Inward(link, JAZZY, Pose, Twist)(odometry(), Twist(0.25, 0.5))
+    assert made == Pose(0.5, 0.5, pytest.approx(0.5))
+
+
+def test_of_transforms_the_one_that_is_meant():
+    there = JAZZY.decode(TF, said(TF, Pose, frame="map", child="odom")(Pose(1.0, 2.0, 0.3), 5))
+    assert len(there.transforms) == 1
+    made, stamp_ns = heard(TF, Pose, frame="map", child="odom")(there)
+    assert (made, stamp_ns) == (Pose(1.0, 2.0, pytest.approx(0.3)), 5)
+    with pytest.raises(NotMeantError):
+        heard(TF, Pose, frame="map", child="base_link")(there)
+
+
+@pytest.mark.parametrize("kind", sorted(READY))
+def test_every_ready_form_can_be_heard_as_it_is_and_what_can_be_written_comes_back(kind):
+    frames = {"frame": "map", "child": "odom"} if kind == TF else {}
+    link = Ros2Link(type=kind, subscribe="/x", to="x", **frames)
+    made = message_of(link, JAZZY)
+    assert set(made.__struct_fields__) == set(READY[kind])
+    first = msgspec.convert({name: {float: 0.5, bytes: b"\0\0\0\x3f", bool: True, int: 1}[
+        kind_of(made, name)] for name in made.__struct_fields__}, made)
+    if kind == JOY:  # an item is not written into an empty list
+        return
+    back, _ = Inward(link, JAZZY, made)(JAZZY.decode(kind, said(kind, made, **frames)(first, 0)))
+    for name in WRITTEN[kind]:
+        assert getattr(back, name) == pytest.approx(getattr(first, name)), name
+
+
+def kind_of(made, name):
+    field = next(f for f in msgspec.structs.fields(made) if f.name == name)
+    return getattr(field.type, "__origin__", field.type)
+
+
+@pytest.mark.parametrize("kind", sorted(name for name in JAZZY.known if JAZZY.is_message(name)
+                                        and "/msg/" in name))
+def test_every_type_there_is_can_be_heard_field_by_field(kind):
+    link = Ros2Link(type=kind, subscribe="/x", to="x", frame="a" * (kind == TF),
+                    child="a" * (kind == TF))
+    topic = topic_of(link, JAZZY)
+    if kind not in {TF, JOY}:  # of which it reads items of lists
+        made, _ = Inward(link, JAZZY, topic.type)(JAZZY.blank(kind))
+        assert msgspec.convert(msgspec.to_builtins(made), topic.type) is not None
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_no_number_moves_no_wheel(value):
+    with pytest.raises(ValueError, match="is no number"):
+        said(TWIST, Twist)(Twist(value, 0.0), 0)
+
+
+WRONG = [
+    (lambda: heard(ODOMETRY, Sweep), "nothing says what ranges_f32 of Sweep is"),
+    (lambda: heard(ODOMETRY, Pose, fields={"x": "child_frame_id"}), "Pose has no field 'x'"),
+    (lambda: heard(ODOMETRY, Pose, fields={"x_m": "pose.position.x"}),
+     "geometry_msgs/msg/PoseWithCovariance has no field 'position'; known: pose"),
+    (lambda: heard(ODOMETRY, Pose, fields={"x_m": "pose.x.y"}), "no field 'x'"),
+    (lambda: heard(ODOMETRY, Pose, fields={"x_m": "child_frame_id[0]"}), "of what is no list"),
+    (lambda: heard("nav_msgs/msg/Odometri", Pose), "'nav_msgs/msg/Odometri' is not known to jazzy"),
+    (lambda: heard(TF, Pose), "which transform is meant"),
+    (lambda: said(TF, Pose), "which transform is said"),
+    (lambda: said(TWIST, Sweep), "nothing says what geometry_msgs/msg/Twist is to be"),
+    (lambda: said(TWIST, Twist, fields={"linear.x": "speed"}), "Twist has no field 'speed'"),
+    (lambda: said(TWIST, Twist, fields={"linear": "linear_mps"}), "one of its fields is right"),
+    (lambda: said(TWIST, Twist, fields={"linear.w": "linear_mps"}), "has no field 'w'"),
+]
+
+
+@pytest.mark.parametrize(("make", "why"), WRONG)
+def test_a_table_that_makes_no_sense_is_refused_in_one_line(make, why):
+    with pytest.raises(ValueError, match=r"[^\n]+") as raised:
+        make()
+    assert why in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_another_frame_and_a_value_beyond_its_bounds_are_refused():
+    with pytest.raises(ValueError, match="its frame is 'odom'; 'map' is right"):
+        heard(ODOMETRY, Pose, frame="map")(odometry())
+    message = JAZZY.blank(SCAN)
+    message.ranges = np.zeros(70_000, "f4")
+    with pytest.raises(ValueError, match=r"Expected `?bytes"):
+        heard(SCAN, Sweep)(message)
+
+
+@pytest.mark.parametrize("cut", range(0, 60, 7))
+def test_a_truncated_message_is_one_line_whatever_its_type(cut):
+    for kind in (ODOMETRY, SCAN, "diagnostic_msgs/msg/DiagnosticArray", "nav_msgs/msg/Path"):
+        whole = JAZZY.encode(kind, JAZZY.blank(kind))
+        if cut < len(whole):
+            with pytest.raises(ValueError, match=rf"^{kind}: [^\n]+\Z"):
+                JAZZY.decode(kind, whole[:cut])
+
+
+@pytest.mark.parametrize("data", [b"\0\1\0\0" + b"\xff" * 40, b"\0\x07\0\0" + b"\0" * 40,
+                                  b"\0\1\0\0" + b"\0" * 40 + b"x" * 90, b"\xff" * 300])
+def test_bytes_that_are_no_message_are_one_line(data):
+    with pytest.raises(ValueError, match=rf"^{SCAN}: [^\n]+\Z"):
+        JAZZY.decode(SCAN, data)
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_each_distribution_has_services_and_the_action_of_navigation(name):
+    types = Types(name)
+    assert types.is_action("nav2_msgs/action/NavigateToPose")
+    assert types.is_service("nav2_msgs/action/NavigateToPose_SendGoal")
+    assert types.is_service("lifecycle_msgs/srv/ChangeState")
+    digest = types.hash("std_srvs/srv/Trigger")
+    assert digest == "TypeHashNotSupported" if name == "humble" else digest.startswith("RIHS01_")
+
+
+def write(folder, name, text):
+    file = folder / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+    return folder
+
+
+def test_a_robot_s_own_definitions(tmp_path):
+    folder = write(tmp_path, "arm_msgs/msg/Arm.msg",
+                   "# an arm\nstd_msgs/Header header\nJoint[] joints\n")
+    write(tmp_path, "arm_msgs/msg/Joint.msg", "float64 angle\nstring<=20 name\nuint8[3] rgb\n")
+    write(tmp_path, "arm_msgs/srv/Fold.srv", "bool fast\n---\nbool done\n")
+    types = Types("jazzy", [folder])
+    joint = types.blank("arm_msgs/msg/Joint")
+    joint.angle, joint.name = 0.25, "elbow"
+    arm = types.blank("arm_msgs/msg/Arm")
+    arm.joints = [joint]
+    back = types.decode("arm_msgs/msg/Arm", types.encode("arm_msgs/msg/Arm", arm))
+    assert (back.joints[0].angle, back.joints[0].name) == (0.25, "elbow")
+    assert types.is_service("arm_msgs/srv/Fold")
+    assert types.hash("arm_msgs/srv/Fold") != types.hash("arm_msgs/msg/Arm")
+    link = Ros2Link(type="arm_msgs/msg/Arm", subscribe="/arm", to="arm")
+    made, _ = Inward(link, types, message_of(link, types))(back)
+    assert made.joints[0].rgb_len == 3
+
+
+@pytest.mark.parametrize(("name", "text", "why"), [
+    ("a/msg/A.msg", "float128x y\n", "type 'a/msg/float128x'"),
+    ("a/msg/A.msg", "Missing y\n", "a/msg/Missing"),
+    ("a/srv/A.srv", "bool x\n", "1 parts; 2 with --- between them are right"),
+    ("a/action/A.action", "bool x\n---\n", "2 parts; 3"), ("a/msg/A.msg", "float64\n", "A.msg"),
+    ("geometry_msgs/msg/Twist.msg", "float64 x\n", "already present with different"),
+    ("A.msg", "float64 x\n", "no package/msg/Name.msg in it")])
+def test_definitions_that_make_no_sense_are_refused_in_one_line(tmp_path, name, text, why):
+    with pytest.raises(ValueError, match=r"[^\n]+") as raised:
+        Types("jazzy", [write(tmp_path, name, text)])
+    assert why in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_whatever_arrives_is_read_or_refused():
+    dice = random.Random(7)
+    for kind in (ODOMETRY, SCAN, "diagnostic_msgs/msg/DiagnosticArray", "nav_msgs/msg/Path", TF,
+                 "nav_msgs/msg/OccupancyGrid", "sensor_msgs/msg/BatteryState"):
+        whole, decode = JAZZY.encode(kind, JAZZY.blank(kind)), JAZZY.decoder(kind)
+        for _ in range(1000):
+            data = bytearray(whole)
+            for _ in range(dice.randint(1, 6)):
+                data[dice.randrange(4, len(data))] = dice.choice([0, 1, 127, 128, 255])
+            with contextlib.suppress(ValueError):
+                decode(bytes(data[:dice.randint(4, len(data))]))

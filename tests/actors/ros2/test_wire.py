@@ -1,0 +1,114 @@
+"""The wire format beside captures of a live rmw_zenoh_cpp (Humble, 0.1.8), and what is none."""
+
+from __future__ import annotations
+
+import pytest
+
+from rampart.actors.ros2.graph import MOST, RosGraph, misfits
+from rampart.actors.ros2.wire import (
+    Attachment,
+    Endpoint,
+    EndpointKind,
+    Qos,
+    data_key,
+    dds_name,
+    ros_name,
+)
+
+CAPTURED = ("@ros2_lv/0/9ca0f8facf84ffb1e6bfa4f2500889f0/0/3/MP/%/%/_ros2cli_712/%chatter/"
+            "std_msgs::msg::dds_::String_/TypeHashNotSupported/:1:,1:,:,:,,")
+ATTACHED = bytes.fromhex("d80000000000000034dae10162f8c41810f07168d3856ce9f689254cbed6252151")
+
+
+def test_a_captured_token_is_read_and_written_the_same():
+    found = Endpoint.parse(CAPTURED)
+    assert (found.full_name, found.topic, found.kind) == (
+        "/_ros2cli_712", "/chatter", EndpointKind.PUBLISHER)
+    assert found.qos == Qos(transient_local=True, depth=1)
+    assert found.token == CAPTURED
+    assert found.key == "0/chatter/std_msgs::msg::dds_::String_/TypeHashNotSupported"
+
+
+def test_the_gid_of_a_captured_attachment_is_that_of_the_captured_token():
+    attachment = Attachment.unpack(ATTACHED)
+    assert attachment.gid == Endpoint.parse(CAPTURED).gid
+    assert attachment.sequence == 216
+    assert attachment.pack() == ATTACHED
+
+
+@pytest.mark.parametrize(("qos", "text"), [
+    (Qos(), "::,:,:,:,,"), (Qos(depth=10), "::,10:,:,:,,"),
+    (Qos(reliable=False, depth=1), "2::,1:,:,:,,"), (Qos(reliable=False, depth=7), "2::,7:,:,:,,"),
+    (Qos(transient_local=True, keep_all=True, depth=5), ":1:2,5:,:,:,,")])
+def test_quality_of_service_in_a_token(qos, text):
+    assert qos.token() == text
+    assert Qos.parse(text) == qos
+
+
+def test_nodes_in_namespaces_and_keys():
+    node = Endpoint(7, "ab", "1", "1", EndpointKind.NODE, "amcl", "/robot/front")
+    assert node.token == "@ros2_lv/7/ab/1/1/NN/%/%robot%front/amcl"
+    assert Endpoint.parse(node.token) == node
+    assert node.full_name == "/robot/front/amcl"
+    assert data_key(7, "/a/b/", dds_name("nav_msgs/msg/Path"), "RIHS01_0") == (
+        "7/a/b/nav_msgs::msg::dds_::Path_/RIHS01_0")
+    assert ros_name("std_srvs::srv::dds_::Trigger_") == "std_srvs/srv/Trigger"
+    assert ros_name("what") == "what"
+
+
+def test_what_newer_versions_add_to_a_token_is_left_out():
+    assert Endpoint.parse(f"{CAPTURED}/more/and/more") == Endpoint.parse(CAPTURED)
+
+
+@pytest.mark.parametrize("token", [
+    "", "@ros2_lv", "x" * 1000, CAPTURED.replace("@ros2_lv", "@other"),
+    CAPTURED.replace("/0/9c", "/x/9c"), CAPTURED.replace("/MP/", "/XX/"), CAPTURED[:60],
+    CAPTURED.replace("/:1:,1:,:,:,,", ""), CAPTURED.replace(":1:,1:,:,:,,", "1"),
+    CAPTURED.replace(",1:", ",x:"), CAPTURED.replace("_ros2cli_712", "")])
+def test_what_is_no_token_is_one_line(token):
+    with pytest.raises(ValueError, match=r"^[^\n]{1,400}\Z"):
+        Endpoint.parse(token)
+
+
+@pytest.mark.parametrize("data", [None, b"", ATTACHED[:-1], ATTACHED + b"\0",
+                                  ATTACHED[:16] + b"\x11" + ATTACHED[17:]])
+def test_what_is_no_attachment_is_one_line(data):
+    with pytest.raises(ValueError, match="attachment"):
+        Attachment.unpack(data)
+
+
+def endpoint(kind, node="a", **what):
+    said = {"topic": "/odom", "type": "t", "hash": "h", **what}
+    return Endpoint(0, node, "0", "1", kind, node, **said)
+
+
+@pytest.mark.parametrize(("there", "words"), [
+    (endpoint(EndpointKind.PUBLISHER, "b"), None),
+    (endpoint(EndpointKind.SUBSCRIPTION, "b", hash="x"), None),
+    (endpoint(EndpointKind.PUBLISHER, "b", topic="/other", type="x"), None),
+    (endpoint(EndpointKind.PUBLISHER, "b", type="x"), "/odom: /b has the type x, and not t"),
+    (endpoint(EndpointKind.PUBLISHER, "b", hash="x"), "neither hears the other"),
+    (endpoint(EndpointKind.PUBLISHER, "b", qos=Qos(reliable=False)), "offers best effort")])
+def test_who_cannot_meet_is_told(there, words):
+    found = list(misfits([endpoint(EndpointKind.SUBSCRIPTION)], [there]))
+    assert [words in one for one in found] == ([True] if words else [])
+
+
+def test_a_late_joiner_who_asks_for_what_nobody_keeps_is_told():
+    mine = endpoint(EndpointKind.SUBSCRIPTION, qos=Qos(transient_local=True))
+    assert "does not keep it" in next(misfits([mine], [endpoint(EndpointKind.PUBLISHER, "b")]))
+
+
+def test_the_graph_is_bounded_and_forgets_who_has_gone():
+    graph = RosGraph()
+    assert graph.changed(CAPTURED, True).node == "_ros2cli_712"
+    assert graph.changed(CAPTURED, True) is None
+    assert graph.who(Endpoint.parse(CAPTURED).gid) is not None
+    assert graph.changed(CAPTURED, False) is not None
+    assert graph.changed(CAPTURED, False) is None
+    assert graph.who(Endpoint.parse(CAPTURED).gid) is None
+    for number in range(MOST):
+        graph.changed(f"@ros2_lv/0/a/{number}/{number}/NN/%/%/n", True)
+    with pytest.raises(ValueError, match="left out"):
+        graph.changed(CAPTURED, True)
+    assert graph.nodes() == {"/n": MOST}
