@@ -39,7 +39,7 @@ from rampart.cli.analyse import (
     verify_verb,
 )
 from rampart.cli.bench import verb as bench_verb
-from rampart.cli.look import serving_verbs, topic_verbs
+from rampart.cli.look import ros_verbs, serving_verbs, topic_verbs
 from rampart.cli.operate import (
     adapt_verb,
     inject_verbs,
@@ -53,8 +53,8 @@ from rampart.cli.record import record_verbs
 from rampart.cli.verbs import FORMATTER, PORT, help_of
 from rampart.files import streams, working_folder
 
-_OF_A_RUN = (node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
-             record_verbs, keys_verb, token_verbs)
+_OF_A_RUN = (node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs,
+             adapt_verb, record_verbs, keys_verb, token_verbs)
 _OF_A_SYSTEM = (check_verbs, cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
 # Each adds its verbs, in this order in the help.
 

@@ -9,8 +9,9 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.layout.connections import flaw
 from rampart.actors.layout.layout import Layout, application_class
-from rampart.actors.layout.wiring import heard, load_class, published, topics_of
+from rampart.actors.layout.wiring import heard, load_class, load_member, published, topics_of
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
+from rampart.manager.spec.ros2 import GATEWAY
 from rampart.manager.spec.specification import SystemSpec
 
 _SHIPPED = "rampart."
@@ -36,7 +37,7 @@ def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
             topic that makes no sense.
     """
     known = declared_topics(spec)
-    return (*known, *_beyond(known, _actors(spec)))
+    return _with_made((*known, *_beyond(known, _actors(spec))), spec)
 
 
 def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
@@ -48,8 +49,9 @@ def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     Raises:
         ValueError: as `system_topics`, of the actors that do not ship.
     """
-    return _beyond(declared_topics(spec), (
-        path for path in _actors(spec) if not path.startswith(_SHIPPED)))
+    known = declared_topics(spec)
+    own = _beyond(known, (path for path in _actors(spec) if not path.startswith(_SHIPPED)))
+    return _with_made((*known, *own), spec)[len(known):]
 
 
 def published_keys(spec: SystemSpec) -> tuple[str, ...]:
@@ -84,6 +86,17 @@ def _actors(spec: SystemSpec) -> Iterator[str]:
     tables = (spec.nodes, spec.detections, spec.recoveries)
     return filter(None, [*(row.actor for table in tables for row in table),
                          *(node.stand_in for node in spec.nodes)])
+
+
+def _with_made(known: tuple[Topic[Any], ...], spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return topics with those that there are because parameters say so, each key once."""
+    found = {topic.key: topic for topic in known}
+    for node in spec.nodes if spec.ros2 else ():
+        if node.actor == GATEWAY:
+            member = load_member(node, spec, spec.name)
+            for topic in member.actor.own_topics(member.parameters):
+                found.setdefault(topic.key, topic)
+    return tuple(found.values())
 
 
 def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[Any], ...]:

@@ -18,7 +18,7 @@ import itertools
 import math
 import statistics
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Coroutine
 from typing import Any
 
 import msgspec
@@ -29,6 +29,7 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.cli import systems
 from rampart.cli.following import LOOK_S, is_over
+from rampart.cli.look import ros_verbs
 from rampart.cli.look import topic_catalogue as catalogue
 from rampart.cli.look.topic_catalogue import (
     UnreadableError,
@@ -42,6 +43,7 @@ from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
 from rampart.files import streams
 
+ROS_ROUTER = "tcp/localhost:7447"
 _WINDOW = 500
 _SHOWN_BYTES = 24
 _HZ_REPORT_S = 1.0
@@ -51,21 +53,23 @@ def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     topic = add_family(verbs, "topic", "what travels on the keys", __doc__)
     key = option("key", metavar="KEY")
+    ros = option("--ros", nargs="?", const=ROS_ROUTER, metavar="ENDPOINT",
+                 help=f"of ROS 2, by the router there (default {ROS_ROUTER})")
     add_verb(topic, "list", "all topics (needs no run)", topic_list, systems.choice(),
-             either(JSON, flag("--markdown", "print topics.md")))
+             either(JSON, flag("--markdown", "print topics.md")), ros)
     add_verb(topic, "info", "the contract of one topic (needs no run)", topic_info, key,
              word("--system", "FILE", "system spec; default that of the run, else the shipped one"),
              JSON)
     add_verb(topic, "echo", "print messages as they come", topic_echo, PORT, key,
              option("-n", "--count", type=int, metavar="N", help="end after N messages"),
              number("--duration", "S", "end after S real seconds"),
-             flag("--json", "one JSON object per line"))
+             flag("--json", "one JSON object per line"), ros)
     add_verb(topic, "hz", "measure the rate of a topic", topic_hz, PORT, key,
              number("--duration", "S", "end after S real seconds (with --json 3 if not given)"),
-             flag("--json", "print JSON at the end"))
+             flag("--json", "print JSON at the end"), ros)
 
 
-def topic_list(options: argparse.Namespace) -> int:
+def topic_list(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     """Print all topics.
 
     List all topics with message, QoS and nominal rate.
@@ -73,7 +77,10 @@ def topic_list(options: argparse.Namespace) -> int:
     Examples:
       rampart topic list
       rampart topic list --markdown > topics.md
+      rampart topic list --ros
     """
+    if options.ros:
+        return ros_verbs.look(options).list_topics(options)  # type: ignore[no-any-return]
     spec = systems.at_hand(options.system)
     if options.markdown:
         say_text(catalogue.markdown(spec).rstrip("\n"))
@@ -128,9 +135,11 @@ async def topic_echo(options: argparse.Namespace) -> int:
       rampart topic echo 'detection/*' --duration 5
       rampart topic echo plan/route -n 1 --json
     """
-    topic, key = _topic_of(options)
     positive("--count", options.count)
     positive("--duration", options.duration)
+    if options.ros:
+        return await ros_verbs.look(options).echo(options)  # type: ignore[no-any-return]
+    topic, key = _topic_of(options)
     done = asyncio.Event()
     seen = 0
 
@@ -183,8 +192,10 @@ async def topic_hz(options: argparse.Namespace) -> int:
       rampart topic hz control/command
       rampart topic hz 'heartbeat/*' --duration 3 --json
     """
-    topic, key = _topic_of(options)
     positive("--duration", options.duration)
+    if options.ros:
+        return await ros_verbs.look(options).measure(options)  # type: ignore[no-any-return]
+    topic, key = _topic_of(options)
     arrivals: Remembered[str, deque[float]] = Remembered(MANY)
     duration_s = options.duration or (3.0 if options.json else None)
     async with connect(options.port) as session:
@@ -201,7 +212,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
             await asyncio.sleep(min(_HZ_REPORT_S, left))
             if not options.json:
                 for short in sorted(arrivals):
-                    _print_rate(short, rate_of(list(arrivals[short])))
+                    print_rate(short, rate_of(list(arrivals[short])))
                 if not arrivals:
                     say(f"nothing on {options.key} yet")
     if options.json:
@@ -250,7 +261,8 @@ def in_line(body: Any) -> str:
     return msgspec.json.encode(shorten(plain)).decode()
 
 
-def _print_rate(key: str, rate: dict[str, Any]) -> None:
+def print_rate(key: str, rate: dict[str, Any]) -> None:
+    """Print what `rate_of` returns of a topic."""
     if rate["rate_hz"] is None:
         say(f"{key}: one message so far")
         return

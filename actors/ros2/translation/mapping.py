@@ -102,7 +102,7 @@ class Inward:
             fields.check(one, said)
         if path.endswith(_F32):
             return lambda message: np.asarray(expression.read(message), "<f4").tobytes()
-        return lambda message: _plain(expression.read(message))
+        return lambda message: plain(expression.read(message))
 
     def __call__(self, message: Any, beside: Any = None) -> tuple[msgspec.Struct, int | None]:
         """Return the message of the system, and the stamp of the other's header, nanoseconds.
@@ -181,7 +181,8 @@ class Outward:
         leaves = [path for path, _ in _leaves(heard)]
         there = {path.rpartition(".")[2]: path for path in leaves}
         said: dict[str, str | float | bool] = {} if link.type in WRITTEN else {
-            path: path for path in reads_of(self._name, types) if path in leaves}
+            path: path for path, read in reads_of(self._name, types).items()
+            if path == read and path in leaves}
         for quantity, (where, text) in WRITTEN.get(link.type, {}).items():
             if quantity in there:
                 said[where] = text.replace(quantity, there[quantity])
@@ -353,12 +354,12 @@ def _near(name: str, known: Any) -> str:
     return f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known) or 'none'}"
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return a value of ROS 2 as one that messages of the system are made of."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     names = getattr(value, "__dataclass_fields__", None)
     if names is None:
         return value
@@ -368,7 +369,7 @@ def _plain(value: Any) -> Any:
         if isinstance(inner, np.ndarray) and inner.dtype in _ONE_BYTE:
             found[f"{name}{LEN}"] = len(inner)
         elif name != "__msgtype__":
-            found[name] = _plain(inner)
+            found[name] = plain(inner)
     return found
 
 

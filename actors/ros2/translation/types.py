@@ -132,6 +132,13 @@ class Types:
             made[field] = self._blank_field(what)
         return store.types[name](**made)
 
+    @staticmethod
+    def numbers(values: Sequence[float], kind: str = "float32") -> Any:
+        """Return a list of numbers as messages have it."""
+        import numpy as np  # noqa: PLC0415 with the first message
+
+        return np.asarray(values, np.dtype(kind))
+
     def like(self, name: str, value: Any) -> Any:
         """Return a message whose fields are the attributes of a value."""
         return self._store.types[name](

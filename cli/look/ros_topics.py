@@ -1,0 +1,283 @@
+"""`rampart topic … --ros` and `rampart ros2 check`: ROS 2 as a client without ROS sees it.
+
+It joins the graph as a session without a node: nobody there sees it, and it says nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import msgspec
+
+from rampart.actors.layout.wiring import load_member
+from rampart.actors.ros2.gateway import Gateway, types_of
+from rampart.actors.ros2.graph import RosGraph, misfits
+from rampart.actors.ros2.node import RosNode
+from rampart.actors.ros2.ros_nodes import RosNodes
+from rampart.actors.ros2.side import NoSide, ZenohSide
+from rampart.actors.ros2.translation.mapping import plain
+from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
+from rampart.actors.ros2.wire import ADMIN, Attachment, Endpoint, EndpointKind, Qos, ros_name
+from rampart.cli import systems
+from rampart.cli.look.topic_verbs import in_line, print_rate, rate_of
+from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say, warn
+from rampart.manager.spec.ros2 import GATEWAY, Ros2Link
+from rampart.manager.spec.schema import SystemSpec
+
+DOMAIN, DISTRIBUTION = "ROS_DOMAIN_ID", "ROS_DISTRO"
+"""Variables by which ROS 2 is told the same."""
+
+_LINK_S = 3.0
+_GRAPH_S = 1.0
+_TOPICS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
+
+
+class Onlooker:
+    """A session that hears the graph of a domain.
+
+    Args:
+        side: the network.
+        domain: of ROS.
+
+    Attributes:
+        side: the same.
+        graph: what was heard.
+        odd: what was no token.
+    """
+
+    def __init__(self, side: ZenohSide, domain: int) -> None:
+        self.side, self.graph, self.odd = side, RosGraph(), set[str]()
+        side.tokens(f"{ADMIN}/{domain}/**", self._changed)
+
+    def _changed(self, token: str, alive: bool) -> None:
+        try:
+            self.graph.changed(token, alive)
+        except ValueError as error:
+            self.odd.add(str(error))
+
+
+@asynccontextmanager
+async def onlooker(connect: tuple[str, ...], domain: int) -> AsyncIterator[Onlooker]:
+    """Yield a session that has heard who is there.
+
+    Raises:
+        UsageError: an endpoint makes no sense.
+        NoEffectError: no router answers.
+    """
+    try:
+        side = ZenohSide(connect, asyncio.get_running_loop())
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    try:
+        found = Onlooker(side, domain)
+        until_s = time.monotonic() + _LINK_S
+        while not side.is_linked():
+            if time.monotonic() > until_s:
+                raise NoEffectError(f"no router of ROS 2 at {', '.join(connect)}; "
+                                    "`ros2 run rmw_zenoh_cpp rmw_zenohd` starts one")
+            await asyncio.sleep(0.02)
+        await asyncio.sleep(_GRAPH_S)
+        yield found
+    finally:
+        side.close()
+
+
+def said_domain() -> int:
+    """Return the domain that the environment says, 0 if it says none.
+
+    Raises:
+        UsageError: it is none.
+    """
+    said = os.environ.get(DOMAIN, "0")
+    if not (said.isascii() and said.isdecimal() and len(said) < 4):
+        raise UsageError(f"{DOMAIN}={said}: a number from 0 to 232 is right")
+    return int(said)
+
+
+def said_types() -> Types:
+    """Return the types of the distribution that the environment says, those of Jazzy if none.
+
+    Raises:
+        UsageError: it is not known.
+    """
+    said = os.environ.get(DISTRIBUTION, "jazzy")
+    if said not in DISTRIBUTIONS:
+        raise UsageError(f"{DISTRIBUTION}={said}: known: {', '.join(DISTRIBUTIONS)}")
+    return Types(said)
+
+
+async def list_topics(options: argparse.Namespace) -> int:
+    """Print the topics of ROS 2; options and exit code as of `rampart topic list`."""
+    async with onlooker((options.ros,), said_domain()) as there:
+        found = [_described(topic, ends) for topic, ends in there.graph.topics().items()]
+    if options.json:
+        print_json(found)
+    else:
+        print_table(("topic", "type", "publishers", "subscribers"), [
+            (row["topic"], ", ".join(row["types"]), ", ".join(row["publishers"]) or "-",
+             ", ".join(row["subscribers"]) or "-") for row in found])
+    return 0
+
+
+def _described(topic: str, ends: list[Endpoint]) -> dict[str, Any]:
+    return {"topic": topic, "types": sorted({ros_name(one.type) for one in ends}),
+            **{f"{word}s": sorted({one.full_name for one in ends if one.kind is kind})
+               for kind, word in zip(_TOPICS, ("publisher", "subscriber"), strict=True)}}
+
+
+async def echo(options: argparse.Namespace) -> int:
+    """Print messages of ROS 2 as they come, as `rampart topic echo` does."""
+    done, seen = asyncio.Event(), 0
+
+    def heard(message: Any, attachment: Attachment) -> None:
+        nonlocal seen
+        seen += 1
+        if options.count is not None and seen > options.count:
+            return
+        if options.json:
+            print_json({"topic": options.key, "sent_ns": attachment.stamp_ns,
+                        "sequence": attachment.sequence, "message": plain(message)}, indent=False)
+        else:
+            say(f"{attachment.stamp_ns / 1e9:.3f} {options.key} {in_line(plain(message))}")
+        if options.count is not None and seen >= options.count:
+            done.set()
+
+    await _hear(options, heard, done)
+    if not seen:
+        raise NoEffectError(f"nothing came on {options.key}")
+    return 0
+
+
+async def measure(options: argparse.Namespace) -> int:
+    """Measure how often messages of ROS 2 come, real time, as `rampart topic hz` does."""
+    times: list[float] = []
+    await _hear(options, lambda _message, _attachment: times.append(time.monotonic()),
+                asyncio.Event(), times=None if options.json else times,
+                duration_s=options.duration or (3.0 if options.json else None))
+    if options.json:
+        print_json([{"topic": options.key, **rate_of(times[-500:])}])
+    if not times:
+        raise NoEffectError(f"nothing came on {options.key}")
+    return 0
+
+
+async def _hear(options: argparse.Namespace, heard: Any, done: asyncio.Event, *,
+                times: list[float] | None = None, duration_s: float | None = None) -> None:
+    """Hear a topic until `done`, or the time is over, or it is interrupted."""
+    domain, types = said_domain(), said_types()
+    duration_s = duration_s or options.duration
+    async with onlooker((options.ros,), domain) as there:
+        ends = there.graph.on(options.key, EndpointKind.PUBLISHER)
+        if not ends:
+            known = ", ".join(there.graph.topics()) or "none"
+            raise NoEffectError(f"nobody publishes {options.key}; topics: {known}")
+        name = ros_name(ends[0].type)
+        try:
+            decode = types.decoder(name)
+            if types.hash(name) != ends[0].hash:
+                warn(f"{ends[0].full_name} has another definition of {name} than "
+                     f"{types.distribution}; {DISTRIBUTION} says which one")
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+
+        def arrived(payload: bytes, attached: bytes | None) -> None:
+            try:
+                heard(decode(payload), Attachment.unpack(attached))
+            except ValueError as error:
+                warn(f"{options.key}: {error}")
+
+        there.side.subscribe(ends[0].key, Qos(transient_local=ends[0].qos.transient_local,
+                                              depth=1), arrived)
+        until_s = time.monotonic() + (duration_s or float("inf"))
+        while not done.is_set() and time.monotonic() < until_s:
+            await asyncio.sleep(1.0 if times is not None else 0.02)
+            if times:
+                print_rate(options.key, rate_of(times[-500:]))
+
+
+# -- check ----------------------------------------------------------------------------------------
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """What a check has found of one link or node."""
+
+    what: str
+    well: bool
+    why: str
+
+
+async def check(options: argparse.Namespace) -> int:
+    """Check a system's gateways against the graph; 1 if something does not fit."""
+    spec = systems.load(options.system or str(systems.DEFAULT))
+    if not spec.ros2:
+        raise UsageError(f"{spec.name} has no [[ros2]]: nothing is passed on")
+    found: list[Finding] = []
+    for node in spec.nodes:
+        if node.actor == GATEWAY:
+            said: Any = load_member(node, spec, spec.name).parameters
+            found += await _checked(node.name, said, spec)
+    if options.json:
+        print_json({"system": spec.name, "findings": found,
+                    "well": all(one.well for one in found)})
+    else:
+        print_table(("", "what", "how it is"), [
+            ("ok" if one.well else "!", one.what, one.why) for one in found])
+    return 0 if all(one.well for one in found) else 1
+
+
+async def _checked(name: str, said: Gateway.Parameters, spec: SystemSpec) -> list[Finding]:
+    try:
+        async with onlooker(said.connect, said.domain) as there:
+            found = [Finding(f"router of {name}", True, ", ".join(said.connect))]
+            found += [Finding("graph", False, odd) for odd in sorted(there.odd)]
+            node = RosNode(NoSide(), types_of(said.distribution, said.interfaces), said.node,
+                           wall_ns=lambda: 0, refuse=lambda *_: None,
+                           namespace=said.namespace, domain=said.domain)
+            found += [_of_link(link, there.graph, node) for link in said.ros2]
+            known = there.graph.nodes()
+    except NoEffectError as error:
+        return [Finding(f"router of {name}", False, str(error))]
+    watched = [one for row in spec.detections
+               if row.actor == f"{RosNodes.__module__}:{RosNodes.__name__}"
+               for one in row.parameters.get("nodes", ()) if row.parameters["gateway"] == name]
+    return found + [Finding(one, one in known, "it is there" if one in known else
+                            "no node of this name is in the graph") for one in watched]
+
+
+_OURS = {"subscribe": EndpointKind.SUBSCRIPTION, "publish": EndpointKind.PUBLISHER,
+         "call": EndpointKind.CLIENT, "serve": EndpointKind.SERVICE}
+_THEIRS = {"subscribe": EndpointKind.PUBLISHER, "publish": EndpointKind.SUBSCRIPTION,
+           "call": EndpointKind.SERVICE, "serve": EndpointKind.CLIENT}
+_NOBODY = {"subscribe": "nobody publishes it", "publish": "nobody subscribes to it",
+           "call": "nobody serves it", "serve": "nobody calls it yet",
+           "goal": "no server of this action"}
+
+
+def _of_link(link: Ros2Link, graph: RosGraph, node: RosNode) -> Finding:
+    way = link.way
+    what = f"{way} {link.name}"
+    topic, kind = link.name, link.type
+    if way == "goal":
+        topic, kind, way = f"{link.name}/_action/send_goal", f"{link.type}_SendGoal", "call"
+    mine = node.endpoint(_OURS[way], topic, kind, Qos(
+        link.reliable, link.transient_local, depth=link.depth))
+    there = [one for one in graph.on(topic, _THEIRS[way])
+             if one.full_name != node.full_name]
+    if not there:
+        return Finding(what, way == "serve", _NOBODY[link.way])
+    if problems := list(dict.fromkeys(misfits([mine], there))):
+        return Finding(what, False, problems[0])
+    names = ", ".join(dict.fromkeys(one.full_name for one in there))
+    if way == "publish":
+        others = [one.full_name for one in graph.on(topic, EndpointKind.PUBLISHER)
+                  if one.full_name != node.full_name]
+        if others:
+            return Finding(what, False, f"{others[0]} publishes it too: it moves the robot past "
+                                        "every check")
+    return Finding(what, True, f"{names}, {link.type}")

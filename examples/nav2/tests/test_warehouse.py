@@ -1,0 +1,74 @@
+"""Rounds in virtual time, each with something going wrong, and one on processes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rampart.testing import RealRun, free_port, virtual_run
+
+SYSTEM = Path(__file__).resolve().parents[1] / "warehouse.toml"
+
+
+@pytest.mark.parametrize(("fault", "mechanism", "recovery"), [
+    (None, None, None), ("localization-jump@12", "M_JUMP", "R_STOP"),
+    ("costmap-stale@10", "M_COSTMAP", "R_LIFECYCLE"),
+    ("drop:nav/command@10+5", "M_SILENT", "R_RESTART"),
+    ("kill:controller_server@10", "M_CRASH", "R_RESTART"),
+    pytest.param("kill:amcl@10", "M_CRASH", "R_RESTART", marks=pytest.mark.slow),
+    pytest.param("wedge:planner_server@10", "M_CRASH", "R_RESTART", marks=pytest.mark.slow)])
+def test_the_round_is_made_all_the_same_and_the_mechanism_against_it_acts(
+        fault, mechanism, recovery):
+    done = virtual_run(SYSTEM, *([fault] if fault else []))
+    assert (done.judgement.safe, done.judgement.success) == (True, True)
+    assert done.failures == ()
+    first = done.record.decisions[0] if done.record.decisions else None
+    assert (first is None) is (fault is None)
+    if first is not None:
+        assert mechanism in first.active
+        assert recovery in first.recoveries
+
+
+@pytest.mark.parametrize("node", ["gateway", "guard"])
+def test_what_stands_between_may_die_and_nobody_notices(node):
+    done = virtual_run(SYSTEM, f"kill:{node}@10")
+    assert (done.judgement.safe, done.judgement.success) == (True, True)
+    assert done.record.restarts == {node: 1}
+
+
+def test_with_a_low_battery_the_goal_is_cancelled_and_the_robot_stands_still():
+    done = virtual_run(SYSTEM, "battery-low@10", seconds=30.0)
+    assert done.judgement.safe is True
+    assert [d.recoveries for d in done.record.decisions] == [("R_CANCEL",)]
+
+
+def test_without_the_mechanisms_a_jump_of_the_localization_does_harm():
+    assert virtual_run(SYSTEM, "localization-jump@3+inf", seconds=60.0, ftm=False,
+                       ).judgement.success is False
+
+
+@pytest.mark.processes
+def test_on_processes_it_drives_over_the_wire_format_and_a_killed_controller_is_back(
+        tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(SYSTEM.parent))
+    port = free_port()
+    text = SYSTEM.read_text(encoding="utf-8")
+    here = [f"tcp/127.0.0.1:{port}"]
+    for node in ("controller_server", "planner_server", "amcl", "base"):
+        head = f'name = "{node}"\n'
+        text = text.replace(head, f"{head}parameters = {{ connect = {json.dumps(here)} }}\n", 1)
+    text = text.replace('name = "ros_router"\n', 'name = "ros_router"\n'
+                        f'parameters = {{ listen = "{here[0]}" }}\n')
+    text = text.replace('parameters = { distribution = "jazzy" }',
+                        f"parameters = {{ connect = {json.dumps(here)} }}")
+    (tmp_path / "warehouse.toml").write_text(text)
+    with RealRun(tmp_path, tmp_path / "warehouse.toml", "--duration", "8", "--rate", "1") as run:
+        run.sleep_until(4.0)
+        run.kill("controller_server")
+        code, result = run.result(60)
+    assert result["safety"] == "safe", run.story
+    assert result["restarts"] == {"controller_server": 1}
+    assert "decision 1: R_RESTART" in run.story
+    assert code in {0, 1}

@@ -1,0 +1,104 @@
+"""The robot's driver, and the hall behind it: what stands in for a base that speaks ROS 2."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rampart import every
+from rampart.actors.ros2.stand_in import StandIn
+from warehouse import topics
+from warehouse.hall import WAY_M, clearance_m, sweep_m
+from warehouse.topics import Skew, Truth
+
+STEP_S = 0.02
+RAYS, RANGE_M = 36, 6.0
+MOST_MPS2 = 1.0
+DEAD_MAN_S = 0.3
+"""Without a command for so long it stops by itself, as a driver has to."""
+
+
+class Base(StandIn):
+    """Hears /cmd_vel; says /odom, /scan and /battery_state."""
+
+    class Parameters(StandIn.Parameters, frozen=True, kw_only=True):
+        """Of every world: seed, dead_man, dead_man_timeout_s. How much charge it begins with."""
+
+        seed: int = 0
+        dead_man: bool = True
+        dead_man_timeout_s: float = DEAD_MAN_S
+        charge: float = 0.9
+
+    parameters: Parameters
+    node_name = "base_driver"
+    outputs = (topics.TRUTH, topics.SKEW)
+    node_kind = "world"
+
+    def declare(self) -> None:
+        """Begin at the first corner."""
+        (self._x_m, self._y_m), self._yaw_rad = WAY_M[0], 0.0
+        self._linear_mps = self._angular_radps = 0.0
+        self._told = (0.0, 0.0)
+        self._told_s = -math.inf
+        self._corners = 0
+        self._charge = self.parameters.charge
+        self._say_odometry = self.publisher("/odom", "nav_msgs/msg/Odometry")
+        self._say_scan = self.publisher("/scan", "sensor_msgs/msg/LaserScan")
+        self._say_battery = self.publisher("/battery_state", "sensor_msgs/msg/BatteryState")
+        self.subscribe("/cmd_vel", "geometry_msgs/msg/Twist", self._command)
+
+    def _command(self, message: Any) -> None:
+        self._told = (message.linear.x, message.angular.z)
+        self._told_s = self.clock.now()
+
+    @every(STEP_S)
+    def step(self) -> None:
+        """Let time pass."""
+        wanted, turn = self._told
+        if self.parameters.dead_man and self.clock.now() - self._told_s > DEAD_MAN_S:
+            wanted = turn = 0.0
+        most = MOST_MPS2 * STEP_S
+        self._linear_mps += min(max(wanted - self._linear_mps, -most), most)
+        self._angular_radps = turn
+        self._yaw_rad += turn * STEP_S
+        self._x_m += math.cos(self._yaw_rad) * self._linear_mps * STEP_S
+        self._y_m += math.sin(self._yaw_rad) * self._linear_mps * STEP_S
+        self._charge -= abs(self._linear_mps) * STEP_S * 1e-4
+        there = WAY_M[(self._corners + 1) % len(WAY_M)]
+        if math.hypot(there[0] - self._x_m, there[1] - self._y_m) < 0.6:
+            self._corners += 1
+
+    @every(0.05)
+    def odometry(self) -> None:
+        """Say where it is; its wheels do not slip here."""
+        message = self.types.blank("nav_msgs/msg/Odometry")
+        message.header.frame_id, message.child_frame_id = "odom", "base_link"
+        message.pose.pose.position.x, message.pose.pose.position.y = self._x_m, self._y_m
+        message.pose.pose.orientation.z = math.sin(self._yaw_rad / 2)
+        message.pose.pose.orientation.w = math.cos(self._yaw_rad / 2)
+        message.twist.twist.linear.x = self._linear_mps
+        message.twist.twist.angular.z = self._angular_radps
+        self._say_odometry(message)
+
+    @every(0.1)
+    def scan(self) -> None:
+        """Say what the laser measures, and to the judge what is true."""
+        message = self.types.blank("sensor_msgs/msg/LaserScan")
+        message.header.frame_id = "base_link"
+        message.angle_increment = 2 * math.pi / RAYS
+        message.range_max = RANGE_M
+        message.ranges = self.types.numbers(
+            sweep_m(self._x_m, self._y_m, self._yaw_rad, RAYS, RANGE_M))
+        self._say_scan(message)
+        self.publish(topics.TRUTH, Truth(
+            self._x_m, self._y_m, clearance_m(self._x_m, self._y_m), self._corners / len(WAY_M)))
+        self.publish(topics.SKEW, Skew(0.0))
+
+    @every(1.0)
+    def battery(self) -> None:
+        """Say how full the battery is."""
+        message = self.types.blank("sensor_msgs/msg/BatteryState")
+        message.header.frame_id = "base_link"
+        message.percentage = self._charge
+        message.voltage = 22.0 + 3 * self._charge
+        self._say_battery(message)

@@ -1,0 +1,157 @@
+"""What stands in for the three nodes of the navigation, which in a robot come from Nav2.
+
+Each says and hears what the real one does, as far as the way round a rack needs it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rampart import Header, on
+from rampart.actors.ros2.stand_in import StandIn
+from rampart.actors.ros2.wire import Qos
+from rampart.actors.runtime.actor import every
+from warehouse import topics
+from warehouse.hall import DEPTH_M, WAY_M, WIDTH_M
+from warehouse.topics import Skew
+
+INACTIVE, ACTIVE = 2, 3
+CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
+"""Transitions of lifecycle_msgs/msg/Transition."""
+
+SPEED_MPS = 0.7
+
+
+def heading_rad(rotation: Any) -> float:
+    """Return the heading of a quaternion about z."""
+    return 2 * math.atan2(rotation.z, rotation.w)
+
+
+class Amcl(StandIn):
+    """Localization: /amcl_pose of /odom."""
+
+    node_name = "amcl"
+    _skew_m = 0.0
+
+    def declare(self) -> None:
+        """Hear the odometry."""
+        self._odometry: Any = None
+        self._say = self.publisher("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped",
+                                   Qos(transient_local=True, depth=1))
+        self.subscribe("/odom", "nav_msgs/msg/Odometry", self._heard)
+
+    def _heard(self, message: Any) -> None:
+        self._odometry = message
+
+    @on(topics.SKEW)
+    def skew(self, message: Skew, _header: Header) -> None:
+        """Be wrong by so much."""
+        self._skew_m = message.x_m
+
+    @every(0.1)
+    def tell(self) -> None:
+        """Say the pose."""
+        if self._odometry is not None:
+            message = self.types.blank("geometry_msgs/msg/PoseWithCovarianceStamped")
+            message.header.frame_id = "map"
+            message.pose.pose = self._odometry.pose.pose
+            message.pose.pose.position.x += self._skew_m
+            self._say(message)
+            self._odometry = None
+
+
+class PlannerServer(StandIn):
+    """Planner, its costmap and its life cycle; a goal of the navigation can be cancelled."""
+
+    node_name = "planner_server"
+
+    def declare(self) -> None:
+        """Be active."""
+        self._is_active, self._is_cancelled = True, False
+        self._say_plan = self.publisher("/plan", "nav_msgs/msg/Path")
+        self._say_map = self.publisher("/global_costmap/costmap", "nav_msgs/msg/OccupancyGrid",
+                                       Qos(transient_local=True, depth=1))
+        self.serve("/planner_server/change_state", "lifecycle_msgs/srv/ChangeState", self._change)
+        self.serve("/navigate_to_pose/_action/cancel_goal", "action_msgs/srv/CancelGoal",
+                   self._cancel)
+
+    def _change(self, request: Any, response: Any) -> None:
+        self._is_active = request.transition.id == ACTIVATE
+        response.success = True
+
+    def _cancel(self, _request: Any, response: Any) -> None:
+        self._is_cancelled = True
+        response.return_code = 0
+
+    @every(0.5)
+    def plan(self) -> None:
+        """Say the way, and what is in it."""
+        if not self._is_active:
+            return
+        path = self.types.blank("nav_msgs/msg/Path")
+        path.header.frame_id = "map"
+        for x_m, y_m in () if self._is_cancelled else WAY_M:
+            pose = self.types.blank("geometry_msgs/msg/PoseStamped")
+            pose.pose.position.x, pose.pose.position.y = x_m, y_m
+            path.poses.append(pose)
+        self._say_plan(path)
+        grid = self.types.blank("nav_msgs/msg/OccupancyGrid")
+        grid.header.frame_id = "map"
+        grid.info.resolution = 0.5
+        grid.info.width, grid.info.height = int(WIDTH_M * 2), int(DEPTH_M * 2)
+        grid.data = self.types.numbers([0] * (grid.info.width * grid.info.height), "int8")
+        self._say_map(grid)
+
+
+class ControllerServer(StandIn):
+    """Controller: /cmd_vel_nav by /plan and /amcl_pose."""
+
+    node_name = "controller_server"
+
+    def declare(self) -> None:
+        """Hear the plan and the pose."""
+        self._plan: list[tuple[float, float]] = []
+        self._pose: tuple[float, float, float] | None = None
+        self._next: int | None = None
+        self._say = self.publisher("/cmd_vel_nav", "geometry_msgs/msg/Twist")
+        self.subscribe("/plan", "nav_msgs/msg/Path", self._planned)
+        self.subscribe("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped", self._located,
+                       Qos(transient_local=True, depth=1))
+
+    def _planned(self, message: Any) -> None:
+        self._plan = [(p.pose.position.x, p.pose.position.y) for p in message.poses]
+
+    def _located(self, message: Any) -> None:
+        pose = message.pose.pose
+        self._pose = pose.position.x, pose.position.y, heading_rad(pose.orientation)
+
+    def _off_m(self, place: int) -> float:
+        """Return how far it is from the leg that begins at a corner."""
+        assert self._pose is not None  # noqa: S101 for the type checker
+        (x_m, y_m), there = self._plan[place], self._plan[(place + 1) % len(self._plan)]
+        dx, dy = there[0] - x_m, there[1] - y_m
+        away_x, away_y = self._pose[0] - x_m, self._pose[1] - y_m
+        share = min(max((away_x * dx + away_y * dy) / (dx * dx + dy * dy), 0.0), 1.0)
+        return math.hypot(away_x - share * dx, away_y - share * dy)
+
+    def _away_m(self, place: int) -> float:
+        assert self._pose is not None  # noqa: S101 for the type checker
+        x_m, y_m = self._plan[place]
+        return math.hypot(x_m - self._pose[0], y_m - self._pose[1])
+
+    @every(0.05)
+    def control(self) -> None:
+        """Say how fast to go."""
+        message = self.types.blank("geometry_msgs/msg/Twist")
+        if self._plan and self._pose is not None:
+            if self._next is None:  # a new process goes on where the robot is
+                self._next = min(range(len(self._plan)), key=self._off_m) + 1
+            if self._away_m(self._next % len(self._plan)) < 0.5:
+                self._next += 1
+            x_m, y_m = self._plan[self._next % len(self._plan)]
+            off = math.atan2(y_m - self._pose[1], x_m - self._pose[0]) - self._pose[2]
+            off = math.atan2(math.sin(off), math.cos(off))
+            message.angular.z = max(-1.2, min(1.2, 2 * off))
+            message.linear.x = SPEED_MPS * max(0.0, math.cos(off))
+        self._say(message)

@@ -1,0 +1,48 @@
+"""What the guard and the judge hear and say; all that is of ROS 2 is in warehouse.toml."""
+
+from __future__ import annotations
+
+from rampart import Message, Qos, Topic
+
+
+class Velocity(Message, frozen=True):
+    """Velocity of `base_link` in its own axes."""
+
+    linear_mps: float
+    angular_radps: float
+
+
+class Order(Message, frozen=True):
+    """What the guard is to do besides: stand still."""
+
+    stop: bool
+
+
+class GuardState(Message, frozen=True):
+    """What the guard does, and why it does not pass a command on, "" if it does."""
+
+    stopped: bool
+    reason: str
+
+
+class Truth(Message, frozen=True):
+    """What really happens: where the robot is in `map`, and how close to what it may not touch."""
+
+    x_m: float
+    y_m: float
+    clearance_m: float
+    rounds: float
+
+
+class Skew(Message, frozen=True):
+    """By how much the localization is wrong; 0 unless a fault says otherwise."""
+
+    x_m: float
+
+
+CHECKED = Topic("guard/velocity", Velocity, Qos.SENSOR, 20, "base_link",
+                "What the navigation commands, as far as the guard lets it.")
+ORDER = Topic("guard/order", Order, Qos.STATE, 5, "", "What a recovery has the guard do.")
+STATE = Topic("guard/state", GuardState, Qos.STATE, 5, "", "What the guard does.")
+TRUTH = Topic("world/truth", Truth, Qos.STATE, 10, "map", "For the judge alone.")
+SKEW = Topic("hall/skew", Skew, Qos.STATE, 10, "map", "For faults of the localization.")
