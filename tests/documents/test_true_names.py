@@ -71,5 +71,6 @@ def test_modules_and_classes_are_there(page):
 def test_verbs_are_there(page):
     known = {verb for action in build_parser()._actions  # argparse has no other way
              if isinstance(action, argparse._SubParsersAction) for verb in action.choices}
-    said = set(re.findall(r"(?:^|`|\$ |; |bin/)rampart ([a-z][a-z0-9-]*)", PAGES[page], re.MULTILINE))
+    said = set(re.findall(
+        r"(?:^|`|\$ |; |bin/)rampart ([a-z][a-z0-9-]*)", PAGES[page], re.MULTILINE))
     assert said - TO_COME <= known
