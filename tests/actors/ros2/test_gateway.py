@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import tomllib
 
 import msgspec
 import pytest
@@ -12,6 +13,7 @@ from rampart.actors.layout.layout import Layout
 from rampart.actors.ros2.messages import GRAPH
 from rampart.actors.ros2.wire import Qos
 from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.systems import SHIPPED
 from rampart.testing import Ear, VirtualSystem, run
 
 SYSTEM = """
@@ -458,3 +460,15 @@ def test_a_table_that_cannot_be_is_refused_before_anything_runs(guarded, more, w
     with pytest.raises(ValueError, match=r"guarded\.toml: [^\n]+\Z") as raised:
         Layout(plan, load_system(plan))
     assert why in str(raised.value)
+
+
+def test_osmosis_on_ros_2_is_osmosis_but_for_what_speaks_ros_2():
+    documents = {name: tomllib.loads((SHIPPED / f"{name}.toml").read_text("utf-8"))
+                 for name in ("osmosis", "osmosis-ros2")}
+    there, here = documents["osmosis"], documents["osmosis-ros2"]
+    own = {"gateway", "ros_router", "simulator"}
+    for document in (there, here):
+        document["node"] = [node for node in document["node"] if node["name"] not in own]
+        del document["name"], document["title"]
+    del here["ros2"]
+    assert here == there
