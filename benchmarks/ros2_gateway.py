@@ -10,11 +10,11 @@ the system's bus, and what lies between them; and the share of a core that the g
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 import os
 import statistics
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -178,4 +178,9 @@ async def measure(seconds: float) -> None:
 
 if __name__ == "__main__":
     os.environ.setdefault("PYTHONPATH", str(Path(__file__).resolve().parents[1]))
-    asyncio.run(measure(float(sys.argv[1]) if len(sys.argv) > 1 else 20.0))
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.ros2_gateway", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("seconds", nargs="?", type=float, default=20.0, metavar="SECONDS",
+                        help="how long it is measured (20)")
+    asyncio.run(measure(parser.parse_args().seconds))

@@ -24,6 +24,23 @@ WANTING = {
 be had, and what is not tested without."""
 
 
+VIRTUAL = ("tests/whole/test_virtual_run.py", "tests/whole/test_guards_alone.py",
+           "tests/whole/test_counterexamples.py", "tests/whole/test_checkpointed_nodes.py",
+           "tests/whole/test_verdict_anyway.py", "tests/whole/test_ros2_mission.py",
+           "tests/sim/campaign", "tests/manager/analysis", "tests/cli/analyse",
+           "tests/actors/osmosis", "tests/actors/ros2/test_against_ros.py",
+           "examples/quadrotor/tests/test_flights.py", "examples/nav2")
+"""Tests that only compute, long and in virtual time: they run beside those on real processes."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark the tests that only compute."""
+    for item in items:
+        if item.nodeid.startswith(VIRTUAL):
+            item.add_marker("virtual")
+
+
 def pytest_runtest_setup(item):
     """Skip a test for which something is missing; where a variable says so, fail it."""
     for marker, (is_there, variable, how, _) in WANTING.items():

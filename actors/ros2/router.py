@@ -24,7 +24,9 @@ class RosRouter(Actor):
 
         Attributes:
             listen: its endpoint.
-            dead_man, dead_man_timeout_s, seed: of a world, which it is one of; not heeded.
+            dead_man: of every world; not heeded.
+            dead_man_timeout_s: likewise.
+            seed: likewise.
         """
 
         listen: str = LISTEN

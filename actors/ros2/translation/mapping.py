@@ -6,16 +6,14 @@ a run; what is left for a message is to read and to write.
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import msgspec
 import numpy as np
-from rosbags.interfaces import Nodetype
 
 from rampart.actors.ros2.translation.expressions import Expression, Plane, Read, steps
+from rampart.actors.ros2.translation.fields import TypeFields, near, plain, reads_of
 from rampart.actors.ros2.translation.forms import ON_PLANE, READY, WRITTEN
 from rampart.actors.ros2.translation.types import Types
 from rampart.manager.spec.ros2 import Ros2Link
@@ -27,12 +25,6 @@ _TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _HEADER = "std_msgs/msg/Header"
 _F32 = "_f32"
 BESIDE = "beside."
-
-BULK = ("uint8", "int8", "byte", "char")
-"""A list of these is an image, a point cloud or a map: how long it is is kept, no more."""
-
-LEN = "_len"
-"""Behind the name of such a list."""
 
 
 class Said(Protocol):
@@ -77,7 +69,7 @@ class Inward:
         for path in link.fields:
             if path not in needed:
                 raise ValueError(f"fields: {made.__name__} has no field {path!r}"
-                                 f"{_near(path, needed)}")
+                                 f"{near(path, needed)}")
         self._reads: list[tuple[list[str], Read]] = []
         self._reads_beside: list[tuple[list[str], Read]] = []
         for path, is_needed in needed.items():
@@ -152,7 +144,7 @@ def _read_of(said: str, beside: type[msgspec.Struct]) -> Read:
     for path in expression.paths:
         if path not in known:
             raise ValueError(f"fields: {BESIDE}{said}: {beside.__name__} has no field {path!r}"
-                             f"{_near(path, known)}")
+                             f"{near(path, known)}")
     return expression.read
 
 
@@ -205,7 +197,7 @@ class Outward:
         for path in expression.paths:
             if path not in self._leaves:
                 raise ValueError(f"fields: {said!r}: {self._heard} has no field {path!r}"
-                                 f"{_near(path, self._leaves)}")
+                                 f"{near(path, self._leaves)}")
         read, write = expression.read, fields.writer(where)
         if "".join(expression.paths).endswith(_F32):
             return lambda message, _said: np.frombuffer(read(message), "<f4")
@@ -251,84 +243,6 @@ class Outward:
         return self._types.encode(self._link.type, made)
 
 
-class TypeFields:
-    """The fields of a type of ROS 2, to be checked by path.
-
-    Args:
-        types: of ROS 2.
-        name: of the type.
-
-    Raises:
-        ValueError: it is not known.
-    """
-
-    def __init__(self, types: Types, name: str) -> None:
-        self._types, self._name = types, name
-        self.names = [field for field, _ in types.fields(name)]
-
-    def kind(self, path: str, said: str = "") -> str:
-        """Return the type of a field: of a message or number its name, of a list "[]" behind it.
-
-        "" if there is no such field at the top.
-
-        Raises:
-            ValueError: there is none further down.
-        """
-        what: Any = (Nodetype.NAME, self._name)
-        for step in steps(path, said):
-            kind, detail = what
-            if isinstance(step, int):
-                if kind not in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
-                    raise ValueError(f"{said or path!r}: [{step}] of what is no list")
-                what = detail[0]
-                continue
-            if kind != Nodetype.NAME:
-                raise ValueError(f"{said or path!r}: {step} of what has no fields")
-            name = detail
-            known = dict(self._types.fields(name))
-            if step not in known:
-                if path == step == "header":
-                    return ""
-                raise ValueError(f"{said or path!r}: {name} has no field {step!r}"
-                                 f"{_near(step, known)}")
-            what = known[step]
-        kind, detail = what
-        if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
-            return f"{detail[0][1] if detail[0][0] == Nodetype.NAME else detail[0][1][0]}[]"
-        return str(detail if kind == Nodetype.NAME else detail[0])
-
-    def check(self, path: str, said: str) -> None:
-        """Refuse a path that does not exist.
-
-        Raises:
-            ValueError: it does not.
-        """
-        self.kind(path, said)
-
-    def writer(self, where: str) -> Callable[[Any], Any]:
-        """Return what makes a value fit for a field.
-
-        Raises:
-            ValueError: there is no such field, or nothing is written into it.
-        """
-        kind = self.kind(where)
-        if kind == "geometry_msgs/msg/Quaternion":
-            return lambda value: self._types.like(kind, value)
-        if kind.endswith("[]"):
-            element = kind[:-2]
-            return list if "/" in element or element == "string" else (
-                lambda value: np.asarray(value, _NUMPY_OF.get(element, element)))
-        if "/" in kind:
-            raise ValueError(f"fields: {where} is a {kind}; one of its fields is right")
-        if kind.startswith("float"):
-            return _finite
-        return _ENCODED.get(kind, int)
-
-
-_NUMPY_OF = {"byte": "uint8", "char": "uint8"}
-_ENCODED: Mapping[str, Callable[[Any], Any]] = {"string": str, "bool": bool}
-
-
 def _place(fields: TypeFields, where: str) -> tuple[list[str], str | int]:
     """Return the way to a field that is written, and its last step."""
     fields.check(where, where)
@@ -347,55 +261,3 @@ def _leaves(made: type[msgspec.Struct], above: str = "") -> Iterator[tuple[str, 
             yield from _leaves(kind, f"{path}.")
         else:
             yield path, field.required
-
-
-def _near(name: str, known: Any) -> str:
-    near = difflib.get_close_matches(name, list(known), 1)
-    return f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known) or 'none'}"
-
-
-def plain(value: Any) -> Any:
-    """Return a value of ROS 2 as one that messages of the system are made of."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, list):
-        return [plain(item) for item in value]
-    names = getattr(value, "__dataclass_fields__", None)
-    if names is None:
-        return value
-    found = {}
-    for name in names:
-        inner = getattr(value, name)
-        if isinstance(inner, np.ndarray) and inner.dtype in _ONE_BYTE:
-            found[f"{name}{LEN}"] = len(inner)
-        elif name != "__msgtype__":
-            found[name] = plain(inner)
-    return found
-
-
-def _finite(value: float) -> float:
-    """Return a number that ROS 2 is told; what is none moves no wheel.
-
-    Raises:
-        ValueError: it is not finite.
-    """
-    if not math.isfinite(value):
-        raise ValueError(f"{value} is no number")
-    return float(value)
-
-
-_ONE_BYTE = (np.uint8, np.int8)
-
-
-def reads_of(name: str, types: Types, above: str = "") -> dict[str, str]:
-    """Return field → expression by which a message is read field by field, its parts included."""
-    found: dict[str, str] = {}
-    for field, (kind, detail) in types.fields(name):
-        path = f"{above}{field}"
-        if kind == Nodetype.NAME:
-            found |= reads_of(detail, types, f"{path}.")
-        elif kind != Nodetype.BASE and detail[0][1][0] in BULK:
-            found[f"{path}{LEN}"] = f"count({path})"
-        else:
-            found[path] = path
-    return found

@@ -15,8 +15,9 @@ from rampart.actors.bus.bounds import MOST, Count, Floats32, Meta, Text, Whole
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ros2.translation.expressions import Expression, Plane
+from rampart.actors.ros2.translation.fields import BULK, LEN, TypeFields
 from rampart.actors.ros2.translation.forms import ON_PLANE, READY, kind_of
-from rampart.actors.ros2.translation.mapping import BESIDE, BULK, LEN, TF, TypeFields
+from rampart.actors.ros2.translation.mapping import BESIDE, TF
 from rampart.actors.ros2.translation.types import Types
 from rampart.manager.spec.ros2 import Ros2Link
 

@@ -39,7 +39,7 @@ from tests import CELL
                              "with commas between are right, as 10,35,70,140"),
     (["--sizes", "9"], "--sizes 9: must be between 10 and 500"),
     (["--system", "nowhere.toml"], "nowhere.toml: No such file or directory; a spec is right, or "
-                                   "the name of a shipped one: osmosis, paper"),
+                                   "the name of a shipped one: osmosis, osmosis-ros2, paper"),
     (["--only", "restart", "--system", str(CELL), "--node", "grip"], "unknown node 'grip'; "),
     (["--only", "size", "--out", "FILE"], "--out FILE: no directory that can be written "
                                           "(File exists)")])

@@ -1,0 +1,151 @@
+"""The fields of a type of ROS 2, and values of them. Pure."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from rampart.actors.ros2.translation.expressions import steps
+from rampart.actors.ros2.translation.types import Types
+
+BULK = ("uint8", "int8", "byte", "char")
+"""A list of these is an image, a point cloud or a map: how long it is is kept, no more."""
+
+LEN = "_len"
+"""Behind the name of such a list."""
+
+
+class TypeFields:
+    """The fields of a type of ROS 2, to be checked by path.
+
+    Args:
+        types: of ROS 2.
+        name: of the type.
+
+    Raises:
+        ValueError: it is not known.
+    """
+
+    def __init__(self, types: Types, name: str) -> None:
+        self._types, self._name = types, name
+        self.names = [field for field, _ in types.fields(name)]
+
+    def kind(self, path: str, said: str = "") -> str:
+        """Return the type of a field: of a message or number its name, of a list "[]" behind it.
+
+        "" if there is no such field at the top.
+
+        Raises:
+            ValueError: there is none further down.
+        """
+        what: Any = (Nodetype.NAME, self._name)
+        for step in steps(path, said):
+            kind, detail = what
+            if isinstance(step, int):
+                if kind not in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+                    raise ValueError(f"{said or path!r}: [{step}] of what is no list")
+                what = detail[0]
+                continue
+            if kind != Nodetype.NAME:
+                raise ValueError(f"{said or path!r}: {step} of what has no fields")
+            name = detail
+            known = dict(self._types.fields(name))
+            if step not in known:
+                if path == step == "header":
+                    return ""
+                raise ValueError(f"{said or path!r}: {name} has no field {step!r}"
+                                 f"{near(step, known)}")
+            what = known[step]
+        kind, detail = what
+        if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+            return f"{detail[0][1] if detail[0][0] == Nodetype.NAME else detail[0][1][0]}[]"
+        return str(detail if kind == Nodetype.NAME else detail[0])
+
+    def check(self, path: str, said: str) -> None:
+        """Refuse a path that does not exist.
+
+        Raises:
+            ValueError: it does not.
+        """
+        self.kind(path, said)
+
+    def writer(self, where: str) -> Callable[[Any], Any]:
+        """Return what makes a value fit for a field.
+
+        Raises:
+            ValueError: there is no such field, or nothing is written into it.
+        """
+        kind = self.kind(where)
+        if kind == "geometry_msgs/msg/Quaternion":
+            return lambda value: self._types.like(kind, value)
+        if kind.endswith("[]"):
+            element = kind[:-2]
+            return list if "/" in element or element == "string" else (
+                lambda value: np.asarray(value, _NUMPY_OF.get(element, element)))
+        if "/" in kind:
+            raise ValueError(f"fields: {where} is a {kind}; one of its fields is right")
+        if kind.startswith("float"):
+            return _finite
+        return _ENCODED.get(kind, int)
+
+
+_NUMPY_OF = {"byte": "uint8", "char": "uint8"}
+_ENCODED: Mapping[str, Callable[[Any], Any]] = {"string": str, "bool": bool}
+
+
+def near(name: str, known: Any) -> str:
+    """Return what names are meant or known, as the end of a message."""
+    found = difflib.get_close_matches(name, list(known), 1)
+    return f"; did you mean {found[0]}?" if found else f"; known: {', '.join(known) or 'none'}"
+
+
+def plain(value: Any) -> Any:
+    """Return a value of ROS 2 as one that messages of the system are made of."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list):
+        return [plain(item) for item in value]
+    names = getattr(value, "__dataclass_fields__", None)
+    if names is None:
+        return value
+    found = {}
+    for name in names:
+        inner = getattr(value, name)
+        if isinstance(inner, np.ndarray) and inner.dtype in _ONE_BYTE:
+            found[f"{name}{LEN}"] = len(inner)
+        elif name != "__msgtype__":
+            found[name] = plain(inner)
+    return found
+
+
+def _finite(value: float) -> float:
+    """Return a number that ROS 2 is told; what is none moves no wheel.
+
+    Raises:
+        ValueError: it is not finite.
+    """
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is no number")
+    return float(value)
+
+
+_ONE_BYTE = (np.uint8, np.int8)
+
+
+def reads_of(name: str, types: Types, above: str = "") -> dict[str, str]:
+    """Return field → expression by which a message is read field by field, its parts included."""
+    found: dict[str, str] = {}
+    for field, (kind, detail) in types.fields(name):
+        path = f"{above}{field}"
+        if kind == Nodetype.NAME:
+            found |= reads_of(detail, types, f"{path}.")
+        elif kind != Nodetype.BASE and detail[0][1][0] in BULK:
+            found[f"{path}{LEN}"] = f"count({path})"
+        else:
+            found[path] = path
+    return found
