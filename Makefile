@@ -8,12 +8,14 @@ run: setup
 	$(BIN)/python launch.py
 
 # What has a mission of the real robot against the clock needs the machine for itself, and comes
-# last; beside it runs, at the lowest priority, what only computes.
+# last; beside it runs, at the lowest priority, what only computes. Of the others many wait more than
+# they compute, so there is one worker more than cores.
+WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 1)))
 # Without Chromium the operator's page is not tested, which the last line says.
 test: setup
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
-	$(BIN)/python -m pytest -m "not slow and not alone and (not virtual or processes)" --numprocesses logical
+	$(BIN)/python -m pytest -m "not slow and not alone and (not virtual or processes)" --numprocesses $(WORKERS)
 	$(BIN)/python -m tests.beside
 
 # Long missions on real processes that the suite has shorter relatives of; three minutes.

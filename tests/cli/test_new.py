@@ -35,6 +35,7 @@ def made(folder: Path, monkeypatch, name: str = "courier") -> Path:
     return folder / name
 
 
+@pytest.mark.slow
 def test_what_it_makes_is_tested_typed_and_clean(tmp_path, monkeypatch, capsys):
     robot = made(tmp_path, monkeypatch)
     assert capsys.readouterr().out.startswith("courier/ is a robot that runs: cd courier, then ")

@@ -79,6 +79,7 @@ def compared(capsys, *more):
     return told(capsys)
 
 
+@pytest.mark.slow
 def test_strategies_are_compared_each_in_a_column_of_its_own(capsys):
     table = compared(capsys).splitlines()
     assert table[0].split() == ["active", "safety-first", "mission-first"]

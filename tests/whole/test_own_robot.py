@@ -81,7 +81,9 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("how", ["--rate=4", "--virtual", "--fault=drop:localization/pose"])
+@pytest.mark.parametrize("how", ["--virtual", *(
+    pytest.param(how, marks=pytest.mark.slow)
+    for how in ("--rate=4", "--fault=drop:localization/pose"))])
 @pytest.mark.parametrize("what", BROKEN)
 def test_a_module_of_one_s_own_that_cannot_be_imported_is_one_line_with_file_path_and_cause(
         tmp_path, what, how):

@@ -49,6 +49,7 @@ def test_without_the_mechanisms_a_jump_of_the_localization_does_harm():
                        ).judgement.success is False
 
 
+@pytest.mark.slow
 @pytest.mark.processes
 def test_on_processes_it_drives_over_the_wire_format_and_a_killed_controller_is_back(
         tmp_path, monkeypatch):

@@ -64,6 +64,7 @@ def test_only_its_own_token_is_a_nodes():
                       (*LAYOUT.routers, *LAYOUT.members)}
 
 
+@pytest.mark.slow
 def test_what_actors_do_in_a_mission_with_faults_they_may(monkeypatch):
     """Or it would be refused when keys are on; what they may is no more than what they do."""
     done = {"says": set(), "hears": set(), "asks": set()}

@@ -34,6 +34,7 @@ STICK = "document.querySelector('.stick-state').textContent"
 STATE = f"(({ROW}) || document.createElement('p')).textContent"
 
 
+@pytest.mark.slow
 @pytest.mark.page
 async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed_to_its_report(
         tmp_path):

@@ -146,6 +146,7 @@ def test_the_robot_stands_until_what_was_given_up_is_back_and_then_goes_on(tmp_p
     assert [at for at in record.track if stands_s < at[0] < SICK_S[1]] == []
 
 
+@pytest.mark.slow
 @pytest.mark.processes
 async def test_real_processes_that_fail_at_their_start_come_back_by_themselves(
         tmp_path, monkeypatch):
