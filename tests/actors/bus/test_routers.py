@@ -26,6 +26,7 @@ from rampart.testing import eventually
 
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload([__name__])  # a process of its own that has no session yet
+pytestmark = pytest.mark.alone
 
 
 def be_router(folder: str, name: str, ready) -> None:
