@@ -20,8 +20,8 @@ def main() -> int:
     """Run both; what is beside is printed when it is over."""
     with tempfile.TemporaryFile("w+") as said:
         virtual = subprocess.Popen(
-            ["nice", "-n", "19", *_PYTEST, "virtual and not slow and not alone and not processes"],
-            stdout=said, stderr=subprocess.STDOUT)
+            ["nice", "-n", "19", *_PYTEST, "virtual and not slow and not alone and not processes",
+             "--numprocesses", "logical"], stdout=said, stderr=subprocess.STDOUT)
         alone = subprocess.run([*_PYTEST, "alone and not slow"], check=False).returncode
         beside = virtual.wait()
         said.seek(0)
