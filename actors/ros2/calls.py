@@ -86,14 +86,13 @@ class Called:
         self._host, self._link, self._answers = host, link, answers
         self._request = Outward(msgspec.structs.replace(
             link, type=f"{link.type}{_REQUEST}"), types, asks.type, lenient=True)
-        self._fields = {f.name for f in msgspec.structs.fields(answers.type)}
         self._response = _ResponseOf(link, types, answers.type)
         self._client = host.node.client(link.name, link.type)
-        self._pending = 0
+        self._is_under_way = False
 
     def heard(self, message: Any, header: Header) -> None:
         """Call the service; a request that comes while one is under way comes again."""
-        if self._pending:
+        if self._is_under_way:
             return
         if self._host.now_s() - header.stamp > max(self._link.max_age_s, self._link.within_s):
             self._host.refuse(self._link.name, f"what {header.source} asks is too old")
@@ -103,12 +102,12 @@ class Called:
         except (ValueError, TypeError, OverflowError) as error:
             self._say(None, f"what {header.source} asks: {error}")
             return
-        self._pending += 1
+        self._is_under_way = True
         self._client.ask(payload, self._link.within_s, lambda answer, why: self._host.handle(
             None, partial(self._over, answer, why)))
 
     def _over(self, answer: bytes | None, why: str) -> None:
-        self._pending -= 1
+        self._is_under_way = False
         self._say(answer, why)
 
     def _say(self, answer: bytes | None, why: str) -> None:

@@ -30,7 +30,6 @@ from rampart.actors.ros2.calls import (
     Served,
     answer_topic,
     request_topic,
-    response_of,
 )
 from rampart.actors.ros2.diagnostics import Diagnostics
 from rampart.actors.ros2.graph import RosGraph, misfits
@@ -38,14 +37,14 @@ from rampart.actors.ros2.links import HeardTopic, SaidTopic
 from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import NS, RosClock
-from rampart.actors.ros2.side import ROUTER, NoSide, Side
+from rampart.actors.ros2.side import NoSide, Side
 from rampart.actors.ros2.stand_in import side_of, wall_ns
 from rampart.actors.ros2.translation.mirror import topic_of
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import ADMIN, EndpointKind, Qos
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import RosLinks
-from rampart.manager.spec.ros2 import Ros2Link
+from rampart.manager.spec.ros2 import ROUTER, Ros2Link
 
 _CLOCK, _CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
 _SETTLE_S = 0.05
@@ -103,8 +102,7 @@ class Gateway(Actor):
         self.time = RosClock(said.clock, self.clock.now, self.clock.rate, partial(wall_ns, self))
         self._types = _types(said)
         self._side: Side | None = None
-        self._links: dict[str, SaidTopic | Called | Goal] = {}
-        self._mine: list[str] = []
+        self._links: dict[tuple[str, str], SaidTopic | Called | Goal] = {}
         self._graph_due = False
         self._was_linked = False
         self._diagnostics: Diagnostics | None = None
@@ -152,8 +150,6 @@ class Gateway(Actor):
                      "serve": Served, "goal": Goal}[link.way]
         made(_Nobody(types), link,
              *(topics[key] for key in (link.from_, link.to, link.beside) if key))
-        if link.way == "serve":
-            response_of(link, types)
 
     # -- a run ------------------------------------------------------------------------------------
 
@@ -175,9 +171,9 @@ class Gateway(Actor):
             elif link.way == "serve" and to is not None:
                 Served(self, link, to)
             elif link.way == "publish" and heard is not None:
-                self._links[link.name] = SaidTopic(self, link, heard)
+                self._links[link.way, link.name] = SaidTopic(self, link, heard)
             elif heard is not None and to is not None:
-                self._links[link.name] = (Called if link.way == "call" else Goal)(
+                self._links[link.way, link.name] = (Called if link.way == "call" else Goal)(
                     self, link, heard, to)
         if said.diagnostics:
             system = run.system
@@ -193,7 +189,7 @@ class Gateway(Actor):
 
     def _passed_on(self, link: Ros2Link) -> Callable[[Any, Header], None]:
         def heard(message: Any, header: Header) -> None:
-            self._links[link.name].heard(message, header)
+            self._links[link.way, link.name].heard(message, header)
 
         return heard
 

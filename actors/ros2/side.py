@@ -19,9 +19,6 @@ from zenoh.handlers import Callback
 
 from rampart.actors.ros2.wire import Qos
 
-ROUTER = "tcp/localhost:7447"
-"""Where the router of `rmw_zenoh` listens by default."""
-
 Deliver = Callable[[bytes, bytes | None], None]
 """Called with payload and attachment of a message."""
 

@@ -19,10 +19,11 @@ from rampart.actors.bus.bus import Bus
 from rampart.actors.ros2.bus_side import BusSide
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import EPOCH_NS, NS
-from rampart.actors.ros2.side import ROUTER, Side, ZenohSide
+from rampart.actors.ros2.side import Side, ZenohSide
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import Attachment, Qos
 from rampart.actors.runtime.actor import Actor, Context
+from rampart.manager.spec.ros2 import ROUTER
 
 
 def side_of(actor: Actor, bus: Bus, connect: Sequence[str]) -> Side:

@@ -39,8 +39,8 @@ from rampart.cli.output import NoEffectError, positive, print_json, print_table,
 from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
 from rampart.files import streams
+from rampart.manager.spec.ros2 import ROUTER
 
-ROS_ROUTER = "tcp/localhost:7447"
 _WINDOW = 500
 _SHOWN_BYTES = 24
 _HZ_REPORT_S = 1.0
@@ -50,8 +50,8 @@ def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     topic = add_family(verbs, "topic", "what travels on the keys", __doc__)
     key = option("key", metavar="KEY")
-    ros = option("--ros", nargs="?", const=ROS_ROUTER, metavar="ENDPOINT",
-                 help=f"of ROS 2, by the router there (default {ROS_ROUTER})")
+    ros = option("--ros", nargs="?", const=ROUTER, metavar="ENDPOINT",
+                 help=f"of ROS 2, by the router there (default {ROUTER})")
     add_verb(topic, "list", "all topics (needs no run)", topic_list, systems.choice(),
              either(JSON, flag("--markdown", "print topics.md")), ros)
     add_verb(topic, "info", "the contract of one topic (needs no run)", topic_info, key,

@@ -19,6 +19,9 @@ RosType = Annotated[str, msgspec.Meta(
 Written = dict[str, str | float | bool]
 
 GATEWAY = "rampart.actors.ros2.gateway:Gateway"
+ROUTER = "tcp/localhost:7447"
+"""Where the router of `rmw_zenoh` listens by default."""
+
 INTERFACES = "interfaces"
 """Its parameter with folders, relative to the file of the system."""
 
@@ -99,13 +102,3 @@ class Ros2Link(Table, frozen=True, kw_only=True):
     def name(self) -> str:
         """Name of the topic, service or action of ROS 2."""
         return str(getattr(self, self.way))
-
-    @property
-    def heard(self) -> str:
-        """Key of the topic of the system that is heard; "" for none."""
-        return self.from_
-
-    @property
-    def said(self) -> str:
-        """Key of the topic of the system that is published; "" for none."""
-        return self.to

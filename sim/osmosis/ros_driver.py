@@ -7,7 +7,6 @@ commands there. Only what a judge is told passes by the system's own bus.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from itertools import count
 from typing import Any
@@ -18,11 +17,11 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.ros2.ros_clock import EPOCH_NS
-from rampart.actors.ros2.side import ROUTER, Side
-from rampart.actors.ros2.stand_in import side_of
+from rampart.actors.ros2.side import Side
+from rampart.actors.ros2.stand_in import side_of, wall_ns
 from rampart.actors.ros2.wire import Qos
 from rampart.actors.runtime.actor import Context, Header
+from rampart.manager.spec.ros2 import ROUTER
 from rampart.sim.osmosis.ros_format import Graph, Reader, Writer, attachment
 from rampart.sim.osmosis.simulator import Simulator
 
@@ -108,7 +107,7 @@ class RosDriver(Simulator):
         key, token, gid = self._graph.endpoint("MP", where, of, f"RIHS01_{_HASHES[of]}")
         put, numbers = self._side.publisher(key, Qos()), count(1)
         self._side.token(token)
-        return lambda payload: put(payload, attachment(next(numbers), self._wall_ns(), gid))
+        return lambda payload: put(payload, attachment(next(numbers), wall_ns(self), gid))
 
     def _subscribe(self, where: str, of: str, heard: Callable[[Reader], None]) -> None:
         assert self._side is not None  # noqa: S101 for the type checker
@@ -136,11 +135,11 @@ class RosDriver(Simulator):
 
     def _braked_by(self, data: Reader) -> None:
         holder, engaged, reason = data.text(), bool(data.get("?")), data.text()
-        self.brake(m.BrakeCommand(engaged, reason), self._from(holder, self._wall_ns()))
+        self.brake(m.BrakeCommand(engaged, reason), self._from(holder, wall_ns(self)))
 
     def _from(self, source: str, stamp_ns: int) -> Header:
         """Return the header of what came from ROS 2."""
-        behind_s = (self._wall_ns() - stamp_ns) / 1e9 * self.clock.rate
+        behind_s = (wall_ns(self) - stamp_ns) / 1e9 * self.clock.rate
         return Header(source, 0, 0, self.clock.now() - behind_s)
 
     # -- what it says -----------------------------------------------------------------------------
@@ -156,7 +155,7 @@ class RosDriver(Simulator):
         if say is None:
             super().publish(topic, body, stamp, name)
             return
-        stamp_ns = self._wall_ns() - int(
+        stamp_ns = wall_ns(self) - int(
             (self.clock.now() - (self.clock.now() if stamp is None else stamp))
             / self.clock.rate * 1e9)
         if isinstance(body, m.GpsFix):  # a receiver says its velocity on a topic of its own
@@ -164,11 +163,6 @@ class RosDriver(Simulator):
                 Writer().header(stamp_ns, "map").put(
                     "d", body.velocity_x_mps, body.velocity_y_mps, 0, 0, 0, 0).zeros(36).done())
         say(_WRITE[type(body)](body, Writer(), stamp_ns))
-
-    def _wall_ns(self) -> int:
-        if self.context.run.plan.virtual:
-            return EPOCH_NS + int(self.clock.now() * 1e9)
-        return time.time_ns()
 
 
 def _turn(writer: Writer, yaw_rad: float) -> Writer:
