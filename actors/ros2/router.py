@@ -24,15 +24,9 @@ class RosRouter(Actor):
 
         Attributes:
             listen: its endpoint.
-            dead_man: of every world; not heeded.
-            dead_man_timeout_s: likewise.
-            seed: likewise.
         """
 
         listen: str = LISTEN
-        dead_man: bool = True
-        dead_man_timeout_s: float = 0.0
-        seed: int = 0
 
     parameters: Parameters
     most_spare = "none"

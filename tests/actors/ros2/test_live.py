@@ -53,7 +53,7 @@ MORE = """
 [[node]]
 name = "router"
 actor = "rampart.actors.ros2.router:RosRouter"
-kind = "world"
+kind = "non-control"
 parameters = {{ listen = "tcp/127.0.0.1:{port}" }}
 
 [[node]]
