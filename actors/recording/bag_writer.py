@@ -166,7 +166,7 @@ class BagWriter:
             return
         log_ns = stamp_ns = self._ns(at_s)
         if header is None:
-            self.garbage += 1
+            self.garbage += not form.is_foreign
         elif math.isfinite(header.stamp):
             stamp_ns = self._ns(header.stamp)
         sequence = header.sequence & 0xFFFFFFFF if header else 0

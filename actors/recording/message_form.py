@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE, Envelope, Header, decode, pack
-from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.bus.topic import ROOT, ROS_SIDE, Topic
 from rampart.actors.layout.system_topics import find_topic
 
 B = TypeVar("B")
@@ -52,16 +52,20 @@ class MessageForm:
     Args:
         topic: the contract of the key; None for a key without one: there each payload that has a
             header is a message.
+        foreign: whether it is a key of nodes of ROS 2, whose messages have no header.
     """
 
-    def __init__(self, topic: Topic[Any] | None) -> None:
+    def __init__(self, topic: Topic[Any] | None, *, foreign: bool = False) -> None:
         kind: Any = topic.type if topic else Any
         self.topic = topic
+        self.is_foreign = foreign
         self._decode: Callable[[bytes], Recorded[Any]] = msgspec.json.Decoder(Recorded[kind]).decode
         self._is_plain = topic is not None and _is_plain(topic.type)
 
     def recorded(self, payload: bytes) -> tuple[bytes, Header | None, Any]:
         """Return JSON, header and body of a payload; for garbage the latter are None."""
+        if self.is_foreign:
+            return _encode(Recorded("", 0, 0, None, raw=payload)), None, None
         header: Header
         try:
             if self.topic is None:
@@ -142,6 +146,7 @@ _encode_msgpack = msgspec.msgpack.Encoder().encode
 
 
 _form = cache(MessageForm)
+_FOREIGN = MessageForm(None, foreign=True)
 
 
 class Forms:
@@ -158,7 +163,8 @@ class Forms:
     def of(self, key: str) -> MessageForm:
         """Return the form of the messages on a full key."""
         if key not in self._forms:
-            self._forms[key] = _form(find_topic(key.removeprefix(f"{ROOT}/"), self._topics))
+            self._forms[key] = _FOREIGN if key.startswith(f"{ROS_SIDE}/") else _form(
+                find_topic(key.removeprefix(f"{ROOT}/"), self._topics))
         return self._forms[key]
 
 

@@ -16,11 +16,10 @@ import xxhash
 
 from rampart.actors.bus import topic as bus_topic
 from rampart.actors.bus.bus import Bus
-from rampart.actors.bus.topic import Topic
-from rampart.actors.ros2.side import Answered, Deliver, Reply
+from rampart.actors.bus.topic import ROS_SIDE, Topic
+from rampart.actors.ros2.side import Answered, Deliver, Reply, chunk_of, recorded
 from rampart.actors.ros2.wire import Qos
 
-_ROOT = "ros2-side"
 _KEPT = Topic("", msgspec.Struct, bus_topic.Qos.STATE, 0.0, "", "What newcomers are told.")
 _PASSING = Topic("", msgspec.Struct, bus_topic.Qos.COMMAND, 0.0, "", "What they are not.")
 
@@ -43,12 +42,12 @@ class BusSide:
         self._seen: dict[str, tuple[int, set[str]]] = {}
         self._numbers = count(1)
         self._asked: dict[int, Answered] = {}
-        bus.subscribe(_PASSING, f"{_ROOT}/answer/{self.id}", self._answer)
+        bus.subscribe(_PASSING, f"{ROS_SIDE}/answer/{self.id}", self._answer)
 
     def token(self, key: str) -> None:
         """See `Side.token`."""
         self._tokens.append(key)
-        self._bus.publish(_KEPT, f"{_ROOT}/tokens/{self._name}",
+        self._bus.publish(_KEPT, f"{ROS_SIDE}/tokens/{self._name}",
                           _pack((self._name, self._incarnation, self._tokens)))
 
     def tokens(self, pattern: str, changed: Callable[[str, bool], None]) -> None:
@@ -79,7 +78,7 @@ class BusSide:
             for token in sorted(tokens):
                 changed(token, alive)
 
-        where = f"{_ROOT}/tokens/*"
+        where = f"{ROS_SIDE}/tokens/*"
         self._bus.subscribe(_KEPT, where, heard)
         self._bus.latest(where, heard, lambda: None)
         tell({token for token in self._tokens if token.startswith(above)}, alive=True)
@@ -87,13 +86,12 @@ class BusSide:
     def publisher(self, key: str, qos: Qos) -> Callable[[bytes, bytes], None]:
         """See `Side.publisher`."""
         topic = _KEPT if qos.transient_local else _PASSING
-        where = f"{_ROOT}/data/{_chunk(key)}"
         return lambda payload, attachment: self._bus.publish(
-            topic, where, _pack((payload, attachment)))
+            topic, *recorded(key, payload, attachment))
 
     def subscribe(self, key: str, qos: Qos, deliver: Deliver) -> None:
         """See `Side.subscribe`."""
-        where = f"{_ROOT}/data/{_chunk(key)}"
+        where, _ = recorded(key, b"", None)
         self._bus.subscribe(_PASSING, where, lambda _key, packed: deliver(*_unpack(packed)))
         if qos.transient_local:
             self._bus.latest(
@@ -105,9 +103,9 @@ class BusSide:
         def heard(_key: str, packed: bytes) -> None:
             who, number, payload, attachment = _unpack(packed)
             asked(payload, attachment, lambda answer, attached: self._bus.publish(
-                _PASSING, f"{_ROOT}/answer/{who}", _pack((number, answer, attached))))
+                _PASSING, f"{ROS_SIDE}/answer/{who}", _pack((number, answer, attached))))
 
-        self._bus.subscribe(_PASSING, f"{_ROOT}/ask/{_chunk(key)}", heard)
+        self._bus.subscribe(_PASSING, f"{ROS_SIDE}/ask/{chunk_of(key)}", heard)
 
     def ask(self, key: str, payload: bytes, attachment: bytes, timeout_s: float,
             answered: Answered) -> None:
@@ -121,7 +119,7 @@ class BusSide:
                 late(None, None, "nobody answers")
 
         asyncio.get_running_loop().call_later(timeout_s, over)
-        self._bus.publish(_PASSING, f"{_ROOT}/ask/{_chunk(key)}",
+        self._bus.publish(_PASSING, f"{ROS_SIDE}/ask/{chunk_of(key)}",
                           _pack((self.id, number, payload, attachment)))
 
     def _answer(self, _key: str, packed: bytes) -> None:
@@ -136,7 +134,3 @@ class BusSide:
 
     def close(self) -> None:
         """See `Side.close`; the bus is the actor's to close."""
-
-
-def _chunk(key: str) -> str:
-    return key.replace("/", "|")

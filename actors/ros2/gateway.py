@@ -21,6 +21,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from rampart.actors.bus.bounds import MANY, NAME_CHARS, clip
+from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DecisionRecord, DetectionReport, RecoveryReport
@@ -156,7 +157,8 @@ class Gateway(Actor):
     def on_start(self) -> None:
         """Enter the graph of ROS 2, and declare everything there."""
         said, run = self.parameters, self.context.run
-        self._side = side_of(self, self._bus, said.connect)
+        self._recorder = RecorderConnection(run.plan.base_port)
+        self._side = side_of(self, self._bus, said.connect, self._recorder.take)
         self.node = RosNode(self._side, self._types, said.node, wall_ns=partial(wall_ns, self),
                             refuse=self.refuse, namespace=said.namespace, domain=said.domain)
         if said.clock == "ros":
@@ -186,6 +188,7 @@ class Gateway(Actor):
         """Leave the graph."""
         if self._side is not None:
             self._side.close()
+            self._recorder.close()
 
     def _passed_on(self, link: Ros2Link) -> Callable[[Any, Header], None]:
         def heard(message: Any, header: Header) -> None:

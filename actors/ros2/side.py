@@ -13,10 +13,12 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+import msgspec
 import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
+from rampart.actors.bus.topic import ROS_SIDE
 from rampart.actors.ros2.wire import Qos
 
 Deliver = Callable[[bytes, bytes | None], None]
@@ -27,6 +29,10 @@ Reply = Callable[[bytes, bytes], None]
 
 Answered = Callable[[bytes | None, bytes | None, str], None]
 """Called with payload and attachment of an answer, or with None, None, and why there is none."""
+
+
+Record = Callable[[str, bytes], None]
+"""Takes key and payload of what a recording is to have."""
 
 
 class Side(Protocol):
@@ -103,18 +109,21 @@ class ZenohSide:
     Args:
         dial: endpoints of the routers of ROS 2, e.g. "tcp/localhost:7447".
         loop: on which everything is told.
+        record: takes each message that is published or heard; None for no one.
 
     Raises:
         ValueError: an endpoint makes no sense; one line.
     """
 
-    def __init__(self, dial: Sequence[str], loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, dial: Sequence[str], loop: asyncio.AbstractEventLoop,
+                 record: Record | None = None) -> None:
         try:
             self._session = zenoh.open(_configured(dial))
         except zenoh.ZError as error:
             raise ValueError(f"connect = {list(dial)}: {' '.join(str(error).split())}") from None
         self.id = str(self._session.zid())
         self._loop = loop
+        self._record = record
         self._held: list[Any] = []
 
     def token(self, key: str) -> None:
@@ -149,14 +158,25 @@ class ZenohSide:
             made = self._session.declare_publisher(
                 key, congestion_control=control, reliability=reliability, express=True)
         self._held.append(made)
-        return lambda payload, attachment: made.put(payload, attachment=attachment)
+
+        def publish(payload: bytes, attachment: bytes) -> None:
+            made.put(payload, attachment=attachment)
+            if self._record is not None:
+                self._record(*recorded(key, payload, attachment))
+
+        return publish
 
     def subscribe(self, key: str, qos: Qos, deliver: Deliver) -> None:
         """See `Side.subscribe`."""
 
         def arrived(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
             payload, attached = sample.payload.to_bytes(), sample.attachment
-            self._tell(deliver, payload, None if attached is None else attached.to_bytes())
+            self._tell(heard, payload, None if attached is None else attached.to_bytes())
+
+        def heard(payload: bytes, attachment: bytes | None) -> None:
+            if self._record is not None:
+                self._record(*recorded(key, payload, attachment))
+            deliver(payload, attachment)
 
         if qos.transient_local:
             recovery = ext.RecoveryConfig(
@@ -219,6 +239,16 @@ class ZenohSide:
     def _tell(self, call: Callable[..., None], *what: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(call, *what)
+
+
+def chunk_of(key: str) -> str:
+    """Return a key of ROS 2 as one chunk of another."""
+    return key.replace("/", "|")
+
+
+def recorded(key: str, payload: bytes, attachment: bytes | None) -> tuple[str, bytes]:
+    """Return key and payload by which a message of a topic of ROS 2 stands in a recording."""
+    return f"{ROS_SIDE}/data/{chunk_of(key)}", msgspec.msgpack.encode((payload, attachment))
 
 
 def _direct(call: Callable[[Any], None]) -> Callback[Any]:

@@ -6,6 +6,7 @@ others.
 Examples:
   rampart bag info run.mcap
   rampart bag repair torn.mcap whole.mcap
+  rampart bag ros2 run.mcap run-ros2
 """
 
 from __future__ import annotations
@@ -38,7 +39,17 @@ from rampart.cli.output import (
     say,
 )
 from rampart.cli.record.replaying import DEFAULT_PORT, Replay
-from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag, number, option, whole
+from rampart.cli.verbs import (
+    JSON,
+    PORT,
+    add_family,
+    add_verb,
+    extra,
+    flag,
+    number,
+    option,
+    whole,
+)
 from rampart.files.reading import plain_line
 
 _PORTS = (1024, 65535)
@@ -72,6 +83,13 @@ def add(verbs: Any) -> None:
     add_verb(bag, "repair", "write what can be read into a whole file", bag_repair,
              option("file", metavar="IN"), option("out", metavar="OUT"),
              flag("--overwrite", "OUT may exist"))
+    add_verb(bag, "ros2", "write it as a bag of ROS 2", bag_ros2,
+             option("file", metavar="IN"), option("out", metavar="FOLDER"),
+             option("--system", metavar="SPEC", help="file, or name of a shipped system, whose "
+                    "actors and [[ros2]] count (default: what the recording has of its own)"),
+             option("--distribution", metavar="NAME", help="of ROS 2 (default: the gateway's, or "
+                    "jazzy)"),
+             JSON)
 
 
 def record(options: argparse.Namespace) -> int:
@@ -243,6 +261,34 @@ def bag_repair(options: argparse.Namespace) -> int:
         reader = BagReader(Path(options.file))
         copied = repair(reader, Path(options.out), overwrite=options.overwrite)
     say(f"{options.out}: {copied} messages; left behind: {reader.damage or 'nothing'}")
+    return 0
+
+
+def bag_ros2(options: argparse.Namespace) -> int:
+    """Write a recording as a bag of ROS 2.
+
+    A new folder with MCAP, cdr and ros2msg, as `ros2 bag record` makes it: for
+    `ros2 bag play`, RViz, PlotJuggler. It has what passed a gateway to ROS 2, byte
+    for byte; every topic of the run below /rampart, in types of their own; and
+    what viewers see: /tf, /rosout, /view/scan, /view/map.
+
+    Examples:
+      rampart bag ros2 run.mcap run-ros2
+      rampart bag ros2 run.mcap run-ros2 --system warehouse.toml
+    """
+    extra("ros2", "rosbags")
+    extra("ros2", "xxhash")
+    from rampart.cli.record.ros_bags import write  # noqa: PLC0415 of the extra
+
+    bag = write(Path(options.file), Path(options.out), options.system, options.distribution)
+    left = {plain_line(what): {"times": times, "why": plain_line(why)}
+            for what, (times, why) in bag.left_out.items()}
+    if options.json:
+        print_json({"folder": options.out, "messages": dict(bag.counts), "left_out": left})
+        return 0
+    say(f"{options.out}: {bag.counts.total()} messages on {len(bag.counts)} topics")
+    for what, one in left.items():
+        say(f"left out: {what}: {one['why']} ({one['times']} times)")
     return 0
 
 

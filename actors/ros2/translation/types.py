@@ -9,7 +9,7 @@ in folders of the same shape.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -144,6 +144,28 @@ class Types:
         return self._store.types[name](
             **{field: getattr(value, field) for field, _ in self._definition(name)})
 
+    def new(self, name: str, values: Mapping[str, Any]) -> Any:
+        """Return a message with these fields."""
+        return self._store.types[name](**values)
+
+    def define(self, definitions: Mapping[str, Fields]) -> None:
+        """Make types known that are in no file: name of a message → its fields.
+
+        Raises:
+            ValueError: they make no sense; one line.
+        """
+        self._add({name: ([], fields) for name, fields in definitions.items()})
+
+    def definition(self, name: str) -> tuple[str, str]:
+        """Return the text that defines a message, with all that it is made of, and its hash.
+
+        Raises:
+            ValueError: it is not known.
+        """
+        self._definition(name)
+        text, _ = self._described.generate_msgdef(name, ros_version=2)
+        return text, self._described.hash_rihs01(name)
+
     def _blank_field(self, what: Any) -> Any:
         import numpy as np  # noqa: PLC0415 with the first message
 
@@ -239,16 +261,22 @@ class Types:
                    if n and n not in definitions and n not in self._store.fielddefs}
         for missing, where in unknown.items():
             raise ValueError(f"{folder}: {where}: type {missing!r} is not known")
+        try:
+            self._add(definitions)
+        except ValueError as error:
+            raise ValueError(f"{folder}: {error}") from None
+        return bool(found)
+
+    def _add(self, definitions: Mapping[str, tuple[Any, Fields]]) -> None:
+        """Make types known, with their constants."""
         self._described.fielddefs |= {
             name: (made, _read_as_uint8(fields, "char"))
             for name, (made, fields) in definitions.items()}
-        definitions = {name: (made, _read_as_uint8(fields, "char", "byte"))
-                       for name, (made, fields) in definitions.items()}
         try:
-            self._store.register(definitions)
+            self._store.register({name: (made, _read_as_uint8(fields, "char", "byte"))
+                                  for name, (made, fields) in definitions.items()})
         except TypesysError as error:
-            raise ValueError(f"{folder}: {_line(error)}") from None
-        return bool(found)
+            raise ValueError(_line(error)) from None
 
     def _parsed(self, name: str, kind: str, text: str) -> dict[str, Any]:
         if kind == "msg":

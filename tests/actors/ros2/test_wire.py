@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rampart.actors.ros2.graph import MOST, RosGraph, misfits
+from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import (
     Attachment,
     Endpoint,
@@ -34,6 +35,12 @@ def test_the_gid_of_a_captured_attachment_is_that_of_the_captured_token():
     assert attachment.gid == Endpoint.parse(CAPTURED).gid
     assert attachment.sequence == 216
     assert attachment.pack() == ATTACHED
+
+
+@pytest.mark.parametrize("distribution", ["iron", "jazzy", "kilted"])
+def test_a_hash_that_another_program_has_for_rmw_zenoh(distribution):
+    assert Types(distribution).hash("tf2_msgs/msg/TFMessage") == (
+        "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087")
 
 
 @pytest.mark.parametrize(("qos", "text"), [

@@ -143,10 +143,10 @@ def test_a_top_that_is_constant_has_the_empty_set_or_none(state, count):
 
 def test_thousands_of_gates_in_a_chain_are_no_problem():
     gates = {f"g{i}": any_of(f"g{i + 1}", f"e{i}") if i % 2 else all_of(f"g{i + 1}", f"e{i}")
-             for i in range(5000)}
-    gates["g5000"] = any_of("last")
+             for i in range(2000)}
+    gates["g2000"] = any_of("last")
     found = CutSets(formula(gates))
-    assert found.count == 2501
+    assert found.count == 1001
     with pytest.raises(TooLargeError, match="levels deep, too deeply to list the sets"):
         list(found.sets())
 

@@ -85,7 +85,7 @@ def untimed(made: Attempt) -> Attempt:
                            ("stuck-wheel@2",), ("gps-noise@500",)], marks=pytest.mark.slow),
     ("osmosis", [("stop:DM2@3",), ("kill:ftm_manager@goal1",),
                  ("drop:control/command@3+1", "slow:hmi@1+2")]),
-    (TUG, [("kill:controller@2",), ("drop:controller/motion@3+1",), ("wedge:supervisor@2.5",)])])
+    (TUG, [("kill:controller@2",), ("drop:controller/motion@3+1",)])])
 def test_a_run_that_departs_from_others_is_the_same_as_from_the_start(tmp_path, system, faults):
     options = {} if system == TUG else {
         "obstacles": 2, "mission": str(tmp_path / "ONE.miss")}

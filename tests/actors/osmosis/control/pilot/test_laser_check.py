@@ -50,8 +50,9 @@ def test_after_a_wrong_sweep_the_laser_is_not_believed_for_a_second():
 
 
 @pytest.mark.parametrize("fault", [
-    "laser-stuck@26+inf", "laser-bias@26+inf", "laser-noise@26+inf", "laser-dropout@26+inf",
-    "stuck:summit_xl/scan@2+inf"])
+    "laser-bias@26+inf", "stuck:summit_xl/scan@2+inf",
+    *(pytest.param(f"laser-{way}@26+inf", marks=pytest.mark.slow)
+      for way in ("stuck", "noise", "dropout"))])
 def test_a_robot_that_cannot_trust_its_laser_stands(fault):
     result = run_job(Job(row="x", system="paper", options={"mission": "A", "obstacles": 2},
                          faults=(parse_fault(fault),)))

@@ -1,0 +1,159 @@
+"""A recording as a bag of ROS 2: MCAP with `cdr` channels and `ros2msg` schemas, and metadata.
+
+Three kinds of topics are in it: what passed the gateway, byte for byte under the names of ROS 2;
+each key of the bus below `/rampart`, in a type of its own (`ros_structs`); and what viewers see
+(`ros_views`). `rosbags` writes it, as `ros2 bag record` would.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+
+from rampart.actors.bus.envelope import UNREADABLE, Header, decode
+from rampart.actors.bus.topic import ROOT, ROS_SIDE, Topic
+from rampart.actors.bus.topic import Qos as BusQos
+from rampart.actors.recording.bag_reader import BagReader, key_of
+from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.message_form import Forms
+from rampart.actors.recording.ros_structs import StructTypes
+from rampart.actors.recording.ros_views import RosViews
+from rampart.actors.ros2.translation.types import NO_HASH, Types
+from rampart.actors.ros2.wire import ros_name
+
+_UNHASHED = ("humble", "iron")
+"""Distributions whose bags have a metadata of an older version."""
+
+_NO_NAME = re.compile(r"[^A-Za-z0-9_/]")
+_FOREVER = QosTime(9_223_372_036, 854_775_807)
+
+_PASSED = f"{ROS_SIDE}/data/"
+_LEAST_PARTS = 4  # domain, topic, type and hash
+_packed = msgspec.msgpack.Decoder(tuple[bytes, bytes | None])
+
+Makes = tuple[str, str, Callable[[Header, Any, int], bytes]]
+"""Topic of ROS 2, its type, and what makes a message of header, body and stamp in nanoseconds."""
+
+
+class RosBag:
+    """Writes a recording as a bag of ROS 2. Use: `write`, once.
+
+    Args:
+        types: of ROS 2.
+        topics: that are known of the system.
+
+    Attributes:
+        counts: messages by topic of ROS 2.
+        left_out: what is not in the bag → how often, and why the first time.
+    """
+
+    def __init__(self, types: Types, topics: Sequence[Topic[Any]]) -> None:
+        self.counts = Counter[str]()
+        self.left_out: dict[str, tuple[int, str]] = {}
+        self._types = types
+        self._structs = StructTypes(types)
+        self._views = RosViews(types)
+        self._forms = Forms(topics)
+        self._made: dict[str, Makes] = {}
+        self._connections: dict[str, Any] = {}
+
+    def write(self, reader: BagReader, folder: Path) -> None:
+        """Write the bag into a new folder; one that does not come to its end is not left behind.
+
+        Raises:
+            BagError: there is such a folder already, it cannot be written, or the recording cannot
+                be read.
+        """
+        old = self._types.distribution in _UNHASHED
+        try:
+            writer = Writer(folder, version=8 if old else 9, storage_plugin=StoragePlugin.MCAP)
+        except WriterError:
+            raise BagError(f"{folder}: exists already; choose another name") from None
+        try:
+            with writer:
+                self._copy(reader, writer)
+        except BaseException as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            if isinstance(error, OSError):
+                raise BagError(f"{folder}: {error.strerror or error}") from None
+            raise
+
+    def _copy(self, reader: BagReader, writer: Writer) -> None:
+        for channel, message in reader.messages():
+            key = key_of(channel)
+            try:
+                if key is not None and key.startswith(f"{ROS_SIDE}/"):
+                    self._passed(writer, key, message)
+                    continue
+                if key is not None:
+                    self._bus(writer, key, message)
+                    continue
+                schema = reader.schemas.get(channel.schema_id)
+                for shown in self._views.of(schema.name if schema else "", channel.topic,
+                                            message.data):
+                    self._write(writer, *shown, message.log_time)
+            except (ValueError, TypeError, RecursionError) as error:
+                self._leave_out(channel.topic, " ".join(str(error).split()))
+
+    def _bus(self, writer: Writer, key: str, message: Any) -> None:
+        form = self._forms.of(key)
+        if form.topic is None:
+            self._leave_out(key.removeprefix(f"{ROOT}/"), "no actor that is known declares it")
+            return
+        try:
+            header, body = decode(form.topic, form.payload(message.data))
+        except UNREADABLE as error:
+            raise ValueError(str(error)) from None
+        if key not in self._made:
+            self._made[key] = f"/{_NO_NAME.sub('_', key)}", *self._structs.writer(form.topic)
+        topic, kind, make = self._made[key]
+        self._write(writer, topic, kind, make(header, body, message.publish_time),
+                    message.log_time, stays=form.topic.qos is BusQos.STATE)
+
+    def _passed(self, writer: Writer, key: str, message: Any) -> None:
+        """Write what passed the gateway as it was; what services said is no topic's."""
+        parts = key.removeprefix(_PASSED).split("|")
+        if not key.startswith(_PASSED) or len(parts) < _LEAST_PARTS:
+            return
+        kind, digest = ros_name(parts[-2]), parts[-1]
+        if digest not in {NO_HASH, self._types.hash(kind)}:
+            raise ValueError(f"another definition of {kind} than {self._types.distribution} has; "
+                             "--distribution chooses it")
+        data, _attachment = _packed.decode(self._forms.of(key).payload(message.data))
+        self._write(writer, "/" + "/".join(parts[1:-2]), kind, data, message.log_time)
+
+    def _leave_out(self, what: str, why: str) -> None:
+        count, first = self.left_out.get(what, (0, why))
+        self.left_out[what] = count + 1, first
+
+    def _write(self, writer: Writer, topic: str, kind: str, data: bytes, at_ns: int, *,
+               stays: bool = False) -> None:
+        connection = self._connections.get(topic)
+        if connection is None:
+            text, digest = self._types.definition(kind)
+            connection = self._connections[topic] = writer.add_connection(
+                topic, kind, msgdef=text, rihs01=digest, offered_qos_profiles=[_qos(stays=stays)])
+        writer.write(connection, at_ns, data)
+        self.counts[topic] += 1
+
+
+def _qos(*, stays: bool) -> Qos:
+    return Qos(QosHistory.KEEP_LAST, 1 if stays else 10, QosReliability.RELIABLE,
+               QosDurability.TRANSIENT_LOCAL if stays else QosDurability.VOLATILE,
+               _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER,
+               avoid_ros_namespace_conventions=False)

@@ -1,0 +1,69 @@
+"""Which types and tables a recording has as a bag of ROS 2. Needs the extra `ros2`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.ros_bag import RosBag
+from rampart.actors.ros2.gateway import Gateway
+from rampart.actors.ros2.translation.types import Types
+from rampart.cli import systems
+from rampart.cli.output import NoEffectError, UsageError, refusing
+from rampart.cli.record.replaying import recorded_system
+from rampart.manager.spec.ros2 import GATEWAY
+from rampart.manager.spec.schema import SystemSpec
+
+_DEFAULT = "jazzy"
+
+
+def write(file: Path, folder: Path, system: str | None, distribution: str | None) -> RosBag:
+    """Write a recording as a bag of ROS 2.
+
+    Args:
+        file: the recording.
+        folder: of the bag; must not exist.
+        system: whose actors and tables count; None for what the recording has.
+        distribution: of ROS 2; None for that of the system's gateway.
+
+    Returns:
+        What was written, and what was not.
+
+    Raises:
+        UsageError: a file cannot be read or written, or a word is wrong.
+        NoEffectError: there was nothing to be written.
+    """
+    with refusing(BagError, ValueError):
+        reader = BagReader(file)
+        summary = Summary(reader)
+        if not reader.is_recording:
+            raise UsageError(f"{file}: an MCAP file of {reader.library or 'others'}, not a "
+                             "recording of a run")
+        if system is None:
+            _, known = recorded_system(summary.files)
+            spec, topics = known.system, known.topics
+        else:
+            spec = systems.load(system)
+            topics = systems.topics_of(spec)
+        bag = RosBag(_types(spec, distribution), topics)
+        bag.write(reader, folder)
+    if not bag.counts:
+        raise NoEffectError(f"{file}: no message that could be written")
+    return bag
+
+
+def _types(spec: SystemSpec, distribution: str | None) -> Types:
+    """Return the types that the gateway of a system has, without what is not there any more."""
+    said = Gateway.Parameters()
+    for node in spec.nodes:
+        if node.actor == GATEWAY:
+            said = msgspec.convert(node.parameters, Gateway.Parameters, strict=False)
+    folders = [path for path in map(Path, said.interfaces) if path.is_dir()]
+    name = distribution or (said.distribution if spec.ros2 else _DEFAULT)
+    try:
+        return Types(name, folders)
+    except ValueError as error:
+        raise UsageError(f"--{error}" if distribution else str(error)) from None
