@@ -55,7 +55,7 @@ ros-wheels: .venv-ros/installed
 
 .venv-ros/installed: tests/actors/ros2/wheels.txt
 	$(PYTHON) -m venv .venv-ros
-	.venv-ros/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	.venv-ros/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -r $<
 	@touch $@
 
 # Hits every process of the full system in every way, 50 routers in one mission, then 200 deaths in

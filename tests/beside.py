@@ -19,6 +19,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tests.conftest import VIRTUAL
+
 _PYTEST = (sys.executable, "-m", "pytest", "-m")
 _VIRTUAL = "virtual and not slow and not alone and not processes"
 _LOWEST = 19
@@ -29,12 +31,14 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as said:
         cache = ("-o", f"cache_dir={folder}")
         virtual = subprocess.Popen(
-            ["nice", "-n", str(_LOWEST), *_PYTEST, _VIRTUAL, "--numprocesses", "logical", *cache],
+            ["nice", "-n", str(_LOWEST), *_PYTEST, _VIRTUAL, "--numprocesses", "logical", *cache,
+             *VIRTUAL],
             stdout=said, stderr=subprocess.STDOUT, start_new_session=True)
         with contextlib.suppress(OSError):  # not every kernel has groups
             Path(f"/proc/{virtual.pid}/autogroup").write_text(str(_LOWEST), encoding="ascii")
         try:
-            alone = subprocess.run([*_PYTEST, "alone and not slow"], check=False).returncode
+            alone = subprocess.run([*_PYTEST, "alone and not slow", *having("mark.alone")],
+                                   check=False).returncode
             beside = virtual.wait()
         finally:
             virtual.terminate()
@@ -42,9 +46,15 @@ def main() -> int:
         print(said.read(), flush=True)
         if beside == 1:
             print("once more, by themselves:", flush=True)
-            beside = subprocess.run([*_PYTEST, _VIRTUAL, "--last-failed", *cache],
+            beside = subprocess.run([*_PYTEST, _VIRTUAL, "--last-failed", *cache, *VIRTUAL],
                                     check=False).returncode
     return alone or beside
+
+
+def having(words: str) -> list[str]:
+    """Return the files of tests in which these words are: to collect all of them takes long."""
+    return sorted(str(file) for file in Path("tests").rglob("test_*.py")
+                  if words in file.read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":

@@ -157,8 +157,9 @@ def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
 
 
 @pytest.mark.parametrize("fault", [
-    "command-out-of-bounds@9+60", "localization-not-updated@9+60", "prohibited-area@9+60",
-    "wrong-graph@3+60"])
+    "command-out-of-bounds@9+60", "prohibited-area@9+60",
+    pytest.param("localization-not-updated@9+60", marks=pytest.mark.slow),
+    pytest.param("wrong-graph@3+60", marks=pytest.mark.slow)])
 def test_without_fault_tolerance_the_papers_faults_are_unsafe(fault):
     assert not run_job(job(fault, ftm=False, patience_s=35.0)).safe
 
