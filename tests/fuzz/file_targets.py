@@ -276,7 +276,8 @@ def fault(data: bytes) -> None:
 # -- recordings, results ---------------------------------------------------------------------------
 
 
-def _recordings() -> list[bytes]:
+def recordings() -> list[bytes]:
+    """Return recordings, of ours and of others."""
     made = [_foreign(kind) for kind in (
         CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD)]
     path = folder() / "own.mcap"
@@ -304,7 +305,7 @@ def _foreign(compression: CompressionType) -> bytes:
     return out.getvalue()
 
 
-@target("mcap-info", refuses=(BagError,), kind="mcap", says_one_line=True, samples=_recordings)
+@target("mcap-info", refuses=(BagError,), kind="mcap", says_one_line=True, samples=recordings)
 def mcap_info(data: bytes) -> None:
     summary = Summary(BagReader(written("bag.mcap", data)))
     msgspec.json.encode(described(summary))
@@ -312,7 +313,7 @@ def mcap_info(data: bytes) -> None:
     restore([file for file in summary.files if len(file[2]) < 1 << 16], folder())
 
 
-@target("mcap-repair", refuses=(BagError,), kind="mcap", says_one_line=True, samples=_recordings,
+@target("mcap-repair", refuses=(BagError,), kind="mcap", says_one_line=True, samples=recordings,
         suite_runs=100)
 def mcap_repair(data: bytes) -> None:
     reader = BagReader(written("torn.mcap", data))

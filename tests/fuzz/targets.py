@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from importlib import import_module
 
-from tests.fuzz import file_targets, wire_targets
+from tests.fuzz import file_targets, ros_targets, wire_targets
 from tests.fuzz.target import ALL
 
 MORE = "FUZZ_MODULES"
@@ -14,4 +14,4 @@ MORE = "FUZZ_MODULES"
 for module in filter(None, os.environ.get(MORE, "").split(",")):
     import_module(module)
 
-__all__ = ["ALL", "MORE", "file_targets", "wire_targets"]
+__all__ = ["ALL", "MORE", "file_targets", "ros_targets", "wire_targets"]

@@ -130,8 +130,9 @@ def test_a_second_signal_ends_a_run_at_once_and_what_was_recorded_can_be_read(tm
 
 
 @pytest.mark.parametrize("fault", [
-    "drop:detection/DM1@20+inf", "slow:DM1@20", "freeze:manager/status@20+inf",
+    "drop:detection/DM1@20+inf", "slow:DM1@20",
     *(pytest.param(fault, marks=pytest.mark.slow) for fault in (
+        "freeze:manager/status@20+inf",
         "freeze:detection/DM1@20+inf", "delay:detection/DM2@20+inf",
         "drop:manager/status@20+inf"))])
 def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing(fault):

@@ -19,8 +19,8 @@ UNSAFE_WITHOUT = ("battery-drain:16@4", "gps-dropout@10", "stuck:rotors/pilot@10
                   "stuck:setpoint@10", "stuck:estimate@10")
 
 
-IN_CI = {"weak-rotor@10", "gps-bias@10", "imu-bias@8", "kill:pilot@10", "wedge:pilot@6.2",
-         "kill:estimator@10", "stuck:setpoint@10", "corrupt:estimate@10", "stuck:rotors/pilot@10"}
+IN_CI = {"weak-rotor@10", "gps-bias@10", "imu-bias@8", "wedge:pilot@6.2", "corrupt:estimate@10",
+         "stuck:rotors/pilot@10"}
 """Flown with every change; the others with `make test-slow`."""
 
 
