@@ -47,7 +47,8 @@ def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path, missio
     victims = ("gateway", "ros_router", "osmosis_control", "gateway", "localization", "hmi",
                "ros_router", "safety_pilot", "ftm_manager")
     chosen = mission if mission == "AB" else str(write_row(tmp_path))
-    with RealRun(tmp_path, tmp_path / "ros.toml", "--mission", chosen) as run:
+    with RealRun(tmp_path, tmp_path / "ros.toml", "--mission", chosen,
+                 "--record", str(tmp_path / "run.mcap")) as run:
         run.wait_for("goal 1/")
         at_s = 3.0
         for victim in victims:
@@ -58,3 +59,11 @@ def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path, missio
     assert (result["mission"], result["safety"]) == ("success", "safe"), run.story
     assert code == 0
     assert {"gateway": 2, "ros_router": 2}.items() <= result["restarts"].items()
+    done = subprocess.run(
+        [sys.executable, "-m", "rampart.cli.main", "bag", "ros2", "run.mcap", "bag", "--json",
+         "--system", str(tmp_path / "ros.toml")],
+        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=200)
+    told = json.loads(done.stdout)
+    assert {"/odom", "/imu", "/scan", "/fix", "/cmd_vel", "/brake", "/rampart/decision",
+            "/rampart/localization/pose", "/tf"} <= set(told["messages"]), done.stderr
+    assert told["messages"]["/odom"] > 500
