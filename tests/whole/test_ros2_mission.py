@@ -64,6 +64,6 @@ def test_a_mission_on_processes_with_nodes_killed_on_both_sides(tmp_path, missio
          "--system", str(tmp_path / "ros.toml")],
         cwd=tmp_path, capture_output=True, text=True, check=False, timeout=200)
     told = json.loads(done.stdout)
-    assert {"/odom", "/imu", "/scan", "/fix", "/cmd_vel", "/brake", "/rampart/decision",
+    assert {"/odom", "/imu", "/scan", "/fix", "/cmd_vel", "/rampart/decision",
             "/rampart/localization/pose", "/tf"} <= set(told["messages"]), done.stderr
     assert told["messages"]["/odom"] > 500
