@@ -62,10 +62,10 @@ class Qos(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         parts = text.split(":")
         if len(parts) < 3:
-            raise ValueError(f"QoS {text!r}: reliability:durability:history,depth:… is right")
+            raise ValueError(f"QoS {text[:60]!r}: reliability:durability:history,depth:… is right")
         history, _, depth = parts[2].partition(",")
         if depth and not (depth.isascii() and depth.isdecimal() and len(depth) < 20):
-            raise ValueError(f"QoS {text!r}: depth {depth!r} is no number")
+            raise ValueError(f"QoS {text[:60]!r}: depth {depth[:20]!r} is no number")
         return cls(parts[0] != "2", parts[1] == "1", history == "2",
                    int(depth) if depth else DEFAULT_DEPTH)
 
