@@ -13,10 +13,10 @@ from typing import Generic, TypeVar
 import msgspec
 
 ROOT = "rampart"
+"""First chunk of every key."""
 
 ROS_SIDE = "ros2-side"
 """First chunk of keys of what passes among nodes of ROS 2: in virtual time, and in recordings."""
-"""First chunk of every key."""
 
 T = TypeVar("T", bound=msgspec.Struct)
 

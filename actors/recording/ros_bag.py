@@ -36,7 +36,7 @@ from rampart.actors.recording.ros_views import RosViews
 from rampart.actors.ros2.translation.types import NO_HASH, Types
 from rampart.actors.ros2.wire import ros_name
 
-_UNHASHED = ("humble", "iron")
+_OLDER = ("humble", "iron")
 """Distributions whose bags have a metadata of an older version."""
 
 _NO_NAME = re.compile(r"[^A-Za-z0-9_/]")
@@ -79,9 +79,9 @@ class RosBag:
             BagError: there is such a folder already, it cannot be written, or the recording cannot
                 be read.
         """
-        old = self._types.distribution in _UNHASHED
+        version: Any = 8 if self._types.distribution in _OLDER else 9
         try:
-            writer = Writer(folder, version=8 if old else 9, storage_plugin=StoragePlugin.MCAP)
+            writer = Writer(folder, version=version, storage_plugin=StoragePlugin.MCAP)
         except WriterError:
             raise BagError(f"{folder}: exists already; choose another name") from None
         try:
@@ -99,15 +99,12 @@ class RosBag:
             try:
                 if key is not None and key.startswith(f"{ROS_SIDE}/"):
                     self._passed(writer, key, message)
-                    continue
-                if key is not None:
+                elif key is not None:
                     self._bus(writer, key, message)
-                    continue
-                schema = reader.schemas.get(channel.schema_id)
-                for shown in self._views.of(schema.name if schema else "", channel.topic,
-                                            message.data):
-                    self._write(writer, *shown, message.log_time)
-            except (ValueError, TypeError, RecursionError) as error:
+                elif (schema := reader.schemas.get(channel.schema_id)) is not None:
+                    for shown in self._views.of(schema.name, channel.topic, message.data):
+                        self._write(writer, *shown, message.log_time)
+            except (*UNREADABLE, ValueError, TypeError, RecursionError) as error:
                 self._leave_out(channel.topic, " ".join(str(error).split()))
 
     def _bus(self, writer: Writer, key: str, message: Any) -> None:
@@ -115,10 +112,7 @@ class RosBag:
         if form.topic is None:
             self._leave_out(key.removeprefix(f"{ROOT}/"), "no actor that is known declares it")
             return
-        try:
-            header, body = decode(form.topic, form.payload(message.data))
-        except UNREADABLE as error:
-            raise ValueError(str(error)) from None
+        header, body = decode(form.topic, form.payload(message.data))
         if key not in self._made:
             self._made[key] = f"/{_NO_NAME.sub('_', key)}", *self._structs.writer(form.topic)
         topic, kind, make = self._made[key]

@@ -18,13 +18,13 @@ from rosbags.interfaces import Nodetype
 
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ros2.ros_clock import NS
 from rampart.actors.ros2.translation.types import Types
 
 PACKAGE = "rampart_bus"
 """Package of all types that are made."""
 
 _HEADER = "std_msgs/msg/Header"
-_NS = 1_000_000_000
 _NO_NAME = re.compile(r"[^a-z0-9]+")
 _F32 = "_f32"
 
@@ -86,7 +86,7 @@ class StructTypes:
 
         def write(header: Header, said: Any, stamp_ns: int) -> bytes:
             head = self._types.blank(_HEADER)
-            head.stamp.sec, head.stamp.nanosec = divmod(max(stamp_ns, 0), _NS)
+            head.stamp.sec, head.stamp.nanosec = divmod(max(stamp_ns, 0), NS)
             head.frame_id = topic.frame
             values = {"header": head, "node": header.source, "incarnation": header.incarnation,
                       "sequence": header.sequence}

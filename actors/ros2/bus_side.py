@@ -17,7 +17,7 @@ import xxhash
 from rampart.actors.bus import topic as bus_topic
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.topic import ROS_SIDE, Topic
-from rampart.actors.ros2.side import Answered, Deliver, Reply, chunk_of, recorded
+from rampart.actors.ros2.side import Answered, Deliver, Reply, chunk_of, packed, recorded_key
 from rampart.actors.ros2.wire import Qos
 
 _KEPT = Topic("", msgspec.Struct, bus_topic.Qos.STATE, 0.0, "", "What newcomers are told.")
@@ -86,22 +86,23 @@ class BusSide:
     def publisher(self, key: str, qos: Qos) -> Callable[[bytes, bytes], None]:
         """See `Side.publisher`."""
         topic = _KEPT if qos.transient_local else _PASSING
+        where = recorded_key(key)
         return lambda payload, attachment: self._bus.publish(
-            topic, *recorded(key, payload, attachment))
+            topic, where, packed(payload, attachment))
 
     def subscribe(self, key: str, qos: Qos, deliver: Deliver) -> None:
         """See `Side.subscribe`."""
-        where, _ = recorded(key, b"", None)
-        self._bus.subscribe(_PASSING, where, lambda _key, packed: deliver(*_unpack(packed)))
+        where = recorded_key(key)
+        self._bus.subscribe(_PASSING, where, lambda _key, whole: deliver(*_unpack(whole)))
         if qos.transient_local:
             self._bus.latest(
-                where, lambda _key, packed: deliver(*_unpack(packed)), lambda: None)
+                where, lambda _key, whole: deliver(*_unpack(whole)), lambda: None)
 
     def serve(self, key: str, asked: Callable[[bytes, bytes | None, Reply], None]) -> None:
         """See `Side.serve`."""
 
-        def heard(_key: str, packed: bytes) -> None:
-            who, number, payload, attachment = _unpack(packed)
+        def heard(_key: str, whole: bytes) -> None:
+            who, number, payload, attachment = _unpack(whole)
             asked(payload, attachment, lambda answer, attached: self._bus.publish(
                 _PASSING, f"{ROS_SIDE}/answer/{who}", _pack((number, answer, attached))))
 
@@ -122,8 +123,8 @@ class BusSide:
         self._bus.publish(_PASSING, f"{ROS_SIDE}/ask/{chunk_of(key)}",
                           _pack((self.id, number, payload, attachment)))
 
-    def _answer(self, _key: str, packed: bytes) -> None:
-        number, payload, attachment = _unpack(packed)
+    def _answer(self, _key: str, whole: bytes) -> None:
+        number, payload, attachment = _unpack(whole)
         waiting: Any = self._asked.pop(number, None)
         if waiting is not None:
             waiting(payload, attachment, "")

@@ -159,10 +159,12 @@ class ZenohSide:
                 key, congestion_control=control, reliability=reliability, express=True)
         self._held.append(made)
 
+        where = recorded_key(key)
+
         def publish(payload: bytes, attachment: bytes) -> None:
             made.put(payload, attachment=attachment)
             if self._record is not None:
-                self._record(*recorded(key, payload, attachment))
+                self._record(where, packed(payload, attachment))
 
         return publish
 
@@ -173,10 +175,12 @@ class ZenohSide:
             payload, attached = sample.payload.to_bytes(), sample.attachment
             self._tell(heard, payload, None if attached is None else attached.to_bytes())
 
+        where = recorded_key(key)
+
         def heard(payload: bytes, attachment: bytes | None) -> None:
-            if self._record is not None:
-                self._record(*recorded(key, payload, attachment))
             deliver(payload, attachment)
+            if self._record is not None:
+                self._record(where, packed(payload, attachment))
 
         if qos.transient_local:
             recovery = ext.RecoveryConfig(
@@ -246,9 +250,14 @@ def chunk_of(key: str) -> str:
     return key.replace("/", "|")
 
 
-def recorded(key: str, payload: bytes, attachment: bytes | None) -> tuple[str, bytes]:
-    """Return key and payload by which a message of a topic of ROS 2 stands in a recording."""
-    return f"{ROS_SIDE}/data/{chunk_of(key)}", msgspec.msgpack.encode((payload, attachment))
+def recorded_key(key: str) -> str:
+    """Return the key under which messages on a key of ROS 2 stand in a recording."""
+    return f"{ROS_SIDE}/data/{chunk_of(key)}"
+
+
+def packed(payload: bytes, attachment: bytes | None) -> bytes:
+    """Return a message of ROS 2 as it stands there."""
+    return msgspec.msgpack.encode((payload, attachment))
 
 
 def _direct(call: Callable[[Any], None]) -> Callback[Any]:

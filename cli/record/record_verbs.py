@@ -86,7 +86,7 @@ def add(verbs: Any) -> None:
     add_verb(bag, "ros2", "write it as a bag of ROS 2", bag_ros2,
              option("file", metavar="IN"), option("out", metavar="FOLDER"),
              option("--system", metavar="SPEC", help="file, or name of a shipped system, whose "
-                    "actors and [[ros2]] count (default: what the recording has of its own)"),
+                    "actors and definitions count (default: what the recording has of its own)"),
              option("--distribution", metavar="NAME", help="of ROS 2 (default: the gateway's, or "
                     "jazzy)"),
              JSON)

@@ -1,4 +1,4 @@
-"""Which types and tables a recording has as a bag of ROS 2. Needs the extra `ros2`."""
+"""Which types and topics a recording has as a bag of ROS 2. Needs the extra `ros2`."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from rampart.cli.record.replaying import recorded_system
 from rampart.manager.spec.ros2 import GATEWAY
 from rampart.manager.spec.schema import SystemSpec
 
-_DEFAULT = "jazzy"
-
 
 def write(file: Path, folder: Path, system: str | None, distribution: str | None) -> RosBag:
     """Write a recording as a bag of ROS 2.
@@ -26,7 +24,7 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
     Args:
         file: the recording.
         folder: of the bag; must not exist.
-        system: whose actors and tables count; None for what the recording has.
+        system: whose actors and definitions count; None for what the recording has.
         distribution: of ROS 2; None for that of the system's gateway.
 
     Returns:
@@ -62,8 +60,7 @@ def _types(spec: SystemSpec, distribution: str | None) -> Types:
         if node.actor == GATEWAY:
             said = msgspec.convert(node.parameters, Gateway.Parameters, strict=False)
     folders = [path for path in map(Path, said.interfaces) if path.is_dir()]
-    name = distribution or (said.distribution if spec.ros2 else _DEFAULT)
     try:
-        return Types(name, folders)
+        return Types(distribution or said.distribution, folders)
     except ValueError as error:
         raise UsageError(f"--{error}" if distribution else str(error)) from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import resource
 import struct
@@ -22,10 +23,11 @@ from rampart.actors.recording.bag_reader import BagReader
 from rampart.actors.recording.bag_writer import BagWriter
 from rampart.actors.recording.ros_bag import RosBag
 from rampart.actors.recording.ros_structs import StructTypes
-from rampart.actors.ros2.side import recorded
+from rampart.actors.ros2.side import ZenohSide, packed, recorded_key
 from rampart.actors.ros2.translation.types import Types
-from rampart.actors.ros2.wire import data_key, dds_name
+from rampart.actors.ros2.wire import Qos, data_key, dds_name
 from rampart.cli.main import main
+from tests import ROOT
 from tests.actors.recording.samples import documents, pose, sample, write
 from tests.fuzz.message_extremes import all_topics
 from tests.fuzz.samples import sample as some
@@ -59,7 +61,8 @@ def twist(speed_mps):
 
 
 def passed(topic, kind, data, digest=None):
-    return recorded(data_key(0, topic, dds_name(kind), digest or JAZZY.hash(kind)), data, b"")
+    key = data_key(0, topic, dds_name(kind), digest or JAZZY.hash(kind))
+    return recorded_key(key), packed(data, b"")
 
 
 def plain(value):
@@ -180,6 +183,32 @@ def test_what_passed_the_gateway_is_there_byte_for_byte(tmp_path):
         (connection,) = reader.connections
         assert connection.digest == JAZZY.hash(TWIST)
         assert [bytes(data) for *_, data in reader.messages()] == [twist(n) for n in range(3)]
+
+
+async def test_what_the_gateway_says_and_hears_is_handed_to_the_recorder_as_it_travelled():
+    taken, heard = [], asyncio.Event()
+    side = ZenohSide([], asyncio.get_running_loop(), lambda *what: taken.append(what))
+    key = data_key(0, "/cmd_vel", dds_name(TWIST), JAZZY.hash(TWIST))
+    side.subscribe(key, Qos(), lambda *_: heard.set())
+    side.publisher(key, Qos())(twist(1.0), b"attached")
+    async with asyncio.timeout(10):
+        await heard.wait()
+    side.close()
+    assert taken == [(recorded_key(key), packed(twist(1.0), b"attached"))] * 2
+
+
+def test_definitions_of_a_robot_s_own_are_those_of_its_system(tmp_path, capsys):
+    brake, path = "summit_xl_msgs/msg/Brake", tmp_path / "run.mcap"
+    types = Types("jazzy", [ROOT / "systems/osmosis-ros2"])
+    writer = BagWriter(path.open("wb"), documents())
+    writer.take(0.1, *passed("/brake", brake, types.encode(brake, types.blank(brake)),
+                             types.hash(brake)))
+    writer.take(0.2, *pose(1, 0.2)[1:])
+    writer.close()
+    assert "/brake" not in made(path, tmp_path / "without")
+    assert f"type '{brake}' is not known to jazzy" in capsys.readouterr().out
+    kind, said = made(path, tmp_path / "with", "--system", "osmosis-ros2")["/brake"]
+    assert (kind, said[0][1].engaged) == (brake, False)
 
 
 def test_a_newcomer_to_a_replayed_bag_is_told_what_stays(tmp_path):
