@@ -169,7 +169,9 @@ class HostSupervisor(Supervisor):
             self.parameters.host) for row in super()._rows())
 
     def _publish_table(self) -> None:
-        self.publish(topics.HOST_NODES, fm.NodeTable(self._own_rows()))
+        given_back = (fm.NodeInfo(node, "", 0, fm.NodeState.UNREACHABLE, highest, 0, host=home)
+                      for node, home, highest in self._placement.given_back(self._mine()))
+        self.publish(topics.HOST_NODES, fm.NodeTable((*self._own_rows(), *given_back)))
 
 
 class FirstSupervisor(HostSupervisor):

@@ -11,6 +11,10 @@ for two rules hold at any time:
 * **Only the first host takes over.** A home that hears nothing of the first goes on with what it
   has, which then only those can hear who are cut off with it.
 
+A link may carry one way before it does the other, and go again. So nothing is given back to a home
+that says that it still runs its own, and the first host says which incarnation it has given back
+until the home runs a higher one (`given_back`): whatever got lost, in the end both know.
+
 So a recovery module obeys one manager at any time: that of the highest incarnation it can hear of.
 """
 
@@ -141,7 +145,8 @@ class Placement:
 
         Args:
             host: Its name.
-            rows: What it says; of nodes that are not its own to run, nothing is believed.
+            rows: What it says; of nodes that are not its own to run, nothing is believed. A row
+                with another host's name says what was issued, see `given_back`.
             mine: Incarnation of each node that is run here.
             now_s: Now.
 
@@ -151,7 +156,7 @@ class Placement:
         other = self._others[host]
         other.told_s = now_s
         believed = {row.name: row for row in rows if self._may_run(host, row.name)}
-        other.runs = believed
+        other.runs = {name: row for name, row in believed.items() if row.host == host}
         news, drop = [], dict[str, None]()
         for name, row in believed.items():
             if row.incarnation > self._highest.get(name, 0):
@@ -182,9 +187,11 @@ class Placement:
                   and now_s - other.since_s >= self._link.return_after_s):
                 other.is_lost = False
                 back.append(host)
-                if self._own == FIRST:
-                    drop += [unit for unit in self._homed(host) if unit in self.held]
-            if other.is_lost and is_silent and self._own == FIRST:
+            if self._own != FIRST:
+                continue
+            if not other.is_lost:
+                drop += self._wanted_back(host, other)
+            elif is_silent:
                 take += [(unit, self._next_epoch(unit, mine)) for unit in self._homed(host)
                          if unit not in self.held and not self._homes[unit].is_fixed]
         if self._own != FIRST:
@@ -198,10 +205,40 @@ class Placement:
         return [row for other in self._others.values() for row in other.runs.values()
                 if self._unit_of.get(row.name, "") not in self.held]
 
+    def given_back(self, mine: Mapping[str, int]) -> list[tuple[str, str, int]]:
+        """Return what was run here in another host's place, as long as its home runs a lower one.
+
+        Until a home has heard of that number, all that its own says is refused.
+
+        Args:
+            mine: Incarnation of each node that was ever issued on this host.
+
+        Returns:
+            Node, its home, and the highest incarnation that was issued here.
+        """
+        return [(node, home.host, mine[node]) for unit, home in self._homes.items()
+                if home.host != self._own and unit not in self.held for node in home.nodes
+                if mine.get(node, 0) > self._runs_at(home.host, node)]
+
+    def _runs_at(self, host: str, node: str) -> int:
+        row = self._others[host].runs.get(node)
+        return row.incarnation if row else 0
+
     def _may_run(self, host: str, node: str) -> bool:
         """Whether a host may speak of a node: the first of those of all, another of its own."""
         unit = self._unit_of.get(node)
         return unit is None or host == FIRST or self._homes[unit].host == host
+
+    def _wanted_back(self, host: str, other: _Other) -> list[str]:
+        """Return what is run here and no more at home, as its supervisor says since it is back.
+
+        One that still has its own has not heard yet that there is a higher incarnation. It may be
+        heard here before it hears anything; what was given back then would be run by nobody.
+        """
+        if other.told_s < other.since_s:
+            return []
+        return [unit for unit in self._homed(host) if unit in self.held
+                and other.runs.keys().isdisjoint(self._homes[unit].nodes)]
 
     def _homed(self, host: str) -> list[str]:
         return [unit for unit, home in self._homes.items() if home.host == host]

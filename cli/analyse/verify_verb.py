@@ -96,7 +96,8 @@ def _show(spec: SystemSpec, report: Report, seconds: float) -> None:
              "stopped;\nit cannot be reset until somebody repairs by hand, and repairs-run exempts "
              "them", report.stuck_behind_last_resort)):
         say()
-        say(f"active sets {words}:")
+        for line in f"active sets {words}:".splitlines():
+            say(line)
         for strategy, count in counts.items():
             say(f"  {strategy:<16} {count:>5} of {report.active_sets}")
     say()

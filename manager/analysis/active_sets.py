@@ -18,8 +18,8 @@ from rampart.manager.strategies.decision import Decision, Strategy
 from rampart.manager.strategies.escalation import succession
 from rampart.manager.strategies.registry import listing
 
-MAX_MECHANISMS = 14
-"""2^14 sets are checked in seconds; above that verification refuses."""
+MAX_MECHANISMS = 16
+"""2^14 sets are checked in seconds, 2^16 in minutes; above that verification refuses."""
 
 KEPT = 3
 """Counterexamples kept of each property; all are counted."""

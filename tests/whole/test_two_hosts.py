@@ -16,7 +16,7 @@ import pytest
 
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
-from tests.two_hosts import two_hosts
+from tests.two_hosts import home_when_lost, two_hosts
 from tests.whole.network import Line, Network, network, why_not
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone,
@@ -177,6 +177,28 @@ def test_the_robot_brakes_when_the_host_that_drives_it_ends_as_a_whole(net, tmp_
 
 
 @pytest.mark.slow
+def test_a_robot_that_is_to_come_home_when_nobody_can_reach_it_does(net, tmp_path):
+    spec = specification(net, tmp_path)
+    spec.write_text(home_when_lost(spec.read_text(encoding="utf-8")), encoding="utf-8")
+    with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as ground,
+          host(net, "robot", tmp_path / "r", spec, "--no-keys", "--mission", "A") as robot):
+        robot.wait_for("goal 2/", 120)
+        net.line = Line(is_cut=True)
+        robot.wait_for("DM15")
+        robot.wait_for("returning home", 15)
+        net.line = Line()
+        robot.wait_for("supervisor_ground back", 30)
+        code, result = robot.result(200)
+        assert ground.result(20)[0] == 0
+    assert (code, result["mission"], result["safety"]) == (1, "fail", "safe")
+    assert any("returned home, RM9: " in reason for reason in result["reasons"]), result["reasons"]
+    ran = {name for one in result["decisions"] for name in one["recoveries"]}
+    assert ran >= {"RM9"}, result["decisions"]
+    assert not ran & {"RM1", "RM2"}, result["decisions"]  # it drove, and was not stopped
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_the_mission_goes_on_over_a_bad_line_a_partition_and_the_end_of_the_other_host(
         net, tmp_path):
     spec = specification(net, tmp_path)

@@ -21,6 +21,11 @@ def row(name: str, incarnation: int, host: str = "ground") -> NodeInfo:
     return NodeInfo(name, "detection", 1, NodeState.RUNNING, incarnation, 0, host=host)
 
 
+LINES = {"cut": set(), "join": {"", "ground"}, "only the robot hears": {""},
+         "only ground hears": {"ground"}}
+"""Who hears the other, by what happens to the line."""
+
+
 def robot() -> Placement:
     made = Placement("", ["ground"], HOMES, LINK, 0.0)
     made.heard("ground", 0.0)
@@ -59,21 +64,39 @@ def test_a_second_time_they_are_higher_again():
 def test_it_is_given_back_when_the_host_was_heard_for_a_while_without_a_break():
     made = robot()
     made.look(LOST_S, {})
-    for tenth in range(10, 19):
-        made.heard("ground", tenth / 10)
+    for tenth in range(10, 14):
+        hear_table(made, tenth / 10)
         assert made.look(tenth / 10, {}) == Changes()
-    made.heard("ground", 4.0)  # after a break: it begins anew
-    for tenth in range(40, 50):
-        made.heard("ground", tenth / 10)
+    for tenth in range(40, 45):  # after a break: it begins anew
+        hear_table(made, tenth / 10)
         assert made.look(tenth / 10, {}) == Changes()
-    made.heard("ground", 5.1)
-    assert made.look(5.1, {}) == Changes(back=("ground",), drop=("page", "modules"))
+    made.heard("ground", 4.6)
+    assert made.look(4.6, {}) == Changes(back=("ground",), drop=("page", "modules"))
+    assert made.held == {"pilot"}
+
+
+def hear_table(made: Placement, now_s: float, *rows: NodeInfo) -> None:
+    made.heard("ground", now_s)
+    made.told("ground", rows, {"hmi": EPOCH + 1, "DM1": EPOCH + 1, "DM2": EPOCH + 1}, now_s)
+
+
+def test_what_the_host_says_it_still_runs_is_not_given_back_until_it_has_heard_of_the_higher_one():
+    made = robot()
+    hear_table(made, 0.1, row("hmi", 1))
+    made.look(LOST_S + 0.1, {})
+    made.heard("ground", 1.0)
+    made.heard("ground", 1.5)
+    assert made.look(1.5, {}) == Changes(back=("ground",))  # it has said nothing since
+    hear_table(made, 1.7, row("hmi", 1))
+    assert made.look(1.7, {}) == Changes(drop=("modules",))
+    hear_table(made, 1.9)
+    assert made.look(1.9, {}) == Changes(drop=("page",))
     assert made.held == {"pilot"}
 
 
 def test_who_hears_of_a_higher_incarnation_lets_go_of_its_own_and_starts_it_when_it_is_given_back():
     ground = Placement("ground", [""], HOMES, LINK, 0.0)
-    news, drop = ground.told("", [row("hmi", EPOCH + 1)], {"hmi": 2}, 1.0)
+    news, drop = ground.told("", [row("hmi", EPOCH + 1, "")], {"hmi": 2}, 1.0)
     assert [(one.name, one.incarnation) for one in news] == [("hmi", EPOCH + 1)]
     assert drop == ["page"]
     assert ground.look(1.1, {}).take == ()
@@ -95,15 +118,16 @@ def test_a_host_that_was_started_anew_waits_until_it_is_given_what_is_its_own():
     ground = Placement("ground", [""], HOMES, LINK, 0.0)
     assert ground.waits() == ["page", "modules"]
     assert ground.held == {"world"}
-    ground.told("", [row("hmi", EPOCH + 1), row("DM1", EPOCH + 1), row("DM2", 1)], {}, 1.0)
+    ground.told("", [row("hmi", EPOCH + 1, ""), row("DM1", EPOCH + 1, ""), row("DM2", 1, "")], {},
+                1.0)
     assert ground.look(1.1, {}).take == ()
-    ground.told("", [row("DM1", EPOCH + 1), row("DM2", 1)], {}, 1.2)
+    ground.told("", [row("DM1", EPOCH + 1, ""), row("DM2", 1, "")], {}, 1.2)
     assert ground.look(1.3, {"hmi": EPOCH + 1}).take == (("page", EPOCH + 1),)
 
 
 def test_of_an_old_table_nothing_follows():
     ground = Placement("ground", [""], HOMES, LINK, 0.0)
-    ground.told("", [row("hmi", EPOCH + 1)], {}, 1.0)
+    ground.told("", [row("hmi", EPOCH + 1, "")], {}, 1.0)
     ground.told("", [], {}, 1.2)
     assert ground.look(3.0, {}).take == ()
 
@@ -130,15 +154,36 @@ def test_a_unit_that_was_found_running_here_says_that_its_host_is_lost():
     assert [unit for unit, _ in made.look(0.1, {}).take] == ["modules"]
 
 
-@given(st.lists(st.sampled_from(["cut", "join", "robot restarts a unit", "ground restarts a unit",
-                                 "wait"]), max_size=40))
+def test_a_number_that_was_given_back_is_said_until_the_home_runs_a_higher_one():
+    made = robot()
+    made.look(LOST_S, {})
+    mine = {"pilot": 1, "hmi": EPOCH + 1}
+    assert made.given_back(mine) == []  # it still runs here
+    made.held.discard("page")
+    assert made.given_back(mine) == [("hmi", "ground", EPOCH + 1)]
+    made.told("ground", [row("hmi", 3)], mine, 1.0)
+    assert made.given_back(mine) == [("hmi", "ground", EPOCH + 1)]
+    made.told("ground", [row("hmi", EPOCH + 2)], mine, 1.1)
+    assert made.given_back(mine) == []
+
+
+def test_who_hears_of_such_a_number_starts_its_own_above_it():
+    ground = Placement("ground", [""], HOMES, LINK, 0.0)
+    _, drop = ground.told("", [row("hmi", EPOCH + 1, "ground")], {"hmi": 2}, 1.0)
+    assert drop == ["page"]
+    assert ground.look(1.1, {"hmi": 2}).take == (("page", EPOCH + 1),)
+
+
+@given(st.lists(st.sampled_from(["cut", "join", "only the robot hears", "only ground hears", "wait",
+                                 "robot restarts a unit", "ground restarts a unit"]), max_size=40))
 @settings(deadline=None, max_examples=200)
 def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(steps):
     """Two supervisors that exchange tables while they are joined; the issued numbers decide."""
-    now_s, joined = 0.0, True
+    now_s, hears = 0.0, {"", "ground"}
     sides = {"": Placement("", ["ground"], HOMES, LINK, 0.0),
              "ground": Placement("ground", [""], HOMES, LINK, 0.0)}
     issued = {"": {"pilot": 1}, "ground": {"hmi": 1, "DM1": 1, "DM2": 1, "world": 1}}
+    mine = {own: dict(numbers) for own, numbers in issued.items()}
 
     def pass_time(seconds: float) -> None:
         nonlocal now_s
@@ -147,22 +192,26 @@ def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(st
             now_s += 0.1
             for own, side in sides.items():
                 other = "ground" if own == "" else ""
-                if joined:
+                if other in hears:
                     sides[other].heard(own, now_s)
-                    rows = [row(node, issued[own][node]) for unit in side.held
+                    rows = [row(node, issued[own][node], own) for unit in side.held
                             for node in HOMES[unit].nodes]
+                    rows += [row(node, highest, home)
+                             for node, home, highest in side.given_back(mine[own])]
                     news, _ = sides[other].told(own, rows, issued[other], now_s)
                     issued[other].update({one.name: max(
                         one.incarnation, issued[other].get(one.name, 0)) for one in news})
                 for unit, above in side.look(now_s, issued[own]).take:
                     issued[own].update(dict.fromkeys(HOMES[unit].nodes, above + 1))
+                    mine[own].update(dict.fromkeys(HOMES[unit].nodes, above + 1))
 
     for step in (*steps, "join", "wait"):
-        if step in {"cut", "join"}:
-            joined = step == "join"
+        hears = LINES.get(step, hears)
         for side, unit in (("", "pilot"), ("ground", "page")):
             if step.startswith(side or "robot") and unit in sides[side].held:
-                issued[side].update({node: issued[side][node] + 1 for node in HOMES[unit].nodes})
+                more = {node: issued[side][node] + 1 for node in HOMES[unit].nodes}
+                issued[side].update(more)
+                mine[side].update(more)
         pass_time(12.0 if step == "wait" else 0.5)
     assert sides[""].held == {"pilot"}
     assert sides["ground"].held == {"page", "modules", "world"}

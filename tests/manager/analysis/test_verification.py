@@ -406,8 +406,8 @@ def large(count: int):
 
 def test_a_system_too_large_to_look_at_every_set_is_refused():
     with pytest.raises(TooLargeError) as caught:
-        verify(large(15))
-    assert str(caught.value) == ("paper: 15 mechanisms have 32767 active sets; at most 14 "
+        verify(large(17))
+    assert str(caught.value) == ("paper: 17 mechanisms have 131071 active sets; at most 16 "
                                  "mechanisms can be verified exhaustively")
 
 
@@ -428,8 +428,8 @@ def test_the_command_refuses_nonsense_in_one_line(capsys, monkeypatch):
     assert "unknown strategy 'bold'; known: guarded-repair" in refused(
         capsys, "--strategy", "bold")
     assert "--together 0: a number from 1 up is right" in refused(capsys, "--together", "0")
-    monkeypatch.setattr("rampart.cli.systems.load", lambda name: large(15))
-    assert "at most 14 mechanisms can be verified" in refused(capsys)
+    monkeypatch.setattr("rampart.cli.systems.load", lambda name: large(17))
+    assert "at most 16 mechanisms can be verified" in refused(capsys)
 
 
 def test_the_command_prints_json_of_the_promised_shape(capsys):
@@ -453,6 +453,8 @@ def test_strict_the_exit_code_tells_whether_all_holds(capsys, strategy, code):
 def test_the_command_prints_a_table_the_states_and_the_traces(capsys):
     assert main(["verify", "paper", "--strategy", "safety-first"]) == 0
     told = capsys.readouterr().out
+    assert "active sets in which a repair" in told
+    assert "\\u000a" not in told
     assert "127 active sets, " in told
     assert "FAILS in 32" in told
     assert "90 of 127" in told

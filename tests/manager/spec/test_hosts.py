@@ -8,7 +8,7 @@ from rampart.actors.layout.hosts import Hosts
 from rampart.manager.spec.budget import check
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError
-from tests.two_hosts import two_hosts
+from tests.two_hosts import home_when_lost, two_hosts
 
 ADDRESSES = {"robot": "192.168.7.1", "ground": "192.168.7.2"}
 TEXT = two_hosts(ADDRESSES)
@@ -44,6 +44,14 @@ def test_a_module_beyond_the_link_has_so_much_less_time():
     far = {b.name: b for b in check(SPEC)}
     assert far["FTM10"].detection_s == pytest.approx(alone["FTM10"].detection_s + 0.3)
     assert far["FTM1"].detection_s == alone["FTM1"].detection_s
+
+
+def test_to_go_home_when_nobody_can_reach_the_robot_fits_in_what_the_specification_allows():
+    budgets = check(parse_specification(home_when_lost(TEXT), "home.toml"))
+    home, = (one for one in budgets if one.name == "FTM15")
+    assert home.time_left_s == 10.0
+    assert home.detection_s == 6.2
+    assert home.fits
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [

@@ -9,17 +9,11 @@ import pytest
 
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
 from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode, PilotMode
-from rampart.actors.osmosis.recovery.replan import Replan
-from rampart.actors.runtime.actor import Actor, on
 from rampart.sim.virtual.virtual_loop import VirtualLoop
-from rampart.testing import run
 from tests.actors.osmosis.control.mission_world import full_house
 from tests.actors.osmosis.control.test_actors import AIRPORT
 from tests.actors.osmosis.control.world import World
-from tests.actors.osmosis.recovery.world import Boss
-from tests.osmosis_system import System
 
 START = (AIRPORT.start.x_m, AIRPORT.start.y_m, AIRPORT.start.yaw_rad)
 DOWN = m.Goal(-29.5, -3.0, Mode.TAXI)
@@ -183,90 +177,3 @@ def test_without_a_good_route_for_the_goal_the_robot_stands_and_control_says_why
         assert "crosses the prohibited area" in told.reason
 
     play(scenario)
-
-
-# ---- RM6 ----------------------------------------------------------------------------------------
-
-
-class Planner(Actor):
-    """Answers each goal with a route, unless it is told to be dumb."""
-
-    outputs = (topics.ROUTE, topics.MISSION_REQUEST)
-
-    def __init__(self, context):
-        super().__init__(context)
-        self.way = ((0.0, 0.0), (1.0, 0.0))
-        self.dumb = False
-
-    @on(topics.GOAL)
-    def goal(self, message, header):
-        if not self.dumb:
-            self.publish(topics.ROUTE, m.Route(
-                message.mission_id, message.step, message.goal.mode, message.active,
-                self.way if message.active else (), "" if self.way else "no way", message.plan))
-
-
-def replanning(scenario, *, mission=True):
-    async def scene():
-        async with System(airport=AIRPORT) as system:
-            boss, planner = system.start("boss", Boss), system.start("planner", Planner)
-            manager = system.start("mission_manager", MissionManager)
-            system.start("RM6", Replan)
-            await system.settle()
-            if mission:
-                planner.publish(topics.MISSION_REQUEST, m.MissionRequest("m1", "A", (DOWN,)))
-            await asyncio.sleep(0.5)
-            await scenario(boss, planner, manager)
-
-    run(scene)
-
-
-def test_a_replan_is_done_when_the_new_route_is_there():
-    async def scenario(boss, planner, manager):
-        boss.order("RM6")
-        await asyncio.sleep(0.1)
-        assert boss.phases == ["idle", "acting", "done"]
-        assert manager.state.plan == 1
-        boss.order("RM6")
-        await asyncio.sleep(0.5)
-        assert manager.state.plan == 1, "the same command is the same order"
-        boss.order("RM6", decision=2)
-        await asyncio.sleep(0.5)
-        assert manager.state.plan == 2
-        boss.release("RM6", decision=3)
-        await asyncio.sleep(0.1)
-        assert boss.phases == ["idle", "acting", "done", "acting", "done", "idle"]
-
-    replanning(scenario)
-
-
-def test_a_replan_fails_without_a_mission_with_the_managers_reason():
-    async def scenario(boss, planner, manager):
-        boss.order("RM6")
-        await asyncio.sleep(0.1)
-        assert boss.phases == ["idle", "acting", "failed"]
-        assert boss.reports[-1][1].reason == "refused: no mission is under way"
-
-    replanning(scenario, mission=False)
-
-
-def test_a_replan_fails_if_there_is_no_way():
-    async def scenario(boss, planner, manager):
-        planner.way = ()
-        boss.order("RM6")
-        await asyncio.sleep(0.1)
-        assert boss.reports[-1][1].reason == "no way: no way"
-
-    replanning(scenario)
-
-
-def test_a_replan_fails_at_its_deadline_if_no_route_comes():
-    async def scenario(boss, planner, manager):
-        planner.dumb = True
-        boss.order("RM6")
-        await asyncio.sleep(1.9)
-        assert boss.phases == ["idle", "acting"]
-        await asyncio.sleep(0.3)
-        assert boss.reports[-1][1].reason == "not done within 2 s: no new route"
-
-    replanning(scenario)
