@@ -7,19 +7,13 @@ BIN := .venv/bin
 run: setup
 	$(BIN)/python launch.py
 
-# What has a mission of the real robot against the clock needs the machine for itself, and comes
-# last; beside it runs, at the lowest priority, what only computes. Of the others many wait more than
-# they compute, so there is one worker more than cores; what fails in that crowd, as a wait of half a
-# second may, is run once more by itself, and counts then.
-CROWD := "not slow and not alone and (not virtual or processes)"
-WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 1)))
-# Without Chromium the operator's page is not tested, which the last line says.
+# What is compiled is kept, even where the environment says otherwise: the tests start a thousand
+# interpreters. Without Chromium the operator's page is not tested, which the last line says.
+unexport PYTHONDONTWRITEBYTECODE
 test: setup
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
-	$(BIN)/python -m pytest -m $(CROWD) --numprocesses $(WORKERS) || \
-		{ echo "once more, by themselves:"; $(BIN)/python -m pytest -m $(CROWD) --last-failed --last-failed-no-failures none; }
-	$(BIN)/python -m tests.beside
+	$(BIN)/python -m tests.suite
 
 # Long missions on real processes that the suite has shorter relatives of; three minutes.
 test-slow: setup

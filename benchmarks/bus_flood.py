@@ -46,14 +46,24 @@ PER_S = 40_000
 _POINT = load_airport("vallombre").prohibited_polygon().representative_point()
 _GRASS = (_POINT.x, _POINT.y)
 
-FLOOD = """
+JOIN = """
 import sys, time, zenoh
+from rampart.actors.bus.zenoh_session import open_client
+from rampart.actors.run.run_info import find_runs
+from rampart.cli.session import tools_credentials
+def join():
+    run = next(run for run in find_runs() if run.base_port == int(sys.argv[-1]))
+    return open_client(run.endpoints, tools_credentials(run)[0])
+"""
+"""How a program becomes a member of the run whose base port is its last argument; with the key that
+`RAMPART_KEY` names, if the run has keys."""
+
+FLOOD = JOIN + """
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm, topics as ftm_topics
 from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.bus.messages import Injection
-from rampart.actors.bus.zenoh_session import session_config
-kind, per_s, seconds, dial = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), sys.argv[4:]
+kind, per_s, seconds = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 order = Injection("i", "no/topic", "drop", 1.0)
 report = fm.DetectionReport(fm.DetectionState.IDLE, "", (), 0.0)
 def message(i):
@@ -65,7 +75,7 @@ def message(i):
     return bus_topics.INJECT.at(), encode(Header(name, 1, i, 0.0), order)
 def ask():
     session.get(ftm_topics.DETECTION.pattern, lambda reply: None, timeout=0.1)
-with zenoh.open(session_config((), dial)) as session:
+with join() as session:
     time.sleep(1)
     print("here", flush=True)
     publishers, begun, sent = {}, time.monotonic(), 0
@@ -162,7 +172,7 @@ async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
             if kind != "none":
                 flood = await asyncio.create_subprocess_exec(
                     sys.executable, "-c", FLOOD, kind, str(options.per_s), "100000",
-                    *session.run.endpoints, cwd=ROOT)
+                    str(PORT), cwd=ROOT)
                 await asyncio.sleep(3.0)
             samples = []
             for _ in range(options.brakes):

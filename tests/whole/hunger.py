@@ -117,9 +117,15 @@ def _group_of(pid: int) -> str:
 
 
 @contextmanager
-def member(run: RealRun, script: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a script that is given how to join the bus of a run; wait until it says it is there."""
-    with subprocess.Popen([sys.executable, "-c", script, *arguments, *run.info.endpoints],
+def member(run: RealRun, script: str, *arguments: str, key: str | Path = ""
+           ) -> Iterator[subprocess.Popen[str]]:
+    """Run a script that is told the port of a run to join; wait until it says it is there.
+
+    Args:
+        key: with which it joins a run with keys.
+    """
+    with subprocess.Popen([sys.executable, "-c", script, *arguments, str(run.port)],
+                          env={**os.environ, "RAMPART_KEY": str(key)},
                           stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None

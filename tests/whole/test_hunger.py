@@ -12,12 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.bus_flood import FLOOD, KINDS, PER_S, Watch
+from benchmarks.bus_flood import FLOOD, JOIN, KINDS, PER_S, Watch
 from rampart.actors.bus.zenoh_session import ROUTERS
 from rampart.cli.session import connect
 from rampart.manager.spec.specification import check_document, read_document
 from rampart.testing import RealRun
 from tests import ROOT
+from tests.actors.access.keyed import layout_of, make_keys
 from tests.whole.hunger import (
     OwnClock,
     fill,
@@ -33,11 +34,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.processes, pytest.mark.alone, pytest
 MORE_MB = 60.0
 """By how much a process may grow meanwhile: mailboxes, queues of the bus, allocators."""
 
-HEARS_ALL = """
-import sys, time, zenoh
+HEARS_ALL = JOIN + """
 from rampart.actors.bus.topic import ROOT
-from rampart.actors.bus.zenoh_session import session_config
-with zenoh.open(session_config((), sys.argv[1:])) as session:
+with join() as session:
     session.declare_subscriber(ROOT + "/**", lambda sample: None)
     time.sleep(1)
     print("here", flush=True)
@@ -159,15 +158,22 @@ def test_a_member_that_hears_all_and_reads_nothing_is_let_go_of(tmp_path):
     assert result["restarts"] == {}
 
 
-def test_a_member_that_floods_delays_no_emergency_stop_and_harms_nobody(tmp_path):
-    """The budget of the arbitration is kept by most stops; the tail is in `measurements.md`."""
+@pytest.mark.parametrize("thief", ["", "DM1", "ada"])
+def test_a_member_that_floods_delays_no_emergency_stop_and_harms_nobody(tmp_path, thief):
+    """The budget of the arbitration is kept by most stops; the tail is in `measurements.md`.
+
+    In a run with keys the member has the stolen key of the module that reports, or an operator's.
+    """
     file = ROOT / "systems" / "paper.toml"
     spec = check_document(read_document(file.read_text(encoding="utf-8"), file.name), file.name)
-    with RealRun(tmp_path, "paper", "--patience", "100000") as run:
+    keys = make_keys(tmp_path / "keys", layout_of("paper")) if thief else None
+    with RealRun(tmp_path, "paper", "--patience", "100000",
+                 *(("--keys", str(keys)) if keys else ())) as run:
         run.wait_for("goal 1/")
         before, memory = pids(run), memory_mb(run)
         for kind in KINDS:
-            with member(run, FLOOD, kind, str(PER_S), "100000"):
+            with member(run, FLOOD, kind, str(PER_S), "100000",
+                        key=keys / f"{thief}.pem" if keys else ""):
                 time.sleep(2)
                 took_s = sorted(asyncio.run(_stops(run.port, 7)))
                 assert pids(run) == before, kind
