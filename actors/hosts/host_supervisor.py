@@ -94,8 +94,8 @@ class HostSupervisor(Supervisor):
     def guard_heard(self, _message: Heartbeat, header: Header) -> None:
         """Note that another host is there."""
         host = self._guard_of.get(header.source)
-        if host is not None:
-            self._placement.heard(host, self._loop.time())
+        if host is not None and self._placement.heard(host, self._loop.time()):
+            self._publish_table()  # each soon knows what the other runs
 
     @on(topics.HOST_NODES)
     def told(self, table: fm.NodeTable, header: Header) -> None:
@@ -104,13 +104,13 @@ class HostSupervisor(Supervisor):
         if host is None:
             return
         now_s = self._loop.time()
-        self._placement.heard(host, now_s)
+        was_missed = self._placement.heard(host, now_s)
         news, drop = self._placement.told(host, table.nodes, self._mine(), now_s)
         for row in news:
             self._issue(row)
         for unit in drop:
             self._drop(unit)
-        if news or drop:
+        if news or drop or was_missed:
             self._publish_table()
 
     def _issue(self, row: fm.NodeInfo) -> None:

@@ -132,12 +132,14 @@ class Placement:
         other = self._others[self._homes[unit].host]
         other.is_lost, other.heard_s = True, -math.inf
 
-    def heard(self, host: str, now_s: float) -> None:
-        """Note that a guard of another host was heard."""
+    def heard(self, host: str, now_s: float) -> bool:
+        """Note that a guard of another host was heard; return whether that was missed before."""
         other = self._others[host]
-        if now_s - other.heard_s > self._link.lost_after_s:
+        was_missed = now_s - other.heard_s > self._link.lost_after_s
+        if was_missed:
             other.since_s = now_s
         other.heard_s = now_s
+        return was_missed
 
     def told(self, host: str, rows: Iterable[NodeInfo], mine: Mapping[str, int], now_s: float
              ) -> tuple[list[NodeInfo], list[str]]:

@@ -48,4 +48,4 @@ class Link(Table, frozen=True):
     delay_s: Positive = 0.3
     clock_s: Positive = 0.1
     lost_after_s: Positive = 0.6
-    return_after_s: Positive = 0.5
+    return_after_s: Positive = 0.3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -15,8 +14,7 @@ from rampart.actors.access import key_folder
 from rampart.actors.supervision.process_title import find_processes
 from rampart.cli.main import main
 from rampart.testing import RealRun
-from tests import ROOT
-from tests.actors.access.keyed import every_key, layout_of, make_keys
+from tests.actors.access.keyed import every_key, layout_of, make_keys, try_all
 from tests.other_user import needs_root
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
@@ -108,18 +106,10 @@ def test_another_user_at_the_ports_of_a_run_hears_nothing_and_is_not_heard(tmp_p
         run.wait_for("goal 1/3", 60)
         ports = run.info.ports
         assert len(ports) == 2
-        (tmp_path / "ca.crt").write_bytes((keys / "ca.crt").read_bytes())
-        order = {"endpoints": [f"{kind}/127.0.0.1:{port}" for port in ports
-                               for kind in ("tls", "tcp")],
-                 "shown": {"nothing": {}, "the authority": {
-                     "root_ca_certificate": str(keys / "ca.crt")}},
-                 "keys": every_key(layout_of("osmosis")), "becomes_nobody": True}
-        done = subprocess.run(
-            [sys.executable, str(ROOT / "tests/actors/access/tls_stranger.py")],
-            input=json.dumps(order), env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True, text=True, timeout=100, check=False)
-        assert done.returncode == 0, done.stderr
-        found = json.loads(done.stdout)
+        found = try_all(
+            [f"{kind}/127.0.0.1:{port}" for port in ports for kind in ("tls", "tcp")],
+            {"nothing": {}, "the authority": {"root_ca_certificate": str(keys / "ca.crt")}},
+            every_key(layout_of("osmosis")), becomes_nobody=True)
         assert found["user"] == 65534
         assert sum(one["heard"] for one in found["tried"].values()) == 0
         assert not any(one["joined"] for one in found["tried"].values())

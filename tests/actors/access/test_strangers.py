@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
-import json
 import os
-import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -23,15 +20,22 @@ from rampart.actors.bus import run_folder
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, session_config
-from tests import ROOT
-from tests.actors.access.keyed import Keyed, every_key, layout_of, make_keys, opened, wait_for
+from tests.actors.access.keyed import (
+    Keyed,
+    every_key,
+    layout_of,
+    make_keys,
+    opened,
+    shown_by_strangers,
+    try_all,
+    wait_for,
+)
 from tests.other_user import needs_root
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 LAYOUT = layout_of("osmosis")
 KEYS = every_key(LAYOUT)
-STRANGER = ROOT / "tests/actors/access/tls_stranger.py"
 NOW = dt.datetime.now(dt.UTC)
 
 
@@ -49,26 +53,11 @@ def keyed(folder, tmp_path):
 
 
 @pytest.fixture
-def public(keyed):
-    """What any stranger may have: the authority's certificate, and keys of an authority of his."""
+def shown(keyed):
+    """What any stranger may have, where every user can read it."""
     with tempfile.TemporaryDirectory(prefix="stranger-", dir="/tmp") as place:
-        here = Path(place)
-        here.chmod(0o755)
-        shutil.copy(keyed.keys / "ca.crt", here / "ca.crt")
-        forged = new_authority(NOW, 10)
-        (here / "forged.pem").write_bytes(new_certificate(
-            forged, "safety_pilot", "node", addresses=(), now=NOW, days=5))
-        for file in here.iterdir():
-            file.chmod(0o644)
-        yield here
-
-
-def shown_by_strangers(public):
-    own = str(public / "forged.pem")
-    return {"nothing": {},
-            "no certificate": {"root_ca_certificate": str(public / "ca.crt")},
-            "one of his own": {"root_ca_certificate": str(public / "ca.crt"), "enable_mtls": True,
-                               "connect_private_key": own, "connect_certificate": own}}
+        Path(place).chmod(0o755)
+        yield shown_by_strangers(Path(place), keyed.keys)
 
 
 @contextlib.contextmanager
@@ -97,22 +86,11 @@ def a_busy_bus(keyed):
             del held, tokens
 
 
-def try_all(endpoints, shown, *, becomes_nobody, before=()):
-    order = {"endpoints": endpoints, "shown": shown, "keys": KEYS,
-             "becomes_nobody": becomes_nobody}
-    done = subprocess.run([*before, sys.executable, str(STRANGER)], input=json.dumps(order),
-                          env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True,
-                          text=True, timeout=100, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
 @needs_root
-def test_another_user_reads_nothing_and_is_not_heard(keyed, public):
+def test_another_user_reads_nothing_and_is_not_heard(keyed, shown):
     with a_busy_bus(keyed) as accepted:
         plain = f"tcp/127.0.0.1:{keyed.port}"
-        found = try_all([keyed.at, plain, keyed.socket], shown_by_strangers(public),
-                        becomes_nobody=True)
+        found = try_all([keyed.at, plain, keyed.socket], shown, KEYS, becomes_nobody=True)
         assert found["user"] == 65534
         assert len(found["tried"]) == 9
         assert sum(one["heard"] for one in found["tried"].values()) == 0, found
@@ -125,7 +103,7 @@ def test_the_same_attempts_succeed_with_a_key(keyed):
     with a_busy_bus(keyed) as accepted:
         found = try_all([keyed.at], {"a key": {
             "root_ca_certificate": ours, "enable_mtls": True,
-            "connect_private_key": own, "connect_certificate": own}}, becomes_nobody=False)
+            "connect_private_key": own, "connect_certificate": own}}, KEYS)
         (one,) = found["tried"].values()
         assert one["joined"]
         assert one["heard"] > len(KEYS)
@@ -166,14 +144,11 @@ def test_another_network_reads_nothing_and_is_not_heard(folder, tmp_path, networ
     keys = make_keys(tmp_path / "keys", LAYOUT, (address,))
     inside = ("ip", "netns", "exec", name)
     with Keyed(folder, keys, LAYOUT, address) as keyed:
-        shown = shown_by_strangers(tmp_path)
-        shutil.copy(keys / "ca.crt", tmp_path / "ca.crt")
-        (tmp_path / "forged.pem").write_bytes(new_certificate(
-            new_authority(NOW, 10), "router_b", "router", addresses=(address,), now=NOW, days=5))
+        shown = shown_by_strangers(tmp_path, keys, "router_b", "router", (address,))
         with a_busy_bus(keyed) as accepted:
             plain = f"tcp/{address}:{keyed.port}"
-            found = try_all([keyed.at, plain, f"tls/127.0.0.1:{keyed.port}"], shown,
-                            becomes_nobody=False, before=inside)
+            found = try_all([keyed.at, plain, f"tls/127.0.0.1:{keyed.port}"], shown, KEYS,
+                            before=inside)
             assert len(found["tried"]) == 9
             assert sum(one["heard"] for one in found["tried"].values()) == 0, found
             assert accepted == []
@@ -181,14 +156,14 @@ def test_another_network_reads_nothing_and_is_not_heard(folder, tmp_path, networ
             with_key = try_all([keyed.at], {"a key": {
                 "root_ca_certificate": str(keys / "ca.crt"), "enable_mtls": True,
                 "connect_private_key": own, "connect_certificate": own}},
-                becomes_nobody=False, before=inside)
+                KEYS, before=inside)
             assert next(iter(with_key["tried"].values()))["heard"] > 0  # the cable is there
 
 
 def test_the_socket_in_the_folder_lets_nothing_through(keyed):
     """By it a client finds out that the router is there, as the run's user; and no more."""
     with a_busy_bus(keyed) as accepted:
-        found = try_all([keyed.socket], {"nothing": {}}, becomes_nobody=False)
+        found = try_all([keyed.socket], {"nothing": {}}, KEYS)
         assert found["tried"][f"{keyed.socket} nothing"]["heard"] == 0
         assert accepted == []
 
