@@ -63,14 +63,15 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm, topics as ftm_topics
 from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.bus.messages import Injection
-kind, per_s, seconds = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+kind, per_s, seconds, own = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), sys.argv[4]
 order = Injection("i", "no/topic", "drop", 1.0)
 report = fm.DetectionReport(fm.DetectionState.IDLE, "", (), 0.0)
 def message(i):
     if kind == "garbage":
-        return ftm_topics.DETECTION.at("DM1"), b"\\xff" * 200
+        return ftm_topics.DETECTION.at(own or "DM1"), b"\\xff" * 200
     if kind == "reports":
-        return ftm_topics.DETECTION.at("DM99"), encode(Header("DM99", 1, i, 0.0), report)
+        name = own or "DM99"
+        return ftm_topics.DETECTION.at(name), encode(Header(name, 1, i, 0.0), report)
     name = f"stranger{i % 26_000}" if kind == "names" else "stranger"
     return bus_topics.INJECT.at(), encode(Header(name, 1, i, 0.0), order)
 def ask():
@@ -172,7 +173,7 @@ async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
             if kind != "none":
                 flood = await asyncio.create_subprocess_exec(
                     sys.executable, "-c", FLOOD, kind, str(options.per_s), "100000",
-                    str(PORT), cwd=ROOT)
+                    "", str(PORT), cwd=ROOT)
                 await asyncio.sleep(3.0)
             samples = []
             for _ in range(options.brakes):
