@@ -177,7 +177,8 @@ def test_a_member_that_floods_delays_no_emergency_stop_and_harms_nobody(tmp_path
                         key=keys / f"{thief}.pem" if keys else ""):
                 time.sleep(2)
                 took_s = sorted(asyncio.run(_stops(run.port, 7)))
-                assert pids(run) == before, kind
+                died = {name for name, pid in pids(run).items() if before[name] != pid}
+                assert died <= {thief}, kind  # what is said in its name counts as its own
                 grown = {n: mb - memory[n] for n, mb in memory_mb(run).items()
                          if n in memory and mb - memory[n] > MORE_MB}
                 assert grown == {}, kind
