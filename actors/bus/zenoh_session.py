@@ -28,9 +28,10 @@ one of the hundred places that Zenoh has for handshakes no longer than this."""
 FAR_HANDSHAKE_MS = 2000
 """Of a router that other hosts are linked to: four messages, some of which may be lost."""
 
-_SOCKET_BYTES = 65_536
-"""What the kernel keeps for a TCP socket on either side. Left to itself it keeps megabytes: what a
-flooding member with a key had sent stood before an emergency stop for 0.4 s."""
+_SOCKET_BYTES, _FAR_SOCKET_BYTES = 16_384, 65_536
+"""What the kernel keeps for a TCP socket on either side; it takes twice that. Left to itself it keeps
+megabytes: what a flooding member with a key had sent stood before an emergency stop for 0.4 s.
+Between hosts it is what may be under way: with 0.1 s there and back 1 MB a second."""
 
 _NOT_FATAL = "exit_on_failure=false"
 
@@ -160,7 +161,7 @@ def session_config(listen: Sequence[str], dial: Sequence[str],
         "transport/link/tx/queue/congestion_control/block/wait_before_close": FULL_US,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _ROOM_US,
         **{f"transport/link/tx/queue/size/{kind}": room for kind, room in _ROOM.items()},
-        **{f"transport/link/{link}/so_{side}buf": _SOCKET_BYTES
+        **{f"transport/link/{link}/so_{side}buf": _FAR_SOCKET_BYTES if is_far else _SOCKET_BYTES
            for link in ("tcp", "tls") for side in ("snd", "rcv")},
         **(credentials.settings() if credentials is not None else {}),
         **({"access_control": access} if access is not None else {})}
