@@ -48,6 +48,10 @@ _ANSWER_S = 1.0
 
 _LOOK_S = 0.002
 
+_BURST = 256
+"""Messages that are delivered one after the other before something else gets its turn: who floods
+an actor does not keep it from its timers."""
+
 _ALIVE, _GONE = f"{ROOT}/alive", f"{ROOT}/gone"
 _DELIVERY = {Qos.SENSOR: zenoh.Priority.DATA, Qos.STATE: zenoh.Priority.INTERACTIVE_HIGH,
              Qos.COMMAND: zenoh.Priority.INTERACTIVE_HIGH}
@@ -308,8 +312,12 @@ class ZenohBus:
         self._woken = False  # after the reading: who finds it set still rings, or is drained below
         after: list[Callable[[], None]] = []
         self._after_burst = after
-        while self._session is not None and self._arrived:
+        for _ in range(_BURST):
+            if self._session is None or not self._arrived:
+                break
             self._try(self._arrived.popleft())
+        else:
+            os.eventfd_write(self._bell.number, 1)  # the rest after what else is due
         self._after_burst = None
         for call in after:
             self._try(call)

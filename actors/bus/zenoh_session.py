@@ -29,9 +29,9 @@ FAR_HANDSHAKE_MS = 2000
 """Of a router that other hosts are linked to: four messages, some of which may be lost."""
 
 _SOCKET_BYTES, _FAR_SOCKET_BYTES = 16_384, 65_536
-"""What the kernel keeps for a TCP socket on either side; it takes twice that. Left to itself it keeps
-megabytes: what a flooding member with a key had sent stood before an emergency stop for 0.4 s.
-Between hosts it is what may be under way: with 0.1 s there and back 1 MB a second."""
+"""What the kernel keeps for a TCP socket on either side; it takes twice that. Left to itself it
+keeps megabytes: what a flooding member with a key had sent stood before an emergency stop for 0.4
+s. Between hosts it is what may be under way: with 0.1 s there and back 1 MB a second."""
 
 _NOT_FATAL = "exit_on_failure=false"
 
