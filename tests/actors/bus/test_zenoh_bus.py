@@ -1,0 +1,46 @@
+"""The bus over Zenoh: what becomes of a reader that gets more than it can handle."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from itertools import pairwise
+
+import zenoh
+
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.bus.zenoh_session import endpoints, open_client
+from rampart.actors.ftm import topics
+
+MANY = 1500
+
+
+async def test_who_is_flooded_gets_round_to_its_timers(bus_folder):
+    reader = ZenohBus("reader", 1, endpoints(bus_folder))
+    await reader.open()
+    heard, begun = [], asyncio.Event()
+
+    def slow(_key: str, payload: bytes) -> None:
+        heard.append(payload)
+        begun.set()
+        time.sleep(0.001)  # busy: it is nobody else's turn
+
+    reader.subscribe(topics.DETECTION, topics.DETECTION.at("DM1"), slow)
+    with open_client(endpoints(bus_folder)) as member:
+        flood = member.declare_publisher(topics.DETECTION.at("DM1"),
+                                         congestion_control=zenoh.CongestionControl.BLOCK)
+
+        def say() -> None:
+            for _ in range(MANY):
+                flood.put(b"x")
+
+        await asyncio.sleep(0.1)  # the subscription is known
+        saying = asyncio.create_task(asyncio.to_thread(say))
+        await begun.wait()
+        turns = []
+        while len(heard) < MANY and len(turns) < 10_000:
+            turns.append(len(heard))
+            await asyncio.sleep(0.001)
+        await saying
+    await reader.close()
+    assert max(later - one for one, later in pairwise([*turns, MANY])) <= MANY / 2
