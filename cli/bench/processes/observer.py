@@ -89,7 +89,7 @@ class Observer:
 
 def bus(observer: Observer, endpoint: str) -> None:
     """Be the bus of the peers' nodes, and publish their input until stdin closes."""
-    with zenoh.open(session_config(endpoint, ())) as session:
+    with zenoh.open(session_config([endpoint], ())) as session:
         session.declare_subscriber("bench/output/*", observer.output)
         source = session.declare_publisher("bench/input", express=True)
         observer.say(b"ready")

@@ -75,7 +75,7 @@ async def _closed() -> None:
 
 async def main(role: str, first: str, second: str) -> None:
     """Play a role until stdin closes."""
-    with (zenoh.open(session_config(first, [second])) if role == "router"
+    with (zenoh.open(session_config([first], [second])) if role == "router"
           else joined([first, second])) as session:
         print("ready", flush=True)
         await {"router": lambda _: _closed(), "answerer": answer, "asker": ask}[role](session)

@@ -101,7 +101,7 @@ def command(*arguments: str) -> list[str]:
     return [sys.executable, "-P", "-m", "rampart.cli.main", "bench", *arguments]
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(240)
 def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
     out, broken = tmp_path / "out", tmp_path / "peers" / "bin" / "circusd"
