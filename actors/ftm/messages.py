@@ -217,8 +217,22 @@ class RespawnRequest(Message, frozen=True):
     by: Name
 
 
+class SignalOrder(Message, frozen=True):
+    """An order to signal the process of a node; the same `order` twice is one.
+
+    `signal` is one that `kill-node` has, such as `KILL`.
+    """
+
+    order: Name
+    node: Name
+    signal: Name
+
+
 class ProcessEvent(Message, frozen=True):
-    """Something happened to a process: crashed, stopped, wedged, respawned, refused, given up."""
+    """Something happened to a process: crashed, stopped, wedged, respawned, refused, given up.
+
+    And *signalled*, `by` the id of the order.
+    """
 
     node: Name
     event: Name

@@ -40,6 +40,9 @@ HOST_NODES = Topic("supervisor/{name}/nodes", m.NodeTable, Qos.STATE, 2, "",
                    "What supervisor {name} runs, of a system of several hosts; for the others.")
 RESPAWN = Topic("supervisor/respawn", m.RespawnRequest, Qos.COMMAND, 0, "",
                 "Ask for a node to be respawned.")
+SIGNAL = Topic("supervisor/signal", m.SignalOrder, Qos.COMMAND, 0, "",
+               "Signal the process of a node that runs on another host, as `kill-node` does on its "
+               "own; in a system of several.", outside=True)
 PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",
                       "What happened to processes.")
 

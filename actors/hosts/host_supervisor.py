@@ -8,9 +8,13 @@ first host's publishes the table of all.
 
 from __future__ import annotations
 
+from collections import deque
+from functools import partial
+from signal import Signals
 from typing import Any, ClassVar
 
 from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.run_folder import issue
 from rampart.actors.bus.topic import Members, Topic
@@ -19,6 +23,13 @@ from rampart.actors.ftm import topics
 from rampart.actors.hosts.placement import Changes, Home, Placement
 from rampart.actors.run.run_plan import SUPERVISOR, on_host
 from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.supervision.kill_node import (
+    SIGNALS,
+    SignalError,
+    UnknownNodeError,
+    find_node,
+)
+from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.processes import Processes
 from rampart.actors.supervision.supervised_process import Event
 from rampart.actors.supervision.supervisor import Supervisor
@@ -26,6 +37,12 @@ from rampart.manager.spec.schema import Kind
 
 _LOOK_S = 0.05
 """Real seconds between two looks at the other hosts."""
+
+_SAID_S = 0.1
+"""Simulated seconds after which it is signalled itself: the answer has gone by then."""
+
+_ORDERS_KEPT = 64
+"""An order to signal that is repeated is the same as long as it is among the last so many."""
 
 
 class HostSupervisor(Supervisor):
@@ -52,6 +69,7 @@ class HostSupervisor(Supervisor):
         self._supervisors = {hosts.supervisors[host]: host for host in others}
         self._guard_of = {name: host for host in others for name in hosts.guards_of(host)}
         self._issued = dict(context.run.known_incarnations)
+        self._signalled: deque[str] = deque(maxlen=_ORDERS_KEPT)
         self._placement = Placement(
             own, others,
             {name: Home(hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes),
@@ -113,6 +131,25 @@ class HostSupervisor(Supervisor):
         if news or drop or was_missed:
             self._publish_table()
 
+    @on(topics.SIGNAL)
+    def signal(self, order: fm.SignalOrder, _header: Header) -> None:
+        """Signal a process of this host; what is none, another supervisor may know."""
+        if order.order in self._signalled:
+            return
+        try:
+            victim = find_node(order.node, order.signal, self._plan.base_port)
+        except UnknownNodeError:
+            return
+        except SignalError as refusal:
+            pid, incarnation, event, detail = 0, 0, "refused", clip(str(refusal))
+        else:
+            pid, incarnation = victim.pid, victim.incarnation
+            event, detail = "signalled", order.signal
+            self.call_later(_SAID_S, partial(_kill, pid, SIGNALS[order.signal]))
+        self._signalled.append(order.order)
+        self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
+            order.node, event, pid, incarnation, order.order, detail))
+
     def _issue(self, row: fm.NodeInfo) -> None:
         if row.name in self._supervisors:  # of itself it is believed: who else could say it?
             return
@@ -172,6 +209,10 @@ class HostSupervisor(Supervisor):
         given_back = (fm.NodeInfo(node, "", 0, fm.NodeState.UNREACHABLE, highest, 0, host=home)
                       for node, home, highest in self._placement.given_back(self._mine()))
         self.publish(topics.HOST_NODES, fm.NodeTable((*self._own_rows(), *given_back)))
+
+
+def _kill(pid: int, number: Signals) -> None:
+    kill(pid, number)  # it may be gone by now
 
 
 class FirstSupervisor(HostSupervisor):

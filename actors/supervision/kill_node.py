@@ -7,6 +7,8 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Callable
+from typing import NamedTuple
 
 from rampart.actors.supervision.process_title import RunProcess, find_processes
 from rampart.files import streams
@@ -26,12 +28,17 @@ examples:
   kill-node osmosis_control                  kill it and watch it come back
   kill-node localization --signal STOP       only its heartbeat shows that it is gone
   kill-node --list                           what there is to kill
+In a system of several hosts it reaches nodes of all of them; --list shows those of this one.
 A plain `kill -9 PID` or `pkill -9 -f osmosis_control` does the same.
 """
 
 
 class SignalError(Exception):
     """A node cannot be signalled; one line for the user."""
+
+
+class UnknownNodeError(SignalError):
+    """No process of this machine is the node's."""
 
 
 def signal_node(node: str, name: str, port: int | None = None) -> RunProcess:
@@ -45,9 +52,7 @@ def signal_node(node: str, name: str, port: int | None = None) -> RunProcess:
     Raises:
         SignalError: there is no such node or signal, or it may not be sent.
     """
-    if name not in SIGNALS:
-        raise SignalError(f"unknown signal {name!r}; known: {', '.join(SIGNALS)}")
-    victim = _find(find_processes(port), node, port)
+    victim = find_node(node, name, port)
     try:
         os.kill(victim.pid, SIGNALS[name])
     except OSError as error:
@@ -55,12 +60,36 @@ def signal_node(node: str, name: str, port: int | None = None) -> RunProcess:
     return victim
 
 
-def main(arguments: list[str] | None = None) -> int:
+def find_node(node: str, name: str, port: int | None = None) -> RunProcess:
+    """Return what `signal_node` would signal.
+
+    Raises:
+        SignalError: there is no such node or signal.
+    """
+    if name not in SIGNALS:
+        raise SignalError(f"unknown signal {name!r}; known: {', '.join(SIGNALS)}")
+    return _find(find_processes(port), node, port)
+
+
+class Signalled(NamedTuple):
+    """Which process got a signal."""
+
+    pid: int
+    incarnation: int
+
+
+Elsewhere = Callable[[str, str, int | None], Signalled | None]
+"""Signals a node that no process of this machine is: name, signal, port of the run; None if nobody
+knows of such a node. It raises `SignalError` if it cannot."""
+
+
+def main(arguments: list[str] | None = None,
+         elsewhere: Elsewhere = lambda _node, _name, _port: None) -> int:
     """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
     streams.secure()
     options = _parser().parse_args(arguments)
     try:
-        for line in _listed(options) if options.list else _signalled(options):
+        for line in _listed(options) if options.list else _signalled(options, elsewhere):
             print(line)
     except SignalError as refusal:
         print(f"kill-node: {refusal}", file=sys.stderr)
@@ -83,12 +112,19 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _signalled(options: argparse.Namespace) -> list[str]:
+def _signalled(options: argparse.Namespace, elsewhere: Elsewhere) -> list[str]:
     if options.node is None:
         raise SignalError("no node given; --list shows what there is")
     if options.signal not in SIGNALS:
         raise SignalError(f"--signal {options.signal}: unknown signal; known: {', '.join(SIGNALS)}")
-    victim = signal_node(options.node, options.signal, options.port)
+    try:
+        process = signal_node(options.node, options.signal, options.port)
+        victim = Signalled(process.pid, process.incarnation)
+    except UnknownNodeError:
+        found = elsewhere(options.node, options.signal, options.port)
+        if found is None:
+            raise
+        victim = found
     if options.json:
         return [json.dumps({"node": options.node, "pid": victim.pid, "signal": options.signal,
                             "incarnation": victim.incarnation})]
@@ -111,7 +147,7 @@ def _find(processes: list[RunProcess], node: str, port: int | None) -> RunProces
     matches = [p for p in processes if node in p.names]
     if not matches:
         known = ", ".join(sorted({n for p in processes for n in p.names}))
-        raise SignalError(f"unknown node {node!r}{where}; known: {known}")
+        raise UnknownNodeError(f"unknown node {node!r}{where}; known: {known}")
     if len({p.port for p in matches}) > 1:
         ports = ", ".join(str(p.port) for p in matches)
         raise SignalError(f"{node}: in several runs; choose one with --port: {ports}")

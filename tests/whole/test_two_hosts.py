@@ -64,6 +64,13 @@ def with_keys(folder: Path, spec: Path) -> dict[str, tuple[str, ...]]:
     return {name: ("--keys", str(folder / name)) for name in ("robot", "ground")}
 
 
+def kill_node(net: Network, name: str, run: RealRun, node: str):
+    """Kill a node from a host."""
+    command = net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_elsewhere",
+                          node, "--port", str(run.port))
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+
+
 @pytest.mark.parametrize("keyed", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_back(
         net, tmp_path, keyed):
@@ -77,6 +84,12 @@ def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_ba
         ground.kill("camera")
         robot.wait_for("camera respawned, incarnation 2")
         assert robot.pid("camera") is None
+        killed = kill_node(net, "robot", robot, "camera")
+        assert killed.stdout.startswith("camera (pid "), killed.stderr
+        robot.wait_for("camera respawned, incarnation 3")
+        refused = kill_node(net, "robot", robot, "kamera")
+        assert refused.returncode == 2
+        assert "kill-node: unknown node 'kamera'" in refused.stderr
         net.line = Line(is_cut=True)
         robot.wait_for("supervisor_ground unreachable")
         robot.wait_for("camera respawned, incarnation 1000001")

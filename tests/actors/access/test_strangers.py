@@ -109,7 +109,8 @@ def test_the_same_attempts_succeed_with_a_key(keyed):
         assert one["heard"] > len(KEYS)
         assert set(accepted) == {"rampart/" + key for key in (
             "inject/order", "manager/adapt", "manager/reset", "mission/order", "mission/request",
-            "stub/trigger", "teleoperation/joystick", "world/actuator_fault", "world/obstacle")}
+            "stub/trigger", "supervisor/signal",
+            "teleoperation/joystick", "world/actuator_fault", "world/obstacle")}
 
 
 @pytest.fixture

@@ -101,6 +101,7 @@ def command(*arguments: str) -> list[str]:
     return [sys.executable, "-P", "-m", "rampart.cli.main", "bench", *arguments]
 
 
+@pytest.mark.processes
 @pytest.mark.alone
 @pytest.mark.timeout(240)
 def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
@@ -109,7 +110,7 @@ def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
     broken.write_text("#!/bin/sh\necho no licence\n")
     broken.chmod(0o755)
     with subprocess.Popen(command(
-            "--only", "peers", "--only", "restart", "--only", "size", "--kills", "2",
+            *(f"--only={part}" for part in ("peers", "floors", "restart", "size")), "--kills", "2",
             *(f"--peer={name}" for name in ("dora", "circus", "subprocess", *OURS)),
             "--peers-in", str(tmp_path / "peers"),
             "--system", str(CELL), "--node", "gripper", "--sizes", "10", "--json",
@@ -135,6 +136,9 @@ def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
             else:
                 assert 0 < kill["begun"] < kill["output"]
     assert peers["rampart-actor"]["times"]["median"] == 1
+    for floor in found["floors"]:
+        assert floor["note"] == ""
+        assert floor["ratio"] is None or floor["ratio"] > 0
     [gripper] = found["restart"]
     assert (gripper["title"], len(gripper["kills"])) == ("heartbeat/gripper", 2)
     [ten] = found["size"]
