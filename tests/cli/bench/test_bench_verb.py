@@ -147,7 +147,7 @@ def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
     assert min(ten["start_s"], ten["cores"]) > 0
     assert json.loads((out / "bench.json").read_text()) == found
     assert {file.name for file in out.iterdir()} == {
-        "bench.html", "bench.json", "peers.svg", "restart.svg", "size.svg"}
+        "bench.html", "bench.json", "floors.svg", "peers.svg", "restart.svg", "size.svg"}
     assert left_of(done.pid) == []
 
 
