@@ -32,12 +32,15 @@ VIRTUAL = ("tests/whole/test_virtual_run.py", "tests/whole/test_guards_alone.py"
            "examples/quadrotor/tests/test_flights.py", "examples/nav2")
 """Tests that only compute, long and in virtual time: they run beside those on real processes."""
 
+TIMED = "tests/actors/osmosis/control/teleoperation"
+"""These among them go by the clock."""
+
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """Mark the tests that only compute."""
     for item in items:
-        if item.nodeid.startswith(VIRTUAL):
+        if item.nodeid.startswith(VIRTUAL) and not item.nodeid.startswith(TIMED):
             item.add_marker("virtual")
 
 
