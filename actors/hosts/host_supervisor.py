@@ -42,7 +42,7 @@ _SAID_S = 0.1
 """Simulated seconds after which it is signalled itself: the answer has gone by then."""
 
 _ORDERS_KEPT = 64
-"""An order to signal that is repeated is the same as long as it is among the last so many."""
+"""An order to signal that is repeated gets its old answer, as long as it is among the last ones."""
 
 
 class HostSupervisor(Supervisor):
@@ -69,7 +69,7 @@ class HostSupervisor(Supervisor):
         self._supervisors = {hosts.supervisors[host]: host for host in others}
         self._guard_of = {name: host for host in others for name in hosts.guards_of(host)}
         self._issued = dict(context.run.known_incarnations)
-        self._signalled: deque[str] = deque(maxlen=_ORDERS_KEPT)
+        self._signalled: deque[fm.ProcessEvent] = deque(maxlen=_ORDERS_KEPT)
         self._placement = Placement(
             own, others,
             {name: Home(hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes),
@@ -134,21 +134,25 @@ class HostSupervisor(Supervisor):
     @on(topics.SIGNAL)
     def signal(self, order: fm.SignalOrder, _header: Header) -> None:
         """Signal a process of this host; what is none, another supervisor may know."""
-        if order.order in self._signalled:
-            return
+        answers = [answer for answer in self._signalled if answer.by == order.order]
+        answer = answers[0] if answers else self._carried_out(order)
+        if answer is not None:
+            self.publish(topics.PROCESS_EVENT, answer)
+
+    def _carried_out(self, order: fm.SignalOrder) -> fm.ProcessEvent | None:
         try:
             victim = find_node(order.node, order.signal, self._plan.base_port)
         except UnknownNodeError:
-            return
+            return None
         except SignalError as refusal:
             pid, incarnation, event, detail = 0, 0, "refused", clip(str(refusal))
         else:
             pid, incarnation = victim.pid, victim.incarnation
             event, detail = "signalled", order.signal
             self.call_later(_SAID_S, partial(_kill, pid, SIGNALS[order.signal]))
-        self._signalled.append(order.order)
-        self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
-            order.node, event, pid, incarnation, order.order, detail))
+        answer = fm.ProcessEvent(order.node, event, pid, incarnation, order.order, detail)
+        self._signalled.append(answer)
+        return answer
 
     def _issue(self, row: fm.NodeInfo) -> None:
         if row.name in self._supervisors:  # of itself it is believed: who else could say it?
