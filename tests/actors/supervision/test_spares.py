@@ -94,6 +94,7 @@ def respawn(witness: base.Witness, node: str, failed: int) -> None:
 
 
 @pytest.mark.processes
+@pytest.mark.alone
 async def test_a_spare_becomes_the_node_and_one_that_cannot_costs_nothing_but_itself(tmp_path):
     async with base.running(tmp_path) as (launcher, witness):
         port, both = launcher.plan.base_port, ("spare_a", "spare_b")
