@@ -6,7 +6,9 @@ secret that could leak, no port that could be taken, and no handshake that takes
 
 An incarnation is a number that a new process issues before it is heard (`issue`); a reader that
 meets a new one looks it up (`Register`). It is kept as the target of a symbolic link, which is
-written and read whole or not at all, in a system call or two and with no byte of a disk.
+written and read whole or not at all, in a system call or two and with no byte of a disk. Beside it
+stands which process that is, if it is one of this machine: who watches the node has its end from
+the kernel (`process_of`).
 
 The folder lies in memory where it can: `$XDG_RUNTIME_DIR`, else `/dev/shm`, else the folder for
 temporary files. What ends a run removes it; what is left when all of a run dies at once goes
@@ -23,6 +25,8 @@ import stat
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+
+from rampart.actors.bus.unix_peer import ProcessId
 
 ROUTERS = ("router_a", "router_b")
 """Names of the sockets of the two routers."""
@@ -77,8 +81,15 @@ def socket_path(folder: str, name: str) -> str:
     return path
 
 
-def issue(folder: str, names: Iterable[str], incarnation: int) -> None:
+def issue(folder: str, names: Iterable[str], incarnation: int,
+          process: ProcessId | None = None) -> None:
     """Make a number known as the incarnation of these nodes, before their process is heard.
+
+    Args:
+        folder: of the run.
+        names: of the nodes.
+        incarnation: of their process.
+        process: which that is; None if it is on another machine.
 
     Raises:
         OSError: the folder is gone, or full.
@@ -86,7 +97,7 @@ def issue(folder: str, names: Iterable[str], incarnation: int) -> None:
     for name in names:
         fresh = Path(folder, _ISSUED, f"{name}~")
         fresh.unlink(missing_ok=True)  # left by a process that died here
-        fresh.symlink_to(str(incarnation))
+        fresh.symlink_to(" ".join(map(str, (incarnation, *(process or ())))))
         fresh.replace(fresh.with_name(name))
 
 
@@ -119,15 +130,29 @@ def register_of(folder: str) -> Register:
     """Return the register of a run."""
 
     def look_up(name: str) -> int | None:
-        if "/" in name or "\0" in name:
-            return None
-        try:
-            target = os.readlink(f"{folder}/{_ISSUED}/{name}")  # noqa: PTH115 made of each newcomer
-        except (OSError, UnicodeError):
-            return None
-        return int(target) if target.isdecimal() else None
+        found = _look_up(folder, name)
+        return found[0] if found else None
 
     return look_up
+
+
+def process_of(folder: str, name: str, incarnation: int) -> ProcessId | None:
+    """Return the process of a node; None unless it is that incarnation, and of this machine."""
+    found = _look_up(folder, name)
+    if found is None or found[0] != incarnation or len(found) < 1 + len(ProcessId._fields):
+        return None
+    return ProcessId(*found[1:])
+
+
+def _look_up(folder: str, name: str) -> tuple[int, ...] | None:
+    if "/" in name or "\0" in name:
+        return None
+    try:
+        target = os.readlink(f"{folder}/{_ISSUED}/{name}")  # noqa: PTH115 made of each newcomer
+    except (OSError, UnicodeError):
+        return None
+    words = target.split(" ")
+    return tuple(map(int, words)) if all(map(str.isdecimal, words)) else None
 
 
 def _places() -> Iterator[str]:

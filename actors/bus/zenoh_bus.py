@@ -7,8 +7,9 @@ Zenoh goes over to the other within some milliseconds, with all that was declare
 meanwhile is lost, as on any network.
 
 **In that moment the liveliness tokens of all clients vanish and come back.** So a token that
-vanishes says that a node is gone only if it has not come back after `SETTLE_S`. What the kernel
-knows is told at once: `gone`.
+vanishes says that a node is gone only if it has not come back after `SETTLE_S`. The kernel knows
+at once: of a process of this machine each watcher has its end from there (`process_ends`), and is
+told by who watches the processes besides (`gone`), which reaches other machines.
 
 Zenoh calls back on the thread that reads the socket (`indirect=False`): by default each subscriber
 has a thread of its own, which costs a millisecond to declare, as much again when the process ends,
@@ -30,9 +31,17 @@ from zenoh.handlers import Callback
 
 from rampart.actors.bus.bus import BusError, Deliver, PeerChange
 from rampart.actors.bus.limits import RateLimit
+from rampart.actors.bus.process_ends import ProcessEnds
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.bus.zenoh_session import Credentials, answering, open_client, session_config
+from rampart.actors.bus.unix_peer import ProcessId
+from rampart.actors.bus.zenoh_session import (
+    Credentials,
+    answering,
+    open_alone,
+    open_client,
+    session_config,
+)
 
 PATIENCE_S = 10.0
 """Real seconds that a client looks for a router when it starts."""
@@ -86,11 +95,13 @@ class ZenohBus:
     Args:
         node: name under which this session announces itself; "" announces nothing (a tool).
         incarnation: of the node.
-        dial: endpoints of the routers; to a router, of the other one.
+        dial: endpoints of the routers; to a router, of the other one. None, where nothing listens
+            either: it is alone.
         listen: endpoints of a router, that in the folder first; none for a client.
         recorder: connection to a recorder of the run; None for none.
         credentials: by which it shows who it is; None in a run without keys.
         access: what a router lets through; None for everything.
+        process_of: returns the process of a node's incarnation, if it is one of this machine.
     """
 
     bursts = True
@@ -98,7 +109,8 @@ class ZenohBus:
     def __init__(self, node: str, incarnation: int, dial: Sequence[str],
                  listen: Sequence[str] = (), recorder: RecorderConnection | None = None, *,
                  credentials: Credentials | None = None,
-                 access: Mapping[str, Any] | None = None) -> None:
+                 access: Mapping[str, Any] | None = None,
+                 process_of: Callable[[str, int], ProcessId | None] = lambda *_: None) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
@@ -106,6 +118,8 @@ class ZenohBus:
         self._recorder = recorder
         self._credentials = credentials
         self._access = access
+        self._process_of = process_of
+        self._ends: ProcessEnds | None = None
         self._session: zenoh.Session | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._arrived: deque[Callable[[], None]] = deque()
@@ -137,9 +151,13 @@ class ZenohBus:
     async def _open(self) -> None:
         self._loop = asyncio.get_running_loop()
         try:
-            self._session = (await self._joined(self._loop) if not self._listen
-                             else zenoh.open(session_config(
-                                 self._listen, self._dial, self._credentials, self._access)))
+            if self._listen:
+                self._session = zenoh.open(session_config(
+                    self._listen, self._dial, self._credentials, self._access))
+            elif self._dial:
+                self._session = await self._joined(self._loop)
+            else:
+                self._session = open_alone(self._credentials)
         except zenoh.ZError as error:
             text = " ".join(str(error).split())
             node = f"(node {self._node})"
@@ -234,6 +252,7 @@ class ZenohBus:
 
     def watch(self, node: str, changed: PeerChange) -> None:
         """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
+        self._ends = self._ends or ProcessEnds()
 
         def arrived(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
             place, _, incarnation = str(sample.key_expr).rsplit("/", 2)
@@ -258,6 +277,9 @@ class ZenohBus:
             leaving.cancel()
         if alive:
             changed(node, incarnation, True)
+            process = self._process_of(node, incarnation)
+            if process is not None and self._ends is not None:
+                self._ends.hold(which, process, lambda: changed(node, incarnation, False))
         else:
             self._leaving[which] = self._loop.call_later(SETTLE_S, self._left, which)
 
@@ -281,18 +303,32 @@ class ZenohBus:
     def _linked(self) -> list[str]:
         return [str(router) for router in self._require().info.routers_zid()]
 
+    def forget(self) -> None:
+        """Hear, watch and answer nothing more; the session stays open."""
+        for one in (*self._held, *self._publishers.values()):
+            one.undeclare()
+        for leaving in self._leaving.values():
+            leaving.cancel()
+        self._leaving.clear()
+        self._clear()
+
     async def close(self) -> None:
         """Close the session."""
         session, self._session = self._session, None
-        self._held.clear()
-        self._publishers.clear()
-        self._latest.clear()
-        self._arrived.clear()
+        self._clear()
         if self._recorder is not None:
             self._recorder.close()
         if session is not None:
             await asyncio.to_thread(session.close)
             asyncio.get_running_loop().remove_reader(self._bell.number)
+
+    def _clear(self) -> None:
+        self._held.clear()
+        self._publishers.clear()
+        self._latest.clear()
+        self._arrived.clear()
+        if self._ends is not None:
+            self._ends.close()
 
     def _require(self) -> zenoh.Session:
         if self._session is None:

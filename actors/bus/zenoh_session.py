@@ -195,14 +195,11 @@ def open_client(dial: Sequence[str], credentials: Credentials | None = None) -> 
     return _open(session_config((), dial, credentials))
 
 
-def warm_up(credentials: Credentials) -> None:
-    """Open a session without any link and close it: the next one of this process opens sooner.
-
-    For a spare of a run with keys, which cannot join the bus before it knows who it is.
-    """
+def open_alone(credentials: Credentials | None = None) -> zenoh.Session:
+    """Open a session without any link; the next one of this process opens sooner."""
     config = session_config((), [], credentials)
     config.insert_json5("mode", '"peer"')
-    _open(config).close()  # type: ignore[no-untyped-call]
+    return _open(config)
 
 
 def _open(config: zenoh.Config) -> zenoh.Session:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rampart.actors.foreign import keeper
+from rampart.actors.runtime import turns
 from rampart.manager.spec.nodes import ChildLimits
 
 GRACE_S = 0.3
@@ -64,10 +65,11 @@ class Child:
         mine, other = socket.socketpair()
         with other:
             try:
-                self._keeper = subprocess.Popen(  # noqa: S603 our own interpreter and file
-                    [sys.executable, "-I", "-S", keeper.__file__, str(other.fileno())],
-                    stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True,
-                    pass_fds=[other.fileno(), *inherited])
+                with turns.usual_for_others():
+                    self._keeper = subprocess.Popen(  # noqa: S603 our own interpreter and file
+                        [sys.executable, "-I", "-S", keeper.__file__, str(other.fileno())],
+                        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                        start_new_session=True, pass_fds=[other.fileno(), *inherited])
             except OSError as error:
                 mine.close()
                 raise CommandError(f"its keeper cannot be started: {error.strerror}") from None

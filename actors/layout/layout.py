@@ -18,6 +18,7 @@ from rampart.actors.layout.hosts import Hosts
 from rampart.actors.layout.wiring import (
     SPARES,
     Member,
+    Spare,
     import_class,
     load_class,
     load_member,
@@ -122,10 +123,10 @@ class Layout:
                 if self.hosts.several else {"nodes": self.hosts.heard_by(host, self.unit_of)},
                 kind.Parameters))
 
-    def spare_of(self, names: Collection[str]) -> str:
+    def spare_of(self, names: Collection[str]) -> Spare:
         """Return which spare the process of these actors is to have; the least that one allows."""
-        return min((self.members[name].spare if name in self.members else "none"
-                    for name in names), key=SPARES.index)
+        return SPARES[min(SPARES.index(
+            self.members[name].spare if name in self.members else "none") for name in names)]
 
     def _check(self, judge: Any, known: Collection[Topic[Any]], file: str) -> None:
         """Check who hears and publishes what; raises as the constructor."""

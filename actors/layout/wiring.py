@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -36,6 +36,12 @@ _PLACE = {Kind.DETECTION: "it belongs into [[detection]]",
 _ROOMS_OF_0_6 = ("actors", "manager", "sim")
 
 
+Spare = Literal["none", "warm", "own", "hot"]
+SPARES: tuple[Spare, ...] = ("none", "warm", "own", "hot")
+_WITHIN = {"none": SPARES[:1], "warm": SPARES[:3], "hot": SPARES}
+"""What a class allows, by the most that it does."""
+
+
 @dataclass(frozen=True, slots=True)
 class Member:
     """One actor of the system: its name, class and parameters, and where these are in its table.
@@ -49,7 +55,7 @@ class Member:
     parameters: Actor.Parameters
     table: str = "parameters."
     kind: Kind = Kind.SUPERVISION
-    spare: str = "none"
+    spare: Spare = "none"
     hears: Mapping[str, Members] = field(default_factory=dict)
     publishes: Mapping[str, Members] = field(default_factory=dict)
 
@@ -142,10 +148,7 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
         spare=_spare(node, actor, f"{file}: {path}"))
 
 
-SPARES = ("none", "warm", "hot")
-
-
-def _spare(node: NodeSpec, actor: type[Actor], path: str) -> str:
+def _spare(node: NodeSpec, actor: type[Actor], path: str) -> Spare:
     """Return which spare a node is to have.
 
     Raises:
@@ -153,8 +156,8 @@ def _spare(node: NodeSpec, actor: type[Actor], path: str) -> str:
     """
     most = "none" if node.kind is Kind.WORLD else actor.most_spare
     if not node.spare:
-        return min(most, "warm", key=SPARES.index)
-    if SPARES.index(node.spare) > SPARES.index(most):
+        return "none" if most == "none" else "warm"
+    if node.spare not in _WITHIN[most]:
         raise ValueError(
             f"{path}: spare = {node.spare!r}: {actor.__name__} allows {most!r} at most")
     return node.spare

@@ -188,6 +188,10 @@ class StateFormat(Generic[S]):
         default_factory=dict)
     objection: Callable[[S], str] = lambda _state: ""
 
+    def __post_init__(self) -> None:
+        """Read the struct's annotations now, and not in each process that restores a state."""
+        msgspec.msgpack.Decoder(self.kind)
+
     def encode(self, state: S) -> bytes:
         """Return a state as bytes."""
         return msgspec.msgpack.encode(state)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Literal
 
 from rampart.actors.bus.run_folder import restarts_of
 from rampart.actors.ftm.messages import NodeInfo
 from rampart.actors.runtime.timer import Timer
+from rampart.actors.supervision.node_process import Waits
 from rampart.actors.supervision.processes import Processes, ProcessHandle
 from rampart.actors.supervision.supervised_process import SupervisedProcess
 
@@ -31,16 +31,21 @@ class HeldProcess(SupervisedProcess):
             yield NodeInfo(node.name, node.kind.value, self.pid, self.shown, self.incarnation,
                            restarts_of(self.incarnation), late_s(node.name))
 
-    def prepare(self, machine: Processes, kind: Literal["warm", "hot"]
-                ) -> Callable[[], None] | None:
-        """Have its next process made ready; return what ends that if it has not been needed.
-
-        None if one is ready.
-        """
+    def keep_spare(self, machine: Processes, kind: Waits) -> bool:
+        """Have a process made that may be its next one; False if there is one."""
         if machine.is_ready(self.names):
-            return None
+            return False
+        machine.prepare(self.names, self.highest + 1, kind)
+        return True
+
+    def prepare(self, machine: Processes) -> Callable[[], None] | None:
+        """Have its next process set up; return what ends that if it has not been needed.
+
+        None if one is set up already.
+        """
         names, incarnation = self.names, self.highest + 1
-        machine.prepare(names, incarnation, kind)
+        if not self.keep_spare(machine, "warm") and not machine.set_up(names):
+            return None
         return lambda: machine.forget(names) if self.highest < incarnation else None
 
     def take(self, pid: int, incarnation: int) -> None:

@@ -30,17 +30,20 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum, auto
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.run_folder import ROUTERS, register_of
+from rampart.actors.bus.run_folder import ROUTERS, process_of, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.layout.layout import Layout, router
 from rampart.actors.run.run_context import RunContext
+from rampart.actors.runtime import turns
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
@@ -49,6 +52,9 @@ from rampart.actors.supervision.process_title import WAITING, end_run, kill, set
 from rampart.actors.supervision.unseen import tell_of_callbacks
 from rampart.files.streams import complain
 from rampart.manager.spec.schema import Kind
+
+_SET_UP_S = 0.05
+"""Real seconds within which a process that replaces another is set up, and has computed once."""
 
 WORLD_NICE = -10
 """Niceness of the simulated world, where that is permitted."""
@@ -83,20 +89,12 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         run: what all actors of the run have in common.
         loop: that it will run on.
         failed: is told its error.
-        bus: that it is to have, open already; None for one of its own.
+        bus: that it is to have; None for one of its own.
         waits: "warm" or "hot" if it is to be silent until it is promoted.
     """
     member = layout.members.get(name) or router(name)
     clock = clock_of(layout.plan, loop.time)
-    recorder = RecorderConnection(layout.plan.base_port)
-    if bus is None:
-        plan = layout.plan
-        bus = ZenohBus(name, incarnation, *_ends(layout, name), recorder,
-                       credentials=plan.credentials(name),
-                       access=access_of(layout, plan.keys)
-                       if plan.keys and name in plan.routers else None)
-    else:
-        bus.take_name(name, incarnation, recorder)
+    bus = bus or _bus_of(layout, name, incarnation)
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
@@ -104,6 +102,19 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
         members=frozenset((*layout.members, *layout.routers)), topics=layout.topics, waits=waits,
         command_age_s=layout.hosts.command_age_s))
+
+
+def _bus_of(layout: Layout, name: str, incarnation: int, bus: ZenohBus | None = None) -> ZenohBus:
+    """Return the bus of an actor: the one given, under its name from now on, or one of its own."""
+    plan = layout.plan
+    recorder = RecorderConnection(plan.base_port)
+    if bus is not None:
+        bus.take_name(name, incarnation, recorder)
+        return bus
+    access = access_of(layout, plan.keys) if plan.keys and name in plan.routers else None
+    return ZenohBus(name, incarnation, *_ends(layout, name), recorder, access=access,
+                    credentials=plan.credentials(name),
+                    process_of=partial(process_of, plan.folder))
 
 
 def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:
@@ -125,6 +136,20 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
     return SqliteCheckpoints(Path(plan.checkpoints, f"{name}.sqlite"), plan.run_id, incarnation)
 
 
+Waits = Literal["own", "warm", "hot"]
+"""How far one that waits to be a node goes in silence: "own", it has joined the bus, has made its
+actors once in rehearsal, and waits to be told to set them up; "warm" and "hot", it is set up, the
+node's process having ended or beside it."""
+
+
+class Told(Enum):
+    """What one that waits has been told."""
+
+    NOTHING = auto()
+    SET_UP = auto()
+    BE_THE_NODE = auto()
+
+
 @dataclass(frozen=True)
 class Role:
     """Who a process is to be.
@@ -134,17 +159,17 @@ class Role:
         incarnation: of the process.
         born: called when it has its title, before it does anything that others see; it may not
             return, if the process is not wanted any more.
-        waits: "warm" or "hot" if it is to be set up first and wait to be born, else "".
-        told: if it waits, called when something has come for it by its connection: returns whether
-            it is to be born now. It does not return if it is not wanted any more.
+        waits: how, if it is to wait until it is born, else "".
+        told: if it waits, called when something has come for it by its connection: returns what.
+            It does not return if it is not wanted any more.
         connection: by which it is told.
     """
 
     names: tuple[str, ...]
     incarnation: int
     born: Callable[[], None] = lambda: None
-    waits: str = ""
-    told: Callable[[], bool] = lambda: True
+    waits: Waits | Literal[""] = ""
+    told: Callable[[], Told] = lambda: Told.BE_THE_NODE
     connection: socket.socket | None = None
 
 
@@ -205,17 +230,28 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
     loop = asyncio.get_running_loop()
     tell_of_callbacks(
         loop, lambda line: complain(f"{'+'.join(role.names)} #{role.incarnation}: {line}"))
-    actors = [make_actor(layout, name, role.incarnation, run, loop, failed=failed,
-                         bus=bus if name == role.names[0] else None, waits=role.waits)
-              for name in role.names]
+    buses = {name: _bus_of(layout, name, role.incarnation, bus if name == role.names[0] else None)
+             for name in role.names}
+    actors: list[Actor] = []
+    wanted = asyncio.Event()
+    waits = "warm" if role.waits == "own" else role.waits
+
+    def made() -> list[Actor]:
+        return [make_actor(layout, name, role.incarnation, run, loop, failed=failed, bus=one,
+                           waits=waits) for name, one in buses.items()]
 
     def stop_all() -> None:
         for actor in actors:
             actor.stop()
 
     def told(connection: socket.socket) -> None:
-        if not role.told():
+        nonlocal waits
+        what = role.told()
+        if what is not Told.NOTHING:
+            wanted.set()
+        if what is not Told.BE_THE_NODE:
             return
+        waits = ""
         loop.remove_reader(connection)
         _take_title(layout, role, role.names)
         role.born()
@@ -224,7 +260,16 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
 
     if role.connection is not None:
         loop.add_reader(role.connection, told, role.connection)
+    if role.waits == "own":
+        for one in buses.values():
+            await one.open(announce=False)
+        made()  # in rehearsal: what they are made of is this process' own then, see `rehearsal`
+        await wanted.wait()
     loop.add_signal_handler(signal.SIGTERM, stop_all)
+    if role.waits == "own" or bus is not None:  # its session is open, whose threads have short ones
+        turns.usual()
+        loop.call_later(_SET_UP_S, turns.short)
+    actors += made()
     tasks = [asyncio.create_task(actor.run()) for actor in actors]
     try:
         await asyncio.gather(*tasks)

@@ -14,11 +14,12 @@ import select
 import signal
 import time
 from collections.abc import Callable, Sequence
-from typing import Literal, Protocol
+from typing import Protocol
 
 from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.ftm.patience import AT_LEISURE, Usage, usage
+from rampart.actors.supervision.node_process import Waits
 from rampart.actors.supervision.process_title import RunProcess, find_processes
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
@@ -79,12 +80,14 @@ class Processes(Protocol):
             OSError: Likewise, for want of memory or descriptors.
         """
 
-    def prepare(self, names: tuple[str, ...], incarnation: int,
-                kind: Literal["warm", "hot"]) -> None:
+    def prepare(self, names: tuple[str, ...], incarnation: int, kind: Waits) -> None:
         """Have a process made ready for these actors, silent, for `fork` to take if it can."""
 
     def is_ready(self, names: tuple[str, ...]) -> bool:
         """Whether there is one, which neither hangs nor is stopped, as far as is known."""
+
+    def set_up(self, names: tuple[str, ...]) -> bool:
+        """Have that process set up what it has only rehearsed; False if that is not so."""
 
     def forget(self, names: tuple[str, ...]) -> None:
         """End a process that was made ready and is not wanted."""

@@ -23,15 +23,18 @@ import selectors
 import socket
 import time
 from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any, NoReturn
 
 from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.run_folder import process_of
 from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.bus.zenoh_session import endpoints, warm_up
+from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.ftm.patience import Patience, usage
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.supervision.process_title import kill
+from rampart.actors.supervision.rehearsal import rehearse
 
 _TAKE_MS = 10
 """A spare that could take a request does so in a fraction of a millisecond."""
@@ -233,12 +236,14 @@ async def _session(plan: RunPlan) -> ZenohBus | None:
         BusError: there is no router.
     """
     shown = plan.credentials("")
-    if shown is not None:
-        await asyncio.to_thread(warm_up, shown)
-        return None
-    bus = ZenohBus("", 0, endpoints(plan.folder))
+    bus = ZenohBus("", 0, endpoints(plan.folder) if shown is None else [], credentials=shown,
+                   process_of=partial(process_of, plan.folder))
     await bus.open()
-    return bus
+    await rehearse(plan, bus)
+    if shown is None:
+        return bus
+    await bus.close()
+    return None
 
 
 async def wait(control: socket.socket, plan: RunPlan, begin: Begin) -> int:

@@ -29,13 +29,14 @@ from msgspec.structs import replace
 
 from rampart.actors.bus.envelope import decoder
 from rampart.actors.bus.run_folder import issue, issued, register_of, socket_path
-from rampart.actors.bus.unix_peer import is_same_user
+from rampart.actors.bus.unix_peer import is_same_user, process_id
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.layout import Layout, adapted_system, load_run
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
-from rampart.actors.supervision.node_process import Role, live, node_main, wedge
+from rampart.actors.runtime import turns
+from rampart.actors.supervision.node_process import Role, Told, Waits, live, node_main, wedge
 from rampart.actors.supervision.process_title import end_run, set_title
 from rampart.actors.supervision.spare import Spares, wait
 from rampart.files import streams, working_folder
@@ -54,8 +55,12 @@ class ForkRequest(msgspec.Struct, frozen=True, tag="fork"):
 
     names: tuple[str, ...]
     incarnation: int
-    waits: Literal["", "warm", "hot"] = ""
-    """Not "" if it is to be silent, and to answer now, to pings, and to `Go`: it is the node."""
+    waits: Waits | Literal[""] = ""
+    """Not "" if it is to be silent, and to answer now, to pings, to `SetUp` and to `Go`."""
+
+
+class SetUp(msgspec.Struct, frozen=True, tag="set up"):
+    """Set the node up in silence that you may be: its process has ended."""
 
 
 class Go(msgspec.Struct, frozen=True, tag="go"):
@@ -85,7 +90,7 @@ class Reply(msgspec.Struct, frozen=True):
     sender: int = 0
 
 
-Request = ForkRequest | Go | Ping | SetOrigin | Adapt
+Request = ForkRequest | SetUp | Go | Ping | SetOrigin | Adapt
 
 
 class Loaded(msgspec.Struct, frozen=True):
@@ -181,8 +186,8 @@ class Spawner:
         self._selector.unregister(connection)
         connection.close()
 
-    def _obey(self, request: Go | Ping | SetOrigin | Adapt) -> None:
-        if isinstance(request, Go):
+    def _obey(self, request: SetUp | Go | Ping | SetOrigin | Adapt) -> None:
+        if isinstance(request, SetUp | Go):
             raise ValueError("this is no process that waits")
         if isinstance(request, SetOrigin):
             self._layout.plan = replace(self._layout.plan, origin_s=request.origin_s)
@@ -238,15 +243,15 @@ class Spawner:
     def _role(self, request: ForkRequest, connection: socket.socket) -> Role:
         folder, names = self._layout.plan.folder, request.names
 
-        def told() -> bool:
+        def told() -> Told:
             try:
                 said = msgspec.json.decode(connection.recv(MAX_DATAGRAM), type=Request)
             except (OSError, msgspec.MsgspecError):
                 os._exit(0)
             if isinstance(said, Go):
-                return True
+                return Told.BE_THE_NODE
             _answer(connection, Reply())
-            return False
+            return Told.SET_UP if isinstance(said, SetUp) else Told.NOTHING
 
         def born() -> None:
             if not _answer(connection, Reply()):
@@ -255,7 +260,7 @@ class Spawner:
             newest = max(register_of(folder)(name) or 0 for name in names)
             if newest >= request.incarnation:
                 os._exit(0)  # asked for too late: a later one had its place, or has
-            issue(folder, names, request.incarnation)
+            issue(folder, names, request.incarnation, process_id(os.getpid()))
 
         if request.waits:
             _answer(connection, Reply())
@@ -321,6 +326,7 @@ def load_and_serve(name: str, plan: RunPlan, lifeline: int, output: int) -> int:
         lifeline: read end of the pipe.
         output: takes the line that `main` prints; closed then.
     """
+    turns.short()
     try:
         spec = load_system(plan)
         run = load_run(plan, spec)

@@ -21,7 +21,6 @@ import contextlib
 import select
 import socket
 import time
-from typing import Literal
 
 import msgspec
 
@@ -29,6 +28,7 @@ from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.unix_peer import is_same_user, process_state, receive_signed
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.supervision import spawner as protocol
+from rampart.actors.supervision.node_process import Waits
 from rampart.actors.supervision.process_title import WAITING, find_process, kill
 from rampart.actors.supervision.spawner import NAMES, Reply, Request
 
@@ -68,7 +68,7 @@ class _Asked:
         self._unanswered = 0
         self._first = 0
         self.sent = False
-        self.waits = False
+        self.waits = self.rehearses = False
         self.patience_s = PATIENCE_S
         self._since_s = time.monotonic()
         self._reply: Reply | None = None
@@ -228,8 +228,7 @@ class SpawnerClient:
             asked = other
         raise SpawnerUnavailableError("; ".join(failures))
 
-    def prepare(self, names: tuple[str, ...], incarnation: int,
-                kind: Literal["warm", "hot"]) -> None:
+    def prepare(self, names: tuple[str, ...], incarnation: int, kind: Waits) -> None:
         """Have a process made ready that `fork` makes the node; if that is not possible, none is.
 
         Until then it is silent. Another incarnation, or `forget`, ends it.
@@ -237,7 +236,7 @@ class SpawnerClient:
         self.forget(names)
         asked = self._reach([name for name in NAMES if name not in self._slow], [])
         if asked is not None:
-            asked.waits = True
+            asked.waits, asked.rehearses = True, kind == "own"
             asked.send(*self._requests(protocol.ForkRequest(names, incarnation, kind)))
             self._ready[names] = incarnation, asked
 
@@ -247,6 +246,15 @@ class SpawnerClient:
         if asked is not None and not asked.turns():
             self.forget(names)
         return names in self._ready
+
+    def set_up(self, names: tuple[str, ...]) -> bool:
+        """Have the process that was made ready set its actors up; False if it has, or is none."""
+        _, asked = self._ready.get(names, (0, None))
+        if asked is None or not asked.rehearses:
+            return False
+        asked.rehearses = False
+        asked.send(protocol.SetUp())
+        return True
 
     def forget(self, names: tuple[str, ...]) -> None:
         """End the process that was made ready, if there is one."""

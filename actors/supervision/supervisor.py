@@ -247,9 +247,16 @@ class Supervisor(Actor):
         """Repeat the node table for those who joined late, and see to the spares."""
         self._publish_table()
         self._lateness.turn()
+        self._keep_spares()
+
+    def _keep_spares(self) -> None:
+        """See to the spares that are one node's: to hot ones at once, to others one by one."""
         for process in self._processes.values():
-            if process.state is State.RUNNING and self._layout.spare_of(process.names) == "hot":
-                process.prepare(self._machine, "hot")
+            kind = self._layout.spare_of(process.names)
+            if process.state is State.RUNNING and (kind == "own" or kind == "hot"):  # noqa: PLR1714 mypy
+                is_new = process.keep_spare(self._machine, kind)
+                if is_new and kind == "own":
+                    return
 
     def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
         if process.pid == pid:  # else it was replaced while the news waited in the mailbox
@@ -263,7 +270,7 @@ class Supervisor(Actor):
     def _prepare(self, process: HeldProcess) -> None:
         """Have the next process made ready while it is decided whether there is to be one."""
         if (self._layout.spare_of(process.names) != "none"
-                and (forget := process.prepare(self._machine, "warm"))):
+                and (forget := process.prepare(self._machine))):
             self.call_later(_WANTED_S * self.clock.rate, forget)
 
     def _owns(self, process: HeldProcess) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from rampart.actors.bus import run_folder
+from rampart.actors.bus.unix_peer import process_id
 
 
 @pytest.fixture
@@ -47,6 +48,18 @@ def test_what_was_issued_last_is_known():
     assert run_folder.issued(folder) == {}
     with pytest.raises(OSError, match="No such file"):
         run_folder.issue(folder, ("DM1",), 13)
+
+
+def test_it_is_known_which_process_an_incarnation_is(sockets):
+    own = process_id(os.getpid())
+    run_folder.issue(sockets, ["DM1"], 3, own)
+    assert run_folder.register_of(sockets)("DM1") == 3
+    assert run_folder.issued(sockets) == {"DM1": 3}
+    assert run_folder.process_of(sockets, "DM1", 3) == own
+    assert run_folder.process_of(sockets, "DM1", 2) is None
+    assert run_folder.process_of(sockets, "DM2", 3) is None
+    run_folder.issue(sockets, ["DM1"], 4)  # of another machine
+    assert run_folder.process_of(sockets, "DM1", 4) is None
 
 
 def test_a_number_that_was_half_issued_is_issued_again(sockets):

@@ -192,6 +192,55 @@ async def test_a_hot_spare_is_silent_until_it_is_the_node(tmp_path):
             await task
 
 
+@pytest.mark.processes
+async def test_a_spare_of_ones_own_is_silent_and_costs_nothing_but_itself(tmp_path):
+    file = hot_system(tmp_path)
+    file.write_text(file.read_text(encoding="utf-8").replace('"hot"', '"own"'), encoding="utf-8")
+    async with launched(stub_plan(file)) as launcher:
+        port, waits = launcher.plan.base_port, "spare.localization"
+        witness = Listener(base.Context(
+            "observer", 1, base.Clock(launcher.plan.origin_s), launcher.observers_bus()), launcher)
+        task = asyncio.create_task(witness.run())
+        try:
+            await eventually(lambda: witness.state("localization") == ("running", 1), 20)
+            own = await spares(port, waits)
+            for hurt in HURTS:  # it is found out though nobody needs it
+                os.kill(own[waits], hurt)
+                own = await spares(port, waits, other_than=own)
+            assert set(witness.said) == {1}
+            for failed in (1, 2):  # RM3 decides at once, or when the spare is set up
+                os.kill(witness.pid("localization"), signal.SIGKILL)
+                await asyncio.sleep(0.2 * (failed - 1))
+                assert witness.said[-1] == failed
+                respawn(witness, "localization", failed)
+                await eventually(
+                    lambda f=failed: witness.state("localization") == ("running", f + 1))
+                assert witness.pid("localization") == own[waits]
+                await eventually(lambda f=failed: witness.said[-1] == f + 1)
+                own = await spares(port, waits, other_than=own)
+            assert witness.said == sorted(witness.said), "both spoke"
+            for failed, hurt in enumerate(HURTS, 3):
+                os.kill(witness.pid("localization"), signal.SIGKILL)
+                os.kill(own[waits], hurt)
+                respawn(witness, "localization", failed)
+                await eventually(
+                    lambda f=failed: witness.state("localization") == ("running", f + 1))
+                assert witness.pid("localization") != own[waits]
+                await eventually(lambda o=own: not Path(f"/proc/{o[waits]}").exists())
+                own = await spares(port, waits, other_than=own)
+            assert [number for number, there in witness.there if there] == [1, 2, 3, 4, 5, 6]
+        finally:
+            witness.stop()
+            await task
+
+
+@pytest.mark.processes
+async def test_of_a_rehearsal_nothing_remains(tmp_path):
+    async with base.running(tmp_path) as (launcher, _witness):
+        await spares(launcher.plan.base_port, "spare_a", "spare_b")
+        assert not list(Path(launcher.plan.folder).glob("rehearsal*"))
+
+
 def spare_of(folder: Path, name: str) -> str:
     plan = stub_plan(folder / "stub.toml")
     return Layout(plan, load_system(plan)).spare_of((name,))
@@ -203,13 +252,18 @@ def test_a_spare_is_what_the_spec_says_and_the_class_allows(tmp_path, monkeypatc
     assert spare_of(tmp_path, "DM1") == "warm"
     assert spare_of(tmp_path, "supervisor") == "none"
     assert spare_of(tmp_path, "router_a") == "none"
+    text = (tmp_path / "stub.toml").read_text()
+    with monkeypatch.context() as changed:
+        changed.setattr(TalkingPose, "most_spare", "warm")
+        (tmp_path / "stub.toml").write_text(text.replace('spare = "hot"', 'spare = "own"'))
+        assert spare_of(tmp_path, "localization") == "own"
+        (tmp_path / "stub.toml").write_text(text)
     for most, allowed in (("none", "'none'"), ("warm", "'warm'")):
         monkeypatch.setattr(TalkingPose, "most_spare", most)
         with pytest.raises(ValueError, match=re.escape(
                 f"stub.toml: node localization: spare = 'hot': TalkingPose allows {allowed} at "
                 "most")):
             spare_of(tmp_path, "localization")
-    text = (tmp_path / "stub.toml").read_text()
     (tmp_path / "stub.toml").write_text(text.replace('spare = "hot"', 'spare = "boiling"'))
     with pytest.raises(ValueError, match=r"spare.*'boiling'"):
         spare_of(tmp_path, "localization")

@@ -107,6 +107,13 @@ class Machine:
     def is_ready(self, names: tuple[str, ...]) -> bool:
         return names[0] in self.ready
 
+    def set_up(self, names: tuple[str, ...]) -> bool:
+        incarnation, kind = self.ready.get(names[0], (0, ""))
+        if kind != "own":
+            return False
+        self.ready[names[0]] = incarnation, "warm"
+        return True
+
     def forget(self, names: tuple[str, ...]) -> None:
         self.ready.pop(names[0], None)
 
@@ -736,5 +743,31 @@ def test_a_hot_spare_is_there_before_anything_happens_and_replaced_when_it_is_go
             await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
             await eventually(lambda: machine.ready == {"DM1": (3, "hot")}, 1.0)
             assert [kind for _, _, kind in machine.prepared] == 3 * ["hot"]
+
+    run(scenario)
+
+
+def test_a_spare_of_ones_own_is_set_up_when_its_node_has_ended_and_replaced_if_it_is_not_wanted():
+    async def scenario() -> None:
+        async with running() as world:
+            machine = world.machine
+            members = world.supervisor._layout.members
+            for name in ("osmosis_control", "localization"):
+                members[name] = replace(members[name], spare="own")
+            await eventually(lambda: len(machine.ready) == 1, 1.0)
+            await asyncio.sleep(0.3)
+            assert len(machine.ready) == 1, "they are made one by one"
+            both = {"osmosis_control": (2, "own"), "localization": (2, "own")}
+            await eventually(lambda: machine.ready == both, 1.0)
+            world.kill("osmosis_control")
+            await eventually(lambda: machine.ready["osmosis_control"] == (2, "warm"), 0.1)
+            await eventually(lambda: "osmosis_control" not in machine.ready, 1.2)
+            await asyncio.sleep(1.0)
+            assert "osmosis_control" not in machine.ready, "it is for a node that runs"
+            world.respawn("osmosis_control", 1)
+            await eventually(lambda: machine.ready == both | {"osmosis_control": (3, "own")}, 1.0)
+            world.kill("osmosis_control")
+            world.respawn("osmosis_control", 2)
+            await eventually(lambda: world.row("osmosis_control")[:2] == ("running", 3))
 
     run(scenario)
