@@ -65,7 +65,7 @@ class Child:
         mine, other = socket.socketpair()
         with other:
             try:
-                with turns.usual_for_others():
+                with turns.usual():
                     self._keeper = subprocess.Popen(  # noqa: S603 our own interpreter and file
                         [sys.executable, "-I", "-S", keeper.__file__, str(other.fileno())],
                         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,

@@ -54,13 +54,28 @@ def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     return _with_made((*known, *own), spec)[len(known):]
 
 
-def published_keys(spec: SystemSpec) -> tuple[str, ...]:
+def published_keys(spec: SystemSpec, layout: Layout | None = None) -> tuple[str, ...]:
     """Return the keys that the nodes of a system and its supervisor publish, families spelt out.
+
+    Those of the last system are remembered: a page asks for them when it starts, and starts again.
+
+    Args:
+        spec: the system.
+        layout: of it, if there is one; it takes 60 ms to make another.
 
     Raises:
         ValueError: the spec names an actor class that does not exist.
     """
-    layout = Layout(RunPlan(system_file=spec.name), spec)
+    global _last  # noqa: PLW0603 one entry, by identity: a spec is no key of a dictionary
+    if _last[0] is not spec:
+        _last = spec, _published_keys(layout or Layout(RunPlan(system_file=spec.name), spec))
+    return _last[1]
+
+
+_last: tuple[SystemSpec | None, tuple[str, ...]] = None, ()
+
+
+def _published_keys(layout: Layout) -> tuple[str, ...]:
     members = [m for m in layout.members.values() if m.name != OBSERVER]
     wanted: dict[str, dict[str, None]] = {}
     for member in members:

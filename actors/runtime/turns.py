@@ -3,7 +3,7 @@
 The processes of a run are awake for a tenth of a millisecond at a time, and the one that does more
 than that, because it is being set up or computes, keeps the others waiting: for up to a whole turn
 of the scheduler, 1.4 to 3 ms, though another processor is idle. On two processors a report of a
-detection module stood for 2 ms behind the process that was to replace the dead one.
+detection module stood for 1.4 ms behind the process that was to replace the dead one.
 
 Since Linux 6.12 a thread says how long its turns are to be (sched_setattr(2), `sched_runtime`), no
 privilege needed, and who asks for short ones is let in before the turn of one with longer ones is
@@ -40,19 +40,14 @@ def _ask_for(turn_ns: int) -> None:
 
 
 def short() -> None:
-    """Ask for short turns for the calling thread, and for those it starts from now on."""
+    """Ask for short turns for the calling thread, and for what it starts from now on."""
     _ask_for(_SHORT_NS)
 
 
-def usual() -> None:
-    """Give that up: for what takes long, and others are not to wait for."""
-    _ask_for(_USUAL_NS)
-
-
 @contextlib.contextmanager
-def usual_for_others() -> Iterator[None]:
-    """Start a program that is none of the run's own in a `with` block: it has the usual turns."""
-    usual()
+def usual() -> Iterator[None]:
+    """Have the usual ones in a `with` block: what is started there is none of the run's own."""
+    _ask_for(_USUAL_NS)
     try:
         yield
     finally:

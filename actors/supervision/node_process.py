@@ -43,7 +43,6 @@ from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.layout.layout import Layout, router
 from rampart.actors.run.run_context import RunContext
-from rampart.actors.runtime import turns
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
@@ -52,9 +51,6 @@ from rampart.actors.supervision.process_title import WAITING, end_run, kill, set
 from rampart.actors.supervision.unseen import tell_of_callbacks
 from rampart.files.streams import complain
 from rampart.manager.spec.schema import Kind
-
-_SET_UP_S = 0.05
-"""Real seconds within which a process that replaces another is set up, and has computed once."""
 
 WORLD_NICE = -10
 """Niceness of the simulated world, where that is permitted."""
@@ -266,9 +262,6 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
         made()  # in rehearsal: what they are made of is this process' own then, see `rehearsal`
         await wanted.wait()
     loop.add_signal_handler(signal.SIGTERM, stop_all)
-    if role.waits == "own" or bus is not None:  # its session is open, whose threads have short ones
-        turns.usual()
-        loop.call_later(_SET_UP_S, turns.short)
     actors += made()
     tasks = [asyncio.create_task(actor.run()) for actor in actors]
     try:

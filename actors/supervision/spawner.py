@@ -33,6 +33,7 @@ from rampart.actors.bus.unix_peer import is_same_user, process_id
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.layout import Layout, adapted_system, load_run
+from rampart.actors.layout.system_topics import published_keys
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime import turns
@@ -331,6 +332,7 @@ def load_and_serve(name: str, plan: RunPlan, lifeline: int, output: int) -> int:
         spec = load_system(plan)
         run = load_run(plan, spec)
         layout = Layout(plan, spec, run.application)
+        published_keys(spec, layout)
     except (ValueError, OSError) as error:
         os.write(output, f"error: {' '.join(str(error).split())}\n".encode())
         return 2
