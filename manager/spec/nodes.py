@@ -83,8 +83,9 @@ class NodeSpec(Table, frozen=True):
         host: Name of the machine on which it runs; "" for the first.
         respawn: Who brings it back: a recovery module, or "supervisor".
         spare: What its next process is made of. "none": a new one. "warm": one that is connected
-            and waits for a role. "hot": one that hears everything in this role, in silence. "" is
-            the most that its class allows, "warm" at most.
+            and waits for a role. "own": one that waits for this role, and has rehearsed it. "hot":
+            one that hears everything in this role, in silence. "" is the most that its class
+            allows, "warm" at most.
         parameters: For the actor, or for that which stands in for the command. A value of a key
             in `_s` may name a `[timing]` value.
         command: Executable and arguments, in place of an actor.

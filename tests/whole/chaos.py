@@ -32,7 +32,7 @@ from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 from rampart.actors.supervision.kill_node import SIGNALS
-from rampart.actors.supervision.process_title import find_processes, process_state
+from rampart.actors.supervision.process_title import WAITING, find_processes, process_state
 from rampart.actors.supervision.spawner import NAMES
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.testing import RealRun
@@ -40,6 +40,13 @@ from rampart.testing import RealRun
 WAYS = ("KILL", "STOP", "SEGV", "WEDGE")
 SPAWNERS = tuple(f"spawner_{name}" for name in NAMES)
 SPARES = tuple(f"spare_{name}" for name in NAMES)
+
+
+def is_spare(name: str) -> bool:
+    """Whether a process is a spare, of all nodes or of one."""
+    return name in SPARES or name.startswith(WAITING)
+
+
 
 BACK_WITHIN_S = 10.0
 """Wall seconds after which a victim counts as not having come back; a loaded machine is slow."""
@@ -76,7 +83,8 @@ def targets(spec: SystemSpec) -> Targets:
     nodes = {unit: members[0] for unit, members in spec.processes().items()}
     world = tuple(n.name for n in nodes.values() if n.kind is Kind.WORLD)
     mortal = tuple(n.name for n in nodes.values() if n.kind is not Kind.WORLD)
-    return Targets((*mortal, SUPERVISOR, *SPAWNERS, *ROUTERS, *SPARES), world)
+    beside = tuple(f"{WAITING}{n.name}" for n in nodes.values() if n.spare in {"own", "hot"})
+    return Targets((*mortal, SUPERVISOR, *SPAWNERS, *ROUTERS, *SPARES, *beside), world)
 
 
 def each_in_every_way(of: Targets, seed: int, pause_s: tuple[float, float]) -> list[Hit]:

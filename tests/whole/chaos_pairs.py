@@ -33,7 +33,7 @@ from rampart.actors.supervision.process_title import find_processes, process_sta
 from rampart.cli.output import UsageError
 from rampart.cli.session import connect
 from rampart.testing import RealRun
-from tests.whole.chaos import SPARES, SPAWNERS, WORLD_PAUSE_S, Targets, tells_end
+from tests.whole.chaos import SPAWNERS, WORLD_PAUSE_S, Targets, is_spare, tells_end
 
 LAUNCHER = "launcher"
 WAYS = ("KILL", "STOP", "WEDGE")
@@ -72,7 +72,7 @@ class Pair:
 def plan_pairs(of: Targets, seed: int) -> list[Pair]:
     """Return every pair of a system's processes, in the order of its dice."""
     dice = random.Random(f"pairs {seed}")
-    mortal = [name for name in of.mortal if name not in SPARES]  # one may become the other's heir
+    mortal = [name for name in of.mortal if not is_spare(name)]  # one may become the other's heir
     everybody = (*mortal, *of.world, LAUNCHER)
     paused = {*of.world, LAUNCHER}
     drawn = []

@@ -31,7 +31,7 @@ def test_everybody_is_hit_in_every_way_and_the_world_is_only_stopped():
         read_document(SHIPPED.read_text(encoding="utf-8"), SHIPPED.name), SHIPPED.name))
     hits = each_in_every_way(everybody, 1, PAUSE_S)
     assert {"hmi", "safety_pilot", "ftm_manager", "supervisor", "spawner_a", "spawner_b",
-            "router_a", "router_b", "spare_a", "spare_b", "DM13", "RM8",
+            "router_a", "router_b", "spare_a", "spare_b", "spare.safety_pilot", "DM13", "RM8",
             "standby_control"} <= set(everybody.mortal)
     assert sorted((h.name, h.way) for h in hits) == sorted(
         [*[("simulator", "STOP")] * 4, *((name, way) for name in everybody.mortal for way in WAYS)])
