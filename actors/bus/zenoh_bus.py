@@ -8,7 +8,7 @@ meanwhile is lost, as on any network.
 
 **In that moment the liveliness tokens of all clients vanish and come back.** So a token that
 vanishes says that a node is gone only if it has not come back after `SETTLE_S`. The kernel knows
-at once: of a process of this machine each watcher has its end from there (`process_ends`), and is
+at once: of a process of this machine each watcher has its end from there (`ProcessEnds`), and is
 told by who watches the processes besides (`gone`), which reaches other machines.
 
 Zenoh calls back on the thread that reads the socket (`indirect=False`): by default each subscriber
@@ -31,10 +31,9 @@ from zenoh.handlers import Callback
 
 from rampart.actors.bus.bus import BusError, Deliver, PeerChange
 from rampart.actors.bus.limits import RateLimit
-from rampart.actors.bus.process_ends import ProcessEnds
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.bus.unix_peer import ProcessId
+from rampart.actors.bus.unix_peer import ProcessEnds, ProcessId
 from rampart.actors.bus.zenoh_session import (
     Credentials,
     answering,

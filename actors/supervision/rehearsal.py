@@ -88,9 +88,9 @@ async def rehearse(plan: RunPlan, bus: ZenohBus) -> None:
     """
     name, file = f"{os.getpid()}", Path(plan.folder, f"rehearsal-{os.getpid()}.sqlite")
     store: CheckpointStore = SqliteCheckpoints(
-        file, plan.run_id, 2, sync_period_s=0) if plan.checkpoints else NoCheckpoints()
+        file, plan.run_id, 1, sync_period_s=0) if plan.checkpoints else NoCheckpoints()
     actor = _Understudy(Context(
-        name, 2, Clock(time.monotonic()), SharedBus(bus), {"number": 2.0},
+        name, 1, Clock(time.monotonic()), SharedBus(bus), {"number": 2.0},
         checkpoints=store, topics={LINE.key: LINE}))
     try:
         await actor.run()

@@ -30,12 +30,12 @@ from rampart.actors.bus.run_folder import restarts_of
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
+from rampart.actors.ftm.lateness import Lateness
 from rampart.actors.ftm.patience import Patience
 from rampart.actors.layout.layout import Layout, Unit, adapted_system
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.supervision.held_process import HeldProcess
-from rampart.actors.supervision.lateness import Lateness
 from rampart.actors.supervision.processes import OsProcesses, Processes, ProcessHandle, RunProcess
 from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import (
@@ -57,7 +57,7 @@ _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
 
 _LATE_S = 0.02
-"""Wall seconds by which this look is late when its own process lacks processor time."""
+"""Wall seconds by which it is late when its own process lacks processor time."""
 _ROUTERS_S = 0.03
 """Wall seconds between two looks whether a router is stopped."""
 
@@ -247,16 +247,8 @@ class Supervisor(Actor):
         """Repeat the node table for those who joined late, and see to the spares."""
         self._publish_table()
         self._lateness.turn()
-        self._keep_spares()
-
-    def _keep_spares(self) -> None:
-        """See to the spares that are one node's: to hot ones at once, to others one by one."""
-        for process in self._processes.values():
-            kind = self._layout.spare_of(process.names)
-            if process.state is State.RUNNING and (kind == "own" or kind == "hot"):  # noqa: PLR1714 mypy
-                is_new = process.keep_spare(self._machine, kind)
-                if is_new and kind == "own":
-                    return
+        running = (p for p in self._processes.values() if p.state is State.RUNNING)
+        any(p.keep_spare(self._machine, self._layout.spare_of(p.names)) for p in running)
 
     def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
         if process.pid == pid:  # else it was replaced while the news waited in the mailbox
