@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
+import time
+from collections import Counter
+from pathlib import Path
 
 import pytest
 
+from rampart.actors.ftm import topics
+from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
+from rampart.actors.recording.message_form import Forms, header_of
 from rampart.testing import RealRun
 from tests.whole.network import Line, Network, network, why_not
-from tests.whole.test_two_hosts import CELL_ON_GROUND, host, specification
+from tests.whole.test_two_hosts import CELL_ON_GROUND, host, specification, with_keys
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone,
               pytest.mark.skipif(bool(why_not()), reason=f"no two hosts here: {why_not()}")]
@@ -23,7 +30,7 @@ def net():
 
 
 def listed(net: Network, name: str, run: RealRun) -> tuple[dict[str, str], str]:
-    """Return each node that `kill-node --list` lists on a host, with its host, and what it tells."""
+    """Return each node that `kill-node --list` lists, with its host, and what it tells."""
     done = subprocess.run(
         net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_elsewhere",
                     "--list", "--json", "--port", str(run.port)),
@@ -31,10 +38,22 @@ def listed(net: Network, name: str, run: RealRun) -> tuple[dict[str, str], str]:
     return {row["name"]: row["host"] for row in json.loads(done.stdout)}, done.stderr
 
 
-def test_the_first_host_sees_what_the_other_does_and_goes_on_from_where_it_was(net, tmp_path):
+def recorded(file: Path) -> tuple[Counter[str], Summary]:
+    """Return how many messages of each source a recording has, and what else is in it."""
+    forms, reader, sources = Forms(topics.ALL), BagReader(file), Counter[str]()
+    for channel, message in reader.messages():
+        if (key := key_of(channel)) and (header := header_of(forms.of(key).payload(message.data))):
+            sources[header.source] += 1
+    return sources, Summary(BagReader(file))
+
+
+@pytest.mark.parametrize("keyed", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_first_host_sees_what_the_other_does(net, tmp_path, keyed):
     spec = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1)
-    with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as ground,
-          host(net, "robot", tmp_path / "r", spec, "--no-keys") as robot):
+    own = with_keys(tmp_path, spec) if keyed else dict.fromkeys(net.addresses, ("--no-keys",))
+    file = tmp_path / "run.mcap"
+    with (host(net, "ground", tmp_path / "g", spec, *own["ground"]) as ground,
+          host(net, "robot", tmp_path / "r", spec, *own["robot"], "--record", str(file)) as robot):
         ground.wait_for("takes part in run")
         robot.wait_for("ctrl-C ends it")
         ground.wait_for("router_b_ground adopted")
@@ -49,3 +68,19 @@ def test_the_first_host_sees_what_the_other_does_and_goes_on_from_where_it_was(n
         assert found["camera"] == "robot"
         assert "supervisor_ground" not in found
         assert told == "kill-node: the processes of ground are missing: nothing was heard\n"
+        net.line = Line()
+        robot.wait_for("supervisor_ground back")
+        robot.wait_until(lambda: not any(map(robot.pid, CELL_ON_GROUND)), 10, "not given back")
+        time.sleep(1.0)
+        robot.process.send_signal(signal.SIGINT)
+        code, _ = robot.result(20)
+        assert code == 0
+    sources, summary = recorded(file)
+    for node in (*CELL_ON_GROUND, "supervisor_ground", "router_a_ground", "observer_ground"):
+        assert sources[node] > 10, (node, sources)
+    assert sources["gripper"] > 10
+    cut = [(begin_s, end_s) for begin_s, end_s in summary.unheard["ground"] if begin_s > 0.5]
+    assert cut, summary.unheard  # the partition is told
+    assert all(end_s is None or 0.6 < end_s - begin_s < 20 for begin_s, end_s in cut)
+    assert not {"gripper", "supervisor", "cell_manager"} & json.loads(summary.end["lost"]).keys()
+    assert "; ground could not be heard all the time" in robot.story
