@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from rampart.actors.runtime.checkpoint import CheckpointError, Record, SupersededError
-from rampart.actors.runtime.checkpoint_file import beside, words
-from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints, newest
+from rampart.actors.runtime.checkpoint_file import beside, primary_code, words
+from rampart.actors.runtime.checkpoint_store import LOCKED, SqliteCheckpoints, newest
 
 LOOK_S = 0.02
 """Real seconds between two looks at the files."""
@@ -106,7 +106,11 @@ class StateFiles:
             return
         try:
             record = newest(file, self._run)
-        except Exception as error:  # whatever lies there; it is the node's to tell
+        except Exception as error:  # whatever lies there
+            if primary_code(error) in LOCKED:  # in this moment
+                if settles:
+                    self.settle(node)
+                return
             self._problem(node, f"{file.name} cannot be read for another host: {words(error)}")
             self._seen[node] = trace
             if settles:

@@ -53,7 +53,7 @@ _COPIES = 3
 _FAR = 8
 """At so many times its limit the log is cut whatever comes."""
 
-_LOCKED = frozenset({sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED})
+LOCKED = frozenset({sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED})
 
 _PUT = ("REPLACE INTO checkpoint (slot, generation, incarnation, version, state, checksum)"
         " SELECT ?, ?, ?, ?, ?, ? WHERE EXISTS"
@@ -331,7 +331,7 @@ class SqliteCheckpoints(CheckpointStore):
     def _error(self, error: Exception) -> CheckpointError:
         if isinstance(error, CheckpointError):
             return error
-        kind = BusyError if disk.primary_code(error) in _LOCKED else CheckpointError
+        kind = BusyError if disk.primary_code(error) in LOCKED else CheckpointError
         why = getattr(error, "strerror", None) or disk.words(error)
         return kind(f"{self._file}: {why}")
 
