@@ -76,7 +76,8 @@ class HostSupervisor(Supervisor):
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         topics.HOST_NODES, topics.PROCESS_EVENT, topics.CHECKPOINTS)
 
-    def __init__(self, context: Context, processes: Processes | None = None) -> None:
+    def __init__(self, context: Context, processes: Processes | None = None,
+                 files: Callable[..., StateFiles] = StateFiles) -> None:
         super().__init__(context, processes)
         hosts, units = self._layout.hosts, self._layout.units
         own, others = self.parameters.host, self.parameters.others
@@ -98,7 +99,7 @@ class HostSupervisor(Supervisor):
                 if (home := hosts.home_of[unit.nodes[0].name]) != FIRST
                 and not self._placement.is_fixed(name)},
             self._runs, lambda node: context.register(node) or 0)
-        self._files = StateFiles(
+        self._files = files(
             Path(self._plan.checkpoints), self._plan.run_id, self._copies.nodes,
             partial(self._from_thread, self._state_kept), partial(
                 self._from_thread, self._state_problem))

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 
+from rampart.actors.hosts import state_files
 from rampart.actors.hosts.state_files import LOOK_S, StateFiles
 from rampart.actors.runtime.checkpoint import CheckpointError, Record, SupersededError
 from rampart.actors.runtime.checkpoint_file import record_checksum
@@ -97,6 +98,23 @@ def test_a_process_that_has_loaded_refuses_copies_of_what_came_before_it(file):
     with store(file, EPOCH + 1) as own:
         own.load()
         with store(file, 1) as made, pytest.raises(SupersededError):
+            made.take(record(1, 6))
+    assert newest(file, "r") == record(1, 5)
+
+
+def test_a_process_that_loads_in_the_moment_in_which_a_copy_comes_is_not_disturbed(
+        file, monkeypatch):
+    with store(file, 1) as made, store(file, EPOCH + 1) as own:
+        made.take(record(1, 5))
+        load = made._load_and_claim
+
+        def load_and_be_overtaken():
+            found = load()
+            own.load()
+            return found
+
+        monkeypatch.setattr(made, "_load_and_claim", load_and_be_overtaken)
+        with pytest.raises(SupersededError):
             made.take(record(1, 6))
     assert newest(file, "r") == record(1, 5)
 
@@ -195,6 +213,21 @@ def test_the_last_of_many_is_always_seen(file, watched):
             if number % 20 == 0:
                 time.sleep(LOOK_S * (number % 3))
         wait_until(lambda: watched.next()[1].generation == 399, 10, "it was not seen")
+
+
+def test_a_change_that_neither_time_nor_size_tell_is_seen(file, monkeypatch):
+    """The kernel's clock ticks each few milliseconds, and a log is written over in place."""
+    trace = ((1, 1, time.time_ns()),)
+    monkeypatch.setattr(state_files, "_trace", lambda _file: trace)
+    monkeypatch.setattr(state_files, "_SETTLED_S", 60.0)
+    made = Watched(file)
+    with store(file, 1) as node:
+        node.load()
+        made.files.start()
+        for number in range(1, 4):
+            node.save(1, b"%d" % number)
+            assert made.next()[1].generation == number
+    made.files.close()
 
 
 def test_who_looks_keeps_no_node_from_keeping_its_state(file, watched):
