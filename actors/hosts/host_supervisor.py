@@ -51,6 +51,9 @@ _LOOK_S = 0.05
 _SAID_S = 0.1
 """Simulated seconds after which it is signalled itself: the answer has gone by then."""
 
+_ENDING_S = 0.005
+"""Real seconds between two looks whether a process that was given back has ended."""
+
 _STATE_S = 2.0
 """Real seconds that the last state of a node is waited for, at most, when it is given back."""
 
@@ -218,7 +221,6 @@ class HostSupervisor(Supervisor):
             self.report_diagnostic("incarnation", f"not noted: {error}", row.name)
 
     def _look_at_hosts(self) -> None:
-        self._settle()
         changes = self._placement.look(self._loop.time(), self._mine(), self._has_states)
         if changes != Changes():
             for host in changes.lost:
@@ -254,7 +256,9 @@ class HostSupervisor(Supervisor):
             self._tell(process, "handed over", self.name)
             self._issued.update(dict.fromkeys(process.names, process.highest))
             self._copies.unsettle(process.names)
-            if unit in self._ending:
+            if not self._ending:
+                self.call_later(_ENDING_S * self.clock.rate, self._settle)
+            elif unit in self._ending:
                 self._ending[unit].close()
             self._ending[unit], process.handle = process.handle, ProcessHandle()
 
@@ -294,6 +298,8 @@ class HostSupervisor(Supervisor):
                 for node in self._layout.units[unit].nodes:
                     if node.name in self._copies.nodes:
                         self._files.settle(node.name)
+        if self._ending:
+            self.call_later(_ENDING_S * self.clock.rate, self._settle)
 
     def _has_states(self, unit: str) -> bool:
         """Whether a unit that was given back can go on from what it has kept there."""

@@ -81,9 +81,9 @@ def test_the_first_host_sees_what_the_other_does(net, tmp_path, keyed):
     for node in (*CELL_ON_GROUND, "supervisor_ground", "router_a_ground", "observer_ground"):
         assert sources[node] > 10, (node, sources)
     assert sources["gripper"] > 10
-    cut = [(begin_s, end_s) for begin_s, end_s in summary.unheard["ground"] if begin_s > 0.5]
+    cut = [end_s - begin_s for begin_s, end_s in summary.unheard["ground"] if end_s and end_s > 1.5]
     assert cut, summary.unheard  # the partition is told
-    assert all(end_s is None or 0.6 < end_s - begin_s < 20 for begin_s, end_s in cut)
+    assert 0.6 < max(cut) < 20
     assert not {"gripper", "supervisor", "cell_manager"} & json.loads(summary.end["lost"]).keys()
     assert "; ground could not be heard all the time" in robot.story
 
