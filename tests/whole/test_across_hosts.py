@@ -64,6 +64,12 @@ def test_the_first_host_sees_what_the_other_does(net, tmp_path, keyed):
             assert {found[node] for node in (*CELL_ON_GROUND, "supervisor_ground")} == {"ground"}
             assert {found[node] for node in ("gripper", "supervisor", "router_a")} == {"robot"}
             assert told == ""
+        beside = subprocess.run(  # on the other host, too, while the run goes on
+            net.command("ground", sys.executable, "-P", "-m", "rampart.cli.main", "record",
+                        str(tmp_path / "beside.mcap"), "--duration", "2",
+                        "--port", str(ground.port)),
+            capture_output=True, text=True, check=False, timeout=60)
+        assert beside.returncode == 0, beside.stderr
         net.line = Line(is_cut=True)
         robot.wait_for("camera respawned, incarnation 1000001")
         found, told = listed(net, "robot", robot)
@@ -77,6 +83,9 @@ def test_the_first_host_sees_what_the_other_does(net, tmp_path, keyed):
         robot.process.send_signal(signal.SIGINT)
         code, _ = robot.result(20)
         assert code == 0
+    sources, summary = recorded(tmp_path / "beside.mcap")
+    assert all(sources[node] > 10 for node in ("camera", "gripper", "router_a")), sources
+    assert summary.unheard.keys() == {"robot"}
     sources, summary = recorded(file)
     for node in (*CELL_ON_GROUND, "supervisor_ground", "router_a_ground", "observer_ground"):
         assert sources[node] > 10, (node, sources)
