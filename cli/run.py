@@ -23,6 +23,7 @@ import msgspec
 from rampart.actors.layout.layout import Layout, load_application
 from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.other_hosts import others_of
 from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.virtual import VirtualRecording
 from rampart.actors.run.run_context import RunContext
@@ -125,7 +126,7 @@ class Run:
         self._trial = self._made(self._plan, sys.stderr)
 
     async def _on_processes(self, run: ProcessRun) -> int:
-        with _recorded(self._options):
+        with _recorded(self._options, self._plan, self._trial.run.system):
             _interruptible(run)
             return self._conclude(await run.run(), run.failure)
 
@@ -221,13 +222,14 @@ def _kept(directory: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _recorded(options: argparse.Namespace) -> Iterator[None]:
+def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> Iterator[None]:
     """Have what runs meanwhile recorded, if that is asked for, by a process of its own."""
     if not options.record:
         yield
         return
-    recorder = RecorderProcess(Order(options.port, str(Path(options.record).resolve()),
-                                     os.getpid(), options.overwrite))
+    recorder = RecorderProcess(Order(
+        options.port, str(Path(options.record).resolve()), os.getpid(), options.overwrite,
+        others_of(Layout(plan, spec))))
     recorder.start()
     try:
         yield

@@ -79,7 +79,22 @@ def rights_of_all(layout: Layout) -> dict[str, Rights]:
     operating = Rights(says=frozenset(_operated(layout, topics)))
     if OBSERVER in found:  # the launcher's, which carries out what `--fault` asks for
         found[OBSERVER] |= operating
+        if hosts.several:  # its recorder hears what other hosts publish
+            found[OBSERVER] |= Rights(hears=viewer.hears)
     return {**found, OPERATOR: viewer | operating, VIEWER: viewer}
+
+
+def said_elsewhere(layout: Layout) -> frozenset[str]:
+    """Return what processes and people of the other hosts may publish, as key expressions.
+
+    Args:
+        layout: of the system, as one host has it.
+    """
+    hosts, rights = layout.hosts, rights_of_all(layout)
+    there = {name for host in hosts.supervisors if host != layout.plan.host
+             for name in (*hosts.routers_of(host), *hosts.may_run(host, layout.members))}
+    said = together((*(rights[name] for name in there), rights[OPERATOR])).says
+    return frozenset(key for key in said if not key.startswith(f"{_GONE}/"))
 
 
 def _rights_of(member: Member, topics: Mapping[str, Topic[Any]]) -> Rights:

@@ -14,6 +14,7 @@ from typing import Annotated
 import msgspec
 
 from rampart.actors.bus.bounds import (
+    MAX_PAYLOAD_BYTES,
     Count,
     Document,
     Explained,
@@ -29,6 +30,12 @@ from rampart.actors.bus.bounds import (
 )
 from rampart.actors.bus.messages import ON_TIME, Injection, Message
 from rampart.manager.model.mechanisms import RecoveryPhase
+
+LARGEST_COPY_BYTES = MAX_PAYLOAD_BYTES - (128 << 10)
+"""Of a state that is copied to another host: what else is in the message has to fit as well."""
+
+KeptBytes = Annotated[bytes, msgspec.Meta(max_length=LARGEST_COPY_BYTES)]
+Checksum = Annotated[bytes, msgspec.Meta(max_length=32)]
 
 
 class Holds(Message, frozen=True):
@@ -206,6 +213,42 @@ class NodeTable(Message, frozen=True):
     """All nodes of the system."""
 
     nodes: Many[NodeInfo]
+
+
+class KeptState(Message, frozen=True):
+    """Which state of a node a host holds: the newest, by incarnation and generation; 0 for none.
+
+    `issued` is the highest incarnation of the node that host has issued. `final`: no process of the
+    node is there, and this is the last that any has kept.
+    """
+
+    node: Name
+    incarnation: Incarnation
+    generation: Count
+    issued: Incarnation
+    final: bool
+
+
+class StateCopy(Message, frozen=True):
+    """A state that a node has kept; `checksum` is a SHA-256 over all of it, node and run."""
+
+    node: Name
+    incarnation: Incarnation
+    generation: Count
+    version: Count
+    state: KeptBytes
+    checksum: Checksum
+
+
+class Checkpoints(Message, frozen=True):
+    """What a host holds of the states of nodes that two hosts may run, and copies of some.
+
+    Copies are of what is newer than the other host says it holds.
+    """
+
+    run: Name
+    kept: Many[KeptState]
+    copies: Many[StateCopy] = ()
 
 
 class RespawnRequest(Message, frozen=True):

@@ -4,12 +4,19 @@ They tell each other what they run, and of which incarnation (`supervisor/{name}
 hears is noted in the folder of the run on its own host, where every reader looks whether an
 incarnation was issued; nobody but a supervisor writes there what another host has issued. The
 first host's publishes the table of all.
+
+With checkpoints they also hold the newest state of each node that either of two hosts may run
+(`Copies`): what the other lacks they send, and a node that is given back starts when what it has
+kept there has come.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from signal import Signals
 from typing import Any, ClassVar
 
@@ -20,9 +27,12 @@ from rampart.actors.bus.run_folder import issue
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
-from rampart.actors.hosts.placement import Changes, Home, Placement
+from rampart.actors.hosts.copies import Copies
+from rampart.actors.hosts.placement import FIRST, Changes, Home, Placement
+from rampart.actors.hosts.state_files import StateFiles
 from rampart.actors.run.run_plan import SUPERVISOR, on_host
-from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.runtime.actor import Context, Header, every, on
+from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.supervision.kill_node import (
     SIGNALS,
     SignalError,
@@ -30,7 +40,7 @@ from rampart.actors.supervision.kill_node import (
     find_node,
 )
 from rampart.actors.supervision.process_title import kill
-from rampart.actors.supervision.processes import Processes
+from rampart.actors.supervision.processes import Processes, ProcessHandle
 from rampart.actors.supervision.supervised_process import Event
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.manager.spec.schema import Kind
@@ -40,6 +50,12 @@ _LOOK_S = 0.05
 
 _SAID_S = 0.1
 """Simulated seconds after which it is signalled itself: the answer has gone by then."""
+
+_ENDING_S = 0.005
+"""Real seconds between two looks whether a process that was given back has ended."""
+
+_STATE_S = 2.0
+"""Real seconds that the last state of a node is waited for, at most, when it is given back."""
 
 _ORDERS_KEPT = 64
 """An order to signal that is repeated gets its old answer, as long as it is among the last ones."""
@@ -60,9 +76,11 @@ class HostSupervisor(Supervisor):
         others: tuple[str, ...] = ()
 
     parameters: Parameters
-    outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.HOST_NODES, topics.PROCESS_EVENT)
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (
+        topics.HOST_NODES, topics.PROCESS_EVENT, topics.CHECKPOINTS)
 
-    def __init__(self, context: Context, processes: Processes | None = None) -> None:
+    def __init__(self, context: Context, processes: Processes | None = None,
+                 files: Callable[..., StateFiles] = StateFiles) -> None:
         super().__init__(context, processes)
         hosts, units = self._layout.hosts, self._layout.units
         own, others = self.parameters.host, self.parameters.others
@@ -76,23 +94,37 @@ class HostSupervisor(Supervisor):
                         any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
              for name, unit in units.items()},
             hosts.link, self._loop.time())
+        self._ending: dict[str, ProcessHandle] = {}
+        self._given_back_s: dict[str, tuple[float, float]] = {}
+        self._copies = Copies(
+            self._plan.run_id, own, {} if not self._keeps_states() else {
+                node.name: home for name, unit in units.items() for node in unit.nodes
+                if (home := hosts.home_of[unit.nodes[0].name]) != FIRST
+                and not self._placement.is_fixed(name)},
+            self._runs, lambda node: context.register(node) or 0)
+        self._files = files(
+            Path(self._plan.checkpoints), self._plan.run_id, self._copies.nodes,
+            partial(self._from_thread, self._state_kept), partial(
+                self._from_thread, self._state_problem))
         if self._plan.incarnations and self._incarnation == self._plan.incarnations + 1:
             for unit in self._placement.waits():
                 del self._processes[unit]
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Supervisor.Parameters) -> Members:
-        """Hear the other supervisors, too."""
-        if topic is topics.HOST_NODES:
+        """Hear the other supervisors, too; of states, those with which it shares some."""
+        if topic in (topics.HOST_NODES, topics.CHECKPOINTS):
             assert isinstance(parameters, HostSupervisor.Parameters)  # noqa: S101 for the type checker
-            return tuple(on_host(SUPERVISOR, host) for host in parameters.others)
+            shares_all = topic is topics.HOST_NODES or parameters.host == FIRST
+            return tuple(on_host(SUPERVISOR, host) for host in parameters.others
+                         if shares_all or host == FIRST)
         return super().names(topic, name, parameters)
 
     @classmethod
     def output_names(cls, topic: Topic[Any], name: str, parameters: Supervisor.Parameters
                      ) -> Members:
-        """Publish what runs here under its own name."""
-        if topic is topics.HOST_NODES:
+        """Publish what runs here, and what it holds, under its own name."""
+        if topic in (topics.HOST_NODES, topics.CHECKPOINTS):
             return (name,)
         return super().output_names(topic, name, parameters)
 
@@ -104,7 +136,17 @@ class HostSupervisor(Supervisor):
                 self._placement.adopted(unit)
                 self._processes[unit] = self._held(self._layout.units[unit])
         super().on_start()
+        if self._copies.nodes:
+            self._files.start()
+            self._tell_states()
+            for node in self._copies.nodes:
+                self._files.settle(node)
         self._look_at_hosts()
+
+    def on_stop(self) -> None:
+        """End all processes as any supervisor, and look at no states any more."""
+        super().on_stop()
+        self._files.close()
 
     # -- what it hears --------------------------------------------------------------------------
 
@@ -114,6 +156,7 @@ class HostSupervisor(Supervisor):
         host = self._guard_of.get(header.source)
         if host is not None and self._placement.heard(host, self._loop.time()):
             self._publish_table()  # each soon knows what the other runs
+            self.tell_states()
 
     @on(topics.HOST_NODES)
     def told(self, table: fm.NodeTable, header: Header) -> None:
@@ -130,6 +173,20 @@ class HostSupervisor(Supervisor):
             self._drop(unit)
         if news or drop or was_missed:
             self._publish_table()
+
+    @on(topics.CHECKPOINTS)
+    def told_states(self, message: fm.Checkpoints, header: Header) -> None:
+        """Keep what another host holds and this one lacks, and note what that one lacks."""
+        host = self._supervisors.get(header.source)
+        if host is None or not self._copies.nodes:
+            return
+        taken = self._copies.told(host, message)
+        for node, problem in taken.problems:
+            self._state_problem(node, problem)
+        for node, record in taken.records:
+            self._files.take(node, record)
+        if taken.is_first:
+            self._tell_states()
 
     @on(topics.SIGNAL)
     def signal(self, order: fm.SignalOrder, _header: Header) -> None:
@@ -164,9 +221,10 @@ class HostSupervisor(Supervisor):
             self.report_diagnostic("incarnation", f"not noted: {error}", row.name)
 
     def _look_at_hosts(self) -> None:
-        changes = self._placement.look(self._loop.time(), self._mine())
+        changes = self._placement.look(self._loop.time(), self._mine(), self._has_states)
         if changes != Changes():
             for host in changes.lost:
+                self._copies.lost(host)
                 self._tell_of(host, "unreachable")
             for host in changes.back:
                 self._tell_of(host, "back")
@@ -197,7 +255,77 @@ class HostSupervisor(Supervisor):
             process.kill()
             self._tell(process, "handed over", self.name)
             self._issued.update(dict.fromkeys(process.names, process.highest))
-            process.let_go()
+            self._copies.unsettle(process.names)
+            if not self._ending:
+                self.call_later(_ENDING_S * self.clock.rate, self._settle)
+            elif unit in self._ending:
+                self._ending[unit].close()
+            self._ending[unit], process.handle = process.handle, ProcessHandle()
+
+    # -- states of nodes ------------------------------------------------------------------------
+
+    def _keeps_states(self) -> bool:
+        return bool(self._plan.checkpoints) and self._spec.layers.checkpoints
+
+    def _runs(self, node: str) -> int:
+        """Return the highest incarnation of a node that is run here, 0 if it is not."""
+        process = self._process_of(node)
+        return process.highest if process else 0
+
+    def _from_thread(self, call: Callable[..., None], node: str, *what: Any) -> None:
+        """Have a call made as an item of the mailbox."""
+        slot = f"{call.__name__} {node} {what[1:]}"
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(
+                self._dispatcher.put, slot, partial(call, node, *what))
+
+    def _state_kept(self, node: str, record: Record | None, is_last: bool) -> None:
+        if problem := self._copies.kept(node, record):
+            self._state_problem(node, problem)
+        if is_last and self._layout.unit_of[node] not in self._ending:
+            self._copies.settled(node)
+        self._tell_states()
+
+    def _state_problem(self, node: str, problem: str) -> None:
+        self.report_diagnostic("checkpoint", problem, node)
+
+    def _settle(self) -> None:
+        """Have what was ended here looked at for the last time."""
+        for unit, handle in list(self._ending.items()):
+            if handle.gone():
+                del self._ending[unit]
+                handle.close()
+                for node in self._layout.units[unit].nodes:
+                    if node.name in self._copies.nodes:
+                        self._files.settle(node.name)
+        if self._ending:
+            self.call_later(_ENDING_S * self.clock.rate, self._settle)
+
+    def _has_states(self, unit: str) -> bool:
+        """Whether a unit that was given back can go on from what it has kept there."""
+        told, now_s = self._placement.told_of(unit), self._loop.time()
+        since_s, asked_s = self._given_back_s.get(unit, (now_s, now_s))
+        if now_s - asked_s > 4 * _LOOK_S:  # it was run there again meanwhile
+            since_s = now_s
+        self._given_back_s[unit] = since_s, now_s
+        is_caught_up = self._copies.is_caught_up(told, told)
+        if not is_caught_up and now_s - since_s < _STATE_S:
+            return False
+        if not is_caught_up:
+            self._state_problem(unit, "the last state was not sent in time by the host that gave "
+                                "it back; starting with what is here")
+        return True
+
+    @every(0.5)
+    def tell_states(self) -> None:
+        """Repeat what is held here, and what others lack of it."""
+        if self._copies.nodes:
+            self._tell_states()
+
+    def _tell_states(self) -> None:
+        self.publish(topics.CHECKPOINTS, self._copies.message(self._loop.time()))
+
+    # -- what it says ---------------------------------------------------------------------------
 
     def _tell_of(self, host: str, event: str) -> None:
         name = self._layout.hosts.supervisors[host]

@@ -23,9 +23,11 @@ from rampart.actors.hosts.meeting import (
 from rampart.actors.layout.hosts import Hosts
 from rampart.actors.layout.layout import load_application
 from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_info import RunInfo
 from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_system, on_host
 from rampart.actors.runtime.clock import keep_origin, origin_file
 from rampart.actors.supervision.launcher import Launcher, LaunchError
+from rampart.manager.spec.schema import SystemSpec
 
 _RETRY_S = 0.2
 
@@ -65,6 +67,10 @@ class FirstLauncher(Launcher):
                 raise LaunchError("interrupted while it waited for the other hosts")
         await super().start()
         self._meeting.begin(self.plan.origin_s)
+
+    def info(self) -> RunInfo:
+        """Return what tools need to know of this run, which machines there are among it."""
+        return msgspec.structs.replace(super().info(), hosts=Hosts(self._run.system).called)
 
     async def end(self) -> None:
         """End this host's processes, and have the others end theirs."""
@@ -112,7 +118,7 @@ class OtherHost:
         application = load_application(plan, self._spec)
         self._attendance.ready(contents_of(plan, application))
         plan = msgspec.structs.replace(plan, incarnations=(told.starts - 1) * run_folder.EPOCH)
-        self.launcher = OtherLauncher(plan, self._spec.title, told.incarnations)
+        self.launcher = OtherLauncher(plan, self._spec, told.incarnations)
         return plan
 
     async def start(self) -> None:
@@ -198,15 +204,17 @@ class OtherLauncher(Launcher):
     """Another host's launcher.
 
     Args:
+        spec: of the system.
         incarnations: of the nodes, those that were issued already.
 
     Attributes:
         begins_s: reading of this host's monotonic clock at simulated time 0.
     """
 
-    def __init__(self, plan: RunPlan, title: str, incarnations: dict[str, int]) -> None:
-        super().__init__(plan, title)
+    def __init__(self, plan: RunPlan, spec: SystemSpec, incarnations: dict[str, int]) -> None:
+        super().__init__(plan, spec.title)
         self.begins_s = 0.0
+        self._spec = spec
         self._incarnations = incarnations
 
     def begin(self, *, forks: bool = False) -> None:
@@ -219,6 +227,10 @@ class OtherLauncher(Launcher):
         """Return when simulated time began, or will, as the first host has it."""
         self.follow(self.begins_s)
         return self.begins_s
+
+    def info(self) -> RunInfo:
+        """Return what tools need to know of this run, which machines there are among it."""
+        return msgspec.structs.replace(super().info(), hosts=Hosts(self._spec).called)
 
     def follow(self, origin_s: float) -> None:
         """Have all processes of this host go by this origin."""

@@ -21,7 +21,7 @@ So a recovery module obeys one manager at any time: that of the highest incarnat
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -117,6 +117,10 @@ class Placement:
         """Whether a host is lost."""
         return host != self._own and self._others[host].is_lost
 
+    def is_fixed(self, unit: str) -> bool:
+        """Whether a unit runs at its home or nowhere."""
+        return self._homes[unit].is_fixed
+
     def waits(self) -> list[str]:
         """Begin without what the first host may be running, and return what that is.
 
@@ -171,12 +175,14 @@ class Placement:
         self.held.difference_update(drop)
         return news, list(drop)
 
-    def look(self, now_s: float, mine: Mapping[str, int]) -> Changes:
+    def look(self, now_s: float, mine: Mapping[str, int],
+             is_ready: Callable[[str], bool] = lambda _unit: True) -> Changes:
         """Return what is to be done.
 
         Args:
             now_s: Now.
             mine: Incarnation of each node that was ever issued on this host.
+            is_ready: Asked of a unit that was given back: whether it can be started.
         """
         lost, back, drop = list[str](), list[str](), list[str]()
         take: list[tuple[str, int]] = []
@@ -197,7 +203,7 @@ class Placement:
                 take += [(unit, self._next_epoch(unit, mine)) for unit in self._homed(host)
                          if unit not in self.held and not self._homes[unit].is_fixed]
         if self._own != FIRST:
-            take += self._given_back(now_s, mine)
+            take += [one for one in self._given_back(now_s, mine) if is_ready(one[0])]
         self.held.update(unit for unit, _ in take)
         self.held.difference_update(drop)
         return Changes(tuple(lost), tuple(back), tuple(take), tuple(drop))
@@ -221,6 +227,10 @@ class Placement:
         return [(node, home.host, mine[node]) for unit, home in self._homes.items()
                 if home.host != self._own and unit not in self.held for node in home.nodes
                 if mine.get(node, 0) > self._runs_at(home.host, node)]
+
+    def told_of(self, unit: str) -> dict[str, int]:
+        """Return the highest incarnation of each node of a unit that another host has told of."""
+        return {node: self._highest.get(node, 0) for node in self._homes[unit].nodes}
 
     def _runs_at(self, host: str, node: str) -> int:
         row = self._others[host].runs.get(node)

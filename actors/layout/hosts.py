@@ -24,6 +24,7 @@ class Hosts:
     Attributes:
         several: whether there is more than one.
         supervisors: name of the supervisor of each host.
+        called: the same by what the hosts are called, the first one too; empty if there is one.
         link: what is assumed of the network between them.
         command_age_s: a command that was under way for longer is not obeyed.
         home_of: name of each node with that of the host on which it runs, unless that is lost.
@@ -39,6 +40,8 @@ class Hosts:
             raise ValueError(f"no host {own!r}")
         self.several = len(names) > 1
         self.supervisors = {name: on_host(SUPERVISOR, name) for name in names}
+        self.called = {host.name: self.supervisors[name] for name, host in zip(
+            names, spec.hosts, strict=False) if self.several}
         self.home_of = {node: "" if host == first else host
                         for node, host in spec.host_of.items()}
         self.link = spec.link

@@ -15,12 +15,13 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from rampart.actors.recording import bag_records as br
-from rampart.actors.recording.bag_writer import END, KEY, RUN, BagError, open_target
+from rampart.actors.recording.bag_writer import END, KEY, RUN, UNHEARD, BagError, open_target
 from rampart.actors.recording.run_documents import MAX_FILE_BYTES
 from rampart.files.reading import shown
 
@@ -258,6 +259,18 @@ class Summary:
         except ValueError:
             return 0.0
         return zero_s if math.isfinite(zero_s) else 0.0
+
+    @property
+    def unheard(self) -> dict[str, list[tuple[float, float | None]]]:
+        """Host → from when to when it was not heard, simulated seconds; None is to the end.
+
+        Of the hosts on which it was not made. What makes no sense is left out.
+        """
+        found = {}
+        for host, text in self.reader.metadata.get(UNHEARD, {}).items():
+            with contextlib.suppress(ValueError, RecursionError):
+                found[host] = msgspec.json.decode(text, type=list[tuple[float, float | None]])
+        return found
 
     @property
     def keys(self) -> dict[str, int]:

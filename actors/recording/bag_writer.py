@@ -22,6 +22,7 @@ from typing import Any, BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.json_schema import plain_schema
@@ -34,10 +35,18 @@ RUN = "rampart.run"
 END = "rampart.end"
 """Names of the metadata records: what was run, and what came of the recording."""
 
+UNHEARD = "rampart.unheard"
+"""Name of the metadata record that tells, host by host, from when to when it was not heard: a JSON
+list of pairs of simulated seconds, the last open (null) if it is not heard now. It is written anew
+with each change; the last one counts. Of a run on one machine there is none."""
+
 KEY = "key"
 """Channel metadata that only channels of the bus have: the full key."""
 
 _MAX_NS = (1 << 64) - 1
+
+_LATE = 1024
+"""So many missing messages may still come."""
 
 
 class BagError(Exception):
@@ -86,9 +95,13 @@ class SequenceGaps:
         self._first: dict[str, int] = {}
         self._last: dict[tuple[str, int], int] = {}
         self._lost = Counter[str]()
+        self._missing: Remembered[tuple[str, int, int], None] = Remembered(_LATE)
 
     def hear(self, header: Header) -> None:
-        """Note one message; copies have the same number."""
+        """Note one message; copies have the same number.
+
+        What comes from another host may be overtaken by what is more urgent: that is not lost.
+        """
         one = (header.source, header.incarnation)
         last = self._last.get(one)
         if last is None:
@@ -97,11 +110,16 @@ class SequenceGaps:
             last = 0 if new else header.sequence - 1
         if header.sequence > last + 1:
             self._lost[header.source] += header.sequence - last - 1
+            for number in range(max(last + 1, header.sequence - _LATE), header.sequence):
+                self._missing[*one, number] = None
+        elif (late := (*one, header.sequence)) in self._missing:
+            del self._missing[late]
+            self._lost[header.source] -= 1
         self._last[one] = max(last, header.sequence)
 
     def lost(self) -> dict[str, int]:
         """Return source → messages that were sent and not recorded."""
-        return dict(self._lost)
+        return {source: count for source, count in self._lost.items() if count}
 
 
 class BagWriter:
@@ -125,6 +143,7 @@ class BagWriter:
         self.messages = 0
         self.garbage = 0
         self.untranslated = 0
+        self.unheard: dict[str, str] = {}
         self.gaps = SequenceGaps(from_start=from_start)
         self._file = file
         self._zero_s = time_zero_s
@@ -178,6 +197,16 @@ class BagWriter:
             self._show(self._views, self._views.of(form.topic, key, header, body, log_ns), log_ns)
         except (ValueError, TypeError, OverflowError):  # the message itself is recorded
             self.untranslated += 1
+
+    def tell_unheard(self, record: dict[str, str]) -> None:
+        """Have the file tell of hosts that were not heard, if that is news; see `UNHEARD`.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        if record != self.unheard:
+            self.unheard = record
+            self._writer.add_metadata(UNHEARD, record)
 
     def flush(self) -> None:
         """Close the chunk and hand everything to the kernel, which keeps it if this process dies.

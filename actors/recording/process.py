@@ -18,8 +18,12 @@ from pathlib import Path
 import msgspec
 import setproctitle
 
+from rampart.actors.bus.zenoh_session import Credentials, credentials_in
 from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.other_hosts import OtherHosts
 from rampart.actors.recording.recorder import RUN_ENDED, Recorder
+from rampart.actors.run.run_info import RunInfo
+from rampart.actors.run.run_plan import OBSERVER
 from rampart.files import streams, working_folder
 
 _READY = "ready"
@@ -28,12 +32,13 @@ _START_S, _END_S = 30.0, 10.0
 
 
 class Order(msgspec.Struct, frozen=True):
-    """What to record where; `launcher` is the pid of the run's launcher."""
+    """What to record where; `launcher` is the pid of the run's launcher, `others` other hosts."""
 
     port: int
     path: str
     launcher: int
     overwrite: bool = False
+    others: OtherHosts | None = None
 
 
 class RecorderProcess:
@@ -107,7 +112,8 @@ def record(order: Order) -> int:
     for number in (signal.SIGINT, signal.SIGHUP):  # the launcher's to handle; we see its end
         signal.signal(number, signal.SIG_IGN)
     signal.signal(RUN_ENDED, lambda *_: None)
-    recorder = Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher)
+    recorder = Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher,
+                        others=order.others, shown=_launchers)
     try:
         recorder.open()
     except BagError as error:
@@ -124,6 +130,11 @@ def record(order: Order) -> int:
     return 0
 
 
+def _launchers(run: RunInfo) -> Credentials | None:
+    """Return by what the launcher of a run shows who it is, and so does its recorder."""
+    return credentials_in(run.keys, OBSERVER, run.folder, run.ports)
+
+
 def told(recorder: Recorder) -> str:
     """Return one line on what came of a recording."""
     writer = recorder.writer
@@ -133,8 +144,10 @@ def told(recorder: Recorder) -> str:
         return f"{recorder.path}: was taken away while it was written: nothing is recorded"
     lost = sum(writer.gaps.lost().values())
     garbage = f", {writer.garbage} of them garbage" if writer.garbage else ""
+    silent = "".join(f"; {host} could not be heard all the time, see `rampart bag info`"
+                     for host, spans in writer.unheard.items() if spans != "[]")
     return (f"recorded {writer.messages} messages in {recorder.path}{garbage}, "
-            f"{lost or 'none'} lost")
+            f"{lost or 'none'} lost{silent}")
 
 
 def _answer(text: str) -> None:

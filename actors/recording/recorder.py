@@ -5,6 +5,9 @@ for it, and the robot drives on. It sleeps most of the time: some twenty times a
 all sockets at once, puts what it found into order by time of sending, and writes; every 0.8 s it
 hands the file to the kernel. It ends when it is told to, or when the launcher of the run has ended,
 however that ended; then it takes what is still in the sockets and closes the file in order.
+
+In a run on several hosts it also hears, on the bus, what the others publish (`other_hosts`). Then
+what has come is written one turn later: by then all that was sent here before has been handed over.
 """
 
 from __future__ import annotations
@@ -24,7 +27,9 @@ from pathlib import Path
 
 from rampart.actors.bus import recorder_connection
 from rampart.actors.bus.unix_peer import is_same_user
+from rampart.actors.bus.zenoh_session import Credentials
 from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
+from rampart.actors.recording.other_hosts import EachOnce, Ear, Frame, OtherHosts, Silences
 from rampart.actors.recording.run_documents import collect
 from rampart.actors.run.run_info import RunInfo, ask
 
@@ -44,8 +49,6 @@ _RUN_ENDED = "the run has ended"
 _ASK_S = 0.2
 _WAITING_FRAMES = 500_000
 
-Frame = tuple[float, str, bytes]
-
 
 class Recorder:
     """One recording of one run. Use: `open`, then `run`, once.
@@ -56,11 +59,14 @@ class Recorder:
         overwrite: it may.
         wants: says of a full key whether it is recorded.
         launcher: pid of the run's launcher if it is about to start; None joins the run there is.
+        others: what there is to be heard of other hosts; None in a run on one.
+        shown: returns by what it shows who it is on the bus of a run, for that.
     """
 
     def __init__(self, port: int, path: Path, *, overwrite: bool = False,
                  wants: Callable[[str], bool] = lambda _key: True,
-                 launcher: int | None = None) -> None:
+                 launcher: int | None = None, others: OtherHosts | None = None,
+                 shown: Callable[[RunInfo], Credentials | None] = lambda _run: None) -> None:
         self.path = path
         self.writer: BagWriter | None = None
         self._port = port
@@ -73,6 +79,9 @@ class Recorder:
         self._buffer = bytearray(recorder_connection.MAX_FRAME_BYTES)
         self._info: RunInfo | None = None
         self._waiting: list[Frame] = []
+        self._others = others
+        self._shown = shown
+        self._elsewhere: _Elsewhere | None = None
         self._next_ask_s = 0.0
         self._next_flush_s = 0.0
 
@@ -142,12 +151,15 @@ class Recorder:
         for key in list(self._sockets.get_map().values()):
             self._drop(key.fileobj)  # type: ignore[arg-type]
         self._sockets.close()
+        if self._elsewhere is not None:
+            self._elsewhere.close()
         if self.writer is not None:
             self.writer.abandon()
 
     # -- one turn -------------------------------------------------------------------------------
 
-    def _turn(self) -> None:
+    def _turn(self, *, is_last: bool = False) -> None:
+        turn_s = time.monotonic()
         frames = self._gather()
         if self.writer is None:
             self._waiting += frames[:max(0, _WAITING_FRAMES - len(self._waiting))]
@@ -157,8 +169,13 @@ class Recorder:
         if writer is None or info is None:  # it is not known yet what runs
             return
         self._waiting = []
+        if self._elsewhere is not None:
+            frames = self._elsewhere.joined(frames, math.inf if is_last else turn_s)
         for at_s, key, payload in sorted(frames, key=itemgetter(0)):
             writer.take((at_s - info.origin_s) * info.rate, key, payload)
+        if self._elsewhere is not None:
+            writer.tell_unheard(self._elsewhere.silences.record(
+                lambda at_s: (at_s - info.origin_s) * info.rate))
         now_s = time.monotonic()
         if now_s >= self._next_flush_s:
             self._next_flush_s = now_s + FLUSH_S
@@ -169,7 +186,7 @@ class Recorder:
         while run_is_over and self._sockets.get_map() and time.monotonic() < deadline:
             time.sleep(self._period_s())
             self._turn()
-        self._turn()
+        self._turn(is_last=True)
         if self.writer is not None:
             self.writer.close({"ended": why, "stopped": _wall()})
 
@@ -191,12 +208,16 @@ class Recorder:
         self._info, self._launcher = info, info.pid
         documents = collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
                             nodes=tuple(info.nodes), started=_wall())
-        begin_s = (min((f[0] for f in self._waiting), default=now_s) - info.origin_s) * info.rate
+        begun_s = min((f[0] for f in self._waiting), default=now_s)
+        begin_s = (begun_s - info.origin_s) * info.rate
         zero_s = min(0.0, float(math.floor(begin_s)))
         file = open_target(self.path, overwrite=self._overwrite)
         self.writer = BagWriter(
             file, documents, time_zero_s=zero_s, begin_s=begin_s, wants=self._wants,
             views=documents.known.views(), from_start=self._from_start)
+        if self._others is not None:
+            self._elsewhere = _Elsewhere(
+                self._others, Ear(self._others, info.endpoints, self._shown(info)), begun_s)
 
     # -- sockets --------------------------------------------------------------------------------
 
@@ -233,6 +254,51 @@ class Recorder:
     def _drop(self, connection: socket.socket) -> None:
         self._sockets.unregister(connection)
         connection.close()
+
+
+class _Elsewhere:
+    """What comes of other hosts, put together with what was handed over here.
+
+    Attributes:
+        silences: of theirs.
+    """
+
+    def __init__(self, others: OtherHosts, ear: Ear, now_s: float) -> None:
+        self.silences = Silences(others, now_s)
+        self._ear = ear
+        self._each_once = EachOnce()
+        self._held: list[Frame] = []
+        self._heard: list[Frame] = []
+        self._before_s = now_s
+
+    def joined(self, frames: list[Frame], turn_s: float) -> list[Frame]:
+        """Return what is to be written now: what was sent before the turn before this one.
+
+        Args:
+            frames: handed over in this turn.
+            turn_s: when it began; infinity has nothing held back.
+        """
+        self._each_once.handed_over(frames)
+        self._heard += self._ear.take()
+        self._held += frames
+        until_s, self._before_s = (turn_s if turn_s == math.inf else self._before_s), turn_s
+        now, self._held = _split(self._held, until_s)
+        heard, self._heard = _split(self._heard, until_s)
+        for frame, source in self._each_once.from_elsewhere(heard):
+            now.append(frame)
+            self.silences.heard(source, frame[0])
+        self.silences.look(min(until_s, time.monotonic()))
+        return now
+
+    def close(self) -> None:
+        """Hear nothing more."""
+        self._ear.close()
+
+
+def _split(frames: list[Frame], until_s: float) -> tuple[list[Frame], list[Frame]]:
+    """Return those that were sent until a time, and the others."""
+    return ([frame for frame in frames if frame[0] <= until_s],
+            [frame for frame in frames if frame[0] > until_s])
 
 
 def _wall() -> str:

@@ -33,7 +33,8 @@ class RunInfo(msgspec.Struct, frozen=True):
     what a recording keeps of the run's plan. `replay_of` names the file of a replay. `host` is
     which of the run's machines this is, "" the first, and the only one. `keys` is the folder of
     keys of a run that has one, and `ports` are those of loopback on which its routers are spoken
-    with then.
+    with then. `hosts` are all machines of a run on several, the first one first, by name: each with
+    what its supervisor is called.
     """
 
     pid: int
@@ -52,6 +53,12 @@ class RunInfo(msgspec.Struct, frozen=True):
     host: str = ""
     keys: str = ""
     ports: tuple[int, ...] = ()
+    hosts: dict[str, str] = {}
+
+    @property
+    def own_host(self) -> str:
+        """Name of this machine in a run on several, "" in one on a single machine."""
+        return self.host or next(iter(self.hosts), "")
 
     @property
     def endpoints(self) -> list[str]:

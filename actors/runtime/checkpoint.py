@@ -66,6 +66,11 @@ class Record(NamedTuple):
     version: int
     state: bytes
 
+    @property
+    def age(self) -> tuple[int, int]:
+        """By which of two states of a node the newer one is known: it is the greater."""
+        return self.incarnation, self.generation
+
 
 @dataclass(frozen=True, slots=True)
 class Loaded:

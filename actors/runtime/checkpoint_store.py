@@ -53,7 +53,7 @@ _COPIES = 3
 _FAR = 8
 """At so many times its limit the log is cut whatever comes."""
 
-_LOCKED = frozenset({sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED})
+LOCKED = frozenset({sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED})
 
 _PUT = ("REPLACE INTO checkpoint (slot, generation, incarnation, version, state, checksum)"
         " SELECT ?, ?, ?, ?, ?, ? WHERE EXISTS"
@@ -109,11 +109,41 @@ class SqliteCheckpoints(CheckpointStore):
                 self._insert(version, state)
             except Exception as second:
                 raise self._error(second) from None
-        self._unsynced = True
-        if self._thread is None and self._period_s > 0:
-            self._thread = threading.Thread(target=self._keep_synced, daemon=True,
-                                            name=f"checkpoints {self._file.stem}")
-            self._thread.start()
+        self._have_synced()
+
+    def take(self, record: Record) -> bool:
+        """Keep a state that a process of the node has kept on another host.
+
+        Args:
+            record: of the incarnation that this store is for, which runs there and not here.
+
+        Returns:
+            Whether it was newer than what is here; else nothing has changed.
+
+        Raises:
+            SupersededError: a newer incarnation has claimed the store.
+            CheckpointError: it could not be kept; the previous states are still there.
+        """
+        self._check_place()
+        loaded, unclaimed = self._load_and_claim()
+        if unclaimed:
+            raise unclaimed
+        if loaded.problems:
+            self._trouble = "; ".join(loaded.problems)
+        if loaded.records and record.age <= loaded.records[0].age:
+            return False
+        try:
+            with disk.transaction(self._ready()) as connection:
+                # What has gone on here meanwhile was superseded: the higher generation is newer.
+                connection.execute(
+                    "DELETE FROM checkpoint WHERE generation >= ?", (record.generation,))
+                if self._put(connection, record) != 1:
+                    raise self._superseded()
+        except Exception as error:
+            raise self._error(error) from None
+        self._generation = record.generation
+        self._have_synced()
+        return True
 
     def note_failures(self, failures: int) -> None:
         """Keep how many processes in a row have failed."""
@@ -198,7 +228,8 @@ class SqliteCheckpoints(CheckpointStore):
                 problem = self._replace(found)
             except CheckpointError as error:
                 unclaimed, problem = error, str(error)
-        self._generation = max((record.generation for record in found.records), default=0)
+        # Should the file have vanished, what follows is newer than copies of it all the same.
+        self._generation = max(self._generation, *(r.generation for r in found.records), 0)
         return Loaded(tuple(found.records), (problem,) if problem else (),
                       found.failures), unclaimed
 
@@ -300,7 +331,7 @@ class SqliteCheckpoints(CheckpointStore):
     def _error(self, error: Exception) -> CheckpointError:
         if isinstance(error, CheckpointError):
             return error
-        kind = BusyError if disk.primary_code(error) in _LOCKED else CheckpointError
+        kind = BusyError if disk.primary_code(error) in LOCKED else CheckpointError
         why = getattr(error, "strerror", None) or disk.words(error)
         return kind(f"{self._file}: {why}")
 
@@ -308,6 +339,13 @@ class SqliteCheckpoints(CheckpointStore):
         return SupersededError(f"{self._file}: incarnation {self._incarnation} was superseded")
 
     # -- the thread -----------------------------------------------------------------------------
+
+    def _have_synced(self) -> None:
+        self._unsynced = True
+        if self._thread is None and self._period_s > 0:
+            self._thread = threading.Thread(target=self._keep_synced, daemon=True,
+                                            name=f"checkpoints {self._file.stem}")
+            self._thread.start()
 
     def _keep_synced(self) -> None:
         while not self._ending.wait(self._period_s):
@@ -331,6 +369,20 @@ class SqliteCheckpoints(CheckpointStore):
             connection.execute("PRAGMA synchronous = OFF")  # the lock is not held during the sync
             connection.execute("UPDATE owner SET checksum = checksum")
         _sync_to_disk(log)
+
+
+def newest(file: Path, run: str) -> Record | None:
+    """Return the newest sound state of a run in a node's file, whoever may be writing there.
+
+    Raises:
+        Exception: nothing can be read; whatever a damaged file makes of SQLite.
+    """
+    if not os.path.lexists(file):
+        return None
+    disk.inspect(file)
+    with contextlib.closing(disk.connect(file)) as connection:
+        found = disk.read(connection, file, run)
+    return found.records[0] if found.records else None
 
 
 def _sync_to_disk(path: Path) -> None:

@@ -7,11 +7,12 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from rampart.actors.supervision.process_title import RunProcess, find_processes
 from rampart.files import streams
+from rampart.files.plain_text import one_line
 
 SIGNALS = {name: signal.Signals[f"SIG{name}"] for name in ("KILL", "STOP", "CONT", "TERM", "SEGV")}
 SIGNALS["WEDGE"] = signal.SIGUSR2
@@ -28,7 +29,7 @@ examples:
   kill-node osmosis_control                  kill it and watch it come back
   kill-node localization --signal STOP       only its heartbeat shows that it is gone
   kill-node --list                           what there is to kill
-In a system of several hosts it reaches nodes of all of them; --list shows those of this one.
+In a system of several hosts it reaches, and lists, the nodes of all of them.
 A plain `kill -9 PID` or `pkill -9 -f osmosis_control` does the same.
 """
 
@@ -78,18 +79,55 @@ class Signalled(NamedTuple):
     incarnation: int
 
 
-Elsewhere = Callable[[str, str, int | None], Signalled | None]
-"""Signals a node that no process of this machine is: name, signal, port of the run; None if nobody
-knows of such a node. It raises `SignalError` if it cannot."""
+class OtherProcess(NamedTuple):
+    """A node's process on another machine."""
+
+    host: str
+    name: str
+    pid: int
+    incarnation: int
 
 
-def main(arguments: list[str] | None = None,
-         elsewhere: Elsewhere = lambda _node, _name, _port: None) -> int:
+@dataclass(frozen=True, slots=True)
+class RunElsewhere:
+    """What a run has on other machines.
+
+    Attributes:
+        port: its base port on this one.
+        host: name of this one.
+        processes: of the others.
+        missing: why which others' processes are not among them, in a line; "" if none are missing.
+    """
+
+    port: int
+    host: str
+    processes: tuple[OtherProcess, ...] = ()
+    missing: str = ""
+
+
+class Elsewhere:
+    """What can be known of, and done on, other machines: here nothing."""
+
+    def signal(self, _node: str, _name: str, _port: int | None) -> Signalled | None:
+        """Signal a node that no process of this machine is; None if nobody knows of such a node.
+
+        Raises:
+            SignalError: it cannot be done.
+        """
+        return None
+
+    def runs(self, _port: int | None) -> list[RunElsewhere]:
+        """Return the runs of this machine, or the one on a base port, that have others as well."""
+        return []
+
+
+def main(arguments: list[str] | None = None, elsewhere: Elsewhere | None = None) -> int:
     """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
     streams.secure()
     options = _parser().parse_args(arguments)
+    act = _listed if options.list else _signalled
     try:
-        for line in _listed(options) if options.list else _signalled(options, elsewhere):
+        for line in act(options, elsewhere or Elsewhere()):
             print(line)
     except SignalError as refusal:
         print(f"kill-node: {refusal}", file=sys.stderr)
@@ -121,7 +159,7 @@ def _signalled(options: argparse.Namespace, elsewhere: Elsewhere) -> list[str]:
         process = signal_node(options.node, options.signal, options.port)
         victim = Signalled(process.pid, process.incarnation)
     except UnknownNodeError:
-        found = elsewhere(options.node, options.signal, options.port)
+        found = elsewhere.signal(options.node, options.signal, options.port)
         if found is None:
             raise
         victim = found
@@ -132,12 +170,24 @@ def _signalled(options: argparse.Namespace, elsewhere: Elsewhere) -> list[str]:
             f"{options.signal}"]
 
 
-def _listed(options: argparse.Namespace) -> list[str]:
-    rows = [{"name": name, "pid": p.pid, "incarnation": p.incarnation, "port": p.port}
-            for p in find_processes(options.port) for name in p.names]
+def _listed(options: argparse.Namespace, elsewhere: Elsewhere) -> list[str]:
+    """Return what there is: of this machine by its kernel, of others by what they tell."""
+    rows: list[dict[str, Any]] = [
+        {"name": name, "pid": p.pid, "incarnation": p.incarnation, "port": p.port}
+        for p in find_processes(options.port) for name in p.names]
+    runs = {run.port: run for run in elsewhere.runs(options.port)}
+    for row in rows if runs else ():
+        if row["port"] in runs:
+            row["host"] = runs[row["port"]].host
+    for run in runs.values():
+        rows += ({**one._asdict(), "port": run.port} for one in run.processes)
+        if run.missing:
+            print(f"kill-node: {one_line(run.missing)}", file=sys.stderr)
     if options.json:
         return [json.dumps(rows)]
-    return ["{port:>6} {pid:>8} #{incarnation:<4} {name}".format(**row) for row in rows]
+    width = max((len(row.get("host", "")) for row in rows), default=0)
+    return ["{port:>6} {pid:>8} #{incarnation:<4} {where}{name}".format(
+        where=f"{row.get('host', ''):<{width}} " if width else "", **row) for row in rows]
 
 
 def _find(processes: list[RunProcess], node: str, port: int | None) -> RunProcess:

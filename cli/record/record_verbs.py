@@ -21,11 +21,14 @@ from pathlib import Path
 from typing import Any
 
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.layout.layout import Layout
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair
 from rampart.actors.recording.bag_writer import BagError, check_target
+from rampart.actors.recording.other_hosts import OtherHosts, others_of
 from rampart.actors.recording.process import stop_pipe, told
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
+from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
 from rampart.cli.output import (
@@ -39,6 +42,7 @@ from rampart.cli.output import (
     say,
 )
 from rampart.cli.record.replaying import DEFAULT_PORT, Replay
+from rampart.cli.session import tools_credentials
 from rampart.cli.verbs import (
     JSON,
     PORT,
@@ -50,6 +54,7 @@ from rampart.cli.verbs import (
     option,
     whole,
 )
+from rampart.files import working_folder
 from rampart.files.reading import plain_line
 
 _PORTS = (1024, 65535)
@@ -110,7 +115,8 @@ def record(options: argparse.Namespace) -> int:
         wants = _wanted(options.topics, run)
         path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
         check_target(path, overwrite=options.overwrite)
-        recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants)
+        recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants,
+                            others=_others(run), shown=lambda run: tools_credentials(run)[0])
         recorder.open()
     stop = stop_pipe()
     say(f"recording {run.title} in {path}; ctrl-C ends it")
@@ -178,6 +184,21 @@ def matcher(globs: list[str], known: Iterable[str]) -> Callable[[str], bool]:
         fnmatch.fnmatchcase(key.removeprefix(f"{ROOT}/"), pattern) for pattern in patterns)
 
 
+def _others(run: RunInfo) -> OtherHosts | None:
+    """Return what there is to be heard of other hosts of a run.
+
+    Raises:
+        UsageError: the system's specification, or the folder of keys, cannot be used.
+    """
+    if not run.hosts:
+        return None
+    with refusing(ValueError, OSError):
+        plan = RunPlan(system_file=run.system_file, host=run.host)
+        tools_credentials(run)
+        working_folder.admit(Path(run.system_file).parent)
+        return others_of(Layout(plan, load_system(plan)))
+
+
 def _wanted(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
     """Return whether a key is wanted; all actors are loaded only if the declared ones do not do."""
     if not globs:
@@ -237,6 +258,8 @@ def bag_info(options: argparse.Namespace) -> int:
         if reader.is_recording else f"duration   {summary.duration_s:.1f} s")
     say(f"messages   {summary.messages} on {len(reader.channels)} channels")
     _say(f"lost       {_lost(summary)}")
+    if summary.unheard:
+        _say(f"unheard    {_unheard(summary)}")
     _say(f"closed     {_closing(summary)}")
     if summary.files:
         _say(f"attached   {', '.join(name for name, _, _ in summary.files)}")
@@ -306,6 +329,7 @@ def described(summary: Summary) -> dict[str, Any]:
         "damage": reader.damage, "duration_s": round(summary.duration_s, 3),
         "messages": summary.messages, "time_zero_s": summary.time_zero_s, "run": summary.run,
         "end": summary.end, "lost": _losses(summary),
+        "unheard": summary.unheard,
         "attachments": [name for name, _, _ in summary.files], "channels": summary.table()}
 
 
@@ -322,6 +346,13 @@ def _lost(summary: Summary) -> str:
     if losses is None:
         return "unknown"
     return ", ".join(f"{count} of {name}" for name, count in losses.items()) or "none"
+
+
+def _unheard(summary: Summary) -> str:
+    """Return when other hosts were not heard, so that what they said is missing."""
+    spans = [f"{host} from {begin_s:.1f} s {'on' if end_s is None else f'to {end_s:.1f} s'}"
+             for host, those in summary.unheard.items() for begin_s, end_s in those]
+    return ", ".join(spans) or f"no host: {' and '.join(summary.unheard)} all the time"
 
 
 def _closing(summary: Summary) -> str:

@@ -1,0 +1,359 @@
+"""Two hosts hold the newest states of the nodes that either may run, whatever the line does."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.bus.bounds import MANY, MAX_PAYLOAD_BYTES
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.ftm.messages import LARGEST_COPY_BYTES, Checkpoints, KeptState, StateCopy
+from rampart.actors.hosts.copies import (
+    AGAIN_S,
+    AT_ONCE_BYTES,
+    BATCH_BYTES,
+    Copies,
+    Taken,
+    checksum,
+)
+from rampart.actors.runtime.checkpoint import Record
+
+HOMES = {"camera": "ground", "hmi": "ground", "drill": "moon"}
+EPOCH = 1_000_000
+
+
+def state(incarnation: int, generation: int, content: bytes = b"state") -> Record:
+    return Record(generation, incarnation, 1, content)
+
+
+class Host:
+    """One host: what it has on its disk, what it runs, and what it knows of issued incarnations."""
+
+    def __init__(self, name: str, **runs: int) -> None:
+        self.name = name
+        self.runs = runs
+        self.issued: dict[str, int] = dict.fromkeys(HOMES, 10 * EPOCH)
+        self.disk: dict[str, Record] = {}
+        self.problems: list[tuple[str, str]] = []
+        self.copies = Copies("r", name, HOMES, lambda node: self.runs.get(node, 0),
+                             lambda node: self.issued[node])
+        for node in self.copies.nodes:
+            self.copies.settled(node)
+
+    def keep(self, node: str, record: Record) -> None:
+        before = self.disk.get(node)
+        assert before is None or record.age > before.age, "an older one in a newer one's place"
+        self.disk[node] = record
+        self.copies.kept(node, record)
+
+    def message(self, now_s: float = 0.0) -> Checkpoints:
+        return self.copies.message(now_s)
+
+    def hear(self, other: str, message: Checkpoints) -> Taken:
+        taken = self.copies.told(other, message)
+        self.problems += taken.problems
+        for node, record in taken.records:
+            if node not in self.disk or record.age > self.disk[node].age:  # as a store has it
+                self.keep(node, record)
+        return taken
+
+
+@pytest.fixture
+def robot():
+    return Host("")
+
+
+@pytest.fixture
+def ground():
+    return Host("ground", camera=1, hmi=1)
+
+
+def exchange(robot: Host, ground: Host, now_s: float = 0.0) -> None:
+    """Both say what they hold, and hear it."""
+    for _ in range(2):
+        ground.hear("", robot.message(now_s))
+        robot.hear("ground", ground.message(now_s))
+
+
+def test_the_first_host_shares_with_each_other_and_these_with_it_alone():
+    assert Host("").copies.nodes == ("camera", "hmi", "drill")
+    assert Host("ground").copies.nodes == ("camera", "hmi")
+    assert Host("moon").copies.nodes == ("drill",)
+
+
+def test_what_a_node_keeps_is_with_the_next_message_on_the_other_host(robot, ground):
+    robot.hear("ground", ground.message())
+    ground.hear("", robot.message())
+    ground.keep("camera", state(1, 1))
+    assert ground.copies.has_missed()
+    robot.hear("ground", ground.message())
+    assert robot.disk == {"camera": state(1, 1)}
+    ground.hear("", robot.message())
+    assert not ground.copies.has_missed()
+    assert ground.message().copies == ()
+
+
+def test_to_who_has_said_nothing_nothing_is_sent_but_what_is_held(ground):
+    ground.keep("camera", state(1, 1))
+    assert ground.message() == Checkpoints("r", (
+        KeptState("camera", 1, 1, 10 * EPOCH, False), KeptState("hmi", 0, 0, 10 * EPOCH, False)))
+
+
+# ---- twice, late, never, wrong, from a stranger -------------------------------------------------
+
+
+def test_a_message_that_comes_twice_changes_nothing_the_second_time(robot, ground):
+    exchange(robot, ground)
+    ground.keep("camera", state(1, 1))
+    message = ground.message()
+    assert robot.hear("ground", message).records
+    assert robot.hear("ground", message) == Taken()
+
+
+def test_one_that_comes_after_a_newer_one_changes_nothing(robot, ground):
+    exchange(robot, ground)
+    ground.keep("camera", state(1, 1))
+    late = ground.message()
+    ground.keep("camera", state(1, 2))
+    robot.hear("ground", ground.message())
+    assert robot.hear("ground", late) == Taken()
+    assert robot.disk["camera"] == state(1, 2)
+    exchange(robot, ground)  # the late one told of an older one held there, too
+    assert not ground.copies.has_missed()
+
+
+def test_what_is_lost_is_sent_again_and_only_the_newest(robot, ground):
+    exchange(robot, ground)
+    for generation in range(1, 100):
+        ground.keep("camera", state(1, generation))
+        ground.message()  # and lost
+    [copy] = ground.message().copies
+    assert (copy.incarnation, copy.generation) == (1, 99)
+
+
+@pytest.mark.parametrize("change", [
+    {"state": b"other"}, {"state": b""}, {"generation": 8}, {"incarnation": 2}, {"version": 2},
+    {"checksum": b""}, {"checksum": b"x" * 32}, {"node": "hmi"}])
+def test_a_copy_that_is_not_what_was_sent_is_refused_and_told(robot, ground, change):
+    exchange(robot, ground)
+    ground.keep("camera", state(1, 7))
+    message = ground.message()
+    wrong = msgspec.structs.replace(message, copies=(
+        msgspec.structs.replace(message.copies[0], **change),))
+    robot.hear("ground", wrong)
+    assert robot.disk == {}
+    [(node, problem)] = robot.problems
+    assert node == change.get("node", "camera")
+    assert "checksum is wrong" in problem
+
+
+def test_who_may_not_speak_for_a_node_s_state_is_refused_and_told(robot):
+    record = state(1, 7)
+    copy = StateCopy("camera", 1, 7, 1, b"state", checksum("r", "camera", record))
+    robot.hear("moon", Checkpoints("r", (KeptState("camera", 9, 9, 9, True),), (copy,)))
+    pilot = msgspec.structs.replace(copy, node="pilot", checksum=checksum("r", "pilot", record))
+    robot.hear("ground", Checkpoints("r", (), (pilot,)))
+    assert robot.disk == {}
+    assert robot.problems == [
+        ("camera", "a state from host moon, which it may not keep"),
+        ("pilot", "a state from host ground, which it may not keep")]
+    robot.keep("camera", record)
+    assert not robot.copies.has_missed()  # what moon said of it was not believed either
+
+
+def test_what_the_first_host_sends_to_another_one_is_no_problem(ground):
+    record = state(1, 7)
+    copy = StateCopy("drill", 1, 7, 1, b"state", checksum("r", "drill", record))
+    assert ground.hear("", Checkpoints("r", (), (copy,))) == Taken()
+
+
+def test_another_run_s_states_are_refused_and_told(robot, ground):
+    ground.keep("camera", state(1, 7))
+    robot.hear("ground", msgspec.structs.replace(ground.message(), run="last week's"))
+    assert robot.disk == {}
+    assert robot.problems == [("ground", "checkpoints of run \"last week's\"")]
+
+
+def test_an_incarnation_that_nobody_knows_to_be_issued_is_not_taken_yet(robot, ground):
+    """Else one message with the highest number there is would shut out all real ones for ever."""
+    exchange(robot, ground)
+    ground.keep("camera", state(2**31 - 1, 1))
+    robot.hear("ground", ground.message())
+    assert robot.disk == {}
+    ground = Host("ground", camera=2)
+    ground.copies.told("", robot.message())
+    ground.keep("camera", state(2, 1))
+    robot.issued["camera"] = 1
+    robot.hear("ground", ground.message())
+    assert robot.disk == {}
+    robot.issued["camera"] = 2  # the table of what runs there has come
+    robot.hear("ground", ground.message())
+    assert robot.disk == {"camera": state(2, 1)}
+
+
+# ---- sizes --------------------------------------------------------------------------------------
+
+
+def test_a_state_that_is_too_large_is_told_and_not_sent(robot, ground):
+    exchange(robot, ground)
+    ground.keep("camera", state(1, 1))
+    problem = ground.copies.kept("camera", state(1, 2, b"x" * (LARGEST_COPY_BYTES + 1)))
+    assert problem == (f"a state of {LARGEST_COPY_BYTES + 1} bytes is not copied to another host; "
+                       f"{LARGEST_COPY_BYTES} can be")
+    assert ground.message().copies == ()
+    assert ground.copies.kept("camera", state(1, 3, b"x" * LARGEST_COPY_BYTES)) == ""
+    message = ground.message()
+    payload = encode(Header("supervisor_ground", 1, 1, 0.0), message)
+    assert len(payload) < MAX_PAYLOAD_BYTES
+    robot.hear("ground", message)
+    assert len(robot.disk["camera"].state) == LARGEST_COPY_BYTES
+
+
+def test_a_long_state_is_not_sent_again_before_there_can_be_an_answer(robot, ground):
+    exchange(robot, ground)
+    ground.keep("camera", state(1, 1, b"x" * (AT_ONCE_BYTES + 1)))
+    assert ground.message(10.0).copies
+    assert not ground.message(10.0 + AGAIN_S / 2).copies
+    assert ground.message(10.1 + AGAIN_S).copies
+    ground.keep("camera", state(1, 2, b"y" * (AT_ONCE_BYTES + 1)))
+    assert ground.message(10.1 + AGAIN_S).copies  # another one
+
+
+def test_no_message_has_more_than_a_batch_and_all_get_their_turn(robot, ground):
+    exchange(robot, ground)
+    for node in ("camera", "hmi"):
+        ground.keep(node, state(1, 1, b"x" * (BATCH_BYTES - 1)))
+    sent = [[copy.node for copy in ground.message(float(now_s)).copies] for now_s in range(10, 14)]
+    assert sent == [["camera"], ["hmi"], ["camera"], ["hmi"]]
+
+
+def test_what_is_held_of_as_many_nodes_as_there_may_be_leaves_room_for_a_copy():
+    kept = KeptState("a_name_of_twenty_chr", 2**31 - 1, 2**53, 2**31 - 1, True)
+    size = len(encode(Header("s", 1, 1, 0.0), Checkpoints("r", (kept,) * (MANY // 2))))
+    assert size < MAX_PAYLOAD_BYTES - LARGEST_COPY_BYTES + (128 << 10)
+
+
+# ---- loss of a host, and the way back -----------------------------------------------------------
+
+
+def taken_over(robot: Host, ground: Host) -> None:
+    """Have the camera run on the robot, from its state, while its own host cannot be reached."""
+    exchange(robot, ground)
+    ground.keep("camera", state(1, 10))
+    exchange(robot, ground)
+    robot.copies.lost("ground")
+    ground.copies.lost("")
+    robot.runs["camera"] = EPOCH + 1
+    robot.keep("camera", state(EPOCH + 1, 11))
+
+
+def test_what_a_superseded_process_keeps_meanwhile_never_wins(robot, ground):
+    taken_over(robot, ground)
+    ground.keep("camera", state(1, 500))
+    exchange(robot, ground)
+    assert robot.disk["camera"] == ground.disk["camera"] == state(EPOCH + 1, 11)
+
+
+def test_where_a_node_runs_nothing_is_taken_but_of_a_higher_incarnation(robot, ground):
+    taken_over(robot, ground)
+    del robot.disk["camera"]  # it was set aside, say
+    robot.copies.kept("camera", None)
+    ground.keep("camera", state(1, 500))
+    exchange(robot, ground)
+    assert "camera" not in robot.disk
+
+
+def test_a_node_that_is_given_back_waits_for_the_last_state_that_was_kept(robot, ground):
+    taken_over(robot, ground)
+    told = {"camera": EPOCH + 1}
+    ground.runs["camera"] = 0
+    exchange(robot, ground)
+    assert not ground.copies.is_caught_up(["camera"], told)  # it still runs there
+    robot.copies.unsettle(["camera"])
+    robot.runs["camera"] = 0
+    exchange(robot, ground)
+    assert not ground.copies.is_caught_up(["camera"], told)  # its process is being ended
+    robot.keep("camera", state(EPOCH + 1, 12))
+    robot.copies.settled("camera")
+    last = robot.message()
+    ground.hear("", msgspec.structs.replace(last, copies=()))
+    assert not ground.copies.is_caught_up(["camera"], told)  # the last state has not come
+    ground.hear("", last)
+    assert ground.disk["camera"] == state(EPOCH + 1, 12)
+    assert ground.copies.is_caught_up(["camera"], told)
+
+
+def test_what_was_said_before_the_loss_is_no_word_for_it(robot, ground):
+    robot.issued["camera"] = 1
+    exchange(robot, ground)
+    before = robot.message()
+    taken_over(robot, ground)
+    assert not ground.copies.is_caught_up(["camera"], {"camera": EPOCH + 1})  # nothing since
+    ground.hear("", before)  # it was under way all the time
+    assert not ground.copies.is_caught_up(["camera"], {"camera": EPOCH + 1})
+
+
+def test_a_node_whose_state_nobody_shares_is_not_waited_for(ground):
+    assert ground.copies.is_caught_up(["valve"], {"valve": 7})
+
+
+def test_a_host_with_an_empty_disk_gets_what_the_other_holds(robot):
+    robot.keep("camera", state(3, 40))
+    fresh = Host("ground")
+    exchange(robot, fresh)
+    assert fresh.disk == {"camera": state(3, 40)}
+    assert fresh.copies.is_caught_up(["camera"], {})
+
+
+def test_the_first_word_since_a_loss_is_answered_at_once(robot, ground):
+    assert robot.hear("ground", ground.message()).is_first
+    assert not robot.hear("ground", ground.message()).is_first
+    robot.copies.lost("ground")
+    assert robot.hear("ground", ground.message()).is_first
+
+
+EVENTS = st.lists(st.one_of(
+    st.tuples(st.just("keep"), st.sampled_from(["camera", "hmi"])),
+    st.tuples(st.sampled_from(["robot says", "ground says"]), st.integers(0, 3)),
+    st.tuples(st.sampled_from(["hear", "again"]), st.integers(0, 7)),
+    st.tuples(st.sampled_from(["take over", "give back"]), st.just("camera"))), max_size=60)
+
+
+@given(EVENTS)
+@settings(max_examples=300, deadline=None)
+def test_however_messages_are_lost_late_double_and_disordered_in_the_end_both_hold_the_newest(
+        events):
+    robot, ground = Host(""), Host("ground", camera=1, hmi=1)
+    under_way: list[tuple[Host, str, Checkpoints]] = []
+    epoch = generation = 0
+    for what, which in events:
+        if what == "keep":
+            generation += 1
+            where = robot if robot.runs.get(which) else ground
+            incarnation = where.runs.get(which) or 1
+            if where.disk.get(which, state(0, 0)).age < (incarnation, generation):
+                where.keep(which, state(incarnation, generation, b"%d" % generation))
+        elif what.endswith("says"):
+            says, hears = (robot, ground) if what == "robot says" else (ground, robot)
+            under_way.append((hears, says.name, says.message()))
+        elif what in {"hear", "again"} and under_way:
+            hears, name, message = under_way[which % len(under_way)]
+            hears.hear(name, message)
+            if what == "hear":
+                under_way.remove((hears, name, message))
+        elif what == "take over" and not robot.runs.get("camera"):
+            epoch += EPOCH
+            robot.runs["camera"] = epoch + 1
+        elif what == "give back" and robot.runs.get("camera"):
+            ground.runs["camera"], robot.runs["camera"] = epoch + 2, 0
+    newest = {node: max((host.disk[node].age for host in (robot, ground) if node in host.disk),
+                        default=None) for node in ("camera", "hmi")}
+    robot.runs.clear()
+    ground.runs.clear()
+    for turn in range(2):
+        exchange(robot, ground, 100.0 + turn)
+    for node, age in newest.items():
+        assert age is None or robot.disk[node].age == ground.disk[node].age == age
+    assert not robot.problems and not ground.problems  # noqa: PT018

@@ -1,0 +1,344 @@
+"""Two supervisors in virtual time, on machines and disks that are played: who goes on from what."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from rampart.actors.bus import run_folder
+from rampart.actors.bus.envelope import decode, pack
+from rampart.actors.bus.messages import Heartbeat
+from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import Checkpoints, StateCopy
+from rampart.actors.hosts.copies import checksum
+from rampart.actors.layout.layout import Layout
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.actor import Context
+from rampart.actors.runtime.checkpoint import Record
+from rampart.actors.runtime.clock import Clock
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.testing import eventually, run
+from tests.actors.supervision.test_supervisor import Machine
+from tests.two_hosts import two_hosts
+
+EPOCH = run_folder.EPOCH
+DELAY_S = 0.05
+
+
+def record(incarnation: int, generation: int) -> Record:
+    return Record(generation, incarnation, 1, b"%d" % generation)
+
+
+class Files:
+    """The disk of one host, in memory; `StateFiles` to its supervisor."""
+
+    def __init__(self, disk, _folder, _run, _nodes, kept, _problem) -> None:
+        self.disk: dict[str, Record] = disk
+        self.is_stuck = False
+        self._kept = kept
+
+    def start(self) -> None:
+        for node, kept in self.disk.items():
+            self._kept(node, kept, False)
+
+    def keep(self, node: str, kept: Record) -> None:
+        self.disk[node] = kept
+        self._kept(node, kept, False)
+
+    def take(self, node: str, sent: Record) -> None:
+        if node not in self.disk or sent.age > self.disk[node].age:
+            self.keep(node, sent)
+
+    def settle(self, node: str) -> None:
+        if not self.is_stuck:
+            self._kept(node, self.disk.get(node), True)
+
+    def close(self) -> None:
+        pass
+
+
+class Host(Machine):
+    """A machine of the run: its processes, its disk, and its supervisor.
+
+    Attributes:
+        loaded: by node and incarnation, the state that its process has found.
+    """
+
+    def __init__(self, world: World, name: str, incarnation: int = 1) -> None:
+        super().__init__()
+        self.name = name
+        self.folder = run_folder.make(20000, 1)
+        self.disk: dict[str, Record] = {}
+        self.loaded: dict[tuple[str, int], Record | None] = {}
+        self.ends_after_s = 0.005
+        self.files: Files | None = None
+        plan = RunPlan("r", 20000, system_file=str(world.file), host=name, folder=self.folder,
+                       checkpoints=world.checkpoints, incarnations=incarnation - 1)
+        spec = load_system(plan)
+        layout = Layout(plan, spec)
+        member = layout.members[plan.supervisor]
+        run_folder.issue(self.folder, [plan.supervisor], incarnation)
+        self.supervisor = member.actor(
+            Context(plan.supervisor, incarnation, world.clock,
+                    VirtualBus(world.hub, plan.supervisor, incarnation), member.parameters,
+                    RunContext(plan, spec), register=run_folder.register_of(self.folder),
+                    members=frozenset(layout.members)), self, self.made)
+        self.task = asyncio.create_task(self.supervisor.run())
+
+    def made(self, *arguments):
+        self.files = Files(self.disk, *arguments)
+        return self.files
+
+    def add(self, names, incarnation, *, bound=False):
+        run_folder.issue(self.folder, names, incarnation)
+        for name in names:
+            self.loaded[name, incarnation] = self.disk.get(name)
+        return super().add(names, incarnation, bound=bound)
+
+    def kill(self, process):
+        if not process.killed:
+            process.killed = True
+            asyncio.get_running_loop().call_later(self.ends_after_s, self._exited, process)
+
+    def runs(self, name: str) -> int:
+        return max((p.incarnation for p in self.of(name)), default=0)
+
+
+class World:
+    """The robot, the ground station, and the line between them."""
+
+    def __init__(self, folder: Path, checkpoints: str = "kept") -> None:
+        loop = asyncio.get_running_loop()
+        self.clock = Clock(loop.time(), source=loop.time)
+        self.is_cut = False
+        self.hub = Hub(self.link)
+        self.checkpoints = checkpoints
+        self.file = folder / "two.toml"
+        self.file.write_text(two_hosts({"robot": "10.0.0.1", "ground": "10.0.0.2"},
+                                       ("camera", "part_finder", "D_VISION_CRASH"), "cell", 0.1))
+        self.told: list[tuple[str, str]] = []
+        self.states = 0
+        self.hub.taps.append(self.see)
+        self.robot, self.ground = Host(self, ""), Host(self, "ground")
+        self._buses = {host: VirtualBus(self.hub, f"nodes_{host}") for host in ("", "ground")}
+        self._sequence = 0
+
+    def link(self, source: str, reader: str):
+        def way(now_s: float) -> tuple[float, ...]:
+            return () if self.is_cut else (now_s + DELAY_S,)
+
+        return None if source.endswith("ground") == reader.endswith("ground") else way
+
+    def see(self, _now_s: float, _source: str, key: str, payload: bytes) -> None:
+        if topics.CHECKPOINTS.member(key.removeprefix("rampart/")):
+            self.states += 1
+        if DIAGNOSTIC.member(key.removeprefix("rampart/")):
+            told = decode(DIAGNOSTIC, payload)[1]
+            self.told.append((told.context, told.reason))
+
+    def say(self, host: str, source: str, topic, body, member: str) -> None:
+        """Say something as a node of a host; `source` is its name and its incarnation."""
+        name, _, incarnation = source.partition("#")
+        self._sequence += 1
+        self._buses[host].publish(topic, topic.at(member), pack(
+            (name, int(incarnation), self._sequence, self.clock.now(), body)))
+
+    async def beats(self) -> None:
+        for bus in self._buses.values():
+            await bus.open()
+        while True:
+            for host in (self.robot, self.ground):
+                for one in host.processes.values():
+                    for name in one.names if one.bound and not one.killed else ():
+                        self.say(host.name, f"{name}#{one.incarnation}", HEARTBEAT,
+                                 Heartbeat(one.pid, 0, 0.1, 0, 0), name)
+            await asyncio.sleep(0.1)
+
+    async def taken_over(self) -> None:
+        """Have the camera keep two states at home, and be lost."""
+        self.ground.files.keep("camera", record(1, 1))
+        self.ground.files.keep("camera", record(1, 2))
+        await asyncio.sleep(DELAY_S + 0.01)
+        self.is_cut = True
+        await eventually(lambda: self.robot.runs("camera") == EPOCH + 1)
+
+
+@asynccontextmanager
+async def world(folder: Path, **options: str) -> AsyncIterator[World]:
+    made = World(folder, **options)
+    beats = asyncio.create_task(made.beats())
+    try:
+        await eventually(lambda: made.ground.runs("camera") == 1)
+        await asyncio.sleep(1.0)
+        yield made
+    finally:
+        tasks = (beats, made.robot.task, made.ground.task)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for host in (made.robot, made.ground):
+            run_folder.remove(host.folder)
+
+
+def test_what_a_node_keeps_is_on_the_other_host_after_one_delay(tmp_path):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            made.ground.files.keep("camera", record(1, 1))
+            await asyncio.sleep(DELAY_S + 0.001)
+            assert made.robot.disk == {"camera": record(1, 1)}
+
+    run(scenario)
+
+
+def test_the_first_host_goes_on_from_it_and_its_home_from_what_was_kept_there(tmp_path):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            await made.taken_over()
+            assert made.robot.loaded["camera", EPOCH + 1] == record(1, 2)
+            made.ground.files.keep("camera", record(1, 3))  # it knows nothing of that yet
+            made.robot.files.keep("camera", record(EPOCH + 1, 3))
+            await asyncio.sleep(2.0)
+            made.robot.files.keep("camera", record(EPOCH + 1, 4))
+            made.is_cut = False
+            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+            assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 4)
+            assert made.robot.runs("camera") == 0
+            assert not [one for one in made.told if one[0] == "checkpoint"]
+            made.ground.files.keep("camera", record(EPOCH + 2, 5))
+            await asyncio.sleep(DELAY_S + 0.001)
+            assert made.robot.disk["camera"] == record(EPOCH + 2, 5)
+
+    run(scenario)
+
+
+def test_what_is_kept_in_the_moment_of_its_end_goes_home_as_well(tmp_path):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            await made.taken_over()
+            (process,) = made.robot.of("camera")
+            made.robot.ends_after_s = 0.4
+            made.is_cut = False
+            await eventually(lambda: process.killed)
+            await asyncio.sleep(0.3)
+            made.robot.disk["camera"] = record(EPOCH + 1, 9)  # and it is not gone yet
+            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+            assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 9)
+
+    run(scenario)
+
+
+def test_a_last_state_that_never_comes_is_waited_for_two_seconds_and_told(tmp_path):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            await made.taken_over()
+            made.robot.files.is_stuck = True
+            made.is_cut = False
+            await eventually(lambda: not made.robot.of("camera"))
+            given_back_s = made.clock.now()
+            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+            assert 2.0 < made.clock.now() - given_back_s < 2.5
+            assert any("the last state was not sent in time" in why for _, why in made.told)
+
+    run(scenario)
+
+
+def test_a_host_that_is_started_anew_with_an_empty_disk_goes_on_from_what_the_first_holds(tmp_path):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            await made.taken_over()
+            made.robot.files.keep("camera", record(EPOCH + 1, 3))
+            made.ground.task.cancel()
+            await asyncio.gather(made.ground.task, return_exceptions=True)
+            await made.ground.supervisor.context.bus.close()
+            run_folder.remove(made.ground.folder)
+            made.ground = Host(made, "ground", EPOCH + 1)
+            for name in ("camera", "part_finder", "D_VISION_CRASH"):
+                run_folder.issue(made.ground.folder, [name], EPOCH + 1)
+            await asyncio.sleep(0.26)  # out of step with what is repeated
+            made.is_cut = False
+            await asyncio.sleep(0.1 + 4 * DELAY_S + 0.01)  # a heartbeat, who holds what, a copy
+            assert made.ground.disk == {"camera": record(EPOCH + 1, 3)}
+            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+            assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 3)
+
+    run(scenario)
+
+
+def forged(incarnation: int = 1) -> Checkpoints:
+    sent = record(incarnation, 99)
+    return Checkpoints("r", (), (StateCopy("camera", incarnation, 99, 1, sent.state,
+                                           checksum("r", "camera", sent)),))
+
+
+@pytest.mark.parametrize("source", ["stranger#1", "camera#1", "supervisor_ground#0"])
+def test_a_stranger_s_word_changes_nothing(tmp_path, source):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            made.say("ground", source, topics.CHECKPOINTS, forged(), "supervisor_ground")
+            await asyncio.sleep(1.0)
+            assert made.robot.disk == {}
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("garbage", [b"", b"\xc1", pack(("supervisor_ground", 1, 900, 0.0, (1,)))])
+def test_garbage_changes_nothing_and_is_told(tmp_path, garbage):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            made._buses["ground"].publish(
+                topics.CHECKPOINTS, topics.CHECKPOINTS.at("supervisor_ground"), garbage)
+            await asyncio.sleep(1.0)
+            assert made.robot.disk == {}
+            assert any(why.startswith("not a Checkpoints") for _, why in made.told), made.told
+
+    run(scenario)
+
+
+def test_a_copy_that_is_wrong_changes_nothing_and_is_told(tmp_path):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            message = forged()
+            torn = Checkpoints("r", (), (StateCopy(
+                "camera", 1, 99, 1, message.copies[0].state[:-1], message.copies[0].checksum),))
+            supervisor = made.ground.supervisor
+            supervisor.publish(topics.CHECKPOINTS, torn)
+            await asyncio.sleep(1.0)
+            assert made.robot.disk == {}
+            assert any("its checksum is wrong" in why for _, why in made.told), made.told
+            supervisor.publish(topics.CHECKPOINTS, message)
+            await asyncio.sleep(1.0)
+            assert made.robot.disk == {"camera": record(1, 99)}
+
+    run(scenario)
+
+
+def test_without_checkpoints_nothing_is_said_of_states(tmp_path):
+    async def scenario() -> None:
+        async with world(tmp_path, checkpoints="") as made:
+            await asyncio.sleep(5.0)
+            assert made.states == 0
+            made.is_cut = True
+            await eventually(lambda: made.robot.runs("camera") == EPOCH + 1)
+            made.is_cut = False
+            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+            assert made.states == 0
+
+    run(scenario)
+
+
+def test_with_checkpoints_little_is_said_while_nothing_happens(tmp_path):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            before = made.states
+            await asyncio.sleep(10.0)
+            assert made.states - before == pytest.approx(2 * 20, abs=2)
+
+    run(scenario)
+
+

@@ -1,0 +1,125 @@
+"""`kill-node --list`: what is shown of other hosts, and what is said when they are not heard."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import threading
+from contextlib import contextmanager
+
+import pytest
+
+from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable
+from rampart.actors.run import run_info
+from rampart.actors.run.run_info import RunInfo
+from rampart.actors.supervision import kill_node
+from rampart.actors.supervision.kill_node import Elsewhere, OtherProcess, RunElsewhere
+from rampart.actors.supervision.process_title import RunProcess
+from rampart.cli.operate import kill_elsewhere
+from rampart.cli.operate.kill_elsewhere import listed
+from rampart.testing.ports import free_base_port
+
+HOSTS = {"robot": "supervisor", "ground": "supervisor_ground", "moon": "supervisor_moon"}
+RUN = RunInfo(1, 7450, 1.0, 0.0, "x.toml", "/nowhere", ("camera",), "r", 0, "t", hosts=HOSTS)
+
+
+def row(name: str, pid: int, state: NodeState = NodeState.RUNNING, incarnation: int = 1,
+        host: str = "ground") -> NodeInfo:
+    return NodeInfo(name, "control", pid, state, incarnation, 0, host=host)
+
+
+def test_processes_of_other_hosts_are_those_that_their_supervisors_say_they_run():
+    tables = {"ground": NodeTable((row("camera", 11), row("hmi", 0, NodeState.UNREACHABLE),
+                                   row("DM1", 12, NodeState.CRASHED),
+                                   row("DM2", 13, NodeState.WEDGED, 4))),
+              "moon": NodeTable((row("drill", 14, host="moon"),))}
+    assert listed(RUN, tables, "why") == RunElsewhere(7450, "robot", (
+        OtherProcess("ground", "camera", 11, 1), OtherProcess("ground", "DM2", 13, 4),
+        OtherProcess("moon", "drill", 14, 1)))
+
+
+def test_who_was_not_heard_is_named_with_the_reason():
+    found = listed(RUN, {"moon": NodeTable(())}, "no router answers")
+    assert found.missing == "the processes of ground are missing: no router answers"
+    ground = RunInfo(1, 7450, 1.0, 0.0, "x.toml", "/nowhere", (), "r", 0, "t", host="ground",
+                     hosts=HOSTS)
+    found = listed(ground, {}, "nothing was heard")
+    assert (found.host, found.missing) == (
+        "ground", "the processes of robot and moon are missing: nothing was heard")
+
+
+class Others(Elsewhere):
+    def __init__(self, *runs: RunElsewhere) -> None:
+        self._runs = list(runs)
+
+    def runs(self, _port):
+        return self._runs
+
+
+@pytest.fixture
+def here(monkeypatch):
+    monkeypatch.setattr(kill_node, "find_processes", lambda _port: [
+        RunProcess(21, 7450, 20, ("pilot",), 3), RunProcess(31, 7460, 30, ("a", "b"), 1)])
+
+
+def test_on_one_machine_the_list_is_as_it_was(here, capsys):
+    assert kill_node.main(["--list"], Others()) == 0
+    assert capsys.readouterr() == (
+        "  7450       21 #3    pilot\n  7460       31 #1    a\n  7460       31 #1    b\n", "")
+    assert kill_node.main(["--list", "--json"], Others()) == 0
+    first = json.loads(capsys.readouterr().out)[0]
+    assert first == {"name": "pilot", "pid": 21, "incarnation": 3, "port": 7450}
+
+
+def test_with_several_hosts_each_process_has_its_host(here, capsys):
+    run = RunElsewhere(7450, "robot", (OtherProcess("ground", "hmi", 12, 1),))
+    assert kill_node.main(["--list"], Others(run)) == 0
+    assert capsys.readouterr() == (
+        "  7450       21 #3    robot  pilot\n  7460       31 #1           a\n"
+        "  7460       31 #1           b\n  7450       12 #1    ground hmi\n", "")
+    assert kill_node.main(["--list", "--json"], Others(run)) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [(one["name"], one.get("host")) for one in rows] == [
+        ("pilot", "robot"), ("a", None), ("b", None), ("hmi", "ground")]
+
+
+def test_what_is_missing_is_told_in_a_line_beside_the_list_of_this_machine(here, capsys):
+    assert kill_node.main(["--list"], Others(RunElsewhere(7450, "robot", (), "no\nground"))) == 0
+    told = capsys.readouterr()
+    assert "robot pilot" in told.out
+    assert told.err == "kill-node: no ground\n"
+
+
+@contextmanager
+def launcher(info: RunInfo):
+    """Answer tools as a launcher does, of a run whose bus is not there."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(run_info.address(info.base_port))
+        listener.listen(8)
+        over = threading.Event()
+
+        def serve() -> None:
+            while not over.is_set():
+                run_info.answer(listener, info)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            run_info.ask(info.base_port)
+            thread.join()
+
+
+def test_without_a_bus_the_others_are_not_waited_for_long(tmp_path, monkeypatch):
+    monkeypatch.setattr(kill_elsewhere, "_PATIENCE_S", 0.1)
+    monkeypatch.setattr(kill_elsewhere, "_LISTED_S", 0.1)
+    port = free_base_port()
+    info = RunInfo(os.getpid(), port, 1.0, 0.0, "x.toml", str(tmp_path), (), "r", 0, "t",
+                   hosts=HOSTS)
+    with launcher(info):
+        [found] = kill_elsewhere.OtherHosts().runs(port)
+    assert found == RunElsewhere(
+        port, "robot", (), "the processes of ground and moon are missing: nothing was heard")

@@ -1,0 +1,43 @@
+"""A node that counts, and keeps how far it has come."""
+
+from __future__ import annotations
+
+import msgspec
+
+from rampart.actors.bus.messages import Message
+from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.runtime.actor import Actor, every
+from rampart.actors.runtime.checkpoint import StateFormat
+
+
+class Counted(Message, frozen=True):
+    """How far it has come."""
+
+    number: int
+
+
+class State(msgspec.Struct, frozen=True):
+    """The same, as it is kept."""
+
+    number: int
+
+
+COUNTED = Topic("counting/counted", Counted, Qos.SENSOR, 20, "", "How far it has come.")
+FORM = StateFormat(State)
+
+
+class Counting(Actor):
+    """Counts on from where it was."""
+
+    outputs = (COUNTED,)
+    most_spare = "warm"
+
+    def on_start(self) -> None:
+        state = self.kept(FORM)
+        self._number = state.number if state else 0
+
+    @every(0.05)
+    def count(self) -> None:
+        self._number += 1
+        self.keep(FORM, State(self._number))
+        self.publish(COUNTED, Counted(self._number))

@@ -1,0 +1,153 @@
+"""What one host sees of the others, and keeps for them: processes, recordings, checkpoints."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from rampart.actors.ftm import topics
+from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
+from rampart.actors.recording.message_form import Forms, header_of
+from rampart.testing import RealRun
+from tests import ROOT
+from tests.whole.network import Line, Network, network, why_not
+from tests.whole.test_two_hosts import CELL_ON_GROUND, host, specification, with_keys
+
+pytestmark = [pytest.mark.processes, pytest.mark.alone,
+              pytest.mark.skipif(bool(why_not()), reason=f"no two hosts here: {why_not()}")]
+
+
+@pytest.fixture
+def net():
+    with network(["robot", "ground"]) as made:
+        yield made
+
+
+def listed(net: Network, name: str, run: RealRun) -> tuple[dict[str, str], str]:
+    """Return each node that `kill-node --list` lists, with its host, and what it tells."""
+    done = subprocess.run(
+        net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_elsewhere",
+                    "--list", "--json", "--port", str(run.port)),
+        capture_output=True, text=True, check=True, timeout=30)
+    return {row["name"]: row["host"] for row in json.loads(done.stdout)}, done.stderr
+
+
+def recorded(file: Path) -> tuple[Counter[str], Summary]:
+    """Return how many messages of each source a recording has, and what else is in it."""
+    forms, reader, sources = Forms(topics.ALL), BagReader(file), Counter[str]()
+    for channel, message in reader.messages():
+        if (key := key_of(channel)) and (header := header_of(forms.of(key).payload(message.data))):
+            sources[header.source] += 1
+    return sources, Summary(BagReader(file))
+
+
+@pytest.mark.parametrize("keyed", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_first_host_sees_what_the_other_does(net, tmp_path, keyed):
+    spec = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1)
+    own = with_keys(tmp_path, spec) if keyed else dict.fromkeys(net.addresses, ("--no-keys",))
+    file = tmp_path / "run.mcap"
+    with (host(net, "ground", tmp_path / "g", spec, *own["ground"]) as ground,
+          host(net, "robot", tmp_path / "r", spec, *own["robot"], "--record", str(file)) as robot):
+        ground.wait_for("takes part in run")
+        robot.wait_for("ctrl-C ends it")
+        ground.wait_for("router_b_ground adopted")
+        for name, run in (("robot", robot), ("ground", ground)):
+            found, told = listed(net, name, run)
+            assert {found[node] for node in (*CELL_ON_GROUND, "supervisor_ground")} == {"ground"}
+            assert {found[node] for node in ("gripper", "supervisor", "router_a")} == {"robot"}
+            assert told == ""
+        beside = subprocess.run(  # on the other host, too, while the run goes on
+            net.command("ground", sys.executable, "-P", "-m", "rampart.cli.main", "record",
+                        str(tmp_path / "beside.mcap"), "--duration", "2",
+                        "--port", str(ground.port)),
+            capture_output=True, text=True, check=False, timeout=60)
+        assert beside.returncode == 0, beside.stderr
+        net.line = Line(is_cut=True)
+        robot.wait_for("camera respawned, incarnation 1000001")
+        found, told = listed(net, "robot", robot)
+        assert found["camera"] == "robot"
+        assert "supervisor_ground" not in found
+        assert told == "kill-node: the processes of ground are missing: nothing was heard\n"
+        net.line = Line()
+        robot.wait_for("supervisor_ground back")
+        robot.wait_until(lambda: not any(map(robot.pid, CELL_ON_GROUND)), 10, "not given back")
+        time.sleep(1.0)
+        robot.process.send_signal(signal.SIGINT)
+        code, _ = robot.result(20)
+        assert code == 0
+    sources, summary = recorded(tmp_path / "beside.mcap")
+    assert all(sources[node] > 10 for node in ("camera", "gripper", "router_a")), sources
+    assert summary.unheard.keys() == {"robot"}
+    sources, summary = recorded(file)
+    for node in (*CELL_ON_GROUND, "supervisor_ground", "router_a_ground", "observer_ground"):
+        assert sources[node] > 10, (node, sources)
+    assert sources["gripper"] > 10
+    cut = [end_s - begin_s for begin_s, end_s in summary.unheard["ground"] if end_s and end_s > 1.5]
+    assert cut, summary.unheard  # the partition is told
+    assert 0.6 < max(cut) < 20
+    assert not {"gripper", "supervisor", "cell_manager"} & json.loads(summary.end["lost"]).keys()
+    assert "; ground could not be heard all the time" in robot.story
+
+
+def counted(file: Path) -> dict[int, tuple[int, int]]:
+    """Return by incarnation how far the camera had come at first, and before there was a higher."""
+    found: dict[int, tuple[int, int]] = {}
+    for channel, message in BagReader(file).messages():
+        if channel.topic == "counting/counted":
+            told = json.loads(message.data)
+            incarnation, number = told["incarnation"], told["body"]["number"]
+            if incarnation >= max(found, default=0):
+                found[incarnation] = found.get(incarnation, (number, 0))[0], number
+    return found
+
+
+@pytest.mark.parametrize("keyed", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_node_goes_on_from_its_checkpoint_on_the_first_host_and_from_that_one_s_at_home(
+        net, tmp_path, keyed):
+    spec = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1)
+    spec.write_text(spec.read_text(encoding="utf-8").replace(
+        'actor = "rampart.actors.runtime.stub_node:StubNode"',
+        'actor = "counting_actor:Counting"', 1), encoding="utf-8")
+    shutil.copy(ROOT / "tests" / "counting_actor.py", tmp_path)
+    own = with_keys(tmp_path, spec) if keyed else dict.fromkeys(net.addresses, ("--no-keys",))
+    file = tmp_path / "run.mcap"
+    with (host(net, "ground", tmp_path / "g", spec, *own["ground"]) as ground,
+          host(net, "robot", tmp_path / "r", spec, *own["robot"], "--record", str(file)) as robot):
+        ground.wait_for("takes part in run")
+        robot.wait_for("ctrl-C ends it")
+        ground.wait_for("router_b_ground adopted")
+        time.sleep(3.0)
+        net.line = Line(is_cut=True)
+        robot.wait_for("camera respawned, incarnation 1000001")
+        time.sleep(3.0)
+        net.line = Line()
+        ground.wait_for("camera handed over")
+        ground.wait_for("camera respawned", 20)
+        time.sleep(3.0)
+        ground.process.send_signal(signal.SIGKILL)  # as a whole: its disk is gone with it
+        robot.wait_until(lambda: robot.story.count("supervisor_ground unreachable") > 1, 10,
+                         "the loss of the other host was not told")
+        robot.wait_until(lambda: robot.pid("camera") is not None, 5, "not taken over")
+        time.sleep(1.0)
+        with host(net, "ground", tmp_path / "again", spec, *own["ground"]) as again:
+            again.wait_for("takes part in run")
+            again.wait_for("camera respawned")
+            time.sleep(2.0)
+            robot.process.send_signal(signal.SIGINT)
+            assert robot.result(20)[0] == 0
+    numbers = counted(file)
+    assert [incarnation // 1_000_000 for incarnation in numbers] == [0, 1, 1, 2, 2], numbers
+    (_, last), *later = numbers.values()
+    for first, end in later:  # twenty a second: what was under way when the line was cut is lost
+        assert last - 10 < first <= last + 10, numbers
+        last = end
+    assert last > 100, numbers
+    assert "camera: checkpoint" not in robot.story  # nothing was wrong with one
