@@ -142,7 +142,9 @@ class Declared(Handlers):
         node_kind: what a node of this class has to be, "" for anything.
         most_spare: the most that a spare process of it may be. "hot": set up beside the one that
             speaks, in silence. "warm": set up, in silence, when that has ended; for one that keeps
-            checkpoints. "none": neither, for `on_start` takes a port, or starts a program.
+            checkpoints. "none": neither, for `on_start` takes a port, or starts a program. Of all
+            others a spare of the node's own runs one for a moment beside the node, in rehearsal:
+            what it publishes and keeps then goes nowhere.
         Parameters: what the system spec may say of it, by field: type, range and default. A class
             that takes more derives its own from that of its base class.
     """

@@ -28,7 +28,7 @@ import socket
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import partial
@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rampart.actors.access.rules import access_of
-from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import ROUTERS, process_of, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
@@ -48,6 +48,7 @@ from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 from rampart.actors.runtime.clock import clock_of
 from rampart.actors.supervision.process_title import WAITING, end_run, kill, set_title
+from rampart.actors.supervision.rehearsal import Stage, run_for_a_moment
 from rampart.actors.supervision.unseen import tell_of_callbacks
 from rampart.files.streams import complain
 from rampart.manager.spec.schema import Kind
@@ -75,7 +76,8 @@ def exit_with_launcher(lifeline: int, launcher: int, folder: str) -> None:
 def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
                loop: asyncio.AbstractEventLoop, *,
                failed: Callable[[Exception], None] = lambda _error: None,
-               bus: ZenohBus | None = None, waits: str = "") -> Actor:
+               bus: Bus | None = None, waits: str = "",
+               store: CheckpointStore | None = None) -> Actor:
     """Build one actor of the system, not yet running.
 
     Args:
@@ -87,6 +89,7 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         failed: is told its error.
         bus: that it is to have; None for one of its own.
         waits: "warm" or "hot" if it is to be silent until it is promoted.
+        store: where it is to keep its state; None for where the node keeps it.
     """
     member = layout.members.get(name) or router(name)
     clock = clock_of(layout.plan, loop.time)
@@ -94,7 +97,7 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
-        checkpoints=make_store(layout, name, incarnation),
+        checkpoints=store or make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
         members=frozenset((*layout.members, *layout.routers)), topics=layout.topics, waits=waits,
         command_age_s=layout.hosts.command_age_s))
@@ -259,7 +262,7 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
     if role.waits == "own":
         for one in buses.values():
             await one.open(announce=False)
-        made()  # in rehearsal: what they are made of is this process' own then, see `rehearsal`
+        await _rehearse(layout, role, run, buses, wanted)
         await wanted.wait()
     loop.add_signal_handler(signal.SIGTERM, stop_all)
     actors += made()
@@ -270,6 +273,22 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _rehearse(layout: Layout, role: Role, run: RunContext, buses: Mapping[str, ZenohBus],
+                    wanted: asyncio.Event) -> None:
+    """Have what the actors are made of, and what they use, be this process' own; see `rehearsal`.
+
+    Those of a class that allows no spare are made and not run: `on_start` may take a port.
+    """
+    stages = {name: Stage(layout.plan, bus, name, role.incarnation) for name, bus in buses.items()}
+    made = [make_actor(layout, name, role.incarnation, run, asyncio.get_running_loop(), bus=stage,
+                       store=stage.store) for name, stage in stages.items()]
+    try:
+        await run_for_a_moment([one for one in made if one.most_spare != "none"], wanted)
+    finally:
+        for stage in stages.values():
+            stage.clear()
 
 
 def go_first() -> None:

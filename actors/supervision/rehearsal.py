@@ -2,19 +2,23 @@
 
 A fork shares its parent's memory until it writes there, and Python writes to whatever it uses: it
 counts references. So the first time that forked code runs takes ten times as long as the second,
-for some seven hundred pages that the kernel copies one by one. A spare has that behind it: it makes
-an actor, opens its checkpoints, has it hear itself, and forgets it.
+for some seven hundred pages that the kernel copies one by one. A spare has that behind it.
 
-Only the engine's code runs, none of the system's classes: a constructor of theirs may do what is
-good for one process only.
+A pooled one, which may become any node, makes an actor of the engine's, opens its checkpoints, has
+it hear itself, and forgets it (`rehearse`). A spare of a node's own runs that node for a moment,
+from a copy of its checkpoints and with what is published meanwhile, on a bus that lets nothing out
+(`Stage`).
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -25,11 +29,14 @@ from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints, StateFormat
 from rampart.actors.runtime.checkpoint_file import SUFFIXES, beside
-from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints, newest
 from rampart.actors.runtime.clock import Clock
 
 _PATIENCE_S = 0.05
 """Seconds after which it is over, whatever has not come."""
+
+_RUN_S = 0.3
+"""Seconds for which a node of the system is run: some turns of what works at 10 Hz or more."""
 
 
 class Line(msgspec.Struct, frozen=True, array_like=True):
@@ -86,7 +93,7 @@ async def rehearse(plan: RunPlan, bus: ZenohBus) -> None:
     Raises:
         BusError: the session was closed.
     """
-    name, file = f"{os.getpid()}", Path(plan.folder, f"rehearsal-{os.getpid()}.sqlite")
+    name, file = f"{os.getpid()}", _file(plan, "")
     store: CheckpointStore = SqliteCheckpoints(
         file, plan.run_id, 1, sync_period_s=0) if plan.checkpoints else NoCheckpoints()
     actor = _Understudy(Context(
@@ -96,6 +103,68 @@ async def rehearse(plan: RunPlan, bus: ZenohBus) -> None:
         await actor.run()
     finally:
         bus.forget()
-        for suffix in SUFFIXES:
-            with contextlib.suppress(OSError):
-                beside(file, suffix).unlink()
+        _remove(file)
+
+
+class Stage(SharedBus):
+    """Where a node is rehearsed: it hears what a bus hears, and nothing that it says gets out.
+
+    Args:
+        plan: of the run.
+        bus: of the spare, open.
+        name: of the node.
+        incarnation: that the spare is to be.
+    """
+
+    def __init__(self, plan: RunPlan, bus: ZenohBus, name: str, incarnation: int) -> None:
+        super().__init__(bus)
+        self._bus = bus
+        self._file = _file(plan, name)
+        self.store: CheckpointStore = NoCheckpoints()
+        if plan.checkpoints:
+            self.store = self._copy(Path(plan.checkpoints, f"{name}.sqlite"), plan, incarnation)
+
+    def _copy(self, original: Path, plan: RunPlan, incarnation: int) -> CheckpointStore:
+        copy = SqliteCheckpoints(self._file, plan.run_id, incarnation, sync_period_s=0)
+        with contextlib.suppress(Exception):  # whatever is wrong with it, the node will report
+            state = newest(original, plan.run_id)
+            if state is not None:
+                copy.take(state)
+        return copy
+
+    def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
+        """Nothing."""
+
+    def gone(self, node: str, incarnation: int) -> None:
+        """Nothing."""
+
+    def clear(self) -> None:
+        """Leave nothing of what was played here."""
+        self._open = False
+        self._bus.forget()
+        self.store.close()
+        _remove(self._file)
+
+
+async def run_for_a_moment(actors: Sequence[Actor], wanted: asyncio.Event) -> None:
+    """Run actors, each on a stage of its own, until they are wanted, or for a moment.
+
+    What goes wrong in a rehearsal goes wrong again when it counts, and is reported then.
+    """
+    tasks = [asyncio.create_task(actor.run()) for actor in actors]
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(wanted.wait(), _RUN_S)
+    for actor, task in zip(actors, tasks, strict=True):
+        actor.abandon()
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _file(plan: RunPlan, name: str) -> Path:
+    return Path(plan.folder, f"rehearsal-{os.getpid()}{name and '-'}{name}.sqlite")
+
+
+def _remove(file: Path) -> None:
+    for suffix in SUFFIXES:
+        with contextlib.suppress(OSError):
+            beside(file, suffix).unlink()
