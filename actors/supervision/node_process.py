@@ -1,7 +1,8 @@
 """What runs in a node's process after the fork: title, lifeline, signals, actors, exit code.
 
-SIGTERM asks the actors to end in order. SIGUSR2 wedges the event loop for good, process and
-liveliness token still there: the fault that only a heartbeat from the loop can show.
+SIGTERM asks the actors to end in order; a router it ends at once (see `router`). SIGUSR2 wedges the
+event loop for good, process and liveliness token still there: the fault that only a heartbeat from
+the loop can show.
 
 The lifeline: a pipe whose only write end is in the launcher.
 
@@ -264,7 +265,8 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
             await one.open(announce=False)
         await _rehearse(layout, role, run, buses, wanted)
         await wanted.wait()
-    loop.add_signal_handler(signal.SIGTERM, stop_all)
+    if layout.routers.keys().isdisjoint(role.names):
+        loop.add_signal_handler(signal.SIGTERM, stop_all)
     actors += made()
     tasks = [asyncio.create_task(actor.run()) for actor in actors]
     try:

@@ -131,16 +131,17 @@ class Supervisor(Actor):
     def on_stop(self) -> None:
         """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger.
 
-        After a failure none is ended: the next supervisor adopts them.
+        Routers when all others have ended. After a failure none: the next supervisor adopts them.
         """
-        handles = []
-        for process in reversed(self._processes.values()):
+        nodes, routers = [], []
+        for name, process in reversed(self._processes.items()):
             if not self._dispatcher.stopping:
                 process.let_go()
             elif process.shown is not fm.NodeState.CRASHED:
                 process.handle.ignore()
-                handles.append(process.handle)
-        self._machine.end(handles, STOP_GRACE_S)
+                (routers if name in self._routers else nodes).append(process.handle)
+        for handles in (nodes, routers):
+            self._machine.end(handles, STOP_GRACE_S)
         self._machine.close()
 
     # -- what it hears --------------------------------------------------------------------------

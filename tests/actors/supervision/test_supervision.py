@@ -7,6 +7,7 @@ import contextlib
 import errno
 import os
 import resource
+import select
 import signal
 import socket
 import subprocess
@@ -539,6 +540,31 @@ async def test_an_orderly_end_leaves_no_process(tmp_path):
         os.kill(witness.pid("DM5"), signal.SIGSTOP)
         assert await asyncio.to_thread(find_runs)
     assert find_processes(port) == []
+
+
+def _catches(pid: int, number: signal.Signals) -> bool:
+    status = Path(f"/proc/{pid}/status").read_text()
+    caught = next(row.split()[1] for row in status.splitlines() if row.startswith("SigCgt:"))
+    return bool(int(caught, 16) >> number - 1 & 1)
+
+
+async def test_routers_end_last_and_close_no_session_which_makes_zenoh_panic(tmp_path):
+    order: list[str] = []
+    async with running(tmp_path) as (launcher, _):
+        port, names = launcher.plan.base_port, ("DM1", "DM5", "RM1", *ROUTERS)
+        assert [_catches(process(port, name), signal.SIGTERM) for name in names] == [
+            True, True, True, False, False]
+        held = {os.pidfd_open(process(port, name)): name for name in names}
+
+        def look() -> None:
+            while held:
+                for one in select.select(list(held), [], [], 10)[0]:
+                    order.append(held.pop(one))
+                    os.close(one)
+
+        looking = asyncio.create_task(asyncio.to_thread(look))
+    await asyncio.wait_for(looking, 12)
+    assert set(order[-2:]) == set(ROUTERS)
 
 
 GUARDS = ("supervisor", "spawner_a", "spawner_b")
