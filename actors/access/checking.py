@@ -26,7 +26,7 @@ PEOPLE = ("operator", "viewer")
 MOST_SHOWN = 20
 
 _INCARNATION = "1"
-_FOREIGN = ("nothing/declared", "**", "*/*", "heartbeat/*", "alive/*/*", "gone/*/*")
+_FOREIGN = ("nothing/declared", "**", "*/*", "heartbeat/*", "alive/*/*", "gone/*")
 """What nobody declares; as keys, expressions with wildcards included."""
 
 Claim = tuple[str, str, str]
@@ -198,7 +198,7 @@ class _Declared:
             yield from member.actor.own_keys(member.parameters)
         for name in self._names:
             yield f"alive/{name}/{_INCARNATION}"
-            yield f"gone/{name}/{_INCARNATION}"
+            yield f"gone/{name}"
         yield from _FOREIGN
 
     def may(self, identity: str, what: str, key: str) -> bool:
@@ -258,9 +258,8 @@ class _Declared:
 
 def _gone(key: str) -> str:
     """Return the node of whose end a key tells, "" if it is no such key."""
-    place, _, rest = key.partition("/")
-    node, _, incarnation = rest.partition("/")
-    return node if place == "gone" and incarnation == _INCARNATION else ""
+    place, _, node = key.partition("/")
+    return node if place == "gone" else ""
 
 
 def _says(member: Member, key: str) -> bool:

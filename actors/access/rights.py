@@ -73,7 +73,7 @@ def rights_of_all(layout: Layout) -> dict[str, Rights]:
     found = {name: _rights_of(member, topics) for name, member in members.items()}
     for host, name in hosts.supervisors.items():  # of those that it runs it may tell the end
         nodes = (*hosts.routers_of(host), *hosts.may_run(host, layout.members))
-        found[name] |= Rights(says=frozenset(f"{_GONE}/{node}/*" for node in nodes))
+        found[name] |= Rights(says=frozenset(f"{_GONE}/{node}" for node in nodes))
     viewer = Rights(hears=frozenset({EVERYTHING}), asks=frozenset({EVERYTHING}),
                     watches=frozenset({f"{_ALIVE}/*/*"}))
     operating = Rights(says=frozenset(_operated(layout, topics)))
@@ -103,7 +103,7 @@ def _rights_of(member: Member, topics: Mapping[str, Topic[Any]]) -> Rights:
     watched = member.actor.watches(member.name, member.parameters)
     return Rights(
         says=own | frozenset(_spelt(outputs)), hears=own | frozenset(_spelt(inputs)) | frozenset(
-            f"{_GONE}/{node}/*" for node in watched),
+            f"{_GONE}/{node}" for node in watched),
         answers=frozenset(_spelt(_kept(outputs, topics))),
         asks=frozenset(_spelt(_kept(inputs, topics))),
         is_there=frozenset({f"{_ALIVE}/{member.name}/*"}),

@@ -61,6 +61,12 @@ _BURST = 256
 an actor does not keep it from its timers."""
 
 _ALIVE, _GONE = f"{ROOT}/alive", f"{ROOT}/gone"
+"""The incarnation of what is gone is the payload, not in the key: of a subscription with a wildcard
+that others have too, a client that is killed leaves 0.6 kB in its router for good (Zenoh 1.10)."""
+
+_DIGITS = 20
+"""Of an incarnation, at most."""
+
 _DELIVERY = {Qos.SENSOR: zenoh.Priority.DATA, Qos.STATE: zenoh.Priority.INTERACTIVE_HIGH,
              Qos.COMMAND: zenoh.Priority.INTERACTIVE_HIGH}
 _DROP = zenoh.CongestionControl.DROP
@@ -254,19 +260,20 @@ class ZenohBus:
         self._ends = self._ends or ProcessEnds()
 
         def arrived(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
-            place, _, incarnation = str(sample.key_expr).rsplit("/", 2)
-            if not incarnation.isdecimal():
-                return
-            if place == _GONE:
+            incarnation = str(sample.key_expr).rpartition("/")[2]
+            if incarnation.isdecimal():
+                alive = sample.kind == zenoh.SampleKind.PUT
+                self._hand_over(lambda: self._token(node, int(incarnation), alive, changed))
+
+        def ended(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
+            incarnation = sample.payload.to_bytes()
+            if incarnation.isdigit() and len(incarnation) <= _DIGITS:
                 self._hand_over(lambda: changed(node, int(incarnation), False))
-                return
-            alive = sample.kind == zenoh.SampleKind.PUT
-            self._hand_over(lambda: self._token(node, int(incarnation), alive, changed))
 
         session = self._require()
         self._held.append(session.liveliness().declare_subscriber(
             f"{_ALIVE}/{node}/*", _direct(arrived), history=True))
-        self._held.append(session.declare_subscriber(f"{_GONE}/{node}/*", _direct(arrived)))
+        self._held.append(session.declare_subscriber(f"{_GONE}/{node}", _direct(ended)))
 
     def _token(self, node: str, incarnation: int, alive: bool, changed: PeerChange) -> None:
         assert self._loop is not None  # noqa: S101 for the type checker
@@ -291,7 +298,7 @@ class ZenohBus:
     def gone(self, node: str, incarnation: int) -> None:
         """Tell those who watch a node that a process of it has ended."""
         self._require().put(
-            f"{_GONE}/{node}/{incarnation}", b"", priority=zenoh.Priority.INTERACTIVE_HIGH,
+            f"{_GONE}/{node}", str(incarnation), priority=zenoh.Priority.INTERACTIVE_HIGH,
             congestion_control=_DROP, express=True)
 
     def moved(self) -> bool:

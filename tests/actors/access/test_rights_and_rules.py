@@ -38,7 +38,7 @@ def who_says(key):
     ("manager/decision", {"ftm_manager"}),
     ("supervisor/nodes", {"supervisor"}),
     ("supervisor/event", {"supervisor"}),
-    ("gone/DM4/3", {"supervisor"}),
+    ("gone/DM4", {"supervisor"}),
     ("detection/DM4", {"DM4"}),
     ("heartbeat/DM4", {"DM4"}),
     ("heartbeat/router_a", {"router_a"}),
@@ -111,7 +111,7 @@ def test_another_host_says_what_its_nodes_say_and_no_more():
         said = keys_matched(rules, name, "ingress", "put")
         assert {"rampart/detection/DM5", "rampart/teleoperation/command"} <= said
         assert not [key for key in ("rampart/summit_xl/command", "rampart/supervisor/nodes",
-                                    "rampart/detection/DM4", "rampart/gone/DM4/1",
+                                    "rampart/detection/DM4", "rampart/gone/DM4",
                                     "rampart/recovery/RM1/command")
                     if any(includes(one, key) for one in said)]
         heard = keys_matched(rules, name, "egress", "put")

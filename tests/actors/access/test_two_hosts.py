@@ -119,7 +119,7 @@ def test_tokens_and_questions_cross(hosts):
 
 def test_a_host_that_is_taken_over_says_nothing_that_is_not_its_nodes(hosts):
     """Its router, with its key, tries every way; the robot's router lets nothing through."""
-    forged = ("summit_xl/command", "supervisor/nodes", "supervisor/event", "gone/DM4/9",
+    forged = ("summit_xl/command", "supervisor/nodes", "supervisor/event", "gone/DM4",
               "recovery/RM1/command", "detection/DM4", "inject/order", "**")
     with hosts.router(HOSTS[0]), hosts.client("router_a") as everybody:
         got: list[str] = []
