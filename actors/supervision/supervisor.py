@@ -133,15 +133,15 @@ class Supervisor(Actor):
 
         Routers when all others have ended. After a failure none: the next supervisor adopts them.
         """
-        nodes, routers = [], []
+        handles: dict[bool, list[ProcessHandle]] = {False: [], True: []}  # of routers: True
         for name, process in reversed(self._processes.items()):
             if not self._dispatcher.stopping:
                 process.let_go()
             elif process.shown is not fm.NodeState.CRASHED:
                 process.handle.ignore()
-                (routers if name in self._routers else nodes).append(process.handle)
-        for handles in (nodes, routers):
-            self._machine.end(handles, STOP_GRACE_S)
+                handles[name in self._routers].append(process.handle)
+        for some in handles.values():
+            self._machine.end(some, STOP_GRACE_S)
         self._machine.close()
 
     # -- what it hears --------------------------------------------------------------------------
