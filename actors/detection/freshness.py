@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rampart.actors.bus.plausible import is_possible
 from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import ControlTimeout, Suspects, TopicHeard
 from rampart.manager.spec.tables import NonNegative

@@ -26,11 +26,11 @@ from typing import Any
 
 from rampart.actors.bus import messages as m
 from rampart.actors.bus import topics
-from rampart.actors.bus.plausible import is_possible
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.detection.loop_watch import LoopWatch
 from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.ftm.patience import AT_LEISURE, Patience, Standstill, Usage
+from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import HeartbeatTimeout, NodeNames, SignsOfLife
 from rampart.manager.spec.budget import PERIODS_TO_MISS

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from rampart.actors.bus.plausible import is_sane
+from rampart.actors.ftm.plausible import is_sane
 from rampart.actors.osmosis.airport.model import Airport, Point, show
 
 Points = npt.NDArray[np.float64]

@@ -23,9 +23,9 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus import messages as bm
-from rampart.actors.bus.plausible import is_possible, is_sane
 from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.module import DetectionModule
+from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Context, Header, on

@@ -20,10 +20,10 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import chain, takewhile
 
-from rampart.actors.bus.plausible import is_possible
 from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.lasting import Lasting
 from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Context, Header, on

@@ -14,7 +14,7 @@ from bisect import bisect_right
 from collections import deque
 from operator import itemgetter
 
-from rampart.actors.bus.plausible import is_possible, is_sane
+from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis.control.polyline import Pose2
 
 AFTER_S = 0.15

@@ -17,7 +17,7 @@ from collections.abc import Callable
 import msgspec
 
 from rampart.actors.bus.bounds import clip
-from rampart.actors.bus.plausible import is_sane
+from rampart.actors.ftm.plausible import is_sane
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.route_check import RouteCheck

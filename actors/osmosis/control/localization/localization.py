@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from rampart.actors.bus.plausible import is_possible
+from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import Pose
 from rampart.actors.runtime.actor import Actor, Context, Header, on

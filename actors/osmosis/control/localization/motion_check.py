@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from rampart.actors.bus.plausible import is_possible, is_sane
+from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis.control.polyline import wrap_angle
 from rampart.actors.osmosis.messages import Imu, Odometry
 

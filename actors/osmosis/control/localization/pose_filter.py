@@ -27,7 +27,7 @@ import math
 from typing import NamedTuple
 
 from rampart.actors.bus.envelope import AHEAD_S
-from rampart.actors.bus.plausible import is_sane
+from rampart.actors.ftm.plausible import is_sane
 from rampart.actors.osmosis.control.localization import position_source as positions
 from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf

@@ -24,7 +24,7 @@ import math
 import msgspec
 import numpy as np
 
-from rampart.actors.bus.plausible import is_possible
+from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array, scan_points
 from rampart.actors.osmosis.messages import LaserScan
 

@@ -7,7 +7,7 @@ import math
 import msgspec
 
 from rampart.actors.bus.bounds import clip
-from rampart.actors.bus.plausible import is_sane
+from rampart.actors.ftm.plausible import is_sane
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Point, show
 from rampart.actors.osmosis.application import Osmosis

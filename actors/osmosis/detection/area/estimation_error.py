@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 
-from rampart.actors.bus.plausible import is_sane
 from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.ftm.plausible import is_sane
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.position_vote import PositionVote

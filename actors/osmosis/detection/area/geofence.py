@@ -17,9 +17,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rampart.actors.bus.plausible import is_possible, is_sane
 from rampart.actors.detection.freshness import FreshnessMonitor
 from rampart.actors.detection.lasting import Lasting
+from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis.messages import GpsFix
 
 ProhibitedDistance = Callable[[float, float], float]

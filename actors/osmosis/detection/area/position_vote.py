@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 
 from rampart.actors.bus.envelope import AHEAD_S
-from rampart.actors.bus.plausible import is_possible, is_sane
+from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.detection.area.geofence import is_usable
 
