@@ -7,8 +7,8 @@ secret that could leak, no port that could be taken, and no handshake that takes
 An incarnation is a number that a new process issues before it is heard (`issue`); a reader that
 meets a new one looks it up (`Register`). It is kept as the target of a symbolic link, which is
 written and read whole or not at all, in a system call or two and with no byte of a disk. Beside it
-stands which process that is, if it is one of this machine: who watches the node has its end from
-the kernel (`process_of`).
+stands which process that is, if it is one of this machine, and in another folder its mark: who
+watches the node has its end from the kernel (`process_of`, `process_ends`).
 
 The folder lies in memory where it can: `$XDG_RUNTIME_DIR`, else `/dev/shm`, else the folder for
 temporary files. What ends a run removes it; what is left when all of a run dies at once goes
@@ -26,6 +26,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from rampart.actors.bus.process_ends import LocalProcess, leave_marks
 from rampart.actors.bus.unix_peer import ProcessId
 
 ROUTERS = ("router_a", "router_b")
@@ -38,7 +39,7 @@ ROOM_FOR_NAMES = 64
 """Bytes of such a path that are left for the name of a node."""
 
 _NAME = re.compile(r"rampart-(\d+)-(\d+)-\w+\Z")
-_ISSUED = "issued"
+_ISSUED, _MARKS = "issued", "marks"
 
 
 def make(port: int, launcher: int) -> str:
@@ -56,7 +57,8 @@ def make(port: int, launcher: int) -> str:
         _remove_stale(place)
         try:
             folder = tempfile.mkdtemp(prefix=f"rampart-{port}-{launcher}-", dir=place)
-            Path(folder, _ISSUED).mkdir(mode=0o700)
+            for inner in (_ISSUED, _MARKS):
+                Path(folder, inner).mkdir(mode=0o700)
             return folder
         except OSError as error:
             failure = error
@@ -136,12 +138,22 @@ def register_of(folder: str) -> Register:
     return look_up
 
 
-def process_of(folder: str, name: str, incarnation: int) -> ProcessId | None:
+def process_of(folder: str, name: str, incarnation: int) -> LocalProcess | None:
     """Return the process of a node; None unless it is that incarnation, and of this machine."""
     found = _look_up(folder, name)
     if found is None or found[0] != incarnation or len(found) < 1 + len(ProcessId._fields):
         return None
-    return ProcessId(*found[1:])
+    return LocalProcess(ProcessId(*found[1:]), mark_of(folder, name))
+
+
+def mark_of(folder: str, name: str) -> str:
+    """Return the file that is the mark of a node's process, if it has left one."""
+    return f"{folder}/{_MARKS}/{name}"
+
+
+def mark(folder: str, names: Iterable[str]) -> None:
+    """Have the end of this process, which is that of these nodes, be known at once."""
+    leave_marks([mark_of(folder, name) for name in names])
 
 
 def _look_up(folder: str, name: str) -> tuple[int, ...] | None:

@@ -31,9 +31,9 @@ from zenoh.handlers import Callback
 
 from rampart.actors.bus.bus import BusError, Deliver, PeerChange
 from rampart.actors.bus.limits import RateLimit
+from rampart.actors.bus.process_ends import LocalProcess, ProcessEnds
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.bus.unix_peer import ProcessEnds, ProcessId
 from rampart.actors.bus.zenoh_session import (
     Credentials,
     answering,
@@ -115,7 +115,7 @@ class ZenohBus:
                  listen: Sequence[str] = (), recorder: RecorderConnection | None = None, *,
                  credentials: Credentials | None = None,
                  access: Mapping[str, Any] | None = None,
-                 process_of: Callable[[str, int], ProcessId | None] = lambda *_: None) -> None:
+                 process_of: Callable[[str, int], LocalProcess | None] = lambda *_: None) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
@@ -335,6 +335,7 @@ class ZenohBus:
         self._arrived.clear()
         if self._ends is not None:
             self._ends.close()
+            self._ends = None
 
     def _require(self) -> zenoh.Session:
         if self._session is None:

@@ -128,6 +128,11 @@ class Layout:
         return SPARES[min(SPARES.index(
             self.members[name].spare if name in self.members else "none") for name in names)]
 
+    def may_be_marked(self, names: Collection[str]) -> bool:
+        """Whether all that the process of these actors holds is memory: no port, no program."""
+        return all(name in self.members and self.members[name].actor.most_spare != "none"
+                   for name in names)
+
     def _check(self, judge: Any, known: Collection[Topic[Any]], file: str) -> None:
         """Check who hears and publishes what; raises as the constructor."""
         members = list(self.members.values())

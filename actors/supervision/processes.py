@@ -16,7 +16,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from rampart.actors.bus.unix_peer import process_state
+from rampart.actors.bus.process_ends import LocalProcess, Marks
+from rampart.actors.bus.run_folder import mark_of
+from rampart.actors.bus.unix_peer import process_id, process_state
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.ftm.patience import AT_LEISURE, Usage, usage
 from rampart.actors.supervision.node_process import Waits
@@ -92,8 +94,10 @@ class Processes(Protocol):
     def forget(self, names: tuple[str, ...]) -> None:
         """End a process that was made ready and is not wanted."""
 
-    def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
+    def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> ProcessHandle:
         """Take hold of a process; `ended` is called on the event loop when it ends.
+
+        Sooner if it has left a mark as that node (`process_ends`).
 
         Raises:
             ProcessLookupError: It is gone already.
@@ -111,18 +115,25 @@ class Processes(Protocol):
 
 
 class OsHandle(ProcessHandle):
-    """A pidfd. It works for processes that are not children, so the living can be adopted."""
+    """A pidfd, and the mark of the process: of any, not of children only, so it can be adopted."""
 
-    def __init__(self, pid: int, ended: Callable[[], None]) -> None:
+    def __init__(self, pid: int, ended: Callable[[], None], marks: Marks | None = None,
+                 mark: str = "") -> None:
         self.pidfd = os.pidfd_open(pid)
         self._pid = pid
         self._ended = ended
+        self._is_heard = True
         self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(self.pidfd, self._readable)
+        self._loop.add_reader(self.pidfd, self._told)
+        self._marks = marks
+        process = process_id(pid)
+        if marks is not None and process is not None:
+            marks.watch(self, LocalProcess(process, mark), self._told)
 
-    def _readable(self) -> None:
-        self._loop.remove_reader(self.pidfd)
-        self._ended()
+    def _told(self) -> None:
+        if self._is_heard:
+            self.ignore()
+            self._ended()
 
     def kill(self) -> None:
         self.send(signal.SIGKILL)
@@ -149,8 +160,11 @@ class OsHandle(ProcessHandle):
         return usage(self._pid)
 
     def ignore(self) -> None:
-        if self.pidfd >= 0:
+        if self._is_heard:
+            self._is_heard = False
             self._loop.remove_reader(self.pidfd)
+            if self._marks is not None:
+                self._marks.let_go(self)
 
     def close(self) -> None:
         if self.pidfd >= 0:
@@ -163,14 +177,16 @@ class OsProcesses(SpawnerClient):
     """Processes of this machine; the run's spawners fork them."""
 
     has_routers = True
+    _marks: Marks | None = None
 
     def living(self) -> list[RunProcess]:
         """Return the processes of this run, found in /proc."""
         return find_processes(self._port, self._launcher)
 
-    def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
+    def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> ProcessHandle:
         """Open a pidfd; raises ProcessLookupError if there is no such process."""
-        return OsHandle(pid, ended)
+        self._marks = self._marks or Marks()
+        return OsHandle(pid, ended, self._marks, mark_of(self.folder, node) if node else "")
 
     def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:
         """SIGTERM to all in their sequence, then SIGKILL for those that are there after a while."""
@@ -186,3 +202,9 @@ class OsProcesses(SpawnerClient):
                 del waiting[fd]
         for handle in waiting.values():
             handle.kill()
+
+    def close(self) -> None:
+        """Let go of everything."""
+        if self._marks is not None:
+            self._marks.close()
+        super().close()

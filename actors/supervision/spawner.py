@@ -28,7 +28,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rampart.actors.bus.envelope import decoder
-from rampart.actors.bus.run_folder import issue, issued, register_of, socket_path
+from rampart.actors.bus.run_folder import issue, issued, mark, register_of, socket_path
 from rampart.actors.bus.unix_peer import is_same_user, process_id
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm.messages import AdaptedSystem
@@ -261,6 +261,8 @@ class Spawner:
             newest = max(register_of(folder)(name) or 0 for name in names)
             if newest >= request.incarnation:
                 os._exit(0)  # asked for too late: a later one had its place, or has
+            if self._layout.may_be_marked(names):  # else its end counts when its ports are free
+                mark(folder, names)
             issue(folder, names, request.incarnation, process_id(os.getpid()))
 
         if request.waits:

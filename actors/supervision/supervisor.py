@@ -372,7 +372,7 @@ class Supervisor(Actor):
         process.handle = ProcessHandle(is_gone=False)
         try:
             process.handle = self._machine.hold(pid, lambda: self._dispatcher.put(
-                f"exit {pid}", lambda: self._ended(process, pid)))
+                f"exit {pid}", lambda: self._ended(process, pid)), process.names[0])
         except ProcessLookupError:
             self._ended(process, pid, "it ended before it could be watched")
         except OSError as error:  # no descriptor left: perhaps later

@@ -216,7 +216,7 @@ class VirtualMachine:
         self._loop.call_later(self._start_s(), self._begin, process)
         return pid
 
-    def hold(self, pid: int, ended: Callable[[], None]) -> _Handle:
+    def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> _Handle:  # noqa: ARG002
         """Take hold of a process."""
         process = self._processes.get(pid)
         if process is None:

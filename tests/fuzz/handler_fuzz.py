@@ -131,7 +131,7 @@ class Machine:
         self._pid += 1
         return self._pid
 
-    def hold(self, pid: int, _ended: Callable[[], None]) -> Any:
+    def hold(self, pid: int, _ended: Callable[[], None], node: str = "") -> Any:
         if pid < 100:
             raise ProcessLookupError(pid)
         return self

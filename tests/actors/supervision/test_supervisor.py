@@ -154,7 +154,7 @@ class Machine:
         self.ready.pop(names[0], None)
         return self.add(names, incarnation).pid
 
-    def hold(self, pid: int, ended: Callable[[], None]) -> Handle:
+    def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> Handle:
         if self.hold_error:
             raise self.hold_error
         process = self.processes.get(pid)
