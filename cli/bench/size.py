@@ -27,6 +27,9 @@ TARGET = 3.0
 
 _SETTLE_S = 2.0
 _REST_S = 5.0
+_PAUSE_S = 1.0
+"""Between two kills of the same node, which has a spare again by then, as it has in the other parts.
+"""
 _MB = 1e6
 
 
@@ -90,7 +93,7 @@ def _killed(system: System, processes: int, kills: int, show: Show) -> Killed:
         ended=crashed(name), pid_of=pid,
         finds=lambda found: found.source == name and found.key == f"bench/tick/{name}")
     victim.wait()
-    in_rounds([victim], kills, lambda text: show(f"{processes} processes: {text}"))
+    in_rounds([victim], kills, lambda text: show(f"{processes} processes: {text}"), _PAUSE_S)
     return killed(name, name, victim.kills, victim.note)
 
 
