@@ -28,8 +28,7 @@ TARGET = 3.0
 _SETTLE_S = 2.0
 _REST_S = 5.0
 _PAUSE_S = 1.0
-"""Between two kills of the same node, which has a spare again by then, as it has in the other parts.
-"""
+"""Between two kills of the same node, which has a spare again by then, as in the other parts."""
 _MB = 1e6
 
 
