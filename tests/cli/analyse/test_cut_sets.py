@@ -3,34 +3,37 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+from subprocess import CompletedProcess
 
 import pytest
 
-from tests import CELL, ROOT
+from rampart.cli.main import main
+from tests import CELL
 
 
-def rampart(*arguments: str, cwd=ROOT) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "rampart.cli.main", *arguments], cwd=cwd,
-                          check=False,
-                          capture_output=True, text=True, timeout=60)
+@pytest.fixture
+def rampart(capsys):
+    """Return what calls `rampart` in this process, for an interpreter takes a second to start."""
+    def call(*arguments: str) -> CompletedProcess[str]:
+        return CompletedProcess(arguments, main(list(arguments)), *capsys.readouterr())
+
+    return call
 
 
-def test_the_papers_system_is_listed_with_its_barriers():
+def test_the_papers_system_is_listed_with_its_barriers(rampart):
     done = rampart("cut-sets", "paper")
     assert done.returncode == 0, done.stderr
     assert "7 minimal cut sets" in done.stdout
     assert "fewer than two barriers:\n  erroneous_graph: only FTM1" in done.stdout
 
 
-def test_counts_are_json_for_scripts():
+def test_counts_are_json_for_scripts(rampart):
     done = rampart("cut-sets", "paper", "--count", "--json")
     assert json.loads(done.stdout) == {
         "format": 1, "top": "moving_inside_prohibited_area", "minimal_cut_sets": 7}
 
 
-def test_what_is_exported_is_read_again(tmp_path):
+def test_what_is_exported_is_read_again(rampart, tmp_path):
     file = tmp_path / "cell.xml"
     assert rampart("cut-sets", str(CELL), "--export", str(file)).returncode == 0
     there, back = (json.loads(rampart("cut-sets", name, "--json").stdout)
@@ -39,7 +42,7 @@ def test_what_is_exported_is_read_again(tmp_path):
     assert there["by_size"] == back["by_size"]
 
 
-def test_what_is_left_before_the_top():
+def test_what_is_left_before_the_top(rampart):
     done = rampart("cut-sets", "paper", "--active", "FTM2", "FTM1", "--json")
     view = json.loads(done.stdout)
     assert view["left"] == {"FTM1": [], "FTM2": []}
@@ -53,14 +56,14 @@ def test_what_is_left_before_the_top():
     (["--top", "nobody"], "unknown top 'nobody'"),
     (["nowhere.toml"], "nowhere.toml: No such file or directory"),
 ])
-def test_bad_usage_is_one_line_and_exit_code_2(arguments, words):
+def test_bad_usage_is_one_line_and_exit_code_2(rampart, arguments, words):
     done = rampart("cut-sets", *arguments)
     assert done.returncode == 2
     assert words in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_file_that_is_no_open_psa_is_one_line_and_exit_code_2(tmp_path):
+def test_a_file_that_is_no_open_psa_is_one_line_and_exit_code_2(rampart, tmp_path):
     file = tmp_path / "x.xml"
     file.write_text("<!DOCTYPE x [<!ENTITY a 'b'>]><opsa-mef>&a;</opsa-mef>")
     done = rampart("cut-sets", str(file))
