@@ -23,7 +23,7 @@ ROOMS = (
     "files", "systems",
     "manager.model", "manager.strategies", "manager.spec", "manager.arbitration",
     "manager.analysis", "manager.drawing",
-    "actors.bus", "actors.ftm", "actors.web", "actors.run", "actors.runtime",
+    "actors.machine", "actors.bus", "actors.ftm", "actors.web", "actors.run", "actors.runtime",
     "actors.detection", "actors.recovery", "actors.foreign",
     "actors.ros2.translation", "actors.ros2", "actors.layout", "manager.actor",
     "actors.access", "actors.supervision", "actors.hosts", "actors.recording", "actors.operator",

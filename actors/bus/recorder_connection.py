@@ -19,7 +19,7 @@ import struct
 import time
 from collections.abc import Callable
 
-from rampart.actors.bus.unix_peer import is_same_user
+from rampart.actors.machine.unix_peer import is_same_user
 
 RETRY_S = 1.0
 """Real seconds between two looks for a recorder."""

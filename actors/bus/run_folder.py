@@ -26,8 +26,8 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from rampart.actors.bus.process_ends import LocalProcess, leave_marks
-from rampart.actors.bus.unix_peer import ProcessId
+from rampart.actors.machine.process_ends import LocalProcess, leave_marks
+from rampart.actors.machine.unix_peer import ProcessId
 
 ROUTERS = ("router_a", "router_b")
 """Names of the sockets of the two routers."""

@@ -31,7 +31,6 @@ from zenoh.handlers import Callback
 
 from rampart.actors.bus.bus import BusError, Deliver, PeerChange
 from rampart.actors.bus.limits import RateLimit
-from rampart.actors.bus.process_ends import LocalProcess, ProcessEnds
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.zenoh_session import (
@@ -41,6 +40,7 @@ from rampart.actors.bus.zenoh_session import (
     open_client,
     session_config,
 )
+from rampart.actors.machine.process_ends import LocalProcess, ProcessEnds
 
 PATIENCE_S = 10.0
 """Real seconds that a client looks for a router when it starts."""

@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 
 from rampart.actors.bus.run_folder import ROUTERS, socket_path
-from rampart.actors.bus.unix_peer import peer, process_state
+from rampart.actors.machine.unix_peer import peer, process_state
 
 AUTHORITY = "ca.crt"
 """In a folder of keys: the certificate of the authority."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from rampart.actors.ftm.patience import PROOF_PERIODS, Standstill, Usage
+from rampart.actors.machine.patience import PROOF_PERIODS, Standstill, Usage
 
 PERIODS_SILENT = 2
 """After so many without a sign of life the process is looked at, again when a second look may prove

@@ -26,7 +26,7 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
-from rampart.actors.ftm.patience import Usage
+from rampart.actors.machine.patience import Usage
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.parameters import NodeNames
 from rampart.manager.spec.budget import allowed_late_s

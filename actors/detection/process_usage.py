@@ -11,9 +11,9 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
+from rampart.actors.machine.process_usage import ProcessCount
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.parameters import NodeNames
-from rampart.actors.runtime.process_usage import ProcessCount
 from rampart.manager.spec.tables import NonNegative, Positive
 
 PERIOD_S = 0.5

@@ -9,8 +9,9 @@ neither may be believed of the new one. Being back is proved by a heartbeat, not
 process that exists does not work yet.
 
 A heartbeat that is overdue is a failure if the process could have sent it: time in which it waited
-for a processor does not count (`rampart.actors.ftm.patience`). If others are late as well it is the
-machine, or the bus, and a process is blamed only if it stands still. Both up to twice the timeout.
+for a processor does not count (`rampart.actors.machine.patience`). If others are late as well it is
+the machine, or the bus, and a process is blamed only if it stands still. Both up to twice the
+timeout.
 What a node publishes often anyway is a sign of life as well, and much sooner missed: three periods
 of it are enough to find a loop that hangs (`rampart.actors.detection.loop_watch`).
 """
@@ -29,8 +30,8 @@ from rampart.actors.bus import topics
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.detection.loop_watch import LoopWatch
 from rampart.actors.detection.module import DetectionModule, Waiting
-from rampart.actors.ftm.patience import AT_LEISURE, Patience, Standstill, Usage
 from rampart.actors.ftm.plausible import is_possible
+from rampart.actors.machine.patience import AT_LEISURE, Patience, Standstill, Usage
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import HeartbeatTimeout, NodeNames, SignsOfLife
 from rampart.manager.spec.budget import PERIODS_TO_MISS

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rampart.actors.foreign import keeper
-from rampart.actors.run import turns
+from rampart.actors.machine import turns
 from rampart.manager.spec.nodes import ChildLimits
 
 GRACE_S = 0.3

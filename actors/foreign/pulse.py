@@ -9,7 +9,7 @@ import secrets
 import socket
 from dataclasses import dataclass
 
-from rampart.actors.bus.unix_peer import receive_signed
+from rampart.actors.machine.unix_peer import receive_signed
 
 _DATAGRAM_BYTES = 8192
 

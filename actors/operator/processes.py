@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rampart.actors.ftm.messages import NodeTable
-from rampart.actors.runtime.process_usage import ProcessUsage, UsageMeter
+from rampart.actors.machine.process_usage import ProcessUsage, UsageMeter
 from rampart.actors.supervision.process_title import RunProcess, find_processes, process_state
 
 SEARCH_EVERY = 5

@@ -26,8 +26,8 @@ from operator import itemgetter
 from pathlib import Path
 
 from rampart.actors.bus import recorder_connection
-from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_session import Credentials
+from rampart.actors.machine.unix_peer import is_same_user
 from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
 from rampart.actors.recording.other_hosts import EachOnce, Ear, Frame, OtherHosts, Silences
 from rampart.actors.recording.run_documents import collect

@@ -15,8 +15,8 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE
-from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
+from rampart.actors.machine.unix_peer import is_same_user
 
 REPLAY = "replay"
 """Name of the one socket in the folder of a replay: it plays all nodes."""

@@ -13,12 +13,12 @@ import msgspec
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm.patience import Usage
-from rampart.actors.ftm.patience import usage as read_usage
+from rampart.actors.machine.patience import Usage
+from rampart.actors.machine.patience import usage as read_usage
+from rampart.actors.machine.process_usage import ProcessCount, read_count
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.clock import Clock
-from rampart.actors.runtime.process_usage import ProcessCount, read_count
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from rampart.actors.bus.run_folder import issued
-from rampart.actors.ftm.patience import Patience, usage
+from rampart.actors.machine.patience import Patience, usage
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.supervision.process_title import RunProcess, find_process, find_processes, kill
 from rampart.actors.supervision.processes import OsHandle

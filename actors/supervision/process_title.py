@@ -17,9 +17,9 @@ from pathlib import Path
 import setproctitle
 
 from rampart.actors.bus.run_folder import remove
-from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.foreign.program import LOGS
 from rampart.actors.foreign.strays import kill_strays
+from rampart.actors.machine.unix_peer import process_state
 
 WAITING = "spare."
 """In the title of a process that waits to be a node, before the name of that."""

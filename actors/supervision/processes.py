@@ -16,11 +16,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from rampart.actors.bus.process_ends import LocalProcess, Marks
 from rampart.actors.bus.run_folder import mark_of
-from rampart.actors.bus.unix_peer import process_id, process_state
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.ftm.patience import AT_LEISURE, Usage, usage
+from rampart.actors.machine.patience import AT_LEISURE, Usage, usage
+from rampart.actors.machine.process_ends import LocalProcess, Marks
+from rampart.actors.machine.unix_peer import process_id, process_state
 from rampart.actors.supervision.node_process import Waits
 from rampart.actors.supervision.process_title import RunProcess, find_processes
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError

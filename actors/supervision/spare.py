@@ -28,10 +28,10 @@ from typing import Any, NoReturn
 
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.run_folder import process_of
-from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
-from rampart.actors.ftm.patience import Patience, usage
+from rampart.actors.machine.patience import Patience, usage
+from rampart.actors.machine.unix_peer import process_state
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.rehearsal import rehearse

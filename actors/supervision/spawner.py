@@ -29,12 +29,12 @@ from msgspec.structs import replace
 
 from rampart.actors.bus.envelope import decoder
 from rampart.actors.bus.run_folder import issue, issued, mark, register_of, socket_path
-from rampart.actors.bus.unix_peer import is_same_user, process_id
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.layout import Layout, adapted_system, load_run
 from rampart.actors.layout.system_topics import published_keys
-from rampart.actors.run import turns
+from rampart.actors.machine import turns
+from rampart.actors.machine.unix_peer import is_same_user, process_id
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.supervision.node_process import Role, Told, Waits, live, node_main, wedge

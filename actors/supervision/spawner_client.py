@@ -25,8 +25,8 @@ import time
 import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE
-from rampart.actors.bus.unix_peer import is_same_user, process_state, receive_signed
 from rampart.actors.ftm.messages import AdaptedSystem
+from rampart.actors.machine.unix_peer import is_same_user, process_state, receive_signed
 from rampart.actors.supervision import spawner as protocol
 from rampart.actors.supervision.node_process import Waits
 from rampart.actors.supervision.process_title import WAITING, find_process, kill

@@ -31,8 +31,8 @@ from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.lateness import Lateness
-from rampart.actors.ftm.patience import Patience
 from rampart.actors.layout.layout import Layout, Unit, adapted_system
+from rampart.actors.machine.patience import Patience
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.supervision.held_process import HeldProcess

@@ -15,8 +15,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoM
 
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.machine.process_usage import ProcessCount
 from rampart.actors.run.run_info import RunInfo
-from rampart.actors.runtime.process_usage import ProcessCount
 from rampart.cli.run_picture import RunPicture
 
 Row = tuple[tuple[str, ...], float]

@@ -19,7 +19,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from rampart.actors.ftm import topics
-from rampart.actors.runtime.process_usage import read_count
+from rampart.actors.machine.process_usage import read_count
 from rampart.actors.web.server import WebServer
 from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
 from rampart.cli.look.metrics_families import Exposition, families

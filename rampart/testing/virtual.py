@@ -18,8 +18,8 @@ from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.topics import INJECT
-from rampart.actors.ftm.patience import AT_LEISURE
 from rampart.actors.layout.layout import Layout, load_run
+from rampart.actors.machine.patience import AT_LEISURE
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Actor, Context

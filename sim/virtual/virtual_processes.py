@@ -20,8 +20,8 @@ from typing import Any
 import msgspec
 
 from rampart.actors.ftm.messages import AdaptedSystem, NodeTable
-from rampart.actors.ftm.patience import Usage
 from rampart.actors.layout.layout import Layout, adapted_system
+from rampart.actors.machine.patience import Usage
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime import checkpoint

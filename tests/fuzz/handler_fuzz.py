@@ -31,9 +31,9 @@ from msgspec import inspect
 
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.ftm.patience import AT_LEISURE, Usage
 from rampart.actors.layout.layout import Layout, load_run
 from rampart.actors.layout.system_topics import find_topic
+from rampart.actors.machine.patience import AT_LEISURE, Usage
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_context import RunContext

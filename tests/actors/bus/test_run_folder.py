@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rampart.actors.bus import run_folder
-from rampart.actors.bus.unix_peer import process_id
+from rampart.actors.machine.unix_peer import process_id
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ from itertools import pairwise
 import zenoh
 
 from rampart.actors.bus import run_folder
-from rampart.actors.bus.unix_peer import ProcessId, process_id
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints, open_client
 from rampart.actors.ftm import topics
+from rampart.actors.machine.unix_peer import ProcessId, process_id
 from rampart.testing import eventually
 
 MANY = 1500

@@ -18,8 +18,8 @@ from rampart.actors.detection.progress import Progress, ProgressMonitor, Step
 from rampart.actors.detection.rate import Rate, RateMonitor
 from rampart.actors.detection.threshold import Threshold
 from rampart.actors.detection.unchanged import Unchanged, UnchangedMonitor
+from rampart.actors.machine.process_usage import ProcessCount
 from rampart.actors.runtime.parameters import read_parameters
-from rampart.actors.runtime.process_usage import ProcessCount
 from rampart.testing import Ear, VirtualSystem, play, run, table
 from tests.tank import LEVEL, PUMP, SECOND, THIRD, TOPICS, Level, Phase, Pump
 

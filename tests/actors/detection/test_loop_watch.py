@@ -6,7 +6,7 @@ import pytest
 
 from rampart.actors.detection.loop_watch import LoopWatch
 from rampart.actors.detection.watchdog import WatchdogCore
-from rampart.actors.ftm.patience import AT_LEISURE, Usage
+from rampart.actors.machine.patience import AT_LEISURE, Usage
 from rampart.testing import table, wake
 
 PERIOD_S = 0.02

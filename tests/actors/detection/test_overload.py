@@ -10,7 +10,7 @@ import pytest
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.detection.overload import Overload, RunQueue
-from rampart.actors.ftm.patience import Usage
+from rampart.actors.machine.patience import Usage
 from rampart.manager.spec.budget import allowed_late_s
 from rampart.testing import Ear, VirtualSystem, run
 

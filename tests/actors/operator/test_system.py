@@ -8,9 +8,9 @@ import msgspec
 import pytest
 
 from rampart.actors.ftm import messages as m
+from rampart.actors.machine.process_usage import ProcessCount, UsageMeter
 from rampart.actors.operator.processes import SEARCH_EVERY, ProcessObserver
 from rampart.actors.operator.system import BARRIER, MAX_BOXES, draw_system
-from rampart.actors.runtime.process_usage import ProcessCount, UsageMeter
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.manager.spec.schema import EventSpec
 from rampart.manager.spec.specification import parse_specification

@@ -17,8 +17,8 @@ import pytest
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import RespawnRequest
-from rampart.actors.ftm.patience import usage
 from rampart.actors.layout.layout import Layout
+from rampart.actors.machine.patience import usage
 from rampart.actors.osmosis import topics as robot
 from rampart.actors.run.run_plan import load_system
 from rampart.actors.runtime.actor import Actor, on

@@ -15,7 +15,7 @@ from itertools import pairwise
 import msgspec
 import pytest
 
-from rampart.actors.bus import unix_peer
+from rampart.actors.machine import unix_peer
 from rampart.actors.supervision import spawner_client
 from rampart.actors.supervision.spawner import (
     MAX_DATAGRAM,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rampart.actors.ftm.messages import NodeState
-from rampart.actors.ftm.patience import AT_LEISURE, Patience, Usage
 from rampart.actors.layout.layout import Unit
+from rampart.actors.machine.patience import AT_LEISURE, Patience, Usage
 from rampart.actors.supervision.supervised_process import (
     START_TIMEOUT_S,
     STATUS,

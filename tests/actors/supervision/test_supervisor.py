@@ -19,8 +19,8 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem, ManagerStatus, NodeState, RespawnRequest
-from rampart.actors.ftm.patience import Usage
 from rampart.actors.layout.layout import Layout
+from rampart.actors.machine.patience import Usage
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan, load_document, load_system
 from rampart.actors.runtime.actor import Context

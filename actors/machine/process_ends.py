@@ -27,7 +27,7 @@ from collections.abc import Callable, Hashable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from rampart.actors.bus.unix_peer import ProcessId, process_id
+from rampart.actors.machine.unix_peer import ProcessId, process_id
 
 _PAGE = mmap.PAGESIZE
 _SHARED, _ROBUST = 1, 1

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rampart.actors.run import turns
+from rampart.actors.machine import turns
 
 _GET = {"x86_64": 315, "aarch64": 275}
 _SHORT_NS = 200_000

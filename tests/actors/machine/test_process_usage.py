@@ -9,7 +9,7 @@ import sys
 import psutil
 import pytest
 
-from rampart.actors.runtime.process_usage import (
+from rampart.actors.machine.process_usage import (
     ProcessCount,
     UsageMeter,
     parse_stat,

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from rampart.actors.bus import process_ends
-from rampart.actors.bus.process_ends import LocalProcess, Marks, ProcessEnds, leave_marks
-from rampart.actors.bus.unix_peer import process_id
+from rampart.actors.machine import process_ends
+from rampart.actors.machine.process_ends import LocalProcess, Marks, ProcessEnds, leave_marks
+from rampart.actors.machine.unix_peer import process_id
 from rampart.testing import eventually
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from rampart.actors.bus.unix_peer import process_state
+from rampart.actors.machine.unix_peer import process_state
 
 
 class Usage(NamedTuple):

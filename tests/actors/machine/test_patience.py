@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from rampart.actors.ftm.patience import AT_LEISURE, Patience, Usage, usage
+from rampart.actors.machine.patience import AT_LEISURE, Patience, Usage, usage
 from rampart.testing import wait_until
 
 
