@@ -32,6 +32,12 @@ def job(*faults: str, options=None, **changes) -> Job:
                faults=tuple(map(parse_fault, faults)), **{"system": "paper", **changes})
 
 
+@pytest.fixture
+def short(tmp_path):
+    """Options of a job: a mission of a minute over three lights, a third of mission A."""
+    return {"mission": str(write_short_mission(tmp_path))}
+
+
 def decisions(result):
     return [(d.active, d.recoveries) for d in result.decisions]
 
@@ -135,8 +141,8 @@ def test_a_second_signal_ends_a_run_at_once_and_what_was_recorded_can_be_read(tm
         "freeze:manager/status@20+inf",
         "freeze:detection/DM1@20+inf", "delay:detection/DM2@20+inf",
         "drop:manager/status@20+inf"))])
-def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing(fault):
-    result = run_job(job(fault))
+def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing(short, fault):
+    result = run_job(job(fault, options=short))
     assert (result.success, result.safe, result.decisions) == (True, True, ())
     assert result.effective
 
@@ -165,8 +171,8 @@ def test_without_fault_tolerance_the_papers_faults_are_unsafe(fault):
     assert not run_job(job(fault, ftm=False, patience_s=35.0)).safe
 
 
-def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on():
-    result = run_job(job("kill:osmosis_control@20"))
+def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on(short):
+    result = run_job(job("kill:osmosis_control@20", options=short))
     assert (result.success, result.safe) == (True, True)
     assert decisions(result) == [(("FTM4",), ("RM3",)), ((), ())]
     assert 0 < result.detected_after_s < 0.1
@@ -180,8 +186,8 @@ def test_a_stopped_or_wedged_process_is_detected_by_its_silence(what):
     assert 0.3 < result.detected_after_s < 0.6
 
 
-def test_a_node_that_works_all_the_time_is_found_to_hang_sooner_and_replaced_at_once():
-    result = run_job(job("wedge:osmosis_control@12"))
+def test_a_node_that_works_all_the_time_is_found_to_hang_sooner_and_replaced_at_once(short):
+    result = run_job(job("wedge:osmosis_control@12", options=short))
     assert decisions(result)[0] == (("FTM4",), ("RM3",))
     assert 0.1 < result.detected_after_s < 0.25
     assert result.recovered_after_s < result.detected_after_s + 0.1
@@ -195,8 +201,8 @@ def test_a_slow_process_is_slow():
     assert len(slow.decisions) > len(usual.decisions)  # its heart beats too seldom
 
 
-def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_afterwards():
-    record = run_virtually(job("slow:all:0.03@20+30", system="osmosis")).record
+def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_afterwards(short):
+    record = run_virtually(job("slow:all:0.03@20+30", system="osmosis", options=short)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
     assert [(d.active, d.recoveries) for d in record.decisions] == [
         (("FTM14",), ("RM2",)), ((), ())]
@@ -205,8 +211,8 @@ def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_after
 @pytest.mark.parametrize(("faults", "restarts"), [
     (("drop:detection/DM2@25+8",), {"DM2": 1}),
     pytest.param(("slow:all:0.03@20+30", "drop:detection/DM2@25+8"), {}, marks=pytest.mark.slow)])
-def test_a_module_that_is_not_heard_is_restarted_but_not_for_being_late(faults, restarts):
-    record = run_virtually(job(*faults, system="osmosis")).record
+def test_a_module_that_is_not_heard_is_restarted_but_not_for_being_late(short, faults, restarts):
+    record = run_virtually(job(*faults, system="osmosis", options=short)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", restarts)
 
 
@@ -219,9 +225,10 @@ def test_an_overload_in_which_nearly_nothing_arrives_leaves_no_latch_behind():
     assert record.decisions[-1].active == ()
 
 
-def test_killed_guards_come_back_and_the_mission_goes_on():
+def test_killed_guards_come_back_and_the_mission_goes_on(short):
     record = run_virtually(job("kill:supervisor@12", "kill:ftm_manager@14", "kill:safety_pilot@16",
-                               "kill:supervisor@18", "kill:graph_planner@18.01")).record
+                               "kill:supervisor@18", "kill:graph_planner@18.01",
+                               options=short)).record
     assert (record.mission, record.safety) == ("success", "safe")
     assert record.restarts == {"supervisor": 2, "ftm_manager": 1, "safety_pilot": 1,
                                "graph_planner": 1}
