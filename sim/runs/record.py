@@ -163,7 +163,7 @@ class RunRecorder:
         self._take: dict[str, Callable[[Any, Header], None]] = {
             ftm_topics.DETECTION.key: self._detection, ftm_topics.MANAGER_STATUS.key: self._manager,
             ftm_topics.DECISION.key: self._decision, ftm_topics.SHADOW.key: self._shadow,
-            ftm_topics.PROCESS_EVENT.key: self._process_event,
+            ftm_topics.PROCESS_EVENT.key: self._process_event, ftm_topics.NODES.key: self._nodes,
             bus_topics.INJECT.key: self._injection,
             bus_topics.INJECTION_REPORT.key: self._injection_report}
 
@@ -246,6 +246,19 @@ class RunRecorder:
             if one not in self._respawned:
                 self._respawned[one] = None
                 self._restarts[event.node] = self._restarts.get(event.node, 0) + 1
+
+    def _nodes(self, table: fm.NodeTable, header: Header) -> None:
+        """End what is over though nobody was heard to say so: events are told once.
+
+        What is told while its router dies is lost; the table is repeated.
+        """
+        for row in table.nodes:
+            down = self._open.get(("down", row.name))
+            if down and row.state is fm.NodeState.RUNNING and header.stamp > down[0]:
+                self.turn("down", row.name, False, header.stamp)
+                self._lives_of(row.name).began(header.stamp)
+                self._given_up.pop(row.name, None)
+                self._note(header.stamp, "clear", f"{row.name} runs again")
 
     def _lives_of(self, node: str) -> _Lives:
         if node not in self._lives:

@@ -1,0 +1,50 @@
+"""What becomes of a run's messages in its record."""
+
+from __future__ import annotations
+
+import pytest
+
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable, ProcessEvent
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Header
+from rampart.sim.runs.record import Interval, RunRecorder
+
+
+def recorder_with(*told: tuple[float, str]) -> RunRecorder:
+    recorder = RunRecorder(RunPlan())
+    for number, (at_s, what) in enumerate(told):
+        recorder.feed(topics.PROCESS_EVENT, ProcessEvent("pump", what, 1, 2, "supervisor", ""),
+                      Header("supervisor", 1, number, at_s))
+    return recorder
+
+
+def show(recorder: RunRecorder, at_s: float, state: NodeState) -> None:
+    row = NodeInfo("pump", "control", 1, state, 2, 1)
+    recorder.feed(topics.NODES, NodeTable((row,)), Header("supervisor", 1, 1, at_s))
+
+
+def test_a_node_whose_return_was_not_heard_is_up_when_the_table_shows_it():
+    recorder = recorder_with((5.0, "wedged"))
+    show(recorder, 5.1, NodeState.STARTING)
+    show(recorder, 5.5, NodeState.RUNNING)
+    show(recorder, 6.0, NodeState.RUNNING)
+    record = recorder.record(250.0)
+    assert record.intervals == (Interval("down", "pump", 5.0, 5.5, "wedged"),)
+    assert [event.text for event in record.events] == ["pump wedged", "pump runs again"]
+
+
+@pytest.mark.parametrize(("at_s", "state"), [
+    (4.9, NodeState.RUNNING), (5.5, NodeState.CRASHED), (5.5, NodeState.STARTING)])
+def test_what_was_shown_before_it_failed_or_shows_that_it_has_ends_nothing(at_s, state):
+    recorder = recorder_with((5.0, "crashed"))
+    show(recorder, at_s, state)
+    assert recorder.record(9.0).intervals == (Interval("down", "pump", 5.0, 9.0, "crashed"),)
+
+
+def test_a_return_that_was_heard_is_told_once():
+    recorder = recorder_with((5.0, "crashed"), (5.02, "respawned"))
+    show(recorder, 5.5, NodeState.RUNNING)
+    record = recorder.record(9.0)
+    assert record.intervals == (Interval("down", "pump", 5.0, 5.02, "crashed"),)
+    assert len(record.events) == 2
