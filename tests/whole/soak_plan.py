@@ -1,6 +1,10 @@
 """What goes wrong in a soak: a fault every five seconds, by seed, of everything there is. Pure.
 
-Half of the faults hit a process, from outside: any of the system, routers, spares, supervisor,
+First each process is killed once. One that has replaced another has 1.7 MB more of its own than
+those that were forked at the start, for it was a spare and has rehearsed; so all have made that
+step when it begins to count whether memory grows.
+
+Then half of the faults hit a process, from outside: any of the system, routers, spares, supervisor,
 spawners, and the launcher and the world, which are only stopped for a moment. The other half are
 those of messages, sensors, actuators and the world that the run's injector knows; they last less
 than five seconds, so that one is over when the next one comes.
@@ -48,9 +52,12 @@ def plan(spec: SystemSpec, seed: int, mission: int, length_s: float) -> Plan:
     groups = {kind: names for kind, names in fault_groups(spec).items()
               if kind != "process" and names}
     blows, faults = [], []
+    first = dice.sample(of.mortal, len(of.mortal))
     for i in range(int((length_s - FIRST_S) / EVERY_S)):
         at_s = FIRST_S + i * EVERY_S
-        if dice.random() < 0.5:
+        if i < len(first):
+            blows.append(Blow(at_s, first[i], "KILL"))
+        elif dice.random() < 0.5:
             blows.append(_blow(dice, of, at_s))
         else:
             kind = dice.choice(list(groups))

@@ -15,7 +15,7 @@ from tests import ROOT
 from tests.whole.chaos import WAYS, targets
 from tests.whole.chaos_pairs import LAUNCHER, PAUSE
 from tests.whole.chaos_runs import load
-from tests.whole.soak_growth import Sample, growth, student
+from tests.whole.soak_growth import WARM_UP_S, Sample, growth, student
 from tests.whole.soak_page import write_page
 from tests.whole.soak_plan import EVERY_S, FIRST_S, LASTS_S, plan
 from tests.whole.soak_runs import Soak, main, usage
@@ -69,13 +69,18 @@ def test_the_quantiles_are_those_of_the_tables(free, quantile):
 
 def test_every_five_seconds_something_goes_wrong_by_seed_and_mission():
     spec = load()
+    everybody = len(targets(spec).mortal)
     plans = [plan(spec, seed, mission, 600.0) for seed in (1, 2) for mission in (0, 1)]
     assert plans[0] == plan(spec, 1, 0, 600.0)
     assert len({(p.blows, p.faults) for p in plans}) == 4
     for one in plans:
         moments = sorted([b.at_s for b in one.blows] + [f.at_s for f in one.faults])
         assert moments == [FIRST_S + i * EVERY_S for i in range(118)]
-        assert 35 < len(one.blows) < 83
+        assert sorted((b.name, b.way) for b in one.blows[:everybody]) == sorted(
+            (name, "KILL") for name in targets(spec).mortal)
+        assert one.blows[everybody - 1].at_s < WARM_UP_S  # before it counts what grows
+        later = len(one.blows) - everybody
+        assert 0.3 < later / (later + len(one.faults)) < 0.7
         assert all(LASTS_S[0] <= f.duration_s <= LASTS_S[1] < EVERY_S for f in one.faults)
     assert plan(spec, 1, 0, 300.0).blows == plans[0].blows[:len(plan(spec, 1, 0, 300.0).blows)]
 
