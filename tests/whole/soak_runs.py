@@ -1,11 +1,12 @@
 """The soak, `make soak HOURS=n`: missions without end, a random fault every five seconds.
 
 `python -m tests.whole.soak_runs --hours H [--seed N] [--laps L] [--rate R] [--file FILE]`. Missions
-of the full system, one after the other; what goes wrong in them follows from the seed. An emergency
-stop that latches is reset as an operator would. Everything is kept as lines of JSON: each fault,
-how soon it was detected and over, each mission's verdict, and every ten seconds what each process
-uses: memory of its own (USS) and its share (PSS), descriptors, threads. What is in the file counts:
-an interrupted soak goes on with the same command until it has lasted HOURS.
+of the full system, one after the other; what goes wrong in them follows from the seed, but first
+each process is killed once (`soak_plan`). An emergency stop that latches is reset as an operator
+would. Everything is kept as lines of JSON: each fault, how soon it was detected and over, each
+mission's verdict, and every ten seconds what each process uses: memory of its own (USS) and its
+share (PSS), descriptors, threads. What is in the file counts: an interrupted soak goes on with the
+same command until it has lasted HOURS.
 
 At the end, and with --summary alone: figures, what grows, and beside the file a plot (PNG) and a
 page (HTML). A mission that fails and is safe is counted; one that is not safe ends the soak, its
