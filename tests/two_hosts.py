@@ -54,22 +54,29 @@ def home_when_lost(text: str) -> str:
     return text
 
 
-def two_hosts(addresses: Mapping[str, str], on_ground: Collection[str] = ON_GROUND,
-              system: str = "osmosis", delay_s: float = 0.3) -> str:
-    """Return the specification of a system, some of it on the second host.
+def several_hosts(addresses: Mapping[str, str], places: Mapping[str, Collection[str]],
+                  system: str = "osmosis", delay_s: float = 0.3) -> str:
+    """Return the specification of a system on several hosts.
 
     Args:
         addresses: Of the hosts, the robot's first.
-        on_ground: Names of what runs on the second.
+        places: By host, names of what runs there and not on the robot's.
         system: Which.
         delay_s: Of a message between them, at most.
     """
     text = system_file(system).read_text(encoding="utf-8")
-    _, second = addresses
     hosts = "".join(f'[[host]]\nname = "{name}"\naddress = "{address}"\n\n'
                     for name, address in addresses.items())
-    for name in on_ground:
-        text = text.replace(f'\nname = "{name}"\n', f'\nname = "{name}"\nhost = "{second}"\n', 1)
+    for place, names in places.items():
+        for name in names:
+            text = text.replace(f'\nname = "{name}"\n', f'\nname = "{name}"\nhost = "{place}"\n', 1)
     text = text.replace('event = "non_control_node_crash"\nagainst = "parent"', _PATIENT, 1)
     link = f"[link]\ndelay_s = {delay_s}\n\n"
     return text.replace("[[node]]\n", f"{link}{hosts}[[node]]\n", 1)
+
+
+def two_hosts(addresses: Mapping[str, str], on_ground: Collection[str] = ON_GROUND,
+              system: str = "osmosis", delay_s: float = 0.3) -> str:
+    """Return the specification of a system, some of it on the second of two hosts."""
+    _, second = addresses
+    return several_hosts(addresses, {second: on_ground}, system, delay_s)

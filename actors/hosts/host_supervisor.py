@@ -328,9 +328,10 @@ class HostSupervisor(Supervisor):
     # -- what it says ---------------------------------------------------------------------------
 
     def _tell_of(self, host: str, event: str) -> None:
-        name = self._layout.hosts.supervisors[host]
+        other, own = host or "the first", self.parameters.host or "the first"
         self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
-            name, event, 0, 0, self.name, f"host {host or 'the first'}"))
+            self._layout.hosts.supervisors[host], event, 0, 0, self.name,
+            f"host {other}, as seen from {own}"))
 
     def _own_rows(self) -> tuple[fm.NodeInfo, ...]:
         return tuple(fm.NodeInfo(

@@ -37,6 +37,9 @@ DOOR = ROUTERS[0]
 _PATIENCE_S = 3.0
 """For an answer, or for the next question: then the connection is made again."""
 
+_FAREWELL_S = 2.0
+"""How long others are waited for at the end: over a bad line the word is sent again and again."""
+
 _MAX_LINE = 1 << 20
 
 
@@ -135,11 +138,11 @@ class Meeting:
         self._origin_s = origin_s
 
     async def close(self) -> None:
-        """Tell the others that the run is over, as far as they can be reached at once."""
+        """Tell the others that the run is over, as far as they can be reached soon."""
         self._over = "the first host has ended it"
         waiting = [one.wait() for one in self._told.values()]
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(asyncio.gather(*waiting), 2 * PERIOD_S)
+            await asyncio.wait_for(asyncio.gather(*waiting), _FAREWELL_S)
         if self._server is not None:
             self._server.close()
         for writer in list(self._writers):

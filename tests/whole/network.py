@@ -67,18 +67,21 @@ class Network:
     Attributes:
         addresses: Of the hosts, by name.
         line: Between any two; may be changed while packets go by.
+        apart: Pairs of hosts that do not reach each other, whatever the line; may be changed, too.
         passed: Packets that were handed on.
         lost: Packets that were not.
     """
 
     addresses: dict[str, str]
     line: Line = field(default_factory=Line)
+    apart: frozenset[frozenset[str]] = frozenset()
     passed: int = 0
     lost: int = 0
 
     def __post_init__(self) -> None:
         self._prefix = f"rampart-{os.getpid()}-{next(_NUMBERS)}"
         self._devices: dict[bytes, int] = {}
+        self._hosts: dict[int, str] = {}
         self._over, self._end = os.pipe()
         self._random = random.Random(1)
         self._thread = threading.Thread(target=self._hand_on, name="network")
@@ -86,6 +89,10 @@ class Network:
     def namespace(self, host: str) -> str:
         """Return the name of a host's network namespace."""
         return f"{self._prefix}-{host}"
+
+    def part(self, *pairs: tuple[str, str]) -> None:
+        """Have these pairs of hosts not reach each other, and all others."""
+        self.apart = frozenset(map(frozenset, pairs))
 
     def command(self, host: str, *command: str) -> list[str]:
         """Return the command line that runs a command on a host."""
@@ -100,6 +107,7 @@ class Network:
             fcntl.ioctl(descriptor, _TUNSETIFF, struct.pack(
                 "16sH22x", device.encode(), _IFF_TUN | _IFF_NO_PI))
             self._devices[bytes(map(int, address.split(".")))] = descriptor
+            self._hosts[descriptor] = host
             _ip("link", "set", device, "netns", name)
             for words in (("link", "set", "lo", "up"),
                           ("address", "add", f"{address}/24", "dev", device),
@@ -131,7 +139,8 @@ class Network:
             for device in readable:
                 for packet in _packets(device):
                     line, to = self.line, self._devices.get(packet[_DESTINATION])
-                    if to is None or line.is_cut or self._random.random() < line.loss:
+                    if (to is None or line.is_cut or self._random.random() < line.loss
+                            or {self._hosts[device], self._hosts[to]} in self.apart):
                         self.lost += 1
                         continue
                     later_s = line.delay_s + self._random.random() * line.jitter_s
