@@ -1,15 +1,20 @@
-"""The C heap of this process, and what the machine may have back of it."""
+"""Where the C library puts what this process asks it for."""
 
 from __future__ import annotations
 
 import ctypes
 
+_M_MMAP_THRESHOLD = -3  # malloc.h of glibc
+LARGE_BYTES = 32_768
 
-def give_back() -> None:
-    """Give the machine the pages of the C heap that hold nothing; nothing, where libc cannot.
 
-    glibc keeps what is freed below or between what is in use: malloc_trim(3).
+def keep_large_apart() -> None:
+    """Have what is large lie in pages of its own from now on, which go back when it is freed.
+
+    Else the space that it leaves in the heap is filled with what is small and stays, and the next
+    large block takes new pages: mallopt(3), without which glibc raises the threshold to the size of
+    what was freed. Nothing, where libc cannot.
     """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
+    if set_option is not None:
+        set_option(_M_MMAP_THRESHOLD, LARGE_BYTES)

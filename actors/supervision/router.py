@@ -1,4 +1,4 @@
-"""A router of the bus as an actor: nearly all that it does is done by its Zenoh session.
+"""A router of the bus as an actor: all that it does is done by its Zenoh session.
 
 So it is supervised like everybody else: its heartbeat goes through the session that it is about.
 
@@ -10,16 +10,13 @@ finds a key without its context: Zenoh (1.10.2) panics, on stderr, with an `unwr
 
 from __future__ import annotations
 
-from rampart.actors.machine.heap import give_back
-from rampart.actors.runtime.actor import Actor, every
-
-GIVE_BACK_S = 10.0
+from rampart.actors.machine.heap import keep_large_apart
+from rampart.actors.runtime.actor import Actor, Context
 
 
 class Router(Actor):
     """Hands on what its clients and the other router send (`rampart.actors.bus.zenoh_bus`)."""
 
-    @every(GIVE_BACK_S)
-    def tidy(self) -> None:
-        """Give back what clients took that have died, 0.2 ms: or it grows by 70 kB for each."""
-        give_back()
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        keep_large_apart()  # before it has links: their buffers come and go with its clients
