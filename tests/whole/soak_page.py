@@ -21,7 +21,7 @@ from tests.whole.soak_summary import (
     THREADS,
     Record,
     of_kind,
-    of_one,
+    of_role,
     totals,
 )
 
@@ -56,7 +56,7 @@ def _panels(records: Sequence[Record]) -> list[Panel]:
             ("shares (PSS)", line(totals(records, SHARE, 1e-3)), True),
             ("their own (USS)", line(totals(records, OWN, 1e-3)), True)]),
         Panel("memory of the launcher, MB", False, [
-            ("its own (USS)", line(of_one(records, LAUNCHER, OWN, 1e-3)), True)]),
+            ("its own (USS)", line(of_role(records, [LAUNCHER], OWN, 1e-3)), True)]),
         Panel("descriptors and threads of all processes", False, [
             ("descriptors", line(totals(records, DESCRIPTORS, 1.0)), True),
             ("threads", line(totals(records, THREADS, 1.0)), True)]),

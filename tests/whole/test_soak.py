@@ -157,6 +157,18 @@ def test_a_leak_of_one_process_is_wrong(file):
             if "its own" in line] == ["localization"]
 
 
+@pytest.mark.parametrize(("leak_kb_a_second", "found"), [(0, []), (10, ["routers"])])
+def test_routers_that_change_over_do_not_grow_and_a_leak_of_theirs_is_found(file, leak_kb_a_second,
+                                                                            found):
+    soak = Soak(file, 1)
+    for record in soak.of("sample"):
+        leak = int(record["at_s"] * leak_kb_a_second)
+        a, b = (12_000, 8_000) if record["at_s"] < 700 else (8_000, 12_000)
+        record["used"] |= {"router_a": [a, a, 30, 9], "router_b": [b + leak, b, 30, 9]}
+    assert [line.split(",")[1].split()[0] for line in wrong(soak.records)
+            if "its own" in line] == found
+
+
 def test_the_page_has_the_plot_in_it_and_the_plot_is_a_picture(file):
     soak = Soak(file, 1)
     png, page = write_page(soak.records, ["1 < 2"], file)
