@@ -14,7 +14,6 @@ from typing import Annotated
 import msgspec
 
 from rampart.actors.bus.bounds import (
-    MAX_PAYLOAD_BYTES,
     Count,
     Document,
     Explained,
@@ -31,10 +30,10 @@ from rampart.actors.bus.bounds import (
 from rampart.actors.bus.messages import ON_TIME, Injection, Message
 from rampart.manager.model.mechanisms import RecoveryPhase
 
-LARGEST_COPY_BYTES = MAX_PAYLOAD_BYTES - (128 << 10)
-"""Of a state that is copied to another host: what else is in the message has to fit as well."""
+PART_BYTES = 64 << 10
+"""Of a state that is copied to another host, in one message at most."""
 
-KeptBytes = Annotated[bytes, msgspec.Meta(max_length=LARGEST_COPY_BYTES)]
+KeptBytes = Annotated[bytes, msgspec.Meta(max_length=PART_BYTES)]
 Checksum = Annotated[bytes, msgspec.Meta(max_length=32)]
 
 
@@ -215,11 +214,12 @@ class NodeTable(Message, frozen=True):
     nodes: Many[NodeInfo]
 
 
-class KeptState(Message, frozen=True):
+class KeptState(Message, frozen=True, omit_defaults=True):
     """Which state of a node a host holds: the newest, by incarnation and generation; 0 for none.
 
     `issued` is the highest incarnation of the node that host has issued. `final`: no process of the
-    node is there, and this is the last that any has kept.
+    node is there, and this is the last that any has kept. `coming_…` says of which state how many
+    bytes have come, if not all of it is there, or not kept yet.
     """
 
     node: Name
@@ -227,15 +227,23 @@ class KeptState(Message, frozen=True):
     generation: Count
     issued: Incarnation
     final: bool
+    coming_incarnation: Incarnation = 0
+    coming_generation: Count = 0
+    coming_bytes: Count = 0
 
 
 class StateCopy(Message, frozen=True):
-    """A state that a node has kept; `checksum` is a SHA-256 over all of it, node and run."""
+    """A part of a state that a node has kept: `state` are its bytes from `offset` on.
+
+    `size` is that of the whole; `checksum` is a SHA-256 over all of it, node and run.
+    """
 
     node: Name
     incarnation: Incarnation
     generation: Count
     version: Count
+    size: Count
+    offset: Count
     state: KeptBytes
     checksum: Checksum
 

@@ -185,7 +185,7 @@ class HostSupervisor(Supervisor):
             self._state_problem(node, problem)
         for node, record in taken.records:
             self._files.take(node, record)
-        if taken.is_first:
+        if taken.wants_answer:
             self._tell_states()
 
     @on(topics.SIGNAL)
@@ -280,8 +280,7 @@ class HostSupervisor(Supervisor):
                 self._dispatcher.put, slot, partial(call, node, *what))
 
     def _state_kept(self, node: str, record: Record | None, is_last: bool) -> None:
-        if problem := self._copies.kept(node, record):
-            self._state_problem(node, problem)
+        self._copies.kept(node, record)
         if is_last and self._layout.unit_of[node] not in self._ending:
             self._copies.settled(node)
         self._tell_states()

@@ -185,10 +185,15 @@ def connect(file: Path) -> sqlite3.Connection:
     return connection
 
 
+def is_new(connection: sqlite3.Connection) -> bool:
+    """Whether there is nothing at all: the node is about to make the tables."""
+    return not (_pragma(connection, "user_version") or _pragma(connection, "application_id")
+                or _schema(connection))
+
+
 def make_tables(connection: sqlite3.Connection) -> None:
     """Make the tables, if there is nothing at all."""
-    if (_pragma(connection, "user_version") or _pragma(connection, "application_id")
-            or _schema(connection)):
+    if not is_new(connection):
         return
     connection.execute("PRAGMA synchronous = OFF")  # nothing in it that could be lost yet
     connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")

@@ -381,6 +381,8 @@ def newest(file: Path, run: str) -> Record | None:
         return None
     disk.inspect(file)
     with contextlib.closing(disk.connect(file)) as connection:
+        if disk.is_new(connection):
+            return None
         found = disk.read(connection, file, run)
     return found.records[0] if found.records else None
 

@@ -272,8 +272,9 @@ def test_a_host_that_is_started_anew_with_an_empty_disk_goes_on_from_what_the_fi
 
 def forged(incarnation: int = 1) -> Checkpoints:
     sent = record(incarnation, 99)
-    return Checkpoints("r", (), (StateCopy("camera", incarnation, 99, 1, sent.state,
-                                           checksum("r", "camera", sent)),))
+    return Checkpoints("r", (), (StateCopy(
+        "camera", incarnation, 99, 1, len(sent.state), 0, sent.state,
+        checksum("r", "camera", sent)),))
 
 
 @pytest.mark.parametrize("source", ["stranger#1", "camera#1", "supervisor_ground#0"])
@@ -305,7 +306,8 @@ def test_a_copy_that_is_wrong_changes_nothing_and_is_told(tmp_path):
         async with world(tmp_path) as made:
             message = forged()
             torn = Checkpoints("r", (), (StateCopy(
-                "camera", 1, 99, 1, message.copies[0].state[:-1], message.copies[0].checksum),))
+                "camera", 1, 99, 1, message.copies[0].size, 0, message.copies[0].state[:-1],
+                message.copies[0].checksum),))
             supervisor = made.ground.supervisor
             supervisor.publish(topics.CHECKPOINTS, torn)
             await asyncio.sleep(1.0)

@@ -167,6 +167,12 @@ def test_where_there_is_no_file_there_is_no_state_and_none_is_made(file):
     assert not file.parent.exists()
 
 
+def test_a_file_that_is_about_to_be_made_holds_no_state(file):
+    file.parent.mkdir()
+    file.touch()
+    assert newest(file, "r") is None
+
+
 # ---- the thread ---------------------------------------------------------------------------------
 
 
