@@ -9,10 +9,8 @@ says what is missing, and only what is newer is ever taken.
 *Newer* is decided by incarnation, then generation. A node has one process of an incarnation, and
 that counts its generations up, so no two states have the same two numbers.
 
-A long state goes in parts, the next one when the other host has said that the one before is there.
-On a line between hosts all that goes one way goes one behind the other: 300 kB at once, over a line
-that loses packets and so carries 80 kB a second, hold up every heartbeat behind them for seconds,
-and the host counts as lost. So a part is as long as the line has carried soon.
+A long state goes in parts, the next one when the other host has said that the one before is there
+(`rampart.actors.hosts.parts`).
 
 A host where the node runs takes no copy but of a higher incarnation than its own: what runs there
 is superseded then. And whoever gives a node back says which state is the last (`KeptState.final`),
@@ -21,7 +19,6 @@ so that the other waits for it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
@@ -33,6 +30,7 @@ from rampart.actors.ftm.messages import (
     KeptState,
     StateCopy,
 )
+from rampart.actors.hosts.parts import Age, Coming, Going, Line, whole
 from rampart.actors.hosts.placement import FIRST
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.checkpoint_file import LARGEST_STATE_BYTES, record_checksum
@@ -43,32 +41,7 @@ AT_ONCE_BYTES = 4096
 AGAIN_S = 1.0
 """Real seconds after which a part that was not answered is sent again."""
 
-SOON_S = 0.1
-"""A part that took less than that above the soonest answer is followed by one of twice its length,
-else of half of it: that long may something wait behind it."""
-
-_LEAST_PART_BYTES = 4096
-"""Of the first part, too: what it takes is nearly the way alone."""
-
-Age = tuple[int, int]
 _NONE: Age = (0, 0)
-
-
-@dataclass(slots=True)
-class _Coming:
-    """A long state of which some has come, or all, and is not kept yet.
-
-    Attributes:
-        of: Age, version, size and checksum of it.
-        data: What has come.
-    """
-
-    of: tuple[Age, int, int, bytes]
-    data: bytearray
-
-    @property
-    def age(self) -> Age:
-        return self.of[0]
 
 
 @dataclass(slots=True)
@@ -86,7 +59,7 @@ class _State:
     other: str
     mine: Record | None = None
     theirs: KeptState | None = None
-    coming: _Coming | None = None
+    coming: Coming | None = None
     sent_s: float = 0.0
 
     @property
@@ -104,50 +77,6 @@ class _State:
     def is_long(self) -> bool:
         """Whether the newest one goes in parts."""
         return self.mine is not None and len(self.mine.state) > AT_ONCE_BYTES
-
-
-@dataclass(slots=True)
-class _Going:
-    """A long state that is under way to another host.
-
-    Attributes:
-        node: Whose.
-        record: It.
-        checksum: Of it.
-        there: How many bytes the other host has, as far as it was known when a part was sent last.
-        sent_s: When that was.
-    """
-
-    node: str
-    record: Record
-    checksum: bytes
-    there: int = 0
-    sent_s: float | None = None
-
-
-@dataclass(slots=True)
-class _Line:
-    """What is known of the way to another host.
-
-    Attributes:
-        part_bytes: How much is sent at once.
-        soonest_s: How soon a part was answered at best.
-    """
-
-    part_bytes: int = _LEAST_PART_BYTES
-    soonest_s: float = math.inf
-
-    def answered(self, after_s: float) -> None:
-        """Note that a part was answered."""
-        self.soonest_s = min(self.soonest_s, after_s)
-        if after_s < self.soonest_s + SOON_S:
-            self.part_bytes = min(2 * self.part_bytes, PART_BYTES)
-        else:
-            self.missed()
-
-    def missed(self) -> None:
-        """Note that one was not, in time."""
-        self.part_bytes = max(self.part_bytes // 2, _LEAST_PART_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,8 +115,8 @@ class Copies:
         self._states = {node: _State(FIRST if own == home else home)
                         for node, home in home_of.items() if own in {home, FIRST}}
         self._unsettled = set(self._states)
-        self._going: dict[str, _Going] = {}
-        self._lines = {state.other: _Line() for state in self._states.values()}
+        self._going: dict[str, Going] = {}
+        self._lines = {state.other: Line() for state in self._states.values()}
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -214,7 +143,7 @@ class Copies:
         for state in self._states.values():
             if state.other == host:
                 state.theirs = None
-                self._lines[host] = _Line()
+                self._lines[host] = Line()
 
     def has_missed(self) -> bool:
         """Whether another host lacks something that can be sent to it."""
@@ -274,7 +203,9 @@ class Copies:
         if copy.size > AT_ONCE_BYTES:
             if not self._is_taken(state, copy):
                 return None
-            data = self._added(state, copy)
+            if state.coming is None or state.coming.gives_way_to(copy):
+                state.coming = Coming(whole(copy))
+            data = state.coming.with_part(copy)
             if len(data) < copy.size:
                 return None
         record = Record(copy.generation, copy.incarnation, copy.version, bytes(data))
@@ -282,19 +213,6 @@ class Copies:
             state.coming = None
             raise ValueError("its checksum is wrong")
         return record
-
-    def _added(self, state: _State, copy: StateCopy) -> bytearray:
-        """Return what has come of a long state, with this part if it is the next one."""
-        age = copy.incarnation, copy.generation
-        of = age, copy.version, copy.size, copy.checksum
-        coming = state.coming
-        if coming is None or (coming.of != of and coming.age <= age):
-            coming = state.coming = _Coming(of, bytearray())
-        if coming.of != of:  # from before that
-            return bytearray()
-        if copy.offset == len(coming.data) < copy.size:
-            coming.data += copy.state
-        return coming.data
 
     def message(self, now_s: float) -> Checkpoints:
         """Return what is to be told: what is held here, and copies of what others lack.
@@ -331,7 +249,7 @@ class Copies:
 
     # -- in parts -------------------------------------------------------------------------------
 
-    def _has_come(self, going: _Going) -> int:
+    def _has_come(self, going: Going) -> int:
         """Return how many bytes of a state the other host says that it has."""
         theirs = self._states[going.node].theirs
         if theirs is None or going.record.age != (
@@ -361,7 +279,7 @@ class Copies:
         begin = min(there, size - 1)  # the last byte again has it kept, should that have failed
         return [_copy(going.node, going.record, going.checksum, begin, begin + line.part_bytes)]
 
-    def _still_going(self, host: str, now_s: float) -> _Going | None:
+    def _still_going(self, host: str, now_s: float) -> Going | None:
         """Return the state that is under way to a host, unless it is of no more use there."""
         going = self._going.get(host)
         if going is None:
@@ -375,7 +293,7 @@ class Copies:
             return None
         return going
 
-    def _starting(self, host: str) -> _Going | None:
+    def _starting(self, host: str) -> Going | None:
         missed = [(state.sent_s, node) for node, state in self._states.items()
                   if state.other == host and state.is_missed() and state.is_long()]
         if not missed:
@@ -383,7 +301,7 @@ class Copies:
         node = min(missed)[1]
         record = self._states[node].mine
         assert record is not None  # noqa: S101 for the type checker
-        going = self._going[host] = _Going(node, record, checksum(self._run, node, record))
+        going = self._going[host] = Going(node, record, checksum(self._run, node, record))
         return going
 
     def is_caught_up(self, nodes: Iterable[str], issued: Mapping[str, int]) -> bool:
