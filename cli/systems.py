@@ -23,16 +23,17 @@ from rampart.sim.runs.trial import trial_class
 DEFAULT = systems.DEFAULT
 
 
-def choice(dest: str = "system", what: str = "") -> Option:
+def choice(dest: str = "system", what: str = "", default: str = "the shipped one") -> Option:
     """Return what lets a verb be told its system with or without `--system`.
 
     Args:
         dest: where the choice is found in the options; None if there is none.
         what: the verb takes besides a system.
+        default: in words, what it takes if it is not told.
     """
     return either(
         option(dest, nargs="?", metavar="SPEC", default=argparse.SUPPRESS,
-               help=f"file, or name of a shipped system{what}; default the shipped one"),
+               help=f"file, or name of a shipped system{what}; default {default}"),
         option("--system", dest=dest, metavar="SPEC", help="the same"))
 
 

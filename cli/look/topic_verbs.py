@@ -52,7 +52,8 @@ def add(verbs: Any) -> None:
     key = option("key", metavar="KEY")
     ros = option("--ros", nargs="?", const=ROUTER, metavar="ENDPOINT",
                  help=f"of ROS 2, by the router there (default {ROUTER})")
-    add_verb(topic, "list", "all topics (needs no run)", topic_list, systems.choice(),
+    add_verb(topic, "list", "all topics (needs no run)", topic_list,
+             systems.choice(default="that of the run, else the shipped one"),
              either(JSON, flag("--markdown", "print topics.md")), ros)
     add_verb(topic, "info", "the contract of one topic (needs no run)", topic_info, key,
              word("--system", "FILE", "system spec; default that of the run, else the shipped one"),
@@ -73,7 +74,7 @@ def topic_list(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
 
     Examples:
       rampart topic list
-      rampart topic list --markdown > topics.md
+      rampart topic list osmosis --markdown > topics.md
       rampart topic list --ros
     """
     if options.ros:

@@ -21,7 +21,7 @@ DOCUMENT = ROOT / "topics.md"
 def test_topics_md_is_up_to_date():
     expected = markdown(systems.load(None))
     assert DOCUMENT.read_text(encoding="utf-8") == expected, (
-        "topics.md is out of date; write it again: rampart topic list --markdown > topics.md")
+        "topics.md is out of date; write it: rampart topic list osmosis --markdown > topics.md")
 
 
 def test_every_topic_that_a_node_reads_is_published_by_somebody():
