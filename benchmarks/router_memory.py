@@ -27,6 +27,7 @@ from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
+from rampart.actors.machine.heap import keep_large_apart
 from rampart.actors.osmosis import topics
 
 CLIENTS = 10
@@ -50,6 +51,7 @@ def router(folder: str, name: str) -> int:
     """Start a router that writes down its heap at SIGUSR1."""
 
     async def run() -> None:
+        keep_large_apart()  # as `Router` does
         other = next(one for one in ROUTERS if one != name)
         bus = ZenohBus(name, 1, [endpoint(folder, other)], [endpoint(folder, name)])
         await bus.open()

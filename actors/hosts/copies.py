@@ -143,7 +143,8 @@ class Copies:
         for state in self._states.values():
             if state.other == host:
                 state.theirs = None
-                self._lines[host] = Line()
+        if host in self._lines:
+            self._lines[host] = Line()
 
     def has_missed(self) -> bool:
         """Whether another host lacks something that can be sent to it."""

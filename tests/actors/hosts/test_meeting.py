@@ -133,12 +133,13 @@ async def test_one_that_goes_before_the_start_is_waited_for_again():
         waiting.cancel()
 
 
-async def test_the_end_is_told():
+@pytest.mark.parametrize("later_s", [0.05, 1.0])  # over a bad line it is sent again
+async def test_the_end_is_told(later_s):
     async with meeting() as (made, where):
         ground = Attendance("ground", where, FIRST)
         await ground.ask()
         closing = asyncio.create_task(made.close())
-        await asyncio.sleep(0.05)
+        await asyncio.sleep(later_s)
         assert (await ground.ask())[0].over == "the first host has ended it"
         await closing
         await ground.close()
