@@ -305,6 +305,12 @@ class Copies:
         going = self._going[host] = Going(node, record, checksum(self._run, node, record))
         return going
 
+    def come(self, nodes: Iterable[str]) -> tuple[tuple[Age, int], ...]:
+        """Return what has come of the states of nodes; it changes with each part that comes."""
+        states = [self._states[node] for node in nodes if node in self._states]
+        return tuple((state.coming.age, len(state.coming.data)) if state.coming else (state.age, 0)
+                     for state in states)
+
     def is_caught_up(self, nodes: Iterable[str], issued: Mapping[str, int]) -> bool:
         """Whether the last states that another host has kept of its nodes are here.
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from signal import Signals
@@ -28,6 +29,7 @@ from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.hosts.copies import Copies
+from rampart.actors.hosts.parts import Age
 from rampart.actors.hosts.placement import FIRST, Changes, Home, Placement
 from rampart.actors.hosts.state_files import StateFiles
 from rampart.actors.run.run_plan import SUPERVISOR, on_host
@@ -55,10 +57,32 @@ _ENDING_S = 0.005
 """Real seconds between two looks whether a process that was given back has ended."""
 
 _STATE_S = 2.0
-"""Real seconds that the last state of a node is waited for, at most, when it is given back."""
+"""Real seconds without a byte of it after which the last state of a node that is given back is no
+longer waited for."""
+
+_STATES_S = 10.0
+"""Real seconds after which it is not in any case."""
 
 _ORDERS_KEPT = 64
 """An order to signal that is repeated gets its old answer, as long as it is among the last ones."""
+
+
+@dataclass(slots=True)
+class _Wait:
+    """For the last states of a unit that was given back: since when, and what has come."""
+
+    since_s: float
+    came_s: float
+    asked_s: float
+    came: tuple[tuple[Age, int], ...] = ()
+
+    def is_vain(self, now_s: float, came: tuple[tuple[Age, int], ...]) -> bool:
+        if now_s - self.asked_s > 4 * _LOOK_S:  # it was run there again meanwhile
+            self.since_s = self.came_s = now_s
+        if came != self.came:
+            self.came_s, self.came = now_s, came
+        self.asked_s = now_s
+        return now_s - self.came_s >= _STATE_S or now_s - self.since_s >= _STATES_S
 
 
 class HostSupervisor(Supervisor):
@@ -95,7 +119,7 @@ class HostSupervisor(Supervisor):
              for name, unit in units.items()},
             hosts.link, self._loop.time())
         self._ending: dict[str, ProcessHandle] = {}
-        self._given_back_s: dict[str, tuple[float, float]] = {}
+        self._waits: dict[str, _Wait] = {}
         self._copies = Copies(
             self._plan.run_id, own, {} if not self._keeps_states() else {
                 node.name: home for name, unit in units.items() for node in unit.nodes
@@ -303,12 +327,9 @@ class HostSupervisor(Supervisor):
     def _has_states(self, unit: str) -> bool:
         """Whether a unit that was given back can go on from what it has kept there."""
         told, now_s = self._placement.told_of(unit), self._loop.time()
-        since_s, asked_s = self._given_back_s.get(unit, (now_s, now_s))
-        if now_s - asked_s > 4 * _LOOK_S:  # it was run there again meanwhile
-            since_s = now_s
-        self._given_back_s[unit] = since_s, now_s
         is_caught_up = self._copies.is_caught_up(told, told)
-        if not is_caught_up and now_s - since_s < _STATE_S:
+        wait = self._waits.setdefault(unit, _Wait(now_s, now_s, now_s))
+        if not wait.is_vain(now_s, self._copies.come(told)) and not is_caught_up:
             return False
         if not is_caught_up:
             self._state_problem(unit, "the last state was not sent in time by the host that gave "

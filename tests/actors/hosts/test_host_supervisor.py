@@ -31,8 +31,8 @@ EPOCH = run_folder.EPOCH
 DELAY_S = 0.05
 
 
-def record(incarnation: int, generation: int) -> Record:
-    return Record(generation, incarnation, 1, b"%d" % generation)
+def record(incarnation: int, generation: int, size: int = 1) -> Record:
+    return Record(generation, incarnation, 1, b"%d" % generation * size)
 
 
 class Files:
@@ -117,6 +117,7 @@ class World:
         loop = asyncio.get_running_loop()
         self.clock = Clock(loop.time(), source=loop.time)
         self.is_cut = False
+        self.delay_s = DELAY_S
         self.hub = Hub(self.link)
         self.checkpoints = checkpoints
         self.file = folder / "two.toml"
@@ -131,7 +132,7 @@ class World:
 
     def link(self, source: str, reader: str):
         def way(now_s: float) -> tuple[float, ...]:
-            return () if self.is_cut else (now_s + DELAY_S,)
+            return () if self.is_cut else (now_s + self.delay_s,)
 
         return None if source.endswith("ground") == reader.endswith("ground") else way
 
@@ -244,6 +245,27 @@ def test_a_last_state_that_never_comes_is_waited_for_two_seconds_and_told(tmp_pa
             await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
             assert 2.0 < made.clock.now() - given_back_s < 2.5
             assert any("the last state was not sent in time" in why for _, why in made.told)
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(("delay_s", "size", "comes_after_s"), [
+    (0.05, 2_000_000, (2.1, 5.0)), (0.4, 200_000, (4.0, 9.5)), (0.9, 900_000, None)])
+def test_a_long_last_state_is_waited_for_as_long_as_some_of_it_comes_but_ten_seconds(
+        tmp_path, delay_s, size, comes_after_s):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            await made.taken_over()
+            made.robot.files.keep("camera", record(EPOCH + 1, 3, size))
+            made.is_cut, made.delay_s = False, delay_s
+            await eventually(lambda: not made.robot.of("camera"), 20)
+            given_back_s = made.clock.now()
+            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2, 20)
+            least_s, most_s = comes_after_s or (10.0, 11.5)
+            assert least_s < made.clock.now() - given_back_s < most_s
+            assert made.ground.loaded["camera", EPOCH + 2] == (
+                record(EPOCH + 1, 3, size) if comes_after_s else record(1, 2))
+            assert comes_after_s or any("was not sent in time" in why for _, why in made.told)
 
     run(scenario)
 
