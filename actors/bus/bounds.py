@@ -62,8 +62,8 @@ Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Pid = Annotated[int, Meta(ge=0, le=2**22)]
 """Process of this machine: Linux has no higher ones. 0 if there is none."""
 
-Incarnation = Annotated[int, Meta(ge=0, le=2**31 - 1)]
-"""How many-th process of a node, from 1; 0 before the first."""
+Incarnation = Count
+"""How many-th process of a node, from 1; 0 before the first. A lost host takes a million."""
 
 Seconds = Annotated[float, Meta(ge=-1e12, le=1e12)]
 """A point in simulated time: finite."""

@@ -126,7 +126,7 @@ class OtherHost:
 
         Raises:
             LaunchError: They cannot be started.
-            MeetingError: this host may not take part, or the run is over already.
+            MeetingError: this host may not take part, or the run is over already, or another.
         """
         launcher = self.launcher
         assert launcher is not None  # noqa: S101 for the type checker
@@ -167,7 +167,11 @@ class OtherHost:
         await self._attendance.close()
 
     async def _answer(self) -> Told:
-        """Ask until there is an answer; what the clocks show of it is noted."""
+        """Ask until there is an answer; what the clocks show of it is noted.
+
+        Raises:
+            MeetingError: this host may not take part, or the first one has begun another run.
+        """
         while True:
             try:
                 told, asked_s, heard_s = await self._attendance.ask()
@@ -181,6 +185,9 @@ class OtherHost:
                 continue
             if self._said.startswith("the first host cannot"):
                 self._tell("the first host answers")
+            if self.launcher and told.plan.run_id != self.launcher.plan.run_id:
+                raise MeetingError(f"the first host has begun another run ({told.plan.run_id}); "
+                                   "start this host again")
             if told.now_s:
                 self._clocks.exchanged(asked_s, told.now_s, heard_s)
             return told

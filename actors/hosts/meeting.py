@@ -40,6 +40,9 @@ _PATIENCE_S = 3.0
 _FAREWELL_S = 2.0
 """How long others are waited for at the end: over a bad line the word is sent again and again."""
 
+_GOODBYE_S = 0.5
+"""How long a connection that is closed waits for the other end's word that it has heard so."""
+
 _MAX_LINE = 1 << 20
 
 
@@ -117,7 +120,8 @@ class Meeting:
         try:
             self._server = await asyncio.start_server(
                 self._serve, address, port, limit=_MAX_LINE, reuse_address=True,
-                ssl=context(shown, ssl.Purpose.CLIENT_AUTH) if shown else None)
+                ssl=context(shown, ssl.Purpose.CLIENT_AUTH) if shown else None,
+                ssl_shutdown_timeout=_GOODBYE_S if shown else None)
         except OSError as error:
             raise MeetingError(f"cannot listen at {address} port {port} for the other hosts: "
                                f"{error.strerror or error}") from None
@@ -234,7 +238,8 @@ class Attendance:
             async with asyncio.timeout(_PATIENCE_S):
                 if self._ends is None:
                     self._ends = await asyncio.open_connection(
-                        *self._where, limit=_MAX_LINE, ssl=self._context)
+                        *self._where, limit=_MAX_LINE, ssl=self._context,
+                        ssl_shutdown_timeout=_GOODBYE_S if self._context else None)
                     if self._shown and not _is(self._ends[1], self._shown, "router", DOOR):
                         raise MeetingError("somebody else answers in the first host's place")
                 reader, writer = self._ends

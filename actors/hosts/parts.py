@@ -8,7 +8,7 @@ goes when the other host has said that it is there.
 
 from __future__ import annotations
 
-import math
+from collections import deque
 from dataclasses import dataclass, field
 
 from rampart.actors.ftm.messages import PART_BYTES, StateCopy
@@ -20,6 +20,8 @@ else of half of it: that long may something wait behind it."""
 
 _LEAST_BYTES = 4096
 """Of the first part, too: what it takes is nearly the way alone."""
+
+_LAST = 8
 
 Age = tuple[int, int]
 Of = tuple[Age, int, int, bytes]
@@ -85,16 +87,16 @@ class Line:
 
     Attributes:
         part_bytes: How much is sent at once.
-        soonest_s: How soon a part was answered at best.
+        took_s: How soon the last parts were answered: the way may become longer.
     """
 
     part_bytes: int = _LEAST_BYTES
-    soonest_s: float = math.inf
+    took_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))
 
     def answered(self, after_s: float) -> None:
         """Note that a part was answered."""
-        self.soonest_s = min(self.soonest_s, after_s)
-        if after_s < self.soonest_s + SOON_S:
+        self.took_s.append(after_s)
+        if after_s < min(self.took_s) + SOON_S:
             self.part_bytes = min(2 * self.part_bytes, PART_BYTES)
         else:
             self.missed()

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from rampart.actors.runtime.checkpoint import CheckpointError, Record, SupersededError
-from rampart.actors.runtime.checkpoint_file import beside, primary_code, words
+from rampart.actors.runtime.checkpoint_file import beside, is_damage, primary_code, words
 from rampart.actors.runtime.checkpoint_store import LOCKED, SqliteCheckpoints, newest
 
 LOOK_S = 0.02
@@ -55,6 +55,7 @@ class StateFiles:
         self._is_over = False
         self._seen: dict[str, _Trace] = {}
         self._told: dict[str, tuple[int, int]] = {}
+        self._why_not: dict[str, str] = {}
         self._stores: dict[str, tuple[int, SqliteCheckpoints]] = {}
         self._thread = threading.Thread(target=self._work, name="states of nodes", daemon=True)
 
@@ -107,15 +108,21 @@ class StateFiles:
         try:
             record = newest(file, self._run)
         except Exception as error:  # whatever lies there
+            is_passing = not is_damage(error, file)
+            if is_passing and settles:
+                with self._lock:
+                    self._settling.add(node)
             if primary_code(error) in LOCKED:  # in this moment
-                if settles:
-                    self.settle(node)
                 return
-            self._problem(node, f"{file.name} cannot be read for another host: {words(error)}")
-            self._seen[node] = trace
-            if settles:
-                self._kept(node, None, True)
+            if words(error) != self._why_not.get(node):
+                self._why_not[node] = words(error)
+                self._problem(node, f"{file.name} cannot be read for another host: {words(error)}")
+            if not is_passing:
+                self._seen[node] = trace
+                if settles:
+                    self._kept(node, None, True)
             return
+        self._why_not.pop(node, None)
         changed_s = max((time_ns for _, _, time_ns in trace), default=0) / 1e9
         if not 0 <= read_s - changed_s <= _SETTLED_S:
             self._seen[node] = trace

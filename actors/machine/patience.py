@@ -20,6 +20,7 @@ is blamed only on proof that its loop stands still (`Standstill`).
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -51,8 +52,9 @@ def usage(pid: int) -> Usage:
     except (OSError, ValueError):
         ran_ns = waited_ns = 0
     state = process_state(pid)
-    if state == "S" and any(map(_is_on_run_queue, Path(f"/proc/{pid}/task").glob("*"))):
-        state = "R"
+    with contextlib.suppress(OSError):  # it has ended
+        if state == "S" and any(map(_is_on_run_queue, Path(f"/proc/{pid}/task").iterdir())):
+            state = "R"
     return Usage(state, ran_ns / 1e9, waited_ns / 1e9)
 
 

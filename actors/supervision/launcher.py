@@ -291,14 +291,16 @@ class Launcher:
                 os.close(end)
         self._lifeline = (-1, -1)
         self.guard.end()
-        if self._loaded is not None:
-            self._loaded.close()
         if self._first is not None:
-            with self._first:  # which closes its output and waits for it
-                self._first.kill()
+            self._first.kill()
         deadline = time.monotonic() + 1.0
         while kill_leftovers(self.plan.launcher_pid) and time.monotonic() < deadline:
             time.sleep(0.01)
+        if self._loaded is not None:
+            self._loaded.close()  # not while who writes it lives: a thread may still read it
+        if self._first is not None:
+            with self._first:  # which closes what leads to it and waits for it
+                pass
         end_commands(self.plan.folder)
         run_folder.remove(self.plan.folder)
         self._reap()

@@ -259,6 +259,20 @@ def test_parts_are_as_long_as_the_line_carries_soon(
     assert longest / 2 <= min(later) <= max(later) <= longest, lengths
 
 
+def test_a_way_that_becomes_longer_is_not_taken_for_slow_for_long(robot, ground):
+    exchange(robot, ground)
+    ground.keep("camera", state(1, 1, b"x" * 1_500_000))
+    now_s, lengths = 0.0, list[int]()
+    while ground.copies.has_missed():
+        message = ground.message(now_s)
+        lengths += [len(copy.state) for copy in message.copies]
+        now_s += 0.001 if len(lengths) < 10 else 0.3
+        robot.hear("ground", message)
+        ground.hear("", robot.message(now_s))
+    assert lengths[-2] == PART_BYTES, lengths
+    assert len(lengths) < 60
+
+
 @pytest.mark.parametrize("lost", [(0,), (3,), (3, 4), (0, 2, 4, 6, 8)])
 def test_a_part_that_is_lost_is_sent_again_after_a_while_and_a_shorter_one(robot, ground, lost):
     exchange(robot, ground)

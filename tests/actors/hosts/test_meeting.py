@@ -7,25 +7,33 @@ import contextlib
 import re
 import shutil
 import socket
-from contextlib import asynccontextmanager
+import ssl
+import threading
+from contextlib import asynccontextmanager, contextmanager
 
 import msgspec
 import pytest
 
 from rampart.actors.access import key_folder
 from rampart.actors.bus.zenoh_session import credentials_in
+from rampart.actors.hosts.launchers import OtherHost
 from rampart.actors.hosts.meeting import (
     DOOR,
+    Ask,
     Attendance,
     Meeting,
     MeetingError,
     contents_of,
+    context,
     joined,
 )
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.layout.hosts import Hosts
+from rampart.actors.layout.layout import load_application
+from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.systems import DEFAULT
 from rampart.testing import eventually
 from rampart.testing.ports import free_port
+from tests.two_hosts import two_hosts
 
 PLAN = RunPlan("r1", 7450, seed=7, system_file="/there/x.toml", hmi_token="t0ken-of-mine",
                hmi_secret="k3y", folder="/f")
@@ -257,3 +265,111 @@ async def test_who_answers_in_the_first_host_s_place_with_a_node_s_key_is_not_be
         await ground.ask()
     await ground.close()
     await made.close()
+
+
+# ---- one that is silent -------------------------------------------------------------------------
+
+
+@contextmanager
+def in_a_thread(talk):
+    """Have somebody talk as far as he does, and then neither read nor close until the end."""
+    is_over = threading.Event()
+    thread = threading.Thread(target=talk, args=(is_over.wait,))
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
+
+
+async def test_with_keys_the_end_waits_for_nobody_who_is_silent(keys):
+    """A line that was cut, a launcher that is stopped: TLS would wait half a minute for a word."""
+    shown = credentials_in(str(keys), "observer_ground")
+    made, where = Meeting(PLAN, ("ground",), CONTENTS, dict), ("127.0.0.1", free_port())
+    await made.open(*where, credentials_in(str(keys), DOOR))
+    heard = threading.Event()
+
+    def talk(silent):
+        secure = context(shown, ssl.Purpose.SERVER_AUTH)
+        with secure.wrap_socket(socket.create_connection(where)) as ground:
+            ground.sendall(msgspec.json.encode(Ask("ground", "7", FIRST)) + b"\n")
+            ground.recv(100_000)
+            heard.set()
+            silent()
+
+    with in_a_thread(talk):
+        await asyncio.to_thread(heard.wait)
+        async with asyncio.timeout(15):
+            await made.close()
+
+
+async def test_with_keys_a_first_host_that_is_silent_is_asked_anew_soon(keys):
+    where = ("127.0.0.1", free_port())
+    listening = threading.Event()
+
+    def talk(silent):
+        secure = context(credentials_in(str(keys), DOOR), ssl.Purpose.CLIENT_AUTH)
+        with socket.create_server(where) as server:
+            listening.set()
+            with secure.wrap_socket(server.accept()[0], server_side=True) as first:
+                first.recv(100_000)
+                silent()
+
+    with in_a_thread(talk):
+        await asyncio.to_thread(listening.wait)
+        ground = Attendance("ground", where, FIRST, credentials_in(str(keys), "observer_ground"))
+        async with asyncio.timeout(15):
+            with pytest.raises(TimeoutError):
+                await ground.ask()
+
+
+# ---- another run --------------------------------------------------------------------------------
+
+
+class Started:
+    """What `OtherHost` has of a launcher; it starts nothing."""
+
+    failure = ""
+
+    def __init__(self, plan):
+        self.plan = plan
+
+    async def load(self):
+        pass
+
+    async def start(self):
+        pass
+
+    def follow(self, origin_s):
+        assert origin_s
+
+
+async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path):
+    """Its launcher was killed and started again, at another rate say: nobody told of an end."""
+    file = tmp_path / "two.toml"
+    file.write_text(two_hosts({"robot": "127.0.7.1", "ground": "127.0.7.2"},
+                              ("camera", "part_finder", "D_VISION_CRASH"), "cell", 0.1))
+    own, said = RunPlan(system_file=str(file), host="ground"), []
+    port = Hosts(load_system(own)).meeting_place()[1]
+    plan = RunPlan("r1", system_file=str(file))
+    contents = contents_of(plan, load_application(plan, load_system(plan)))
+    first = Meeting(plan, ("ground",), contents, dict)
+    await first.open("127.0.7.1", port)
+    ground = OtherHost(own, said.append)
+    ground.launcher = Started(await ground.join())
+    starting = asyncio.create_task(ground.start())
+    await first.all_ready(said.append)
+    first.begin(100.0)
+    await starting
+    staying = asyncio.create_task(ground.stay())
+    await asyncio.sleep(0.3)
+    first._server.close()
+    for writer in list(first._writers):
+        writer.transport.abort()
+    again = Meeting(msgspec.structs.replace(plan, run_id="r2"), ("ground",), contents, dict)
+    await again.open("127.0.7.1", port)
+    with pytest.raises(MeetingError, match=r"the first host has begun another run \(r2\)"):
+        await asyncio.wait_for(staying, 15)
+    await ground.close()
+    await again.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import queue
 import sqlite3
 import threading
@@ -281,6 +282,28 @@ def test_a_damaged_file_is_told_and_what_comes_after_it_is_seen(file, watched):
     assert watched.next() == ("camera", Record(1, 2, 1, b"anew"), False)
 
 
+
+
+def test_a_state_that_cannot_be_read_in_one_moment_is_read_in_the_next(file, monkeypatch):
+    with store(file, 1) as made:
+        made.load()
+        made.save(1, b"kept")
+    looks = []
+
+    def read(*what):
+        looks.append(what)
+        if len(looks) < 4:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return newest(*what)
+
+    monkeypatch.setattr(state_files, "newest", read)
+    made = Watched(file)
+    made.files.settle("camera")
+    made.files.start()
+    assert made.next() == ("camera", Record(1, 1, 1, b"kept"), True)
+    made.files.close()
+    [(_, problem)] = made.problems
+    assert "cannot be read for another host" in problem
 
 
 def test_a_place_that_cannot_be_written_is_told(file):

@@ -75,6 +75,11 @@ def test_a_thread_that_is_on_the_run_queue_makes_its_process_one_that_is():
             process.kill()
 
 
+def test_of_one_that_ends_between_two_looks_there_is_nothing_to_see(monkeypatch):
+    monkeypatch.setattr("rampart.actors.machine.patience.process_state", lambda _pid: "S")
+    assert usage(2**22 + 1) == AT_LEISURE
+
+
 def test_an_answer_and_another_process_begin_anew():
     for begin, pid in ((lambda p: p.answered(), 7), (lambda _: None, 8)):
         patience = Patience(0.5)

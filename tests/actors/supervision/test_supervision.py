@@ -12,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -30,6 +31,7 @@ from rampart.actors.run.run_plan import load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision import guard as guard_module
+from rampart.actors.supervision import launcher as launcher_module
 from rampart.actors.supervision import node_process
 from rampart.actors.supervision.kill_node import main as kill_node
 from rampart.actors.supervision.launcher import Launcher, LaunchError
@@ -666,6 +668,22 @@ async def test_an_unsound_spec_is_one_line(tmp_path):
     with pytest.raises(LaunchError, match=r"stub\.toml.*DM9") as caught:
         await launcher.load()
     assert "\n" not in str(caught.value)
+    await launcher.end()
+
+
+async def test_a_spawner_that_hangs_while_it_loads_is_ended(tmp_path, monkeypatch):
+    """Its output is still read, in a thread that waits for a line."""
+    monkeypatch.setattr(launcher_module, "LOAD_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(Launcher, "_load", lambda *_: subprocess.Popen(
+        ["sleep", "60"], stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+    launcher = Launcher(stub_plan(write_stub_system(tmp_path)), "test")
+    launcher.begin()
+    with pytest.raises(LaunchError, match="did not load within"):
+        await launcher.load()
+    ending = threading.Thread(target=launcher.abort)
+    ending.start()
+    await asyncio.to_thread(ending.join, 30)
+    assert not ending.is_alive()
     await launcher.end()
 
 
