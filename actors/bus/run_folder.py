@@ -18,6 +18,7 @@ when the same user starts the next one.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import shutil
@@ -94,9 +95,11 @@ def issue(folder: str, names: Iterable[str], incarnation: int,
         process: which that is; None if it is on another machine.
 
     Raises:
-        OSError: the folder is gone, or full.
+        OSError: the folder is gone, or full; or a name is none of a file.
     """
     for name in names:
+        if "/" in name or "\0" in name:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL), name)
         fresh = Path(folder, _ISSUED, f"{name}~")
         fresh.unlink(missing_ok=True)  # left by a process that died here
         fresh.symlink_to(" ".join(map(str, (incarnation, *(process or ())))))
@@ -144,6 +147,12 @@ def process_of(folder: str, name: str, incarnation: int) -> LocalProcess | None:
     if found is None or found[0] != incarnation or len(found) < 1 + len(ProcessId._fields):
         return None
     return LocalProcess(ProcessId(*found[1:]), mark_of(folder, name))
+
+
+def is_elsewhere(folder: str, name: str) -> bool:
+    """Whether the incarnation of a node that was issued last is on another machine."""
+    found = _look_up(folder, name)
+    return found is not None and len(found) < 1 + len(ProcessId._fields)
 
 
 def mark_of(folder: str, name: str) -> str:

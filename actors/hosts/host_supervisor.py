@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from signal import Signals
@@ -24,17 +23,18 @@ from typing import Any, ClassVar
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.messages import Heartbeat
-from rampart.actors.bus.run_folder import issue
+from rampart.actors.bus.run_folder import is_elsewhere, issue
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.hosts.copies import Copies
-from rampart.actors.hosts.parts import Age
+from rampart.actors.hosts.parts import Wait
 from rampart.actors.hosts.placement import FIRST, Changes, Home, Placement
 from rampart.actors.hosts.state_files import StateFiles
 from rampart.actors.run.run_plan import SUPERVISOR, on_host
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.checkpoint import Record
+from rampart.actors.supervision.held_process import HeldProcess
 from rampart.actors.supervision.kill_node import (
     SIGNALS,
     SignalError,
@@ -42,7 +42,7 @@ from rampart.actors.supervision.kill_node import (
     find_node,
 )
 from rampart.actors.supervision.process_title import kill
-from rampart.actors.supervision.processes import Processes, ProcessHandle
+from rampart.actors.supervision.processes import Processes
 from rampart.actors.supervision.supervised_process import Event
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.manager.spec.schema import Kind
@@ -56,33 +56,8 @@ _SAID_S = 0.1
 _ENDING_S = 0.005
 """Real seconds between two looks whether a process that was given back has ended."""
 
-_STATE_S = 2.0
-"""Real seconds without a byte of it after which the last state of a node that is given back is no
-longer waited for."""
-
-_STATES_S = 10.0
-"""Real seconds after which it is not in any case."""
-
 _ORDERS_KEPT = 64
 """An order to signal that is repeated gets its old answer, as long as it is among the last ones."""
-
-
-@dataclass(slots=True)
-class _Wait:
-    """For the last states of a unit that was given back: since when, and what has come."""
-
-    since_s: float
-    came_s: float
-    asked_s: float
-    came: tuple[tuple[Age, int], ...] = ()
-
-    def is_vain(self, now_s: float, came: tuple[tuple[Age, int], ...]) -> bool:
-        if now_s - self.asked_s > 4 * _LOOK_S:  # it was run there again meanwhile
-            self.since_s = self.came_s = now_s
-        if came != self.came:
-            self.came_s, self.came = now_s, came
-        self.asked_s = now_s
-        return now_s - self.came_s >= _STATE_S or now_s - self.since_s >= _STATES_S
 
 
 class HostSupervisor(Supervisor):
@@ -117,9 +92,11 @@ class HostSupervisor(Supervisor):
             {name: Home(hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes),
                         any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
              for name, unit in units.items()},
-            hosts.link, self._loop.time())
-        self._ending: dict[str, ProcessHandle] = {}
-        self._waits: dict[str, _Wait] = {}
+            hosts.link, self._loop.time(), rate=self._plan.rate,
+            guards={name: host for host in hosts.supervisors for name in hosts.guards_of(host)})
+        self._looked_s = self._loop.time()
+        self._ending: list[HeldProcess] = []
+        self._waits: dict[str, Wait] = {}
         self._copies = Copies(
             self._plan.run_id, own, {} if not self._keeps_states() else {
                 node.name: home for name, unit in units.items() for node in unit.nodes
@@ -130,9 +107,6 @@ class HostSupervisor(Supervisor):
             Path(self._plan.checkpoints), self._plan.run_id, self._copies.nodes,
             partial(self._from_thread, self._state_kept), partial(
                 self._from_thread, self._state_problem))
-        if self._plan.incarnations and self._incarnation == self._plan.incarnations + 1:
-            for unit in self._placement.waits():
-                del self._processes[unit]
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Supervisor.Parameters) -> Members:
@@ -153,12 +127,20 @@ class HostSupervisor(Supervisor):
         return super().output_names(topic, name, parameters)
 
     def on_start(self) -> None:
-        """Adopt what is run here in another host's place as well."""
-        for process in self._machine.living():
-            unit = self._layout.unit_of.get(process.names[0], "")
-            if unit and unit not in self._processes:
-                self._placement.adopted(unit)
-                self._processes[unit] = self._held(self._layout.units[unit])
+        """Adopt what is run here in another host's place as well.
+
+        What the first host ran last is not begun here before that has given it back.
+        """
+        living = {self._layout.unit_of.get(process.names[0], "")
+                  for process in self._machine.living()}
+        for unit in living - self._processes.keys() - {""}:
+            self._placement.adopted(unit)
+            self._processes[unit] = self._held(self._layout.units[unit])
+        is_new = self._plan.incarnations and self._incarnation == self._plan.incarnations + 1
+        for unit in self._placement.waits(lambda unit: bool(is_new) or (
+                unit not in living and any(is_elsewhere(self._plan.folder, node)
+                                           for node in self._processes[unit].names))):
+            del self._processes[unit]
         super().on_start()
         if self._copies.nodes:
             self._files.start()
@@ -245,6 +227,10 @@ class HostSupervisor(Supervisor):
             self.report_diagnostic("incarnation", f"not noted: {error}", row.name)
 
     def _look_at_hosts(self) -> None:
+        # Who stood still has mail to read before others can be said to be silent.
+        stall_s, self._looked_s = self._loop.time() - self._looked_s, self._loop.time()
+        if stall_s > 4 * _LOOK_S:
+            self._placement.excuse(stall_s)
         changes = self._placement.look(self._loop.time(), self._mine(), self._has_states)
         if changes != Changes():
             for host in changes.lost:
@@ -274,17 +260,28 @@ class HostSupervisor(Supervisor):
     def _drop(self, unit: str) -> None:
         process = self._processes.pop(unit, None)
         if process is not None:
-            self._machine.forget(process.names)
+            self._machine.withdraw(process.names)
             process.forget_step()
             process.kill()
             self._tell(process, "handed over", self.name)
-            self._issued.update(dict.fromkeys(process.names, process.highest))
+            # One that was asked for may have begun.
+            self._issued.update(dict.fromkeys(process.names, process.highest + process.waits))
             self._copies.unsettle(process.names)
             if not self._ending:
                 self.call_later(_ENDING_S * self.clock.rate, self._settle)
-            elif unit in self._ending:
-                self._ending[unit].close()
-            self._ending[unit], process.handle = process.handle, ProcessHandle()
+            self._ending.append(process)
+
+    def _is_let_go(self, process: HeldProcess) -> bool:
+        return self._processes.get(process.unit.name) is not process
+
+    def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
+        if not self._is_let_go(process):  # while the news waited in the mailbox
+            super()._ended(process, pid, detail)
+
+    def _hold(self, process: HeldProcess, pid: int) -> None:
+        super()._hold(process, pid)
+        if self._is_let_go(process):  # before there was a descriptor to hold it by
+            process.kill()
 
     # -- states of nodes ------------------------------------------------------------------------
 
@@ -305,7 +302,7 @@ class HostSupervisor(Supervisor):
 
     def _state_kept(self, node: str, record: Record | None, is_last: bool) -> None:
         self._copies.kept(node, record)
-        if is_last and self._layout.unit_of[node] not in self._ending:
+        if is_last and all(node not in process.names for process in self._ending):
             self._copies.settled(node)
         self._tell_states()
 
@@ -314,13 +311,13 @@ class HostSupervisor(Supervisor):
 
     def _settle(self) -> None:
         """Have what was ended here looked at for the last time."""
-        for unit, handle in list(self._ending.items()):
-            if handle.gone():
-                del self._ending[unit]
-                handle.close()
-                for node in self._layout.units[unit].nodes:
-                    if node.name in self._copies.nodes:
-                        self._files.settle(node.name)
+        gone = [process for process in self._ending if process.handle.gone()]
+        for process in gone:
+            self._ending.remove(process)
+            process.let_go()
+            for node in process.names:
+                if node in self._copies.nodes:
+                    self._files.settle(node)
         if self._ending:
             self.call_later(_ENDING_S * self.clock.rate, self._settle)
 
@@ -328,7 +325,7 @@ class HostSupervisor(Supervisor):
         """Whether a unit that was given back can go on from what it has kept there."""
         told, now_s = self._placement.told_of(unit), self._loop.time()
         is_caught_up = self._copies.is_caught_up(told, told)
-        wait = self._waits.setdefault(unit, _Wait(now_s, now_s, now_s))
+        wait = self._waits.setdefault(unit, Wait(now_s))
         if not wait.is_vain(now_s, self._copies.come(told)) and not is_caught_up:
             return False
         if not is_caught_up:

@@ -8,6 +8,7 @@ goes when the other host has said that it is there.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -22,6 +23,16 @@ _LEAST_BYTES = 4096
 """Of the first part, too: what it takes is nearly the way alone."""
 
 _LAST = 8
+
+_WAIT_S = 2.0
+"""Real seconds without a byte of it after which the last state of a node that is given back is no
+longer waited for."""
+
+_WAIT_AT_MOST_S = 10.0
+"""Real seconds after which it is not in any case."""
+
+_ASKED_S = 0.2
+"""Who has not been asked for so long was run there again meanwhile."""
 
 Age = tuple[int, int]
 Of = tuple[Age, int, int, bytes]
@@ -104,3 +115,29 @@ class Line:
     def missed(self) -> None:
         """Note that one was not, in time."""
         self.part_bytes = max(self.part_bytes // 2, _LEAST_BYTES)
+
+
+@dataclass(slots=True)
+class Wait:
+    """For the last states of nodes that were given back.
+
+    Attributes:
+        since_s: Since when, real seconds.
+        came_s: When some of them came last.
+        asked_s: When it was asked last whether it is over.
+        came: What has come.
+    """
+
+    since_s: float
+    came_s: float = -math.inf
+    asked_s: float = -math.inf
+    came: tuple[tuple[Age, int], ...] = ()
+
+    def is_vain(self, now_s: float, came: tuple[tuple[Age, int], ...]) -> bool:
+        """Whether it has lasted for too long; it has begun anew if it was not asked for a while."""
+        if now_s - self.asked_s > _ASKED_S:
+            self.since_s = self.came_s = now_s
+        if came != self.came:
+            self.came_s, self.came = now_s, came
+        self.asked_s = now_s
+        return now_s - self.came_s >= _WAIT_S or now_s - self.since_s >= _WAIT_AT_MOST_S

@@ -97,19 +97,24 @@ class Placement:
         homes: Where each unit belongs.
         link: When a host is lost, and when it is back.
         now_s: Now.
+        guards: Name of each supervisor and router with that of its host.
+        rate: Simulated seconds in a real one: at less than 1 others speak more rarely.
 
     Attributes:
         held: Units that it runs.
     """
 
     def __init__(self, own: str, others: Iterable[str], homes: Mapping[str, Home],
-                 link: Link, now_s: float) -> None:
+                 link: Link, now_s: float, *, guards: Mapping[str, str], rate: float = 1.0) -> None:
         self.held = {unit for unit, home in homes.items() if home.host == own}
         self._own = own
         self._homes = homes
         self._unit_of = {node: unit for unit, home in homes.items() for node in home.nodes}
-        self._link = link
-        self._others = {name: _Other(now_s + _GRACE_S - link.lost_after_s, now_s)
+        self._guards = guards
+        slow = max(1.0, 1.0 / rate)
+        self._lost_after_s, self._table_s = slow * link.lost_after_s, slow * _TABLE_S
+        self._return_after_s = link.return_after_s
+        self._others = {name: _Other(now_s + _GRACE_S - self._lost_after_s, now_s)
                         for name in others}
         self._highest: dict[str, int] = {}
 
@@ -121,14 +126,25 @@ class Placement:
         """Whether a unit runs at its home or nowhere."""
         return self._homes[unit].is_fixed
 
-    def waits(self) -> list[str]:
+    def waits(self, is_elsewhere: Callable[[str], bool]) -> list[str]:
         """Begin without what the first host may be running, and return what that is.
 
-        Of a host that was started anew: it is given back what is its own.
+        It is given back.
+
+        Args:
+            is_elsewhere: Asked of a unit of this host: whether it ran on the first one last.
         """
-        waiting = [unit for unit in self._homed(self._own) if not self._homes[unit].is_fixed]
+        waiting = [unit for unit in self._homed(self._own)
+                   if not self._homes[unit].is_fixed and is_elsewhere(unit)]
         self.held.difference_update(waiting)
         return waiting
+
+    def excuse(self, stall_s: float) -> None:
+        """Do not count as silence of the others a time in which nothing could be heard here."""
+        for other in self._others.values():
+            other.heard_s += stall_s
+            other.since_s += stall_s
+            other.told_s += stall_s
 
     def adopted(self, unit: str) -> None:
         """Note that a unit of another host runs here already: so that is lost."""
@@ -139,7 +155,7 @@ class Placement:
     def heard(self, host: str, now_s: float) -> bool:
         """Note that a guard of another host was heard; return whether that was missed before."""
         other = self._others[host]
-        was_missed = now_s - other.heard_s > self._link.lost_after_s
+        was_missed = now_s - other.heard_s > self._lost_after_s
         if was_missed:
             other.since_s = now_s
         other.heard_s = now_s
@@ -187,12 +203,12 @@ class Placement:
         lost, back, drop = list[str](), list[str](), list[str]()
         take: list[tuple[str, int]] = []
         for host, other in self._others.items():
-            is_silent = now_s - other.heard_s > self._link.lost_after_s
+            is_silent = now_s - other.heard_s > self._lost_after_s
             if not other.is_lost and is_silent:
                 other.is_lost = True
                 lost.append(host)
             elif (other.is_lost and not is_silent
-                  and now_s - other.since_s >= self._link.return_after_s):
+                  and now_s - other.since_s >= self._return_after_s):
                 other.is_lost = False
                 back.append(host)
             if self._own != FIRST:
@@ -237,9 +253,14 @@ class Placement:
         return row.incarnation if row else 0
 
     def _may_run(self, host: str, node: str) -> bool:
-        """Whether a host may speak of a node: the first of those of all, another of its own."""
+        """Whether a host may speak of a node: the first of those of all, another of its own.
+
+        Of its supervisor and routers each alone, and nobody of what is neither.
+        """
         unit = self._unit_of.get(node)
-        return unit is None or host == FIRST or self._homes[unit].host == host
+        if unit is None:
+            return self._guards.get(node) == host
+        return host in {FIRST, self._homes[unit].host}
 
     def _wanted_back(self, host: str, other: _Other) -> list[str]:
         """Return what is run here and no more at home, as its supervisor says since it is back.
@@ -265,7 +286,7 @@ class Placement:
     def _given_back(self, now_s: float, mine: Mapping[str, int]) -> list[tuple[str, int]]:
         """Return what has its home here and is not run: the first host does not list it (more)."""
         first = self._others[FIRST]
-        if now_s - first.told_s > _TABLE_S:
+        if now_s - first.told_s > self._table_s:
             return []
         return [(unit, self._known(unit, mine)) for unit in self._homed(self._own)
                 if unit not in self.held

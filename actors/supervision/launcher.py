@@ -32,7 +32,14 @@ from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.supervision.guard import Guard
-from rampart.actors.supervision.process_title import end_commands, kill, kill_leftovers, set_title
+from rampart.actors.supervision.process_title import (
+    TITLE_BYTES,
+    end_commands,
+    kill,
+    kill_leftovers,
+    set_title,
+    title_room,
+)
 from rampart.actors.supervision.spawner import NAMES, Loaded, load_and_serve
 from rampart.actors.supervision.spawner_client import (
     START_PATIENCE_S,
@@ -130,7 +137,7 @@ class Launcher:
         _, self._descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (self._descriptors, self._descriptors))
         self._begun_s = time.monotonic()
-        if forks and _has_one_thread():
+        if forks and _has_one_thread() and title_room() >= TITLE_BYTES:
             self._begun_s -= _age_s()
             self._loaded = self._fork(NAMES[0])
         else:
@@ -143,7 +150,8 @@ class Launcher:
             [sys.executable, "-P", "-m", "rampart.actors.supervision.spawner", name,
              str(self._lifeline[0])],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
-            env=working_folder.environment(), process_group=0)  # see `node_process`
+            env={**working_folder.environment(), "RAMPART_ROOM_FOR_TITLES": "." * TITLE_BYTES},
+            process_group=0)  # see `node_process`
         assert spawner.stdin is not None  # noqa: S101 for the type checker
         with contextlib.suppress(BrokenPipeError):  # it has died: what waits for it will notice
             spawner.stdin.write(msgspec.json.encode(self.plan))

@@ -94,6 +94,9 @@ class Processes(Protocol):
     def forget(self, names: tuple[str, ...]) -> None:
         """End a process that was made ready and is not wanted."""
 
+    def withdraw(self, names: tuple[str, ...]) -> None:
+        """Likewise, and one that `fork` was called for and is under way."""
+
     def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> ProcessHandle:
         """Take hold of a process; `ended` is called on the event loop when it ends.
 

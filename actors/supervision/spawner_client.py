@@ -262,6 +262,13 @@ class SpawnerClient:
         if asked is not None:
             asked.dismiss()
 
+    def withdraw(self, names: tuple[str, ...]) -> None:
+        """End what is under way for these actors: what was made ready, and what was asked for."""
+        self.forget(names)
+        before, asked = self._forks.pop(names, (0, None))
+        if asked is not None and (child := self._child(asked.withdraw(), names, before)):
+            kill(child)
+
     def turns(self, name: str) -> bool:
         """Whether a spawner answers; one that does not is asked once, however often this is."""
         asked, wait_s = self._pings.pop(name, None), 0.0
@@ -329,12 +336,12 @@ class SpawnerClient:
         return 0
 
     def _resumed(self, names: tuple[str, ...], incarnation: int) -> _Asked | None:
-        before, asked = self._forks.pop(names, (incarnation, None))
-        if asked is None or before == incarnation:
-            return asked
-        if child := self._child(asked.withdraw(), names, before):  # its place is another's now
-            kill(child)
-        return None
+        before, asked = self._forks.get(names, (incarnation, None))
+        if before != incarnation:  # its place is another's now
+            self.withdraw(names)
+            return None
+        self._forks.pop(names, None)
+        return asked
 
     def _child(self, reply: Reply, names: tuple[str, ...], incarnation: int) -> int:
         """Return who sent an answer, if that is the process that was asked for; else 0."""

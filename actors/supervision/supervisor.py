@@ -6,8 +6,7 @@
 * *Wedged*: no heartbeat although the process runs: its event loop turns no more. Of the manager,
   whose silence stops the robot, the status counts as much as the heartbeat.
 
-Who waits for a processor is neither (see `patience`). What follows from what, and what becomes of
-one that ends too often, is in `supervised_process`.
+Who waits for a processor is neither (see `patience`). What follows is in `supervised_process`.
 
 What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
 Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order, stop
@@ -369,13 +368,14 @@ class Supervisor(Actor):
     def _hold(self, process: HeldProcess, pid: int) -> None:
         if process.pid != pid:  # it was replaced while this waited
             return
-        process.handle = ProcessHandle(is_gone=False)
+        process.let_go()
         try:
             process.handle = self._machine.hold(pid, lambda: self._dispatcher.put(
                 f"exit {pid}", lambda: self._ended(process, pid)), process.names[0])
         except ProcessLookupError:
             self._ended(process, pid, "it ended before it could be watched")
         except OSError as error:  # no descriptor left: perhaps later
+            process.handle = ProcessHandle(is_gone=False)
             self.report_diagnostic("hold", str(error), process.unit.name)
             self.call_later(_RETRY_S * self.clock.rate, lambda: self._hold(process, pid))
         else:

@@ -205,6 +205,9 @@ class VirtualMachine:
     def forget(self, names: tuple[str, ...]) -> None:
         """Nothing to do either."""
 
+    def withdraw(self, names: tuple[str, ...]) -> None:
+        """Likewise."""
+
     def fork(self, names: tuple[str, ...], incarnation: int) -> int:
         """Start a process; its first word comes after the measured time."""
         if self._down:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -17,11 +19,13 @@ from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import Checkpoints, StateCopy
 from rampart.actors.hosts.copies import checksum
 from rampart.actors.layout.layout import Layout
+from rampart.actors.machine.unix_peer import process_id
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.spawner_client import SpawnerBusyError
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run
 from tests.actors.supervision.test_supervisor import Machine
@@ -78,8 +82,15 @@ class Host(Machine):
         self.loaded: dict[tuple[str, int], Record | None] = {}
         self.ends_after_s = 0.005
         self.files: Files | None = None
-        plan = RunPlan("r", 20000, system_file=str(world.file), host=name, folder=self.folder,
-                       checkpoints=world.checkpoints, incarnations=incarnation - 1)
+        self._plan = RunPlan(
+            "r", 20000, system_file=str(world.file), host=name, folder=self.folder,
+            checkpoints=world.checkpoints, incarnations=incarnation - 1)
+        self._world = world
+        self.begin(incarnation)
+
+    def begin(self, incarnation: int) -> None:
+        """Begin a supervisor, the first one or one that replaces another."""
+        world, plan = self._world, self._plan
         spec = load_system(plan)
         layout = Layout(plan, spec)
         member = layout.members[plan.supervisor]
@@ -87,7 +98,8 @@ class Host(Machine):
         self.supervisor = member.actor(
             Context(plan.supervisor, incarnation, world.clock,
                     VirtualBus(world.hub, plan.supervisor, incarnation), member.parameters,
-                    RunContext(plan, spec), register=run_folder.register_of(self.folder),
+                    RunContext(plan, spec, known_incarnations=run_folder.issued(self.folder)),
+                    register=run_folder.register_of(self.folder),
                     members=frozenset(layout.members)), self, self.made)
         self.task = asyncio.create_task(self.supervisor.run())
 
@@ -96,7 +108,7 @@ class Host(Machine):
         return self.files
 
     def add(self, names, incarnation, *, bound=False):
-        run_folder.issue(self.folder, names, incarnation)
+        run_folder.issue(self.folder, names, incarnation, process_id(os.getpid()))
         for name in names:
             self.loaded[name, incarnation] = self.disk.get(name)
         return super().add(names, incarnation, bound=bound)
@@ -214,6 +226,115 @@ def test_the_first_host_goes_on_from_it_and_its_home_from_what_was_kept_there(tm
             made.ground.files.keep("camera", record(EPOCH + 2, 5))
             await asyncio.sleep(DELAY_S + 0.001)
             assert made.robot.disk["camera"] == record(EPOCH + 2, 5)
+
+    run(scenario)
+
+
+def test_a_process_that_ends_while_it_is_given_back_is_not_begun_anew(tmp_path, monkeypatch):
+    """The news of its end waits in the mailbox."""
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            await made.taken_over()
+            supervisor, ended = made.robot.supervisor, []
+            look = supervisor._placement.look
+
+            def look_and_end(*arguments):
+                changes = look(*arguments)
+                for unit in changes.drop:
+                    one = made.robot.processes[supervisor._processes[unit].pid]
+                    ended.append(one.names)
+                    one.killed = True
+                    made.robot._exited(one)
+                return changes
+
+            monkeypatch.setattr(supervisor._placement, "look", look_and_end)
+            made.is_cut = False
+            await eventually(lambda: made.ground.runs("D_VISION_CRASH") == EPOCH + 2)
+            await asyncio.sleep(2.0)
+            assert ("D_VISION_CRASH",) in ended
+            for name in ("camera", "part_finder", "D_VISION_CRASH"):
+                assert (made.robot.runs(name), made.ground.runs(name)) == (0, EPOCH + 2)
+
+    run(scenario)
+
+
+def test_one_that_is_being_forked_when_its_home_is_back_gives_way(tmp_path, monkeypatch):
+    """Spawners may be slow; what they fork yet must not have the number of what the home forks."""
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            fork, asked, withdrawn = made.robot.fork, [], []
+
+            def slow(names, incarnation):
+                if "camera" in names:
+                    asked.append(incarnation)
+                    raise SpawnerBusyError("no answer yet")
+                return fork(names, incarnation)
+
+            monkeypatch.setattr(made.robot, "fork", slow)
+            monkeypatch.setattr(made.robot, "withdraw", withdrawn.append)
+            made.is_cut = True
+            await eventually(lambda: asked)
+            made.is_cut = False
+            await eventually(lambda: made.ground.runs("camera") > 1)
+            assert made.ground.runs("camera") > max(asked)
+            assert ("camera",) in withdrawn
+
+    run(scenario)
+
+
+def test_one_that_could_not_be_held_is_ended_as_soon_as_it_can_be(tmp_path, monkeypatch):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            hold, is_full = made.robot.hold, [True]
+
+            def hold_if_there_is_room(pid, ended, node=""):
+                if is_full[0] and node == "camera":
+                    raise OSError(errno.EMFILE, "Too many open files")
+                return hold(pid, ended, node)
+
+            monkeypatch.setattr(made.robot, "hold", hold_if_there_is_room)
+            await made.taken_over()
+            made.is_cut = False
+            await eventually(lambda: made.robot.supervisor._process_of("camera") is None)
+            is_full[0] = False
+            await eventually(lambda: not made.robot.of("camera"))
+            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+            assert not made.robot.supervisor._ending
+
+    run(scenario)
+
+
+def test_what_was_let_go_comes_home_though_the_supervisor_there_is_another_one_by_now(tmp_path):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            await made.taken_over()
+            made.robot.files.keep("camera", record(EPOCH + 1, 3))
+            await asyncio.sleep(1.0)
+            made.is_cut = False
+            await eventually(lambda: not made.ground.of("camera"))
+            made.ground.supervisor.abandon()
+            made.ground.task.cancel()
+            await asyncio.gather(made.ground.task, return_exceptions=True)
+            made.ground.begin(2)
+            for name in ("camera", "part_finder", "D_VISION_CRASH"):
+                await eventually(lambda name=name: made.ground.runs(name) == EPOCH + 2)
+                assert made.robot.runs(name) == 0
+            assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 3)
+
+    run(scenario)
+
+
+def test_who_stood_still_for_a_moment_takes_nothing_over(tmp_path):
+    """What the others said meanwhile is still to be read when the timers are due."""
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            for _ in range(10):
+                made.is_cut = True
+                await asyncio.sleep(DELAY_S + 0.01)  # what was under way has been read
+                asyncio.get_running_loop().jump(0.9)  # no callback runs meanwhile
+                made.is_cut = False
+                await asyncio.sleep(0.53)
+            assert not [names for names, _ in made.robot.forks if "camera" in names]
 
     run(scenario)
 

@@ -6,14 +6,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rampart.actors.bus.envelope import Header, decode, encode
 from rampart.actors.bus.run_folder import EPOCH, restarts_of
-from rampart.actors.ftm.messages import NodeInfo, NodeState
+from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable
+from rampart.actors.ftm.topics import HOST_NODES
 from rampart.actors.hosts.placement import Changes, Home, Placement
 from rampart.manager.spec.hosts import Link
 
 LINK = Link()
 HOMES = {"pilot": Home("", ("pilot",)), "page": Home("ground", ("hmi",)),
          "modules": Home("ground", ("DM1", "DM2")), "world": Home("ground", ("world",), True)}
+GUARDS = {"supervisor": "", "router_a": "", "supervisor_ground": "ground",
+          "router_a_ground": "ground"}
 LOST_S = LINK.lost_after_s + 0.01
 
 
@@ -26,19 +30,24 @@ LINES = {"cut": set(), "join": {"", "ground"}, "only the robot hears": {""},
 """Who hears the other, by what happens to the line."""
 
 
+def placement(host: str) -> Placement:
+    others = [other for other in ("", "ground") if other != host]
+    return Placement(host, others, HOMES, LINK, 0.0, guards=GUARDS)
+
+
 def robot() -> Placement:
-    made = Placement("", ["ground"], HOMES, LINK, 0.0)
+    made = placement("")
     made.heard("ground", 0.0)
     return made
 
 
 def test_each_begins_with_what_has_its_home_there():
     assert robot().held == {"pilot"}
-    assert Placement("ground", [""], HOMES, LINK, 0.0).held == {"page", "modules", "world"}
+    assert placement("ground").held == {"page", "modules", "world"}
 
 
 def test_a_host_that_starts_is_waited_for():
-    made = Placement("", ["ground"], HOMES, LINK, 0.0)
+    made = placement("")
     assert made.look(9.9, {}) == Changes()
     assert made.look(10.1, {}).lost == ("ground",)
 
@@ -95,7 +104,7 @@ def test_what_the_host_says_it_still_runs_is_not_given_back_until_it_has_heard_o
 
 
 def test_who_hears_of_a_higher_incarnation_lets_go_of_its_own_and_starts_it_when_it_is_given_back():
-    ground = Placement("ground", [""], HOMES, LINK, 0.0)
+    ground = placement("ground")
     news, drop = ground.told("", [row("hmi", EPOCH + 1, "")], {"hmi": 2}, 1.0)
     assert [(one.name, one.incarnation) for one in news] == [("hmi", EPOCH + 1)]
     assert drop == ["page"]
@@ -115,8 +124,8 @@ def test_what_another_runs_already_is_not_taken_back_while_that_host_is_heard():
 
 
 def test_a_host_that_was_started_anew_waits_until_it_is_given_what_is_its_own():
-    ground = Placement("ground", [""], HOMES, LINK, 0.0)
-    assert ground.waits() == ["page", "modules"]
+    ground = placement("ground")
+    assert ground.waits(lambda _: True) == ["page", "modules"]
     assert ground.held == {"world"}
     ground.told("", [row("hmi", EPOCH + 1, ""), row("DM1", EPOCH + 1, ""), row("DM2", 1, "")], {},
                 1.0)
@@ -126,14 +135,14 @@ def test_a_host_that_was_started_anew_waits_until_it_is_given_what_is_its_own():
 
 
 def test_of_an_old_table_nothing_follows():
-    ground = Placement("ground", [""], HOMES, LINK, 0.0)
+    ground = placement("ground")
     ground.told("", [row("hmi", EPOCH + 1, "")], {}, 1.0)
     ground.told("", [], {}, 1.2)
     assert ground.look(3.0, {}).take == ()
 
 
 def test_another_host_than_the_first_takes_nothing_over():
-    ground = Placement("ground", [""], HOMES, LINK, 0.0)
+    ground = placement("ground")
     ground.heard("", 0.0)
     changes = ground.look(100.0, {})
     assert changes.lost == ("",)
@@ -148,7 +157,7 @@ def test_a_supervisor_is_believed_about_its_own_host_only():
 
 
 def test_a_unit_that_was_found_running_here_says_that_its_host_is_lost():
-    made = Placement("", ["ground"], HOMES, LINK, 0.0)
+    made = placement("")
     made.adopted("page")
     assert made.is_lost("ground")
     assert [unit for unit, _ in made.look(0.1, {}).take] == ["modules"]
@@ -168,10 +177,49 @@ def test_a_number_that_was_given_back_is_said_until_the_home_runs_a_higher_one()
 
 
 def test_who_hears_of_such_a_number_starts_its_own_above_it():
-    ground = Placement("ground", [""], HOMES, LINK, 0.0)
+    ground = placement("ground")
     _, drop = ground.told("", [row("hmi", EPOCH + 1, "ground")], {"hmi": 2}, 1.0)
     assert drop == ["page"]
     assert ground.look(1.1, {"hmi": 2}).take == (("page", EPOCH + 1),)
+
+
+def test_a_host_may_be_lost_more_often_than_anybody_counts():
+    made, mine = robot(), {"hmi": 1, "DM1": 1, "DM2": 1}
+    for time in range(5000):
+        made.heard("ground", 10.0 * time)
+        made.look(10.0 * time + LINK.return_after_s, mine)
+        made.told("ground", (), mine, 10.0 * time)
+        made.heard("ground", 10.0 * time + 0.5)
+        made.look(10.0 * time + 0.5, mine)
+        for unit, above in made.look(10.0 * time + 0.5 + LOST_S, mine).take:
+            mine.update(dict.fromkeys(HOMES[unit].nodes, above + 1))
+    assert mine["hmi"] > 4000 * EPOCH
+    table = NodeTable((row("hmi", mine["hmi"]),))
+    payload = encode(Header("supervisor", mine["hmi"], 1, 0.0), table)
+    assert decode(HOST_NODES, payload)[1] == table
+
+
+def test_who_stood_still_does_not_take_the_others_for_silent():
+    made = robot()
+    made.excuse(5.0)
+    assert made.look(5.0 + LINK.lost_after_s, {}) == Changes()
+    assert made.look(5.0 + LOST_S, {}).lost == ("ground",)
+
+
+@pytest.mark.parametrize(("rate", "times"), [(0.1, 10), (0.5, 2), (1, 1), (4, 1)])
+def test_in_slow_motion_others_are_waited_for_longer(rate, times):
+    made = Placement("", ["ground"], HOMES, LINK, 0.0, guards=GUARDS, rate=rate)
+    made.heard("ground", 0.0)
+    assert not made.look(times * LINK.lost_after_s, {}).lost
+    assert made.look(times * LINK.lost_after_s + 0.01, {}).lost
+
+
+@pytest.mark.parametrize("name", ["router_a", "supervisor", "observer", "stranger", "../x", "a\0b"])
+def test_a_host_is_not_believed_about_what_is_no_node_and_no_guard_of_its_own(name):
+    made = robot()
+    own = row("router_a_ground", 7)
+    assert made.told("ground", [row(name, 999), own], {}, 1.0) == ([own], [])
+    assert made.rows() == [own]
 
 
 @given(st.lists(st.sampled_from(["cut", "join", "only the robot hears", "only ground hears", "wait",
@@ -180,8 +228,8 @@ def test_who_hears_of_such_a_number_starts_its_own_above_it():
 def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(steps):
     """Two supervisors that exchange tables while they are joined; the issued numbers decide."""
     now_s, hears = 0.0, {"", "ground"}
-    sides = {"": Placement("", ["ground"], HOMES, LINK, 0.0),
-             "ground": Placement("ground", [""], HOMES, LINK, 0.0)}
+    sides = {"": placement(""),
+             "ground": placement("ground")}
     issued = {"": {"pilot": 1}, "ground": {"hmi": 1, "DM1": 1, "DM2": 1, "world": 1}}
     mine = {own: dict(numbers) for own, numbers in issued.items()}
 
@@ -221,7 +269,7 @@ def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(st
 
 @pytest.mark.parametrize("host", ["", "ground"])
 def test_what_is_lost_is_known_by_name(host):
-    made = Placement(host, [other for other in ("", "ground") if other != host], HOMES, LINK, 0.0)
+    made = placement(host)
     assert made.look(20.0, {}).lost == tuple(o for o in ("", "ground") if o != host)
 
 

@@ -248,6 +248,23 @@ def test_a_process_that_nobody_wants_any_more_is_killed(staged):
     assert stage.spawners["a"].children[0].wait(10) == -9
 
 
+@pytest.mark.parametrize("is_late", [False, True])
+def test_one_that_is_withdrawn_is_ended_whether_it_has_answered_or_not(staged, is_late):
+    stage = staged("a")
+    with pytest.raises(SpawnerBusyError):
+        stage.fork(2)
+    if is_late:
+        stage.client.withdraw(DM1)
+        with pytest.raises(OSError, match="pipe"):
+            stage.spawners["a"].answer(b"{}")  # as its child does, which then ends
+    else:
+        child = stage.spawners["a"].fork()
+        assert stage.client._forks[DM1][1].reply(20.0) == Reply("", child)
+        stage.client.withdraw(DM1)
+        assert stage.spawners["a"].children[0].wait(10) == -9
+    assert not stage.client._forks
+
+
 def test_a_spawner_that_hangs_is_pinged_once_however_often_it_is_asked_about(staged):
     stage = staged("a")
     for _ in range(5):

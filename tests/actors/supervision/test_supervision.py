@@ -35,7 +35,7 @@ from rampart.actors.supervision import launcher as launcher_module
 from rampart.actors.supervision import node_process
 from rampart.actors.supervision.kill_node import main as kill_node
 from rampart.actors.supervision.launcher import Launcher, LaunchError
-from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import TITLE_BYTES, find_processes
 from rampart.actors.supervision.spawner import address
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import RestartPolicy
@@ -601,10 +601,14 @@ async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path, sto
     assert not [r for r in find_runs() if r.base_port == plan.base_port]
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-async def test_a_launcher_that_has_one_thread_forks_its_first_spawner(tmp_path, threads):
+@pytest.mark.parametrize(("threads", "variables", "expected"), [
+    (1, {**os.environ, "HOME": "." * TITLE_BYTES}, "fork"), (2, os.environ, "program"),
+    (1, {}, "program")])  # with so few there is no room for titles in a fork
+async def test_a_launcher_that_has_one_thread_forks_its_first_spawner(
+        tmp_path, threads, variables, expected):
     plan = stub_plan(write_stub_system(tmp_path))
-    script = (
+    file = tmp_path / "x.py"
+    file.write_text(
         "import asyncio, threading, time; from tests.stub_actors import *\n"
         f"for _ in range({threads} - 1):\n"
         "    threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
@@ -618,8 +622,8 @@ async def test_a_launcher_that_has_one_thread_forks_its_first_spawner(tmp_path, 
         "    await asyncio.sleep(60)\n"
         "asyncio.run(main())\n")
     child = await asyncio.create_subprocess_exec(
-        sys.executable, "-c", script, stdout=subprocess.PIPE, start_new_session=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"})
+        sys.executable, file, stdout=subprocess.PIPE, start_new_session=True,
+        env={**variables, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"})
     try:
         kind = await asyncio.wait_for(child.stdout.readline(), 20)
         await eventually(lambda: len(find_processes(plan.base_port)) >= 26, 20)
@@ -627,7 +631,7 @@ async def test_a_launcher_that_has_one_thread_forks_its_first_spawner(tmp_path, 
         child.kill()
         await child.wait()
 
-    assert kind.strip() == (b"fork" if threads == 1 else b"program")
+    assert kind.decode().strip() == expected
     await eventually(lambda: find_processes(plan.base_port) == [], 2.0)
 
 

@@ -117,6 +117,9 @@ class Machine:
     def forget(self, names: tuple[str, ...]) -> None:
         self.ready.pop(names[0], None)
 
+    def withdraw(self, names: tuple[str, ...]) -> None:
+        self.forget(names)
+
     def add(self, names: tuple[str, ...], incarnation: int, *, bound: bool = False) -> Process:
         self.issued |= dict.fromkeys(names, incarnation)
         bound = bound or not any(
