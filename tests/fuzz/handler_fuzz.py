@@ -255,7 +255,7 @@ async def _live(of: System, name: str, incarnation: int, shelf: Shelf, stranger:
             bus.publish(topic, _key(actor, topic, stranger), payload)
         if stranger.dice.random() < 0.1:
             hub.announce(stranger.dice.choice(tuple(of.layout.members)), stranger.dice.choice(
-                (1, 2, 2**31 - 1)), alive=stranger.dice.random() < 0.5)
+                (1, 2, 2**53)), alive=stranger.dice.random() < 0.5)
         await asyncio.sleep(stranger.dice.choice((0.0, 0.0, 0.01, 0.06, 0.3)))
         if task.done():
             break

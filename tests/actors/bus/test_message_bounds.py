@@ -82,7 +82,7 @@ def test_the_incarnation_that_killed_the_supervisor_is_refused():
     taken, reason = judged(bus_topics.HEARTBEAT, pack(
         "DM1", 2**64 - 1, 1, 0.0, smallest(bounds_of(bus_topics.HEARTBEAT))))
     assert not taken
-    assert "Expected `int` <= 2147483647" in reason
+    assert "Expected `int` <= 9007199254740992" in reason
 
 
 def test_a_payload_that_is_too_long_is_refused_before_it_is_decoded(monkeypatch):

@@ -179,7 +179,7 @@ def test_another_run_s_states_are_refused_and_told(robot, ground):
 def test_an_incarnation_that_nobody_knows_to_be_issued_is_not_taken_yet(robot, ground):
     """Else one message with the highest number there is would shut out all real ones for ever."""
     exchange(robot, ground)
-    ground.keep("camera", state(2**31 - 1, 1))
+    ground.keep("camera", state(2**53, 1))
     robot.hear("ground", ground.message())
     assert robot.disk == {}
     ground = Host("ground", camera=2)
@@ -370,7 +370,7 @@ def test_what_has_come_before_the_line_was_cut_need_not_come_again(robot, ground
 
 
 def test_what_is_held_of_as_many_nodes_as_there_may_be_leaves_room_for_a_copy():
-    kept = KeptState("a_name_of_twenty_chr", 2**31 - 1, 2**53, 2**31 - 1, True)
+    kept = KeptState("a_name_of_twenty_chr", 2**53, 2**53, 2**53, True)
     size = len(encode(Header("s", 1, 1, 0.0), Checkpoints("r", (kept,) * (MANY // 2))))
     assert size < MAX_PAYLOAD_BYTES - 3 * PART_BYTES
 

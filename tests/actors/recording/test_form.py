@@ -35,7 +35,7 @@ ANYTHING = st.recursive(
     st.none() | st.booleans() | WHOLE | st.floats() | TEXT | st.binary(max_size=4),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXT | WHOLE, inner, max_size=3),
     max_leaves=5)
-HEADS = st.builds(Header, TEXT, st.integers(0, 2**31 - 1), st.integers(0, 2**40),
+HEADS = st.builds(Header, TEXT, st.integers(0, 2**53), st.integers(0, 2**40),
                   st.floats(-1e12, 1e12))
 
 

@@ -194,7 +194,7 @@ async def test_a_superseded_incarnation_is_refused(make_bus):
             assert [body.x_m for body, _ in listener.heard] == [2.0]
 
 
-@pytest.mark.parametrize("forged", [1, 3, 77, 2 ** 31 - 1])
+@pytest.mark.parametrize("forged", [1, 3, 77, 2 ** 53])
 def test_an_incarnation_that_was_not_issued_last_makes_nobody_deaf_to_the_real_one(forged):
     taken, refused = [], []
     guard = ArrivalGuard(lambda: 10.0, register={"talker": 2}.get)
