@@ -34,10 +34,11 @@ def of_kind(records: Iterable[Record], kind: str) -> list[Record]:
     return [record for record in records if record["kind"] == kind]
 
 
-def totals(records: Sequence[Record], place: int, scale: float) -> list[Sample]:
-    """Return the sum over all processes of a run, sample by sample."""
-    return [Sample(r["at_s"], r["mission"], r["into_s"],
-                   scale * sum(used[place] for used in r["used"].values()))
+def totals(records: Sequence[Record], place: int, scale: float,
+           without: Collection[str] = frozenset()) -> list[Sample]:
+    """Return the sum over all processes of a run, or all but some, sample by sample."""
+    return [Sample(r["at_s"], r["mission"], r["into_s"], scale * sum(
+        used[place] for name, used in r["used"].items() if name not in without))
             for r in of_kind(records, "sample")]
 
 
@@ -52,6 +53,9 @@ def of_role(records: Sequence[Record], names: Collection[str], place: int, scale
 def growths(records: Sequence[Record]) -> list[Growth]:
     """Return how the sums grow, the launcher, which nobody replaces, and the worst of the others.
 
+    Once without the launcher and the routers, too: it keeps a record, and they keep something of
+    each client that was killed, so that these grow is known, and the rest is not hidden by it.
+
     A process that is replaced now and then begins anew each time: its role is looked at as a whole.
     The two routers have one between them: all clients are of one, which has 12 MB for it and the
     other 8, and when that one is killed they change over.
@@ -61,6 +65,9 @@ def growths(records: Sequence[Record]) -> list[Growth]:
     found += [growth(f"{what}, {LAUNCHER}", unit, of_role(records, [LAUNCHER], place, scale),
                      RECORD_MB if place == OWN else counts)
               for what, unit, place, scale, counts in SINGLE]
+    _, unit, place, scale, counts = TOTALS[0]
+    found.append(growth("memory of their own, the others", unit, totals(
+        records, place, scale, without={LAUNCHER, *ROUTERS}), counts))
     names = {name for r in of_kind(records, "sample") for name in r["used"]}
     roles = {name: (name,) for name in sorted(names - {LAUNCHER, *ROUTERS})}
     what, unit, place, scale, counts = SINGLE[0]

@@ -19,7 +19,7 @@ from tests.whole.soak_growth import WARM_UP_S, Sample, growth, student
 from tests.whole.soak_page import write_page
 from tests.whole.soak_plan import EVERY_S, FIRST_S, LASTS_S, plan
 from tests.whole.soak_runs import Soak, main, usage
-from tests.whole.soak_summary import summary, wrong
+from tests.whole.soak_summary import growths, summary, wrong
 
 
 def samples(slope: float, *, missions: int = 3, minutes: int = 20, noise: float = 1.0,
@@ -167,6 +167,19 @@ def test_routers_that_change_over_do_not_grow_and_a_leak_of_theirs_is_found(file
         record["used"] |= {"router_a": [a, a, 30, 9], "router_b": [b + leak, b, 30, 9]}
     assert [line.split(",")[1].split()[0] for line in wrong(soak.records)
             if "its own" in line] == found
+
+
+@pytest.mark.parametrize(("name", "verdict"), [
+    ("launcher", "within noise"), ("router_a", "within noise"),
+    ("localization", "grows, less than counts")])
+def test_what_is_known_to_grow_hides_nothing(file, name, verdict):
+    soak = Soak(file, 1)
+    for record in soak.of("sample"):
+        for router in ("router_a", "router_b"):
+            record["used"].setdefault(router, [8_000, 8_000, 30, 9])
+        record["used"][name][0] += int(record["at_s"] * 3)
+    [others] = [one for one in growths(soak.records) if one.what.endswith("the others")]
+    assert others.verdict == verdict
 
 
 def test_the_page_has_the_plot_in_it_and_the_plot_is_a_picture(file):
