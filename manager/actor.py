@@ -284,5 +284,6 @@ def forgive_absence(state: State, missed_s: float) -> State:
     """
     return replace(
         state, started_s=state.started_s + missed_s,
+        since=tuple((name, since_s + missed_s) for name, since_s in state.since),
         detections=tuple(replace(t, heard_s=t.heard_s + missed_s) for t in state.detections),
         recoveries=tuple(replace(t, ordered_s=t.ordered_s + missed_s) for t in state.recoveries))

@@ -35,7 +35,12 @@ from msgspec.structs import replace
 from rampart.manager.arbitration.arbiter import Arbiter
 from rampart.manager.arbitration.arbiter_state import ResetAsked, State, Tick
 from rampart.manager.arbitration.detection_track import DetectionRules, DetectionTrack
-from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, RecoveryTrack
+from rampart.manager.arbitration.recovery_track import (
+    LONG_AGO_S,
+    Command,
+    RecoveryHeard,
+    RecoveryTrack,
+)
 from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryPhase
 from rampart.manager.model.order import PartialOrder, Tree
 from rampart.manager.strategies.arrangement import Arrangement
@@ -248,7 +253,8 @@ class Transitions:
                             if rises.get(d) == r and self.contracts[t.name].kind.repairs),
             heard=True, phase=t.phase if t.acknowledged else RecoveryPhase.IDLE,
             acknowledged=t.acknowledged, draining=t.draining, letting_go=t.letting_go,
-            latched=t.latched, failure="failed" if t.failure else "",
+            latched=t.latched, latched_s=0.0 if t.latched else LONG_AGO_S,
+            failure="failed" if t.failure else "",
             failed_for=tuple(n for n in t.failed_for if f"D_{n[2:]}" in rises))
             for t in state.recoveries)
         decision = replace(state.decision, rejected=tuple(

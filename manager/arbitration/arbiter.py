@@ -331,10 +331,10 @@ class Arbiter:
     def _activate(self, state: State, track: RecoveryTrack, now: float) -> RecoveryTrack:
         """Activate a recovery, order it again if need be, or let it wait for another to drain."""
         ordered_s = now
+        activated = recovery_track.latch(track, now) if self._latches(state, track) else track
         if track.wanted:
             if not self._has_new_cause(state, track):
-                return replace(
-                    track, draining=False, latched=track.latched or self._latches(state, track))
+                return replace(activated, draining=False)
             if not track.acknowledged or not self._is_news(state, track, _without_incarnation):
                 # It has been deaf since then; or its detection has not cleared and blames one
                 # incarnation of a node after the other: it has not ended the error.
@@ -347,10 +347,9 @@ class Arbiter:
         reason = "; ".join(f"{cause.name}: {cause.reason}" if cause.reason else cause.name
                            for cause in causes)
         return replace(
-            track, command=Command(track.name, True, state.number, nodes, reason),
+            activated, command=Command(track.name, True, state.number, nodes, reason),
             ordered_s=ordered_s, cause=frozenset((cause.name, cause.rises) for cause in causes),
-            acknowledged=False, draining=False, letting_go=False, adopted=False,
-            latched=track.latched or self._latches(state, track))
+            acknowledged=False, draining=False, letting_go=False, adopted=False)
 
     def _latches(self, state: State, track: RecoveryTrack) -> bool:
         """Tell whether a recovery that is chosen stays until it is reset.

@@ -23,17 +23,19 @@ from msgspec.structs import replace
 
 from rampart.manager.arbitration.arbiter import LARGEST_NUMBER, Arbiter
 from rampart.manager.arbitration.arbiter_state import State
-from rampart.manager.arbitration.recovery_track import Command, RecoveryTrack
+from rampart.manager.arbitration.recovery_track import LONG_AGO_S, Command, RecoveryTrack
 
 
 class Latch(msgspec.Struct, frozen=True):
     """A recovery that stays until it is reset: what it was told last, and for which detections.
 
-    A safer one may have taken its place for a while.
+    A safer one may have taken its place for a while. `latched_s` is since when it stays; a latch of
+    unknown age is excused by nothing.
     """
 
     command: Command
     cause: tuple[tuple[str, int], ...]
+    latched_s: float = LONG_AGO_S
 
 
 class Memory(msgspec.Struct, frozen=True):
@@ -56,7 +58,7 @@ class Memory(msgspec.Struct, frozen=True):
 def remember(state: State, arbiter: Arbiter) -> Memory:
     """Return what of a state must not be forgotten."""
     contracts = arbiter.mechanisms.contracts
-    kept = {t.name: Latch(t.command, tuple(sorted(t.cause))) for t in state.recoveries}
+    kept = {t.name: Latch(t.command, tuple(sorted(t.cause)), t.latched_s) for t in state.recoveries}
     latched = [t.name for t in state.recoveries if t.latched]
     excused = [t.name for t in state.recoveries
                if t.wanted and not t.latched and contracts[t.name].excused_by]
@@ -89,7 +91,7 @@ def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
             latch, is_latched = latches[recovery.name]
             recoveries[index] = RecoveryTrack(
                 latch.command, ordered_s=now, cause=frozenset(latch.cause), adopted=not is_latched,
-                latched=is_latched)
+                latched=is_latched, latched_s=min(latch.latched_s, now))
     return replace(state, detections=tuple(detections), recoveries=tuple(recoveries))
 
 

@@ -10,6 +10,9 @@ from msgspec.structs import replace
 from rampart.manager.arbitration.detection_track import DetectionTrack
 from rampart.manager.model.mechanisms import Contract, RecoveryPhase
 
+LONG_AGO_S = -1e12
+"""A time before all others; finite, for it is kept."""
+
 
 class Command(msgspec.Struct, frozen=True):
     """What a recovery module is to do, until told otherwise.
@@ -56,6 +59,7 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
         letting_go: It was released and has not confirmed it; it may hold what it claims.
         adopted: It was found activated by an arbiter that had just started.
         latched: It stays until reset.
+        latched_s: Since when; long ago if that is not known. Nothing else changes it.
         failure: Why it counts as failed; "" if it does not.
         failed_for: Mechanisms for whose sake it failed; when none is active, all is forgiven.
     """
@@ -71,6 +75,7 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
     letting_go: bool = False
     adopted: bool = False
     latched: bool = False
+    latched_s: float = LONG_AGO_S
     failure: str = ""
     failed_for: tuple[str, ...] = ()
 
@@ -164,6 +169,11 @@ EXCUSE_S = 5.0
 is noticed."""
 
 
+def latch(track: RecoveryTrack, now: float) -> RecoveryTrack:
+    """Have a recovery stay until it is reset, from now on if it does not already."""
+    return track if track.latched else replace(track, latched=True, latched_s=now)
+
+
 def excuse(track: RecoveryTrack, contract: Contract, reported: Set[str],
            believed: Mapping[str, DetectionTrack]) -> RecoveryTrack:
     """Undo a latch that is excused, unless it came long before what excuses it.
@@ -174,7 +184,7 @@ def excuse(track: RecoveryTrack, contract: Contract, reported: Set[str],
         reported: See `rampart.manager.arbitration.detection_track.said`.
         believed: Belief about all detection modules.
     """
-    if track.latched and any(track.ordered_s >= believed[name].since_s - EXCUSE_S
+    if track.latched and any(track.latched_s >= believed[name].since_s - EXCUSE_S
                              for name in contract.excused_by & reported):
         return replace(track, latched=False)
     return track

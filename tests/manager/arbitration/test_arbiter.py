@@ -3,7 +3,8 @@
 import msgspec
 import pytest
 
-from rampart.manager.arbitration.arbiter_memory import recall, remember
+from rampart.manager.actor import forgive_absence
+from rampart.manager.arbitration.arbiter_memory import Memory, recall, remember
 from rampart.manager.arbitration.arbiter_state import State, Tick
 from rampart.manager.arbitration.recovery_track import Command
 from rampart.manager.model.mechanisms import RecoveryPhase as Phase
@@ -282,6 +283,37 @@ def test_an_old_latch_is_not_excused_by_what_comes_later():
     bench.wait(6.0)
     bench.active("DM5")
     assert bench.state.latched == ("RM1",)
+
+
+@pytest.mark.parametrize("between_s", [0.0, 4.0])
+@pytest.mark.parametrize("again", ["the manager", "the module", "the manager, after a standstill"])
+def test_a_latch_does_not_become_younger_when_somebody_is_started_again(again, between_s):
+    bench = Bench(EXCUSED)
+    bench.active("DM1")
+    stopped(bench)
+    bench.idle("DM1")
+    bench.wait(30.0)
+    if again == "the manager":
+        memory = msgspec.json.decode(msgspec.json.encode(
+            remember(bench.state, bench.arbiter)), type=Memory)
+        bench.state = recall(bench.arbiter, memory, bench.now, bench.state.number)
+        for track in bench.state.detections:
+            bench.idle(track.name)
+        for track in bench.state.recoveries:
+            bench.report(track.name, DONE if track.name == "RM1" else IDLE)
+    elif again == "the module":
+        bench.report("RM1", IDLE)
+        bench.report("RM1", DONE)
+    else:
+        bench.state = forgive_absence(bench.state, 29.0)
+    bench.wait(between_s)
+    assert bench.state.latched == ("RM1",)
+    bench.active("DM5")
+    bench.wait(1.0)
+    bench.idle("DM5")
+    bench.wait(30.0)
+    assert bench.state.latched == ("RM1",)
+    assert bench.orders == "RM1"
 
 
 def test_what_nothing_explains_is_latched():
