@@ -196,7 +196,10 @@ class RecoveryModule(Actor):
 
     def _check_deadline(self) -> None:
         late_s = self.clock.now() - self._due_s
-        if self.phase is not RecoveryPhase.ACTING or late_s < -_EPSILON_S:
+        if self.phase is not RecoveryPhase.ACTING:
+            return
+        if late_s < -_EPSILON_S:  # the first host's clock was followed meanwhile
+            self._look_at(-late_s)
             return
         if late_s > LATE_S and not self._excused:  # it was stopped itself: read the mail first
             self._excused = True

@@ -20,6 +20,7 @@ from rampart.actors.runtime.parameters import (
     OptionalFieldName,
     TopicPublished,
 )
+from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import NonNegative, Positive
 
 Value = str | bool | float
@@ -89,7 +90,7 @@ class Hold(HeldRecovery, _Telling):
         said = self.parameters
         self._back = None if said.back is None else self._made(said.back)
         self.order = HeldOrder(self, self._give, inherits=context.incarnation > 1)
-        self._repeats = 0
+        self._saying: Timer | None = None
         if said.confirm:
             self.hear_field(said.confirm, self._confirmed)
 
@@ -98,9 +99,15 @@ class Hold(HeldRecovery, _Telling):
         super().act(command, renewed=renewed)
         if not self.parameters.confirm:
             self.degrade(f"{self.parameters.topic} is told")
-        if not self._repeats:
-            self._repeats += 1
-            self.call_later(self.parameters.repeat_s, self._again)
+        if self._saying is None:
+            self._say_again_later()
+
+    def let_go(self) -> None:
+        """Say that it is over, and no more that it is not."""
+        if self._saying is not None:
+            self._saying.cancel()
+            self._saying = None
+        super().let_go()
 
     def repeat(self) -> None:
         """Repeat the end for a while."""
@@ -113,12 +120,12 @@ class Hold(HeldRecovery, _Telling):
         if message is not None:
             self._say(message)
 
+    def _say_again_later(self) -> None:
+        self._saying = self.call_later(self.parameters.repeat_s, self._again)
+
     def _again(self) -> None:
-        self._repeats -= 1
-        if self.activated:
-            self.order.repeat()
-            self._repeats += 1
-            self.call_later(self.parameters.repeat_s, self._again)
+        self.order.repeat()
+        self._say_again_later()
 
     def _confirmed(self, value: Any, header: Header) -> None:
         said = self.parameters

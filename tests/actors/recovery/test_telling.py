@@ -75,6 +75,37 @@ def test_a_message_is_held_for_as_long_as_the_recovery_is_in_force():
     play(Hold, script, **SHUT, repeat_s=0.2, back={"shut": False})
 
 
+@pytest.mark.parametrize("idle_s", [0.0, 0.3, 0.41, 0.5, 1.3])
+def test_what_is_confirmed_is_repeated_nevertheless_however_long_it_was_idle(idle_s):
+    async def script(system: VirtualSystem, case: Case) -> None:
+        await asyncio.sleep(idle_s)
+        case.command(1)
+        await system.settle()
+        system.say(VALVE, Valve(True))
+        await system.settle()
+        assert case.phase == "degraded"
+        before = len(case.orders)
+        for _ in range(25):
+            await asyncio.sleep(0.2)
+            case.command(1)  # the manager repeats it
+        assert len(case.orders) - before == pytest.approx(50, abs=1)
+
+    play(Hold, script, **SHUT, repeat_s=0.1, back={"shut": False}, confirm="tank/valve:shut",
+         equals=True)
+
+
+def test_it_is_not_repeated_more_often_for_being_given_and_released_again_and_again():
+    async def script(system: VirtualSystem, case: Case) -> None:
+        for decision in range(1, 18):
+            case.command(decision, activate=decision % 2 == 1)
+            await asyncio.sleep(0.02)
+        before = len(case.orders)
+        await asyncio.sleep(1.0)
+        assert len(case.orders) - before == pytest.approx(10, abs=1)
+
+    play(Hold, script, **SHUT, repeat_s=0.1, back={"shut": False})
+
+
 def test_without_a_message_for_the_end_it_just_stops():
     async def script(system: VirtualSystem, case: Case) -> None:
         case.command(1)
