@@ -91,7 +91,7 @@ def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
                options.hmi_unencrypted)
     except AccessError as error:
         raise UsageError(f"--hmi-host {host}: {error}") from None
-    _check_address(host)
+    _check_address(host, options.hmi_port)
     return {
         "hmi_port": options.hmi_port, "hmi_host": host, "hmi_token": token,
         "hmi_token_is_new": is_new, "hmi_token_file": listed,
@@ -159,7 +159,8 @@ def _shown(host: str, certificate: Certificate | None) -> str:
     return host
 
 
-def _check_address(host: str) -> None:
+def _check_address(host: str, port: int) -> None:
+    """Refuse an address that is not this machine's, and a port that another program serves."""
     try:
         family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, number) as probe:
@@ -168,3 +169,10 @@ def _check_address(host: str) -> None:
         why = getattr(error, "strerror", None) or str(error)
         raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
                          "for all it has") from None
+    with socket.socket(family, kind, number) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((address[0], port, *address[2:]))
+        except OSError as error:
+            raise UsageError(f"--hmi-port {port}: {error.strerror}; choose another --hmi-port, or "
+                             "--no-hmi") from None

@@ -238,7 +238,10 @@ def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> I
 
 
 def _interruptible(run: ProcessRun) -> None:
-    """Have SIGINT, SIGTERM, and the end of the terminal, end a run; the second one is meant."""
+    """Have SIGINT, SIGTERM, and the end of the terminal, end a run; the second one is meant.
+
+    SIGTSTP (ctrl-Z) is refused: it stops the judge, and not the robot.
+    """
 
     def interrupt(name: str) -> None:
         if run.interrupted:
@@ -249,6 +252,8 @@ def _interruptible(run: ProcessRun) -> None:
     for number in _ends():
         asyncio.get_running_loop().add_signal_handler(
             number, interrupt, signal.Signals(number).name)
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTSTP, _say, (
+        "ctrl-Z has no effect; `rampart mission pause` holds the mission, ctrl-C ends the run"))
 
 
 def _ends() -> list[signal.Signals]:

@@ -7,8 +7,10 @@ The kernel lists such sockets in /proc/net/unix; nothing lies on a disk that cou
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import socket
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
-from rampart.actors.machine.unix_peer import is_same_user
+from rampart.actors.machine.unix_peer import is_same_user, peer, process_state
 
 REPLAY = "replay"
 """Name of the one socket in the folder of a replay: it plays all nodes."""
@@ -77,12 +79,15 @@ def address(port: int) -> str:
 
 def find_runs() -> list[RunInfo]:
     """Return all runs of this machine whose launcher answers."""
+    return [info for port in _ports() if (info := ask(port)) is not None]
+
+
+def _ports() -> list[int]:
     try:
         table = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return []
-    ports = sorted(set(map(int, _NAME.findall(table))))
-    return [info for port in ports if (info := ask(port)) is not None]
+    return sorted(set(map(int, _NAME.findall(table))))
 
 
 def find_run(port: int | None = None) -> RunInfo:
@@ -99,6 +104,8 @@ def find_run(port: int | None = None) -> RunInfo:
     else:
         runs = [run for run in found if not run.replay_of] or found
     if not runs:
+        if stopped := ", ".join(_stopped([port] if port is not None else _ports())):
+            raise NoRunError(f"the launcher is stopped: {stopped}; `kill -CONT PID` continues it")
         known = ", ".join(str(run.base_port) for run in found) or "none"
         raise NoRunError("no run found; start one with `python launch.py`" if port is None else
                          f"--port {port}: no run there; runs found: {known}")
@@ -106,6 +113,18 @@ def find_run(port: int | None = None) -> RunInfo:
         listed = ", ".join(f"{r.base_port} ({r.title})" for r in runs)
         raise NoRunError(f"several runs, choose one with --port: {listed}")
     return runs[0]
+
+
+def _stopped(ports: Iterable[int]) -> Iterator[str]:
+    """Yield port and pid of each launcher of this user that is stopped (SIGSTOP)."""
+    for port in ports:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+            connection.setblocking(False)
+            with contextlib.suppress(OSError):
+                connection.connect(address(port))
+                pid, uid = peer(connection)
+                if uid == os.getuid() and process_state(pid) == "T":
+                    yield f"--port {port}, PID {pid}"
 
 
 def ask(port: int) -> RunInfo | None:

@@ -21,6 +21,7 @@ exit code: 0 changed; 1 refused, or nobody answered; 2 bad usage
 from __future__ import annotations
 
 import argparse
+import json
 import uuid
 from pathlib import Path
 from typing import Any
@@ -68,8 +69,18 @@ def add(verbs: Any) -> None:
 
 
 async def change(options: argparse.Namespace) -> int:
-    """Ask the manager for the change and show the answer."""
+    """Ask the manager for the change and show the answer.
+
+    Raises:
+        NoEffectError: The manager refuses the change, or does not answer.
+        UsageError: The values cannot be read, or are not finite.
+    """
     values = _values(options)
+    for name, value in values.items():
+        try:
+            json.dumps(value, allow_nan=False, default=str)
+        except ValueError:  # JSON, which carries the request, has no such number
+            raise UsageError(f"{name} = {value}: expected a finite number") from None
     async with connect(options.port) as session:
         answers: list[m.AdaptationAnswer] = []
         request = m.AdaptationRequest(uuid.uuid4().hex, options.action, options.name,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import socket
 import subprocess
 import sys
 
@@ -10,6 +11,7 @@ import pytest
 
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
+from rampart.testing import free_port
 from tests import CELL, ROOT
 from tests.whole.checkpoint_runs import write_short_mission
 
@@ -41,6 +43,15 @@ def test_a_rate_that_is_none_and_one_without_a_meaning_are_refused_in_one_line(c
     assert ended.value.code == 2
     assert capsys.readouterr().err.splitlines()[-1].endswith(
         "argument --rate: 'fast': a number from 0.1 to 20 is right, or max")
+
+
+def test_a_run_whose_page_would_have_another_program_s_port_is_refused(tmp_path, capsys):
+    port = free_port()
+    with socket.create_server(("127.0.0.1", port)):
+        arguments = ["--hmi-port", str(port), "--report", str(tmp_path / "report")]
+        assert launch.main(arguments) == 2
+    assert capsys.readouterr().err.startswith(f"launch.py: --hmi-port {port}: ")
+    assert not (tmp_path / "report").exists()
 
 
 @pytest.mark.parametrize(("signs", "problem"), [

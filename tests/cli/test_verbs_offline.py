@@ -398,3 +398,11 @@ def test_a_file_comes_before_a_system_that_ships_for_all_who_look_for_one(tmp_pa
     read_document_of.cache_clear()  # what a campaign's job runs is what was checked
     assert read_document_of("paper")[1]["name"] == "osmosis"
     read_document_of.cache_clear()
+
+
+@pytest.mark.parametrize("value", ["1e400", "nan", "[1.0, inf]"])
+def test_an_adaptation_with_a_number_that_is_not_finite_is_refused_by_name(capsys, value):
+    assert main(["adapt", "retune", "RM2", f"deadline_s={value}"]) == 2
+    problem = capsys.readouterr().err
+    assert "deadline_s" in problem
+    assert "finite" in problem

@@ -293,6 +293,20 @@ def test_a_second_run_on_the_same_ports_is_refused_and_does_not_disturb_the_firs
         assert "crashed" not in run.story
 
 
+def test_ctrl_z_stops_no_run_and_a_stopped_launcher_is_named_by_every_tool(tmp_path):
+    with RealRun(tmp_path, "paper", "--mission", "A") as run:
+        run.wait_for("goal 1/3")
+        run.process.send_signal(signal.SIGTSTP)
+        run.wait_for("ctrl-Z has no effect")
+        assert run.tool("status").returncode == 0
+        run.process.send_signal(signal.SIGSTOP)
+        told = run.tool("status")
+        run.process.send_signal(signal.SIGCONT)
+        assert told.returncode != 0
+        assert f"PID {run.process.pid}" in told.stderr
+        assert run.tool("status").returncode == 0
+
+
 def test_two_runs_side_by_side_do_not_know_of_each_other(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
