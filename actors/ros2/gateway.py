@@ -41,7 +41,7 @@ from rampart.actors.ros2.ros_clock import NS, RosClock
 from rampart.actors.ros2.side import NoSide, Side
 from rampart.actors.ros2.stand_in import side_of, wall_ns
 from rampart.actors.ros2.translation.mirror import topic_of
-from rampart.actors.ros2.translation.types import Types
+from rampart.actors.ros2.translation.types import Distribution, Types
 from rampart.actors.ros2.wire import ADMIN, EndpointKind, Qos
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import RosLinks
@@ -83,7 +83,7 @@ class Gateway(Actor):
 
         connect: tuple[str, ...] = (ROUTER,)
         domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
-        distribution: Literal["humble", "iron", "jazzy", "kilted", "rolling"] = "jazzy"
+        distribution: Distribution = "jazzy"
         node: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,60}\Z")] = "rampart"
         namespace: Annotated[
             str, msgspec.Meta(pattern=r"^(/|(/[A-Za-z_][A-Za-z0-9_]*)+)\Z", max_length=200)] = "/"
@@ -183,6 +183,8 @@ class Gateway(Actor):
                 r.name: r.title for r in system.recoveries}
             self._diagnostics = Diagnostics(self.node, titles, system.name, self.time.ros_ns)
         self._side.tokens(f"{ADMIN}/{said.domain}/**", self._token)
+        for name, note in self._types.notes.items():
+            self.refuse(name, note)
 
     def on_stop(self) -> None:
         """Leave the graph."""

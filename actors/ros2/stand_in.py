@@ -11,7 +11,7 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 
@@ -20,7 +20,7 @@ from rampart.actors.ros2.bus_side import BusSide
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import EPOCH_NS, NS
 from rampart.actors.ros2.side import Record, Side, ZenohSide
-from rampart.actors.ros2.translation.types import Types
+from rampart.actors.ros2.translation.types import Distribution, Types
 from rampart.actors.ros2.wire import Attachment, Qos
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.manager.spec.ros2 import ROUTER
@@ -68,7 +68,7 @@ class StandIn(Actor):
 
         connect: tuple[str, ...] = (ROUTER,)
         domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
-        distribution: Literal["humble", "iron", "jazzy", "kilted", "rolling"] = "jazzy"
+        distribution: Distribution = "jazzy"
 
     parameters: Parameters
     most_spare = "none"

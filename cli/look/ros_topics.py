@@ -236,8 +236,9 @@ async def _checked(name: str, said: Gateway.Parameters, spec: SystemSpec) -> lis
         async with onlooker(said.connect, said.domain) as there:
             found = [Finding(f"router of {name}", True, ", ".join(said.connect))]
             found += [Finding("graph", False, odd) for odd in sorted(there.odd)]
-            node = RosNode(NoSide(), types_of(said.distribution, said.interfaces), said.node,
-                           wall_ns=lambda: 0, refuse=lambda *_: None,
+            types = types_of(said.distribution, said.interfaces)
+            found += [Finding(kind, True, note) for kind, note in types.notes.items()]
+            node = RosNode(NoSide(), types, said.node, wall_ns=lambda: 0, refuse=lambda *_: None,
                            namespace=said.namespace, domain=said.domain)
             found += [_of_link(link, there.graph, node) for link in said.ros2]
             known = there.graph.nodes()

@@ -8,11 +8,12 @@ in folders of the same shape.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from rosbags.interfaces import Nodetype
 from rosbags.serde.errors import SerdeError
@@ -21,10 +22,12 @@ from rosbags.typesys.store import Typestore
 
 from rampart.files.reading import read_text
 
+Distribution = Literal["humble", "iron", "jazzy", "kilted", "lyrical", "rolling"]
+
 DISTRIBUTIONS: Final = {"humble": Stores.ROS2_HUMBLE, "iron": Stores.ROS2_IRON,
                         "jazzy": Stores.ROS2_JAZZY, "kilted": Stores.ROS2_KILTED,
-                        "rolling": Stores.LATEST}
-"""Distributions of ROS 2 with `rmw_zenoh`."""
+                        "lyrical": Stores.ROS2_LYRICAL, "rolling": Stores.ROS2_LYRICAL}
+"""Distributions of ROS 2 with `rmw_zenoh`; Rolling has the types of the newest."""
 
 SHIPPED = Path(__file__).with_name("interfaces")
 
@@ -39,7 +42,6 @@ _MOST_TEXT = 1_000_000
 
 _LITTLE, _BIG = b"\0\1", b"\0\0"
 _HEADER_BYTES = 4
-_PADDING_BYTES = 3
 _UNHASHED = ("humble",)
 
 _UNREADABLE = (SerdeError, struct.error, ValueError, TypeError, AttributeError, IndexError,
@@ -47,6 +49,8 @@ _UNREADABLE = (SerdeError, struct.error, ValueError, TypeError, AttributeError, 
 """What `rosbags` raises when bytes are no message, or values do not fit; found by fuzzing."""
 
 _EMPTY = [("structure_needs_at_least_one_member", (Nodetype.BASE, ("uint8", 0)))]
+_UNSUPPORTED = ("wstring", "float128", "wchar")
+_BOUND = re.compile(r"\bwstring<=\d+")
 _PARTS = {"srv": ("_Request", "_Response"), "action": ("_Goal", "_Result", "_Feedback")}
 _QUATERNION = "geometry_msgs/msg/Quaternion"
 _UUID = "unique_identifier_msgs/msg/UUID"
@@ -59,11 +63,14 @@ class Types:
 
     Args:
         distribution: name of the distribution, one of `DISTRIBUTIONS`.
-        folders: with a robot's own definitions.
+        folders: with a robot's own definitions, which replace those that ship.
+
+    Attributes:
+        left_out: name of each type of a folder that cannot be used → why, one line.
 
     Raises:
-        ValueError: there is no such distribution or folder, or a definition makes no sense; one
-            line that names the file.
+        ValueError: there is no such distribution or folder, or a file does not parse; one line
+            that names the file.
     """
 
     def __init__(self, distribution: str, folders: Iterable[Path] = ()) -> None:
@@ -78,6 +85,8 @@ class Types:
         self._hashes: dict[str, str] = {}
         self._services: set[str] = set()
         self._actions: set[str] = set()
+        self._replaced: list[str] = []
+        self.left_out: dict[str, str] = {}
         for folder in (SHIPPED / "common", SHIPPED / distribution):
             self._read(folder)
         for folder in folders:
@@ -88,6 +97,13 @@ class Types:
     def known(self) -> frozenset[str]:
         """Names of all messages, services and actions."""
         return frozenset((*self._store.fielddefs, *self._services, *self._actions))
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What the folders do beyond new types: name of the type → one line."""
+        replaces = f"its definition replaces the one of {self.distribution}"
+        return dict.fromkeys(self._replaced, replaces) | {
+            name: f"left out: {why}" for name, why in self.left_out.items()}
 
     def is_message(self, name: str) -> bool:
         """Whether it is the name of a message that is known."""
@@ -225,9 +241,9 @@ class Types:
             except _UNREADABLE as error:
                 raise ValueError(f"{name}: {len(data)} bytes are no such message: "
                                  f"{_line(error)}") from None
-            left = len(data) - _HEADER_BYTES - end
-            if not 0 <= left <= _PADDING_BYTES:
-                raise ValueError(f"{name}: {abs(left)} bytes too {'many' if left > 0 else 'few'}")
+            few = end - (len(data) - _HEADER_BYTES)
+            if few > 0:  # more is a message serialized beforehand, whose tail ROS 2 ignores
+                raise ValueError(f"{name}: {few} bytes too few")
             return message
 
         return decode
@@ -238,6 +254,8 @@ class Types:
         try:
             return self._store.fielddefs[name][1]
         except KeyError:
+            if name in self.left_out:
+                raise ValueError(f"type {name!r}: {self.left_out[name]}") from None
             raise ValueError(f"type {name!r} is not known to {self.distribution}; a file "
                              f"{name}.{name.split('/')[1] if name.count('/') == 2 else 'msg'} in "
                              "a folder that the gateway's interfaces name makes it known") from None
@@ -252,23 +270,55 @@ class Types:
         for file in found:
             package, kind, name = file.parts[-3], file.parts[-2], file.stem
             try:
-                text = read_text(file, _MOST_TEXT)
+                text = "\n".join(read_text(file, _MOST_TEXT).splitlines())  # as ROS 2 reads it
                 definitions |= self._parsed(f"{package}/{kind}/{name}", kind, text)
             except (ValueError, OSError) as error:
                 raise ValueError(f"{file}: {_line(error)}") from None
-        unknown = {n: name for name, (_, fields) in definitions.items() for _, what in fields
-                   for n in [_named(what)]
-                   if n and n not in definitions and n not in self._store.fielddefs}
-        for missing, where in unknown.items():
-            raise ValueError(f"{folder}: {where}: type {missing!r} is not known")
+        usable = self._usable(definitions)
+        for name in definitions.keys() - usable.keys():
+            self.left_out[name] = self._why_not(name, definitions, usable)
+        for names in (self._services, self._actions):
+            names.difference_update(self.left_out)
         try:
-            self._add(definitions)
+            self._add(usable)
         except ValueError as error:
             raise ValueError(f"{folder}: {error}") from None
         return bool(found)
 
+    def _usable(self, definitions: Mapping[str, tuple[Any, Fields]]) -> dict[str, Any]:
+        """Return the definitions that are made of known types alone."""
+        usable: dict[str, Any] = {}
+        rest = dict(definitions)
+        while True:
+            known = {name: definition for name, definition in rest.items() if all(
+                part in usable or (part in self._store.fielddefs and part not in definitions)
+                for part in _parts(definition[1]))}
+            if not known:
+                return usable
+            usable |= known
+            for name in known:
+                del rest[name]
+
+    def _why_not(self, name: str, definitions: Mapping[str, tuple[Any, Fields]],
+                 usable: Mapping[str, Any]) -> str:
+        """Return why a definition cannot be used: by what it is made of, one after the other."""
+        way = [name]
+        while way[-1] in definitions and way.count(way[-1]) == 1:
+            way += [next(part for part in _parts(definitions[way[-1]][1]) if part not in usable
+                         and (part in definitions or part not in self._store.fielddefs))]
+        if way[-1] in definitions:
+            return f"it contains itself, {' -> '.join(way)}"
+        what = way[-1].rpartition("/")[2]
+        return (f"{way[-2]} has a {what}, which is not supported" if what in _UNSUPPORTED
+                else f"{way[-2]}: type {way[-1]!r} is not known")
+
     def _add(self, definitions: Mapping[str, tuple[Any, Fields]]) -> None:
         """Make types known, with their constants."""
+        for name, (_, fields) in definitions.items():
+            if name in self._store.fielddefs:
+                if self._store.fielddefs[name][1] != _read_as_uint8(fields, "char", "byte"):
+                    self._replaced.append(name)
+                del self._store.fielddefs[name], self._store.types[name]
         self._described.fielddefs |= {
             name: (made, _read_as_uint8(fields, "char"))
             for name, (made, fields) in definitions.items()}
@@ -280,9 +330,9 @@ class Types:
 
     def _parsed(self, name: str, kind: str, text: str) -> dict[str, Any]:
         if kind == "msg":
-            return {name: ([], self._fields(name, text))}
+            return {name: ([], self._fields(name, text) or _EMPTY)}
         parts = [""]
-        for line in text.splitlines():
+        for line in text.split("\n"):
             if line.strip().startswith("---"):
                 parts.append("")
             else:
@@ -310,6 +360,11 @@ class Types:
                 ("result", (Nodetype.NAME, f"{name}_Result"))]),
             f"{name}_FeedbackMessage": ([], [
                 goal_id, ("feedback", (Nodetype.NAME, f"{name}_Feedback"))])}
+        if self.distribution not in _UNHASHED:  # what the hash of the action is made of
+            made[name] = [], [(field, (Nodetype.NAME, f"{name}_{part}")) for field, part in (
+                ("goal", "Goal"), ("result", "Result"), ("feedback", "Feedback"),
+                ("send_goal_service", "SendGoal"), ("get_result_service", "GetResult"),
+                ("feedback_message", "FeedbackMessage"))]
         return made | self._service(sending) | self._service(result)
 
     def _service(self, name: str) -> dict[str, Any]:
@@ -332,7 +387,7 @@ class Types:
     def _fields(name: str, text: str) -> Fields:
         package, _, last = name.split("/")
         try:
-            parsed = get_types_from_msg(text, f"{package}/msg/{last}")
+            parsed = get_types_from_msg(_BOUND.sub("wstring", text), f"{package}/msg/{last}")
         except TypesysError as error:
             raise ValueError(_line(error)) from None
         (_, fields), = parsed.values()
@@ -352,6 +407,11 @@ def _as_uint8(what: Any, names: Sequence[str]) -> Any:
     if kind == Nodetype.BASE:
         return (kind, ("uint8", detail[1])) if detail[0] in names else what
     return what if kind == Nodetype.NAME else (kind, (_as_uint8(detail[0], names), detail[1]))
+
+
+def _parts(fields: Fields) -> list[str]:
+    """Return the types that fields are of, or lists of them."""
+    return [name for _, what in fields if (name := _named(what))]
 
 
 def _named(what: Any) -> str:

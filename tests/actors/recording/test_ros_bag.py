@@ -233,7 +233,7 @@ def test_bad_words_are_refused_and_nothing_is_left_behind(tmp_path, capsys):
     for words, told in (
             ([path, tmp_path / "there"], "exists already; choose another name"),
             ([path, tmp_path / "new", "--distribution", "foxy"],
-             "--distribution = 'foxy': known: humble, iron, jazzy, kilted, rolling"),
+             "--distribution = 'foxy': known: humble, iron, jazzy, kilted, lyrical, rolling"),
             ([tmp_path / "none.mcap", tmp_path / "new"], "not an MCAP file"),
             ([path, "/proc/nowhere/bag"], "/proc/nowhere/bag: No such file or directory"),
             ([path, tmp_path / "new", "--system", "nosuch"], "nosuch")):

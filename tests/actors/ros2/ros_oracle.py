@@ -47,8 +47,10 @@ def value(kind, dice):
         return filled(class_of(f"{package}/msg/{name}"), dice)
     if kind in RANGES:
         return dice.choice([*RANGES[kind], dice.randint(*RANGES[kind])])
+    kind, _, most = kind.partition("<")
     simple = {"octet": lambda: bytes([dice.randint(0, 255)]),
-              "boolean": lambda: dice.random() < 0.5, "string": lambda: dice.choice(WORDS)}
+              "boolean": lambda: dice.random() < 0.5,
+              "string": lambda: dice.choice(WORDS)[:int(most[:-1]) if most else None]}
     if kind in simple:
         return simple[kind]()
     number = dice.choice(EXTREMES) if dice.random() < 0.3 else dice.uniform(-1e6, 1e6)

@@ -344,6 +344,28 @@ def test_bytes_that_are_no_message_and_one_without_attachment_are_refused_and_to
     run(scenario)
 
 
+def test_definitions_that_replace_others_or_are_left_out_are_told_at_the_start(guarded, tmp_path):
+    folder = tmp_path / "own"
+    (folder / "a/msg").mkdir(parents=True)
+    (folder / "a/msg/Wide.msg").write_text("wstring text\n")
+    (folder / "nav_msgs/msg").mkdir(parents=True)
+    (folder / "nav_msgs/msg/Path.msg").write_text("float64 length\n")
+    base = SYSTEM.replace('actor = "rampart.actors.ros2.gateway:Gateway"\n',
+                          'actor = "rampart.actors.ros2.gateway:Gateway"\n'
+                          'parameters = { interfaces = ["own"] }\n')
+
+    async def scenario():
+        async with VirtualSystem.load(guarded(base=base)) as system:
+            told = system.hear(DIAGNOSTIC, "gateway")
+            system.start_node("gateway")
+            await asyncio.sleep(0.5)
+            words = {one.message.offender: one.message.reason for one in told}
+            assert "a/msg/Wide has a wstring" in words["a/msg/Wide"]
+            assert "replaces" in words["nav_msgs/msg/Path"]
+
+    run(scenario)
+
+
 CLOCK = SYSTEM.replace('actor = "rampart.actors.ros2.gateway:Gateway"\n',
                        'actor = "rampart.actors.ros2.gateway:Gateway"\n'
                        'parameters = { clock = "ros" }\n')

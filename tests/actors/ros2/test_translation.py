@@ -194,7 +194,7 @@ def test_a_truncated_message_is_one_line_whatever_its_type(cut):
 
 
 @pytest.mark.parametrize("data", [b"\0\1\0\0" + b"\xff" * 40, b"\0\x07\0\0" + b"\0" * 40,
-                                  b"\0\1\0\0" + b"\0" * 40 + b"x" * 90, b"\xff" * 300])
+                                  b"\0\1\0\0" + b"\0" * 40 + b"x" * 12, b"\xff" * 300])
 def test_bytes_that_are_no_message_are_one_line(data):
     with pytest.raises(ValueError, match=rf"^{SCAN}: [^\n]+\Z"):
         JAZZY.decode(SCAN, data)
@@ -237,17 +237,89 @@ def test_a_robot_s_own_definitions(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "text", "why"), [
-    ("a/msg/A.msg", "float128x y\n", "type 'a/msg/float128x'"),
-    ("a/msg/A.msg", "Missing y\n", "a/msg/Missing"),
     ("a/srv/A.srv", "bool x\n", "1 parts; 2 with --- between them are right"),
     ("a/action/A.action", "bool x\n---\n", "2 parts; 3"), ("a/msg/A.msg", "float64\n", "A.msg"),
-    ("geometry_msgs/msg/Twist.msg", "float64 x\n", "already present with different"),
     ("A.msg", "float64 x\n", "no package/msg/Name.msg in it")])
 def test_definitions_that_make_no_sense_are_refused_in_one_line(tmp_path, name, text, why):
     with pytest.raises(ValueError, match=r"[^\n]+") as raised:
         Types("jazzy", [write(tmp_path, name, text)])
     assert why in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+UNUSABLE = [
+    ({"a/msg/Wide.msg": "wstring text\n"}, "a/msg/Wide has a wstring"),
+    ({"a/msg/Wide.msg": "wstring<=8[] text\n"}, "a/msg/Wide has a wstring"),
+    ({"a/msg/Wide.msg": "Inner[2] in\n", "a/msg/Inner.msg": "wstring x\n"},
+     "a/msg/Inner has a wstring"),
+    ({"a/msg/Wide.msg": "Missing y\n"}, "a/msg/Wide: type 'a/msg/Missing' is not known"),
+    ({"a/msg/Wide.msg": "Wide[] a\n"}, "it contains itself, a/msg/Wide -> a/msg/Wide"),
+    ({"a/msg/Wide.msg": "Inner b\n", "a/msg/Inner.msg": "Wide a\n"},
+     "it contains itself, a/msg/Wide -> a/msg/Inner -> a/msg/Wide")]
+
+
+@pytest.mark.parametrize(("files", "why"), UNUSABLE)
+def test_a_definition_that_cannot_be_used_is_left_out_with_what_is_made_of_it(tmp_path, files, why):
+    for name, text in {**files, "a/msg/Fine.msg": "uint8 a\n",
+                       "a/srv/Ask.srv": "Wide what\n---\nFine fine\n"}.items():
+        write(tmp_path, name, text)
+    types = Types("jazzy", [tmp_path])
+    assert types.encode("a/msg/Fine", types.blank("a/msg/Fine")) == b"\0\1\0\0\0"
+    assert not types.is_service("a/srv/Ask")
+    assert types.notes["a/msg/Wide"] == f"left out: {types.left_out['a/msg/Wide']}"
+    for use in (types.hash, types.decoder, types.blank, types.fields):
+        with pytest.raises(ValueError, match=r"^type 'a/msg/Wide': [^\n]+\Z") as raised:
+            use("a/msg/Wide")
+        assert why in str(raised.value)
+
+
+def test_a_definition_of_a_robot_replaces_the_one_that_ships(tmp_path):
+    text = "string behavior_tree\n---\nuint16 code\n---\nfloat32 left\n"
+    write(tmp_path, "nav2_msgs/action/NavigateToPose.action", text)
+    write(tmp_path, "geometry_msgs/msg/Twist.msg", "Vector3 linear\nVector3 angular\n")
+    types = Types("jazzy", [tmp_path])
+    assert [name for name, _ in types.fields("nav2_msgs/action/NavigateToPose_Result")] == ["code"]
+    changed = "nav2_msgs/action/NavigateToPose_GetResult"
+    assert types.hash(changed) != JAZZY.hash(changed)
+    assert types.hash(TWIST) == JAZZY.hash(TWIST)
+    assert set(types.notes) == {f"nav2_msgs/action/NavigateToPose_{part}"
+                                for part in ("Goal", "Result", "Feedback")}
+
+
+@pytest.mark.parametrize("name", sorted(set(DISTRIBUTIONS) - {"humble", "iron"}))
+def test_the_result_of_navigation_has_its_error_message(name):
+    assert [field for field, _ in Types(name).fields("nav2_msgs/action/NavigateToPose_Result")
+            ] == ["error_code", "error_msg"]
+
+
+@pytest.mark.parametrize("text", ["uint8 a\r\nstring b # c\r\n", "uint8 a\u2028string b\n",
+                                  "# \u00e9\u2028uint8 a\n\x0cstring b"])
+def test_lines_of_a_definition_end_as_in_ros_2(tmp_path, text):
+    for name in ("a/msg/A.msg", "a/srv/A.srv"):
+        file = write(tmp_path, name, "") / name
+        file.write_bytes((text + "\n---\n" * name.endswith("srv")).encode())
+    types = Types("jazzy", [tmp_path])
+    for name in ("a/msg/A", "a/srv/A_Request"):
+        assert [field for field, _ in types.fields(name)] == ["a", "b"]
+
+
+def test_a_message_without_fields_is_one_of_ros_2(tmp_path):
+    types = Types("kilted", [write(tmp_path, "std_msgs/msg/Empty.msg", "uint8 ONE=1\n")])
+    assert types.hash("std_msgs/msg/Empty") == Types("kilted").hash("std_msgs/msg/Empty")
+    assert types.encode("std_msgs/msg/Empty", types.blank("std_msgs/msg/Empty")).hex() == (
+        "0001000000")
+
+
+AS_RCLPY_SAYS = bytes.fromhex(  # JointState(name=["a"], position=[1.0]), by serialize_message
+    "000100000000000000000000010000000000000001000000020000006100000001000000000000000000f03f"
+    "0000000000000000ffffffffffffffff")
+
+
+def test_the_tail_of_a_message_that_was_serialized_beforehand_is_ignored_as_in_ros_2():
+    joint = JAZZY.decode("sensor_msgs/msg/JointState", AS_RCLPY_SAYS)
+    assert (joint.name, joint.position.tolist(), len(joint.effort)) == (["a"], [1.0], 0)
+    with pytest.raises(ValueError, match="JointState"):
+        JAZZY.decode("sensor_msgs/msg/JointState", AS_RCLPY_SAYS[:-12])
 
 
 def test_whatever_arrives_is_read_or_refused():
