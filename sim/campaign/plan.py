@@ -71,9 +71,10 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
            seeds: int = SEEDS) -> list[Job]:
     """Return random runs: kind, fault, moment, length and pattern are drawn.
 
-    A kind is drawn first, then a fault of it, so that the few faults of the actuators weigh as
-    much as the hundreds of topics. A third of the faults is permanent, a third transient, a third
-    intermittent if it hits messages, else transient.
+    A kind is drawn first, by the square root of the number of its faults, then a fault of it. The
+    ten faults of the actuators are neither lost among seven hundred of topics, nor as many as
+    these. A third of the faults is permanent, a third transient, a third intermittent if it hits
+    messages, else transient.
 
     Args:
         jobs: To choose from.
@@ -88,13 +89,13 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
     Raises:
         ValueError: No jobs or faults to choose from.
     """
-    kinds = [kind for kind, names in groups.items() if names]
-    if not jobs or not kinds:
+    weights = {kind: math.sqrt(len(names)) for kind, names in groups.items() if names}
+    if not jobs or not weights:
         raise ValueError("campaign: there is nothing to choose from")
     chosen: list[Job] = []
     for number in range(runs):
         dice = random.Random(f"campaign {seed} {number}")  # noqa: S311 no secret
-        wrong = tuple(_random_fault(dice, groups, kinds, faults, moments)
+        wrong = tuple(_random_fault(dice, groups, weights, faults, moments)
                       for _ in range(together))
         job = dice.choice(list(jobs))
         of_run = dice.randrange(1, 2**31) if number < seeds else chosen[number % seeds].seed
@@ -102,9 +103,10 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
     return chosen
 
 
-def _random_fault(dice: random.Random, groups: dict[str, tuple[str, ...]], kinds: Sequence[str],
-                  faults: Faults, moments: tuple[float, float]) -> PlannedFault:
-    kind = dice.choice(kinds)
+def _random_fault(dice: random.Random, groups: dict[str, tuple[str, ...]],
+                  weights: dict[str, float], faults: Faults, moments: tuple[float, float]
+                  ) -> PlannedFault:
+    (kind,) = dice.choices(list(weights), list(weights.values()))
     fault = dice.choice(groups[kind])
     at_s = round(dice.uniform(*moments), 2)
     lasts_s = round(math.exp(dice.uniform(*map(math.log, LASTS_S))), 2)

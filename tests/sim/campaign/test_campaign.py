@@ -98,12 +98,14 @@ def test_a_longer_sample_begins_with_the_shorter_one_and_another_seed_is_another
     assert sample(BASES, GROUPS, 10, seed=1) != sample(BASES, GROUPS, 10, seed=2)
 
 
-def test_a_sample_draws_all_kinds_patterns_and_conditions_alike():
+def test_a_sample_draws_each_kind_by_the_square_root_of_how_many_faults_it_has():
     jobs = sample(BASES, GROUPS, 3000, seed=1, seeds=3000)
     kind_of = {name: kind for kind, names in GROUPS.items() for name in names}
     kinds = Counter(kind_of[job.faults[0].fault] for job in jobs)
     assert set(kinds) == set(GROUPS)
-    assert min(kinds.values()) > 3000 / 6 * 0.8
+    roots = {kind: math.sqrt(len(names)) for kind, names in GROUPS.items()}
+    for kind, root in roots.items():
+        assert kinds[kind] / 3000 == pytest.approx(root / sum(roots.values()), rel=0.3), kind
     assert 0.4 < sum(job.options["obstacles"] == 2 for job in jobs) / 3000 < 0.6
     messages = [j.faults[0] for j in jobs
                 if kind_of[j.faults[0].fault] in {"paper", "sensor", "topic"}]
@@ -113,6 +115,13 @@ def test_a_sample_draws_all_kinds_patterns_and_conditions_alike():
     assert intermittent / len(messages) == pytest.approx(1 / 3, abs=0.05)
     assert {len(job.faults) for job in jobs} == {1}
     assert len({job.seed for job in jobs}) > 2990
+
+
+def test_three_named_faults_are_not_half_of_the_runs_of_a_robot():
+    groups = {"own": ("a", "b", "c"), "topic": tuple(f"drop:t{i}" for i in range(100))}
+    names = Counter(job.faults[0].fault in groups["own"]
+                    for job in sample(BASES, groups, 1000, seed=1))
+    assert 80 < names[True] < 220  # 0.15 of 1,000 expected: 1.73 of 1.73 + 10
 
 
 def test_a_sample_has_few_seeds_that_take_turns_and_one_for_each_run_if_asked_for():
