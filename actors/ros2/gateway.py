@@ -184,7 +184,7 @@ class Gateway(Actor):
             self._diagnostics = Diagnostics(self.node, titles, system.name, self.time.ros_ns)
         self._side.tokens(f"{ADMIN}/{said.domain}/**", self._token)
         for name, note in self._types.notes.items():
-            self.refuse(name, note)
+            self._note(name, note)
 
     def on_stop(self) -> None:
         """Leave the graph."""
@@ -215,7 +215,11 @@ class Gateway(Actor):
         self.publish(topic, body, stamp_s)
 
     def refuse(self, where: str, why: str) -> None:
-        """Tell that something was not passed on."""
+        """Tell that a message was not passed on, and count it."""
+        self._rejected += 1
+        self._note(where, why)
+
+    def _note(self, where: str, why: str) -> None:
         self.report_diagnostic("ros2", why, clip(where, NAME_CHARS))
 
     def handle(self, slot: str | None, call: Callable[[], None]) -> None:
@@ -244,7 +248,7 @@ class Gateway(Actor):
             if self.graph.changed(token, alive) is None:
                 return
         except ValueError as error:
-            self.refuse("graph", str(error))
+            self._note("graph", str(error))
             return
         if not self._graph_due:  # what comes together is told together
             self._graph_due = True
@@ -263,7 +267,7 @@ class Gateway(Actor):
             return
         is_linked = self._side.is_linked()
         if self._was_linked and not is_linked:
-            self.refuse("graph", f"no router at {', '.join(self.parameters.connect)} any more")
+            self._note("graph", f"no router at {', '.join(self.parameters.connect)} any more")
         self._was_linked = is_linked
         nodes = self.graph.nodes()
         bypassed = self._bypassed()
@@ -272,7 +276,7 @@ class Gateway(Actor):
         self.publish(GRAPH, RosGraphReport(
             is_linked, tuple(clip(one, NAME_CHARS) for one in list(nodes)[:MANY]),
             tuple(clip(name, NAME_CHARS) for name, count in nodes.items() if count > 1)[:MANY],
-            len(bypassed), tuple(map(clip, problems[:_PROBLEMS]))))
+            len(bypassed), tuple(map(clip, problems[:_PROBLEMS])), self._rejected))
 
     def _bypassed(self) -> list[tuple[str, str]]:
         """Return who else publishes on the topics on which the gateway does, by topic."""

@@ -11,7 +11,7 @@ class RosGraphReport(Message, frozen=True):
     """Who is there in ROS 2: full names of nodes, those of which there are several, and problems.
 
     `bypassed` counts publishers of others on topics that the gateway publishes: what they say
-    reaches the robot past every check.
+    reaches the robot past every check. `refused` counts messages that were not passed on.
     """
 
     linked: bool
@@ -19,6 +19,7 @@ class RosGraphReport(Message, frozen=True):
     several: Names
     bypassed: Count
     problems: Texts
+    refused: Count = 0
 
 
 GRAPH = Topic("ros2/{name}/graph", RosGraphReport, Qos.STATE, 1, "",

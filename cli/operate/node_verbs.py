@@ -24,6 +24,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.foreign.program import LOGS
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.cli import systems
 from rampart.cli.following import is_over
@@ -44,6 +45,7 @@ from rampart.cli.run_picture import manager_in_words
 from rampart.cli.session import connect
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag, option, whole
 from rampart.files.plain_text import printable
+from rampart.manager.spec.ros2 import GATEWAY
 
 MOST_LINES = 1_000_000
 _LONGEST_LINE = 1 << 16
@@ -166,8 +168,10 @@ async def status(options: argparse.Namespace) -> int:
       rampart status --json
     """
     async with connect(options.port) as session:
-        run, held, lines = session.run, Holdings(session), _lines(session.run)
-        wanted = (*lines.status_read, ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
+        run, held = session.run, Holdings(session)
+        lines, has_gateway = _lines(session.run)
+        wanted = (*lines.status_read, ftm_topics.MANAGER_STATUS, ftm_topics.NODES,
+                  *[GRAPH] * has_gateway)
         found, _ = await asyncio.gather(
             session.latest(wanted, session.real_s(_WAIT_S)), held.settle())
         time_s = session.clock.now()
@@ -177,12 +181,13 @@ async def status(options: argparse.Namespace) -> int:
 
     manager: fm.ManagerStatus | None = found.get(ftm_topics.MANAGER_STATUS.key)
     nodes: fm.NodeTable | None = found.get(ftm_topics.NODES.key)
+    graph: RosGraphReport | None = found.get(GRAPH.key)
     if options.json:
         print_json({
             "run_id": run.run_id, "title": run.title, "port": run.base_port, "pid": run.pid,
             "rate": run.rate, "system": run.system_file, "time_s": round(time_s, 3),
             **lines.status_data(latest), "manager": manager, "holders": held.holders,
-            "nodes": nodes.nodes if nodes else None})
+            "nodes": nodes.nodes if nodes else None, **({"ros2": graph} if has_gateway else {})})
         return 0
     page = f", page {run.page}" if run.page else ""
     say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
@@ -195,6 +200,8 @@ async def status(options: argparse.Namespace) -> int:
     for name, what in held.holders.items():
         say(f"held      {' and '.join(what)} by {name}, no recovery module of this system; "
             f"rampart reset {name} lets go")
+    if has_gateway:
+        say(f"ros2      {_in_ros2(graph)}")
     say(f"nodes     {_nodes(nodes)}")
     return 0
 
@@ -218,11 +225,21 @@ def top(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     return top_screen.top(options)
 
 
-def _lines(run: RunInfo) -> RobotLines:
+def _lines(run: RunInfo) -> tuple[RobotLines, bool]:
+    """Return what the robot adds, and whether it has a gateway to ROS 2."""
     try:
-        return systems.lines_of(systems.load(run.system_file))
+        spec = systems.load(run.system_file)
+        return systems.lines_of(spec), any(node.actor == GATEWAY for node in spec.nodes)
     except UsageError:  # of a run from elsewhere, say: what the engine tells is there
-        return RobotLines()
+        return RobotLines(), False
+
+
+def _in_ros2(graph: RosGraphReport | None) -> str:
+    if graph is None:
+        return "silent (gateway)"
+    problems = f"; {graph.problems[0]}" if graph.problems else ""
+    return (f"{'linked' if graph.linked else 'no router'}, {len(graph.nodes)} nodes, "
+            f"{graph.refused} messages refused{problems}")
 
 
 def _nodes(table: fm.NodeTable | None) -> str:

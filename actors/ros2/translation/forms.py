@@ -7,6 +7,8 @@ of REP-103 on either side; a message that stands for the robot in the plane has 
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
 
 _POSE = {"x_m": "{0}position.x", "y_m": "{0}position.y", "yaw_rad": "yaw({0}orientation)"}
@@ -51,12 +53,30 @@ READY: Mapping[str, Mapping[str, str]] = {
 }
 """Quantity → how it is read. Of a transform it is read of the one that is meant."""
 
+UNKNOWN: Mapping[str, Mapping[str, tuple[str, float]]] = {
+    "sensor_msgs/msg/Imu": {
+        "orientation": ("orientation_covariance[0]", -1),
+        "angular_velocity": ("angular_velocity_covariance[0]", -1),
+        "linear_acceleration": ("linear_acceleration_covariance[0]", -1)},
+    "sensor_msgs/msg/NavSatFix": {"position_covariance": ("position_covariance_type", 0)},
+    "sensor_msgs/msg/BatteryState": {"current": ("current", math.nan),
+                                     "percentage": ("percentage", math.nan)}}
+"""Type → field that its sensor may not know → the field and value by which it says so."""
+
+UNBOUNDED = ("sensor_msgs/msg/LaserScan",)
+"""Ready types in which infinity is a value: no echo (REP-117)."""
+
 _TEXTS_AND_TRUTHS = {"dead_man": bool, "ranges_f32": bytes, "status": int}
 
 
 def kind_of(quantity: str) -> type:
     """Return the type of a quantity."""
     return _TEXTS_AND_TRUTHS.get(quantity, float)
+
+
+def may_be_unknown(kind: str, text: str) -> bool:
+    """Whether the sensor may say by convention that it does not know what an expression reads."""
+    return any(field in re.findall(r"[a-z_]+", text) for field in UNKNOWN.get(kind, ()))
 
 
 def _written(quantity: str, text: str) -> tuple[str, str] | None:

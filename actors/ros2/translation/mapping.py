@@ -6,15 +6,16 @@ a run; what is left for a message is to read and to write.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import msgspec
 import numpy as np
 
-from rampart.actors.ros2.translation.expressions import Expression, Plane, Read, steps
+from rampart.actors.ros2.translation.expressions import Expression, Plane, Read, reader, steps
 from rampart.actors.ros2.translation.fields import TypeFields, near, plain, reads_of
-from rampart.actors.ros2.translation.forms import ON_PLANE, READY, WRITTEN
+from rampart.actors.ros2.translation.forms import ON_PLANE, READY, UNBOUNDED, UNKNOWN, WRITTEN
 from rampart.actors.ros2.translation.types import Types
 from rampart.manager.spec.ros2 import Ros2Link
 
@@ -66,16 +67,17 @@ class Inward:
         ready = {**READY.get(link.type, reads_of(link.type, types)), **(
             ON_PLANE if plane and link.type == "sensor_msgs/msg/NavSatFix" else {})}
         needed = dict(_leaves(made))
+        self._optional = {path for path, field in needed.items() if field.default is None}
         for path in link.fields:
             if path not in needed:
                 raise ValueError(f"fields: {made.__name__} has no field {path!r}"
                                  f"{near(path, needed)}")
         self._reads: list[tuple[list[str], Read]] = []
         self._reads_beside: list[tuple[list[str], Read]] = []
-        for path, is_needed in needed.items():
+        for path, field in needed.items():
             said = link.fields.get(path, ready.get(path, ready.get(path.rpartition(".")[2])))
             if said is None:
-                if is_needed:
+                if field.required:
                     raise ValueError(f"fields: nothing says what {path} of {made.__name__} is; "
                                      f"{link.type} has {', '.join(fields.names)}")
                 continue
@@ -94,7 +96,32 @@ class Inward:
             fields.check(one, said)
         if path.endswith(_F32):
             return lambda message: np.asarray(expression.read(message), "<f4").tobytes()
-        return lambda message: plain(expression.read(message))
+        return self._checked(path, said, expression)
+
+    def _checked(self, path: str, said: str, expression: Expression) -> Read:
+        """Return what reads a value that means something; None of one that may be missing."""
+        kind, is_optional = self._link.type, path in self._optional
+        parts = [(text, reader(text)) for text in expression.paths]
+        marks = [(text, reader(text), value) for field, (text, value) in
+                 UNKNOWN.get(kind, {}).items() if any(
+                     steps(part)[0] == field for part in expression.paths)]
+        is_bounded = kind in READY and kind not in UNBOUNDED
+
+        def read(message: Any) -> Any:
+            for text, mark, value in marks:
+                there = mark(message)
+                if there == value or (math.isnan(value) and math.isnan(there)):
+                    if is_optional:
+                        return None
+                    raise ValueError(f"{path}: {said} is unknown, {text} = {there:g}")
+            found = plain(expression.read(message))
+            if isinstance(found, float) and (
+                    math.isnan(found) or (is_bounded and math.isinf(found))):
+                values = ", ".join(f"{text} = {_shown(part(message))}" for text, part in parts)
+                raise ValueError(f"{path}: {said} is {found:g}, a number is right; {values}")
+            return found
+
+        return read
 
     def __call__(self, message: Any, beside: Any = None) -> tuple[msgspec.Struct, int | None]:
         """Return the message of the system, and the stamp of the other's header, nanoseconds.
@@ -135,6 +162,14 @@ class Inward:
                     and transform.child_frame_id.lstrip("/") == self._link.child):
                 return transform
         raise NotMeantError
+
+
+def _shown(value: Any) -> str:
+    """Return a value in few characters."""
+    found = plain(value)
+    if isinstance(found, dict):
+        return "(" + ", ".join(f"{name} {_shown(part)}" for name, part in found.items()) + ")"
+    return f"{found:g}" if isinstance(found, float) else str(found)[:60]
 
 
 def _read_of(said: str, beside: type[msgspec.Struct]) -> Read:
@@ -252,12 +287,13 @@ def _place(fields: TypeFields, where: str) -> tuple[list[str], str | int]:
     return [str(step) for step in way[:-1]], way[-1]
 
 
-def _leaves(made: type[msgspec.Struct], above: str = "") -> Iterator[tuple[str, bool]]:
-    """Yield the paths of the fields of a struct, each with whether it has to be given."""
+def _leaves(made: type[msgspec.Struct], above: str = ""
+            ) -> Iterator[tuple[str, msgspec.structs.FieldInfo]]:
+    """Yield the paths of the fields of a struct, each with its field."""
     for field in msgspec.structs.fields(made):
         kind = field.type
         path = f"{above}{field.name}"
         if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
             yield from _leaves(kind, f"{path}.")
         else:
-            yield path, field.required
+            yield path, field

@@ -16,7 +16,7 @@ from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ros2.translation.expressions import Expression, Plane
 from rampart.actors.ros2.translation.fields import BULK, LEN, TypeFields
-from rampart.actors.ros2.translation.forms import ON_PLANE, READY, kind_of
+from rampart.actors.ros2.translation.forms import ON_PLANE, READY, kind_of, may_be_unknown
 from rampart.actors.ros2.translation.mapping import BESIDE, TF
 from rampart.actors.ros2.translation.types import Types
 from rampart.manager.spec.ros2 import Ros2Link
@@ -53,10 +53,13 @@ def message_of(link: Ros2Link, types: Types) -> type[msgspec.Struct]:
         if not name.isidentifier():
             raise ValueError(f"fields: {name!r}: a name such as speed_mps is right")
     kinds = {name: kind_of(name) for name in ready} | kinds
+    made: list[Any] = []
+    for name, kind in kinds.items():
+        what: Any = _BOUNDED.get(kind, kind)
+        is_known = name in link.fields or not may_be_unknown(link.type, ready[name])
+        made.append((name, what) if is_known else (name, what | None, None))
     return msgspec.defstruct(
-        link.type.rpartition("/")[2], [
-            (name, _BOUNDED.get(kind, kind)) for name, kind in kinds.items()],
-        bases=(Message,), frozen=True)
+        link.type.rpartition("/")[2], made, bases=(Message,), frozen=True, kw_only=True)
 
 
 def _kind_of(said: str | float | bool, fields: TypeFields, plane: Plane | None) -> Any:

@@ -344,6 +344,33 @@ def test_bytes_that_are_no_message_and_one_without_attachment_are_refused_and_to
     run(scenario)
 
 
+def test_a_rotation_that_is_none_is_refused_told_and_counted_and_the_topic_falls_silent(guarded):
+    async def scenario():
+        async with VirtualSystem.load(guarded()) as system:
+            gateway = system.start_node("gateway")
+            odometry = system.hear(gateway.chosen_topic("base/odometry"))
+            told, graph = system.hear(DIAGNOSTIC, "gateway"), system.hear(GRAPH, "gateway")
+            base = system.start_node("base")
+            await asyncio.sleep(1.0)
+            say = base.say_odometry
+
+            def turned(message):
+                message.pose.pose.orientation.w = 2.0
+                say(message)
+
+            base.say_odometry = turned
+            await asyncio.sleep(0.1)
+            heard = len(odometry)
+            await asyncio.sleep(3.0)
+            assert len(odometry) == heard
+            assert graph[-1].message.refused == pytest.approx(60, abs=25)
+            reasons = [one.message.reason for one in told if one.message.offender == "/odom"]
+            assert "pose.pose.orientation = (x 0, y 0, z 0, w 2)" in reasons[0]
+            assert len(reasons) <= 4  # one a second
+
+    run(scenario)
+
+
 def test_definitions_that_replace_others_or_are_left_out_are_told_at_the_start(guarded, tmp_path):
     folder = tmp_path / "own"
     (folder / "a/msg").mkdir(parents=True)

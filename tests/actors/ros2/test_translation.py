@@ -104,6 +104,66 @@ def test_beside_it_a_message_of_the_system_is_read():
     assert made == Pose(0.5, 0.5, pytest.approx(0.5))
 
 
+IMU, POSE = "sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+
+class Turn(Message, frozen=True):
+    yaw_rad: float
+    yaw_rate_radps: float = 0.0
+
+
+def changed(kind, **fields):
+    message = JAZZY.blank(kind)
+    for path, value in fields.items():
+        *way, last = path.split("__")
+        inner = message
+        for step in way:
+            inner = getattr(inner, step)
+        setattr(inner, last, value)
+    return message
+
+
+@pytest.mark.parametrize(("kind", "made", "fields", "words"), [
+    (IMU, Turn, {"orientation__w": 0.0}, ("yaw_rad", "orientation = (x 0, y 0, z 0, w 0)")),
+    (IMU, Turn, {"orientation__w": math.sqrt(2)}, ("yaw_rad", "w 1.41421")),
+    (IMU, Turn, {"orientation__z": math.nan}, ("yaw_rad", "z nan")),
+    (IMU, Turn, {"angular_velocity__z": math.nan}, ("yaw_rate_radps", "velocity.z = nan")),
+    (IMU, Turn, {"orientation_covariance": np.full(9, -1.0)},
+     ("yaw_rad", "unknown", "orientation_covariance[0] = -1")),
+    (IMU, Turn, {"angular_velocity_covariance": np.full(9, -1.0)},
+     ("yaw_rate_radps", "angular_velocity_covariance[0] = -1")),
+    (POSE, None, {"pose__covariance": np.full(36, -1.0)},
+     ("position_sd_m", "pose.covariance[0] = -1")),
+    (ODOMETRY, None, {"pose__pose__position__x": math.inf}, ("x_m", "position.x = inf")),
+    (SCAN, None, {"ranges": np.full(3, math.nan, "f4")}, ("nearest_m", "least(ranges)")),
+    ("sensor_msgs/msg/Temperature", None, {"temperature": math.nan}, ("temperature = nan",))])
+def test_a_value_that_means_nothing_is_refused_with_its_field_and_what_it_is(
+        kind, made, fields, words):
+    link = Ros2Link(type=kind, subscribe="/x", to="x")
+    inward = Inward(link, JAZZY, made or message_of(link, JAZZY))
+    with pytest.raises(ValueError, match=r"^[^\n]+\Z") as raised:
+        inward(changed(kind, **fields))
+    assert all(word in str(raised.value) for word in words), str(raised.value)
+
+
+@pytest.mark.parametrize(("kind", "fields", "unknown"), [
+    (IMU, {"orientation_covariance": np.full(9, -1.0), "orientation__w": 0.0}, {"yaw_rad"}),
+    (IMU, {"linear_acceleration_covariance": np.full(9, -1.0)}, {"accel_x_mps2", "accel_y_mps2"}),
+    ("sensor_msgs/msg/NavSatFix", {"position_covariance_type": 0}, {"accuracy_m"}),
+    ("sensor_msgs/msg/BatteryState", {"current": math.nan, "percentage": math.nan},
+     {"current_a", "charge"})])
+def test_what_a_sensor_says_it_does_not_know_is_none_and_the_rest_passes(kind, fields, unknown):
+    link = Ros2Link(type=kind, subscribe="/x", to="x")
+    made, _ = Inward(link, JAZZY, message_of(link, JAZZY))(changed(kind, **fields))
+    assert {name for name in made.__struct_fields__ if getattr(made, name) is None} == unknown
+
+
+def test_no_echo_is_a_range_and_infinite_as_in_rep_117():
+    made, _ = heard(SCAN, message_of(Ros2Link(type=SCAN, subscribe="/x", to="x"), JAZZY))(
+        changed(SCAN, ranges=np.full(3, math.inf, "f4")))
+    assert made.nearest_m == math.inf
+
+
 def test_of_transforms_the_one_that_is_meant():
     there = JAZZY.decode(TF, said(TF, Pose, frame="map", child="odom")(Pose(1.0, 2.0, 0.3), 5))
     assert len(there.transforms) == 1
@@ -130,7 +190,8 @@ def test_every_ready_form_can_be_heard_as_it_is_and_what_can_be_written_comes_ba
 
 def kind_of(made, name):
     field = next(f for f in msgspec.structs.fields(made) if f.name == name)
-    return getattr(field.type, "__origin__", field.type)
+    kind = float if field.type == float | None else field.type
+    return getattr(kind, "__origin__", kind)
 
 
 @pytest.mark.parametrize("kind", sorted(name for name in JAZZY.known if JAZZY.is_message(name)
@@ -140,7 +201,10 @@ def test_every_type_there_is_can_be_heard_field_by_field(kind):
                     child="a" * (kind == TF))
     topic = topic_of(link, JAZZY)
     if kind not in {TF, JOY}:  # of which it reads items of lists
-        made, _ = Inward(link, JAZZY, topic.type)(JAZZY.blank(kind))
+        blank = JAZZY.blank(kind)
+        if kind == SCAN:
+            blank.ranges = np.ones(1, "f4")
+        made, _ = Inward(link, JAZZY, topic.type)(blank)
         assert msgspec.convert(msgspec.to_builtins(made), topic.type) is not None
 
 
