@@ -24,6 +24,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout
+from rampart.actors.run.run_plan import tailor
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.arbitration.arbiter import build_arbiter
@@ -47,7 +48,7 @@ from rampart.manager.arbitration.detection_track import DetectionHeard, overdue
 from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard
 from rampart.manager.spec.adaptation import Action, Change, Document, adapt, describe
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.spec.specification import check_modules
+from rampart.manager.spec.specification import check_change
 
 MANAGER_STATE = StateFormat(Memory, version=1, objection=objection)
 
@@ -177,8 +178,10 @@ class FtmManager(Actor):
             return "this manager was started without a system file"
         file = f"{self._system.name}.toml"
         document, system = adapt(self._document, change, file)
-        check_modules(self._system, system)
-        Layout(replace(self.context.run.plan, system_file=file), system)
+        plan = replace(self.context.run.plan, system_file=file)
+        system = tailor(plan, system)
+        check_change(self._system, system)
+        Layout(plan, system)
         if busy := self.arbiter_state.busy:
             return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
         text = msgspec.json.encode(document).decode()

@@ -40,7 +40,7 @@ ROOM_FOR_NAMES = 64
 """Bytes of such a path that are left for the name of a node."""
 
 _NAME = re.compile(r"rampart-(\d+)-(\d+)-\w+\Z")
-_ISSUED, _MARKS = "issued", "marks"
+_ISSUED, _MARKS, _SYSTEM = "issued", "marks", "system"
 
 
 def make(port: int, launcher: int) -> str:
@@ -104,6 +104,40 @@ def issue(folder: str, names: Iterable[str], incarnation: int,
         fresh.unlink(missing_ok=True)  # left by a process that died here
         fresh.symlink_to(" ".join(map(str, (incarnation, *(process or ())))))
         fresh.replace(fresh.with_name(name))
+
+
+def change_system(folder: str, system: bytes) -> None:
+    """Keep the system as it was changed last, for those that start processes of the run.
+
+    Raises:
+        OSError: the folder is gone, or full.
+    """
+    file = Path(folder, _SYSTEM)
+    with contextlib.suppress(OSError):
+        if file.read_bytes() == system:
+            return
+    fresh = file.with_name(f"{_SYSTEM}~{os.getpid()}")
+    fresh.write_bytes(system)
+    fresh.replace(file)
+
+
+def changed_system(folder: str, seen: tuple[int, ...]) -> tuple[tuple[int, ...], bytes] | None:
+    """Return the system as it was changed last, with a stamp.
+
+    Args:
+        folder: of the run.
+        seen: the stamp of what was read before; () if nothing was.
+
+    Returns:
+        None if there is nothing newer.
+    """
+    try:
+        with Path(folder, _SYSTEM).open("rb") as file:
+            found = os.fstat(file.fileno())
+            stamp = found.st_ino, found.st_mtime_ns
+            return None if stamp == seen else (stamp, file.read())
+    except OSError:
+        return None
 
 
 def issued(folder: str) -> dict[str, int]:

@@ -30,7 +30,7 @@ from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_document, on_hos
 from rampart.actors.runtime.declaration import Handlers
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
-from rampart.manager.spec.specification import check_document, check_modules
+from rampart.manager.spec.specification import check_document, check_change
 from rampart.manager.spec.tables import Layers
 
 SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"
@@ -171,17 +171,15 @@ def adapted_system(layout: Layout, run: RunContext,
     """Return layout and context of the system as it was changed while running.
 
     Raises:
-        ValueError: the changed system is unsound, has other processes, or names a module that the
-            system as it was started does not. The manager lets none of this happen; a message may.
+        ValueError: the changed system is unsound, or the running one cannot be changed into it.
+            The manager lets neither happen; a message may.
     """
     try:
         document = msgspec.json.decode(adapted.document, type=dict[str, Any])
     except RecursionError:
         raise ValueError("the changed system is nested too deep") from None
     spec = tailor(layout.plan, check_document(document, layout.plan.system_file))
-    check_modules(layout.spec, spec)
-    if spec.processes().keys() != layout.units.keys():
-        raise ValueError(f"{layout.plan.system_file}: not the processes that were started")
+    check_change(layout.spec, spec)
     return Layout(layout.plan, spec, run.application), replace(
         run, system=spec, document=document, adapted=adapted)
 

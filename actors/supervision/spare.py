@@ -199,6 +199,8 @@ class Spares:
         self._selector.register(ours, selectors.EVENT_READ, lambda _: self._hear(spare))
 
     def _hear(self, spare: Spare) -> None:
+        if spare not in self._there:  # it was used or ended since the selector saw this
+            return
         if spare.heard():
             self._pause_s = _PAUSE_S
         else:

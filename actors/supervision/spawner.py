@@ -28,7 +28,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rampart.actors.bus.envelope import decoder
-from rampart.actors.bus.run_folder import issue, issued, mark, register_of, socket_path
+from rampart.actors.bus.run_folder import changed_system, issue, issued, mark, register_of, socket_path
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.layout import Layout, adapted_system, load_run
@@ -45,7 +45,7 @@ from rampart.manager.spec.tables import Supervision
 
 NAMES = ("a", "b")
 MAX_DATAGRAM = 160_000
-"""A changed system spec has to fit; unix sockets take 200 kB by default."""
+"""The names of the actors of one process have to fit; unix sockets take 200 kB by default."""
 
 _BACKLOG = 64
 """So many may wait to be accepted: all processes of a run, each asked for on a connection."""
@@ -72,12 +72,6 @@ class Ping(msgspec.Struct, frozen=True, tag="ping"):
     """Ask whether the spawner turns."""
 
 
-class Adapt(msgspec.Struct, frozen=True, tag="adapt"):
-    """Fork from now on by a changed system."""
-
-    adapted: AdaptedSystem
-
-
 class SetOrigin(msgspec.Struct, frozen=True, tag="origin"):
     """Set simulated time 0; sent once by the launcher before the first fork."""
 
@@ -91,7 +85,7 @@ class Reply(msgspec.Struct, frozen=True):
     sender: int = 0
 
 
-Request = ForkRequest | SetUp | Go | Ping | SetOrigin | Adapt
+Request = ForkRequest | SetUp | Go | Ping | SetOrigin
 
 
 class Loaded(msgspec.Struct, frozen=True):
@@ -120,6 +114,7 @@ class Spawner:
         self._run = run
         self._lifeline = lifeline
         self._selector = selectors.DefaultSelector()
+        self._system_read: tuple[int, ...] = ()
         self._spares = Spares(layout.spec.supervision.spares, self._selector, self._be_spare)
 
     def open(self) -> None:
@@ -174,6 +169,7 @@ class Spawner:
             return
         try:
             request = msgspec.json.decode(data, type=Request)
+            self._follow_changes()
             if isinstance(request, ForkRequest):
                 self._fork(request, connection)
                 return
@@ -187,14 +183,24 @@ class Spawner:
         self._selector.unregister(connection)
         connection.close()
 
-    def _obey(self, request: SetUp | Go | Ping | SetOrigin | Adapt) -> None:
+    def _obey(self, request: SetUp | Go | Ping | SetOrigin) -> None:
         if isinstance(request, SetUp | Go):
             raise ValueError("this is no process that waits")
         if isinstance(request, SetOrigin):
             self._layout.plan = replace(self._layout.plan, origin_s=request.origin_s)
-        elif isinstance(request, Adapt):
-            self._layout, self._run = adapted_system(self._layout, self._run, request.adapted)
-        if not isinstance(request, Ping):
+            self._spares.end()  # they know the plan as it was
+
+    def _follow_changes(self) -> None:
+        """Fork from now on by the system as it was changed last.
+
+        Raises:
+            ValueError: it makes no sense, and the one before stays.
+        """
+        changed = changed_system(self._layout.plan.folder, self._system_read)
+        if changed is not None:
+            self._system_read, data = changed
+            self._layout, self._run = adapted_system(
+                self._layout, self._run, msgspec.json.decode(data, type=AdaptedSystem))
             self._spares.end()  # they know the system as it was
 
     def _fork(self, request: ForkRequest, connection: socket.socket) -> None:

@@ -25,6 +25,7 @@ import time
 import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.run_folder import change_system
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.machine.unix_peer import is_same_user, process_state, receive_signed
 from rampart.actors.supervision import spawner as protocol
@@ -95,13 +96,12 @@ class _Asked:
         """Whether the process that waits at the other end is not stopped, as far as is known."""
         return not self._first or process_state(self._first) not in "TtXZ"
 
-    def send(self, *requests: Request) -> None:
-        """Send requests, one after the other."""
+    def send(self, request: Request) -> None:
+        """Send a request."""
         self.sent = True
-        self._unanswered += len(requests)
+        self._unanswered += 1
         try:
-            for request in requests:
-                self._connection.send(msgspec.json.encode(request))
+            self._connection.send(msgspec.json.encode(request))
         except OSError as error:  # it has just ended, or does not empty its queue
             self._end(Reply(error=f"takes no request ({error.strerror})"))
 
@@ -183,7 +183,6 @@ class SpawnerClient:
         self._pings: dict[str, _Asked] = {}
         self._ready: dict[tuple[str, ...], tuple[int, _Asked]] = {}
         self._slow: set[str] = set()
-        self._adapt: protocol.Adapt | None = None
 
     def fork(self, names: tuple[str, ...], incarnation: int) -> int:
         """Fork a process for the named actors and return its pid.
@@ -199,14 +198,13 @@ class SpawnerClient:
         """
         if child := self._promoted(names, incarnation):
             return child
-        requests = self._requests(protocol.ForkRequest(names, incarnation))
         asked = self._resumed(names, incarnation)
         queue = [n for n in sorted(NAMES, key=lambda n: n in self._slow)
                  if names != (f"spawner_{n}",) and (asked is None or n != asked.spawner)]
         failures: list[str] = []
         while asked is not None or (asked := self._reach(queue, failures)) is not None:
             if not asked.sent:
-                asked.send(*requests)
+                asked.send(protocol.ForkRequest(names, incarnation))
             reply, other = asked.reply(0.0 if asked.spawner in self._slow else WAIT_S), None
             if reply is None:
                 self._slow.add(asked.spawner)
@@ -237,7 +235,7 @@ class SpawnerClient:
         asked = self._reach([name for name in NAMES if name not in self._slow], [])
         if asked is not None:
             asked.waits, asked.rehearses = True, kind == "own"
-            asked.send(*self._requests(protocol.ForkRequest(names, incarnation, kind)))
+            asked.send(protocol.ForkRequest(names, incarnation, kind))
             self._ready[names] = incarnation, asked
 
     def is_ready(self, names: tuple[str, ...]) -> bool:
@@ -294,14 +292,14 @@ class SpawnerClient:
             raise SpawnerUnavailableError("spawner_a: no answer")
 
     def adapt(self, adapted: AdaptedSystem) -> None:
-        """Have the spawners fork by a changed system from now on, those still to come included."""
-        self._adapt = protocol.Adapt(adapted)
+        """Have every process that is forked from now on know a changed system.
+
+        Raises:
+            OSError: the folder of the run is full, or gone.
+        """
+        change_system(self.folder, msgspec.json.encode(adapted))
         for names in list(self._ready):  # they know the system as it was
             self.forget(names)
-        for name in NAMES:
-            asked = self._reach([name], [])
-            if asked is not None:  # one that does not answer now reads it first when it turns
-                asked.ask(self._adapt, 0.0 if name in self._slow else WAIT_S)
 
     def close(self) -> None:
         """Withdraw what is under way."""
@@ -313,10 +311,6 @@ class SpawnerClient:
             self.forget(names)
         self._forks.clear()
         self._pings.clear()
-
-    def _requests(self, request: Request) -> list[Request]:
-        # A spawner may have loaded the file as it was.
-        return [request] if self._adapt is None else [self._adapt, request]
 
     def _promoted(self, names: tuple[str, ...], incarnation: int) -> int:
         """Make the process that is ready the node and return its pid; 0 if there is none."""

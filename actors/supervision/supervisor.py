@@ -94,8 +94,6 @@ class Supervisor(Actor):
             if (process := self._process_of(node)) is not None:
                 process.incarnation = process.highest = incarnation
         self._version = (0, run.adapted.version if run.adapted else 0)
-        if run.adapted is not None:
-            self._machine.adapt(run.adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
         self._checked_s = self._loop.time()
@@ -180,13 +178,13 @@ class Supervisor(Actor):
         version = (header.incarnation, message.version)
         if version <= self._version:
             return
-        self._version = version
         try:
             layout, _ = adapted_system(self._layout, self.context.run, message)
-        except ValueError as error:
+            self._machine.adapt(message)
+        except (ValueError, OSError) as error:  # it is repeated, and tried again
             self.report_diagnostic("adaptation", " ".join(str(error).split()), message.change)
             return
-        self._machine.adapt(message)
+        self._version = version
         changed = changed_actors(self._spec, layout.spec)
         self._layout, self._spec = layout, layout.spec
         for unit in {self._layout.unit_of[name] for name in changed} & self._processes.keys():

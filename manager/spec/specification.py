@@ -87,14 +87,15 @@ def read_document(text: str, file: str) -> dict[str, Any]:
         raise SpecificationError(file, "$", str(error)) from None
 
 
-def check_modules(before: SystemSpec, after: SystemSpec) -> None:
-    """Make sure that a changed system names no module that the system it came from does not.
+def check_change(before: SystemSpec, after: SystemSpec) -> None:
+    """Make sure that a running system can be changed into another one.
 
-    A class is imported when it is named, and its module is executed: which ones may be is said by
-    the file that the operator started the system with, and by no message.
+    The actors, their processes and their hosts stay. No module is named that the system it came
+    from does not name: a class is imported when it is named, and its module is executed. Only the
+    file that the operator started the system with decides which ones may be.
 
     Raises:
-        ValueError: It does; the message names node, field and value.
+        ValueError: It cannot; the message names node, field and value.
     """
     known = {node.actor.partition(":")[0] for node in before.actors()}
     for node in after.actors():
@@ -107,6 +108,16 @@ def check_modules(before: SystemSpec, after: SystemSpec) -> None:
         for field in COMMAND_FIELDS if new.command else ():
             if getattr(new, field) != getattr(commands.get(new.name), field, None):
                 raise ValueError(f"{new.name}: {field}: of a command nothing changes while it runs")
+    was, becomes = ({node.name: node for node in spec.actors()} for spec in (before, after))
+    if was.keys() != becomes.keys():
+        names = ", ".join(sorted(was.keys() ^ becomes.keys()))
+        raise ValueError(f"{names}: a running system keeps the actors that it was started with")
+    for name, node in becomes.items():
+        for field in ("process", "host"):
+            value, kept = getattr(node, field), getattr(was[name], field)
+            if value != kept:
+                raise ValueError(f"{name}: {field} = {value!r}: expected {kept!r}, for while a "
+                                 f"system runs no actor moves to another {field}")
 
 
 def check_document(document: dict[str, Any], file: str) -> SystemSpec:

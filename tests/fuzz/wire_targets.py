@@ -25,7 +25,7 @@ from rampart.actors.recording.message_form import Forms
 from rampart.actors.run.run_info import RunInfo, read_info
 from rampart.actors.runtime.checkpoint import StateError
 from rampart.actors.supervision.process_title import parse_title
-from rampart.actors.supervision.spawner import Adapt, ForkRequest, Ping, Reply, Request, SetOrigin
+from rampart.actors.supervision.spawner import ForkRequest, Ping, Reply, Request, SetOrigin
 from rampart.actors.web.access import Access
 from rampart.actors.web.gate import Gate
 from rampart.actors.web.visitors import Register, Role, Visitor, VisitorError, digest, parse
@@ -95,7 +95,7 @@ def run_info(data: bytes) -> None:
 
 
 @target("spawner-request", refuses=UNREADABLE, kind="json", samples=lambda: [
-        msgspec.json.encode(sample(kind)) for kind in (ForkRequest, Ping, Adapt, SetOrigin, Reply)])
+        msgspec.json.encode(sample(kind)) for kind in (ForkRequest, Ping, SetOrigin, Reply)])
 def spawner_request(data: bytes) -> None:
     msgspec.json.decode(data, type=Request)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import os
 import re
@@ -11,23 +12,25 @@ import signal
 import socket
 import time
 from pathlib import Path
+from typing import NoReturn
 
+import msgspec
 import pytest
 
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import RespawnRequest
+from rampart.actors.ftm.messages import AdaptedSystem, RespawnRequest
 from rampart.actors.layout.layout import Layout
 from rampart.actors.machine.patience import usage
 from rampart.actors.osmosis import topics as robot
-from rampart.actors.run.run_plan import load_system
+from rampart.actors.run.run_plan import load_document, load_system
 from rampart.actors.runtime.actor import Actor, on
 from rampart.actors.supervision import spare
 from rampart.actors.supervision.process_title import find_processes
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually
 from tests.actors.supervision import test_supervision as base
-from tests.stub_actors import IdlePose, launched, stub_plan, write_stub_system
+from tests.stub_actors import IdleDetection, IdlePose, launched, stub_plan, write_stub_system
 
 HURTS = (signal.SIGKILL, signal.SIGSTOP, signal.SIGUSR2)
 """Killed, stopped, hung."""
@@ -91,6 +94,47 @@ async def spares(port: int, *names: str,
 
 def respawn(witness: base.Witness, node: str, failed: int) -> None:
     witness.publish(topics.RESPAWN, RespawnRequest(failed, node, failed, "RM3"))
+
+
+class TellingDetection(IdleDetection):
+    """Tells what it was started with."""
+
+    def on_start(self) -> None:
+        self.report_diagnostic("started with", str(self.context.run.document["title"]), "")
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+@pytest.mark.parametrize("characters", [155_000, 400_000])
+async def test_whatever_starts_after_a_change_knows_it_and_spares_are_used_as_before(
+        tmp_path, characters):
+    file = tmp_path / "telling.toml"
+    file.write_text(write_stub_system(tmp_path).read_text(encoding="utf-8").replace(
+        "tests.stub_actors:IdleDetection",
+        "tests.actors.supervision.test_spares:TellingDetection"), encoding="utf-8")
+    async with base.running(tmp_path, system_file=str(file)) as (launcher, witness):
+        port, both = launcher.plan.base_port, ("spare_a", "spare_b")
+        there, start = await spares(port, *both), len(witness.errors)
+        document = load_document(launcher.plan)
+        document["title"] = "changed"
+        document["node"][0].setdefault("parameters", {})["text"] = "x" * characters
+        row = next(row for row in document["detection"] if row["name"] == "DM1")
+        row.setdefault("parameters", {})["margin_m"] = 0.7
+        witness.publish(topics.ADAPTED_SYSTEM, AdaptedSystem(
+            1, "retune DM1", "me", msgspec.json.encode(document).decode()))
+        await eventually(lambda: witness.state("DM1") == ("running", 2))
+        for number in range(2):
+            there = await spares(port, *both, other_than=there)
+            os.kill(witness.pid("DM2"), signal.SIGKILL)
+            await eventually(lambda n=number: witness.state("DM2") == ("running", n + 2))
+            assert witness.pid("DM2") == there["spare_a"]
+            there = {"used": there["spare_a"]}
+        os.kill(pids(port, "supervisor")["supervisor"], signal.SIGKILL)
+        await eventually(lambda: witness.state("supervisor") == ("running", 2))
+        os.kill(witness.pid("DM3"), signal.SIGKILL)
+        await eventually(lambda: witness.state("DM3") == ("running", 2))
+        titles = [e.reason for e in witness.errors[start:] if e.context == "started with"]
+        assert titles == 4 * ["changed"]
 
 
 @pytest.mark.processes
@@ -298,3 +342,24 @@ def test_a_spare_that_cannot_be_made_is_tried_again_and_ends_no_spawner(what, mo
         key.data(key.fileobj)  # it has ended at once
         assert not selector.get_map()
     os.wait()
+
+
+def test_a_spare_that_is_ended_after_it_was_seen_to_speak_ends_no_spawner():
+    def speak(control: socket.socket) -> NoReturn:
+        control.send(b"r")
+        signal.pause()
+        os._exit(0)
+
+    with selectors.DefaultSelector() as selector:
+        spares = spare.Spares(1, selector, speak)
+        until_s = time.monotonic() + 10
+        while not selector.get_map() and time.monotonic() < until_s:
+            time.sleep(0.01)
+            spares.look_after()
+        events = selector.select(10)
+        assert events
+        spares.end()
+        for key, _ in events:
+            key.data(key.fileobj)
+        with contextlib.suppress(ChildProcessError):
+            os.wait()

@@ -50,7 +50,7 @@ pytestmark = pytest.mark.processes
 class Witness(Actor):
     """Hears what the supervisor says, and may ask it to respawn a node, as RM3 does."""
 
-    outputs = (topics.RESPAWN,)
+    outputs = (topics.RESPAWN, topics.ADAPTED_SYSTEM)
 
     def __init__(self, context: Context, launcher: Launcher) -> None:
         super().__init__(context)

@@ -14,6 +14,7 @@ from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from tests import ROOT
+from tests.two_hosts import two_hosts
 
 FILE = ROOT / "systems" / "paper.toml"
 PLAN = RunPlan("r", 20000, system_file=str(FILE))
@@ -50,10 +51,33 @@ def test_a_module_that_was_not_there_at_the_start_is_never_imported(
     assert "intruder" not in sys.modules
 
 
-def test_other_processes_than_those_that_run_are_refused(layout, document):
-    document["detection"][0]["process"] = "another"
-    with pytest.raises(ValueError, match="not the processes that were started"):
+@pytest.mark.parametrize("process", ["another", "DM2"])
+def test_other_processes_than_those_that_run_are_refused(layout, document, process):
+    document["detection"][0]["process"] = process
+    with pytest.raises(ValueError, match=f"DM1: process = '{process}'"):
         change(layout, document)
+
+
+def test_two_actors_that_change_places_are_refused(layout, document):
+    document["detection"][0]["process"], document["detection"][1]["process"] = "DM2", "DM1"
+    with pytest.raises(ValueError, match="process"):
+        change(layout, document)
+
+
+def test_an_actor_that_is_left_out_is_refused(layout, document):
+    document["node"] = [row for row in document["node"] if row["name"] != "teleoperation"]
+    with pytest.raises(ValueError, match="teleoperation"):
+        change(layout, document)
+
+
+def test_a_host_to_which_a_module_would_have_to_move_is_refused(tmp_path):
+    file = tmp_path / "two.toml"
+    file.write_text(two_hosts({"robot": "10.0.0.1", "ground": "10.0.0.2"}))
+    document = tomllib.loads(file.read_text())
+    next(row for row in document["detection"] if row["name"] == "DM13")["host"] = "robot"
+    plan = RunPlan(system_file=str(file))
+    with pytest.raises(ValueError, match="^DM13: host = 'robot'"):
+        change(Layout(plan, load_system(plan)), document)
 
 
 @pytest.mark.parametrize("text", [

@@ -296,6 +296,8 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
      "0.420 s, 3 periods of heartbeat_period_s = 0.140 s, is right"),
     ("retune", "DM1", '{"hold_s": -1}',
      "paper.toml: detection DM1: parameters.hold_s = -1: expected a number, 0 or more"),
+    ("retune", "DM5", '{"process": "DM1"}',
+     "DM5: process = 'DM1': expected 'DM5', for while a system runs no actor moves to another"),
     ("retune", "DM3", '{"hold": 1}',
      "paper.toml: detection DM3: parameters.hold = 1: unknown parameter; known: hold_s, suspects"),
 ])

@@ -9,7 +9,7 @@ from rampart.actors.layout.layout import Layout
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.manager.spec.specification import (
     SpecificationError,
-    check_modules,
+    check_change,
     parse_specification,
 )
 from tests.documents.test_foreign_nodes import TUG, write_tug
@@ -171,6 +171,6 @@ def test_a_topic_that_nobody_declares_is_one_line(tug):
 def test_no_change_of_a_running_system_changes_what_is_executed(old, new, field):
     before = parse_specification(TUG, "tug.toml")
     after = parse_specification(TUG.replace(old, new), "tug.toml")
-    check_modules(before, before)
+    check_change(before, before)
     with pytest.raises(ValueError, match=f": {field}: of a command nothing changes while it runs"):
-        check_modules(before, after)
+        check_change(before, after)
