@@ -30,7 +30,7 @@ from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_document, on_hos
 from rampart.actors.runtime.declaration import Handlers
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
-from rampart.manager.spec.specification import check_document, check_change
+from rampart.manager.spec.specification import check_change, check_document
 from rampart.manager.spec.tables import Layers
 
 SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"

@@ -28,7 +28,14 @@ import msgspec
 from msgspec.structs import replace
 
 from rampart.actors.bus.envelope import decoder
-from rampart.actors.bus.run_folder import changed_system, issue, issued, mark, register_of, socket_path
+from rampart.actors.bus.run_folder import (
+    changed_system,
+    issue,
+    issued,
+    mark,
+    register_of,
+    socket_path,
+)
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.layout import Layout, adapted_system, load_run

@@ -76,7 +76,7 @@ def test_a_host_to_which_a_module_would_have_to_move_is_refused(tmp_path):
     document = tomllib.loads(file.read_text())
     next(row for row in document["detection"] if row["name"] == "DM13")["host"] = "robot"
     plan = RunPlan(system_file=str(file))
-    with pytest.raises(ValueError, match="^DM13: host = 'robot'"):
+    with pytest.raises(ValueError, match=r"^DM13: host = 'robot'"):
         change(Layout(plan, load_system(plan)), document)
 
 
