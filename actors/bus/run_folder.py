@@ -12,17 +12,18 @@ watches the node has its end from the kernel (`process_of`, `process_ends`).
 
 The folder lies in memory where it can: `$XDG_RUNTIME_DIR`, else `/dev/shm`, else the folder for
 temporary files. What ends a run removes it; what is left when all of a run dies at once goes
-when the same user starts the next one.
+when the same user starts the next one. A lock (flock(2)) shows that a run lives. A pid would not:
+the place may be shared with a container, which has pids of its own.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import re
 import shutil
-import stat
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -39,7 +40,10 @@ MAX_SOCKET_BYTES = 107
 ROOM_FOR_NAMES = 64
 """Bytes of such a path that are left for the name of a node."""
 
-_NAME = re.compile(r"rampart-(\d+)-(\d+)-\w+\Z")
+_NAME = re.compile(r"rampart-\d+-\d+-\w+\Z")
+_locks: dict[str, int] = {}
+"""By folder that was made here, the lock on it; processes that are forked hold it as well."""
+
 _ISSUED, _MARKS, _SYSTEM = "issued", "marks", "system"
 
 
@@ -57,9 +61,14 @@ def make(port: int, launcher: int) -> str:
     for place in _places():
         _remove_stale(place)
         try:
-            folder = tempfile.mkdtemp(prefix=f"rampart-{port}-{launcher}-", dir=place)
+            made = Path(tempfile.mkdtemp(prefix=f"rampart-{port}-{launcher}-~", dir=place))
             for inner in (_ISSUED, _MARKS):
-                Path(folder, inner).mkdir(mode=0o700)
+                (made / inner).mkdir(mode=0o700)
+            lock = os.open(made, os.O_RDONLY | os.O_DIRECTORY)
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            folder = str(made).replace("~", "")  # only now others look whether it is locked
+            made.rename(folder)
+            _locks[folder] = lock
             return folder
         except OSError as error:
             failure = error
@@ -70,6 +79,8 @@ def remove(folder: str) -> None:
     """Remove the folder of a run that has ended. Harmless when it is gone."""
     if folder:
         shutil.rmtree(folder, ignore_errors=True)
+        if (lock := _locks.pop(folder, None)) is not None:
+            os.close(lock)
 
 
 def socket_path(folder: str, name: str) -> str:
@@ -100,7 +111,7 @@ def issue(folder: str, names: Iterable[str], incarnation: int,
     for name in names:
         if "/" in name or "\0" in name:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL), name)
-        fresh = Path(folder, _ISSUED, f"{name}~")
+        fresh = Path(folder, _ISSUED, f"{name}~{os.getpid()}~")  # several may issue at once
         fresh.unlink(missing_ok=True)  # left by a process that died here
         fresh.symlink_to(" ".join(map(str, (incarnation, *(process or ())))))
         fresh.replace(fresh.with_name(name))
@@ -183,6 +194,12 @@ def process_of(folder: str, name: str, incarnation: int) -> LocalProcess | None:
     return LocalProcess(ProcessId(*found[1:]), mark_of(folder, name))
 
 
+def is_here(folder: str, name: str) -> bool:
+    """Whether the incarnation of a node that was issued last is a process of this machine."""
+    found = _look_up(folder, name)
+    return found is not None and len(found) >= 1 + len(ProcessId._fields)
+
+
 def is_elsewhere(folder: str, name: str) -> bool:
     """Whether the incarnation of a node that was issued last is on another machine."""
     found = _look_up(folder, name)
@@ -221,10 +238,13 @@ def _places() -> Iterator[str]:
 def _remove_stale(place: str) -> None:
     with contextlib.suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
-            match = _NAME.match(entry.name)
-            if match is None or Path(f"/proc/{match[2]}").exists():
+            if _NAME.match(entry.name) is None:
                 continue
-            with contextlib.suppress(OSError):
-                found = entry.stat(follow_symlinks=False)
-                if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid():
-                    remove(entry.path)
+            with contextlib.suppress(OSError):  # it is locked: its run lives
+                folder = os.open(entry.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+                try:
+                    if os.fstat(folder).st_uid == os.getuid():
+                        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                        remove(entry.path)
+                finally:
+                    os.close(folder)

@@ -166,7 +166,7 @@ class ZenohBus:
         except zenoh.ZError as error:
             text = " ".join(str(error).split())
             node = f"(node {self._node})"
-            where = self._listen[0]
+            where = [*self._listen, *self._dial, "the bus"][0]
             raise BusError(f"{where} is in use by another process {node}"
                            if "acquire lock" in text
                            else f"cannot open {where} {node}: {text}") from None

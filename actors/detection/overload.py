@@ -112,7 +112,7 @@ class Overload(DetectionModule):
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
         """Hear how late a node was; before simulated time 0 the system is starting."""
         now_s = self.clock.now()
-        self._pids[header.source] = message.pid
+        self._pids[header.source] = self.context.local_pid(header.source, message.pid)
         late_s = max(message.late_s, now_s - header.stamp)
         if late_s > self._too_late_s and header.stamp > 0:
             told = self.parameters

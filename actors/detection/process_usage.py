@@ -78,7 +78,8 @@ class ProcessUsage(DetectionModule):
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
         """Hear which process a node runs in."""
         if header.incarnation >= self._running.get(header.source, (0, 0))[1]:
-            self._running[header.source] = message.pid, header.incarnation
+            self._running[header.source] = (
+                self.context.local_pid(header.source, message.pid), header.incarnation)
 
     @every(PERIOD_S)
     def look(self) -> None:

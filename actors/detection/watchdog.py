@@ -119,7 +119,7 @@ class WatchdogCore:
 
     def beat(self, node: str, incarnation: int, stamp_s: float, now_s: float, pid: int = -1
              ) -> None:
-        """Take note of a heartbeat that a process sent at `stamp_s`."""
+        """Take note of a heartbeat sent at `stamp_s`, by a pid of this machine or -1."""
         one = self._watched.get(node)
         if one is None or incarnation < one.incarnation:
             return
@@ -268,6 +268,6 @@ class Watchdog(DetectionModule):
     @on(topics.HEARTBEAT)
     def heartbeat(self, message: m.Heartbeat, header: Header) -> None:
         """Hear that a loop turns."""
-        self.monitor.beat(header.source, header.incarnation, header.stamp,
-                          self.clock.now(), message.pid)
+        self.monitor.beat(header.source, header.incarnation, header.stamp, self.clock.now(),
+                          self.context.local_pid(header.source, message.pid))
         self.follow()

@@ -43,6 +43,7 @@ class Context:
         waits: "warm" or "hot" if it is set up as that, to be silent until `promote`.
         usage: returns what a process has used of the machine.
         scheduled: returns what the main thread of a process has run, and waited for a processor.
+        is_here: whether the process of a node is on this machine.
     """
 
     name: str
@@ -62,3 +63,8 @@ class Context:
     waits: str = ""
     usage: Callable[[int], ProcessCount | None] = read_count
     scheduled: Callable[[int], Usage] = read_usage
+    is_here: Callable[[str], bool] = lambda _node: True
+
+    def local_pid(self, node: str, pid: int) -> int:
+        """Return the pid that a node has reported, -1 if it is a number of another machine."""
+        return pid if self.is_here(node) else -1

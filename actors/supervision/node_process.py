@@ -39,7 +39,7 @@ from typing import Any, Literal
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.run_folder import ROUTERS, process_of, register_of
+from rampart.actors.bus.run_folder import ROUTERS, is_here, process_of, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.layout.layout import Layout, router
@@ -100,6 +100,7 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         register=register_of(layout.plan.folder),
         checkpoints=store or make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
+        is_here=partial(is_here, layout.plan.folder),
         members=frozenset((*layout.members, *layout.routers)), topics=layout.topics, waits=waits,
         command_age_s=layout.hosts.command_age_s))
 

@@ -82,8 +82,9 @@ class Exporter:
             return None
         session, picture = self._watch.session, self._watch.picture
         table = picture.latest(topics.NODES)
-        # On a replay nobody: the recorded numbers may be anybody's today.
-        nodes = table.nodes if table and not session.run.replay_of else ()
+        # Of a replay or another machine the numbers may be any process's here.
+        nodes = [node for node in table.nodes if node.host == session.run.host
+                 ] if table and not session.run.replay_of else ()
         pids = {node.name: node.pid for node in nodes} | {
             row["name"]: row["pid"] for row in self._watch.used["guards"]}
         return Exposition(

@@ -14,6 +14,18 @@ from rampart.actors.bus import run_folder
 from rampart.actors.machine.unix_peer import process_id
 
 
+_MAKE = """
+import os, sys
+from rampart.actors.bus import run_folder
+run_folder._places = lambda: [sys.argv[1]]
+print(run_folder.make(7451, int(sys.argv[2])), flush=True)
+if os.fork():
+    os._exit(0)
+sys.stdin.read()
+"""
+"""Makes a folder; then its process ends, and the one that it has forked does at the end of stdin."""
+
+
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.setattr(run_folder, "_places", lambda: iter([str(tmp_path)]))
@@ -61,7 +73,10 @@ def test_it_is_known_which_process_an_incarnation_is(sockets):
     assert found.mark == run_folder.mark_of(sockets, "DM1")
     assert run_folder.process_of(sockets, "DM1", 2) is None
     assert run_folder.process_of(sockets, "DM2", 3) is None
+    assert run_folder.is_here(sockets, "DM1")
+    assert not run_folder.is_here(sockets, "DM2")
     run_folder.issue(sockets, ["DM1"], 4)  # of another machine
+    assert not run_folder.is_here(sockets, "DM1")
     assert run_folder.process_of(sockets, "DM1", 4) is None
 
 
@@ -90,6 +105,41 @@ def test_what_dead_runs_left_is_removed_and_what_lives_is_not(place):
     assert other.exists()
     assert Path(mine).exists()
     assert Path(again).exists()
+
+
+def test_a_run_lives_as_long_as_its_folder_is_locked_whatever_its_process_is_called(place):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    of_a_container = run_folder.make(7450, ended.pid)  # here there is no such process
+    left = subprocess.run([sys.executable, "-c", _MAKE, str(place), str(os.getpid())],
+                          stdin=subprocess.DEVNULL, capture_output=True, text=True,
+                          check=True).stdout.strip()
+    assert Path(left).exists()
+    run_folder.make(7452, os.getpid())
+    assert Path(of_a_container).exists()
+    assert not Path(left).exists()  # its process has ended; that number is another one's
+    run_folder.remove(of_a_container)
+    assert not Path(of_a_container).exists()
+
+
+def test_what_is_forked_keeps_the_folder_of_its_run(place):
+    with subprocess.Popen([sys.executable, "-c", _MAKE, str(place), "1"], text=True,
+                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as maker:
+        assert maker.stdout is not None
+        folder = maker.stdout.readline().strip()
+        assert maker.wait(10) == 0
+        run_folder.make(7452, os.getpid())
+        assert Path(folder).exists()
+
+
+def test_several_may_issue_a_number_of_one_node_at_once(sockets):
+    issue = ("import sys; from rampart.actors.bus import run_folder\n"
+             "for number in range(int(sys.argv[2]), 20_000, 2): "
+             "run_folder.issue(sys.argv[1], ('DM1',), number)")
+    both = [subprocess.Popen([sys.executable, "-c", issue, sockets, str(first)])
+            for first in (1, 2)]
+    assert [one.wait(30) for one in both] == [0, 0]
+    assert run_folder.issued(sockets)["DM1"] > 19_000
 
 
 def test_a_link_of_that_name_is_not_followed(place, tmp_path):

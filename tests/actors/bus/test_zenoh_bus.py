@@ -9,9 +9,11 @@ import time
 from functools import partial
 from itertools import pairwise
 
+import pytest
 import zenoh
 
 from rampart.actors.bus import run_folder
+from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints, open_client
 from rampart.actors.ftm import topics
@@ -95,3 +97,12 @@ async def test_what_is_forgotten_is_heard_and_answered_no_more(bus_folder):
     await asyncio.sleep(0.1)
     assert (heard, answers) == ([b"before"], [])
     await bus.close()
+
+
+async def test_a_session_that_cannot_be_opened_says_why(monkeypatch):
+    def fail(*_: object) -> None:
+        raise zenoh.ZError("no memory left")
+
+    monkeypatch.setattr(zenoh, "open", fail)
+    with pytest.raises(BusError, match=r"\(node one\): no memory left"):
+        await ZenohBus("one", 1, []).open()

@@ -25,6 +25,7 @@ from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.node_process import make_actor
 from rampart.actors.supervision.spawner_client import SpawnerBusyError
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run
@@ -487,3 +488,18 @@ def test_with_checkpoints_little_is_said_while_nothing_happens(tmp_path):
     run(scenario)
 
 
+def test_a_module_takes_no_number_of_another_machine_for_a_process_of_its_own(tmp_path, sockets):
+    file = tmp_path / "two.toml"
+    file.write_text(two_hosts({"robot": "10.0.0.1", "ground": "10.0.0.2"}))
+
+    async def scenario() -> None:
+        plan = RunPlan(system_file=str(file), folder=sockets)
+        spec = load_system(plan)
+        watchdog = make_actor(Layout(plan, spec), "DM5", 1, RunContext(plan, spec),
+                              asyncio.get_running_loop())
+        run_folder.issue(sockets, ["hmi"], 1)
+        run_folder.issue(sockets, ["DM4"], 1, process_id(os.getpid()))
+        assert watchdog.context.local_pid("hmi", 4711) == -1
+        assert watchdog.context.local_pid("DM4", 4711) == 4711
+
+    run(scenario)
