@@ -13,7 +13,6 @@ import pytest
 from rampart.actors.bus import run_folder
 from rampart.actors.machine.unix_peer import process_id
 
-
 _MAKE = """
 import os, sys
 from rampart.actors.bus import run_folder
@@ -23,7 +22,7 @@ if os.fork():
     os._exit(0)
 sys.stdin.read()
 """
-"""Makes a folder; then its process ends, and the one that it has forked does at the end of stdin."""
+"""Makes a folder and ends; the process that it has forked ends with its stdin."""
 
 
 @pytest.fixture
