@@ -46,6 +46,16 @@ class Twist(Message, frozen=True):
     angular_radps: float
 
 
+class StickTwist(Twist, frozen=True):
+    """Velocity that the operator's stick asks for, and when the stick was taken in hand.
+
+    `held_since_s` is in simulated seconds. A stick that was held before a stop ended drives only
+    after its operator has let go of it.
+    """
+
+    held_since_s: float = 0.0
+
+
 class Odometry(Message, frozen=True):
     """Wheel odometry: pose in `odom` (starts at the origin), velocity in `base_link`."""
 

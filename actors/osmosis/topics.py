@@ -55,7 +55,7 @@ LOCALIZATION_STATUS = Topic("localization/status", m.LocalizationStatus, Qos.STA
                             "What the pose rests on, and how sure it is.")
 JOYSTICK = Topic("teleoperation/joystick", m.Joystick, Qos.SENSOR, 20, "",
                  "The operator's stick, wherever it is.", outside=True)
-TELEOP_COMMAND = Topic("teleoperation/command", m.Twist, Qos.SENSOR, 20, "base_link",
+TELEOP_COMMAND = Topic("teleoperation/command", m.StickTwist, Qos.SENSOR, 20, "base_link",
                        "Velocity from the stick; silent while the dead man is released.")
 
 # Safety Pilot.

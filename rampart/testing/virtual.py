@@ -172,8 +172,10 @@ class VirtualSystem:
         if self.layout is None or name not in self.layout.members:
             raise LookupError(f"no node {name!r} in the file of this system")
         member = self.layout.members[name]
-        return self.start(name, member.actor, *others, **{
-            **msgspec.structs.asdict(member.parameters), **parameters})
+        # What a file must not say may be the default all the same.
+        given = {field.name: value for field in msgspec.structs.fields(member.parameters)
+                 if (value := getattr(member.parameters, field.name)) != field.default}
+        return self.start(name, member.actor, *others, **{**given, **parameters})
 
     async def kill(self, name: str) -> None:
         """End an actor as SIGKILL would: its token vanishes, it says nothing more."""

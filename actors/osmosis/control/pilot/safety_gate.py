@@ -5,6 +5,13 @@ the manager's sign of life, the operator's stick, the last good command, the las
 never trusts its inputs to be there: each has an age, and what is too old counts against motion.
 
 The strictest engaged order wins: stop > teleoperation > auto. A fresh joystick pre-empts auto.
+
+A stick counts if it was taken in hand after the last stop: after an order to stop, a brake, a base
+that had braked by itself, silence of the manager or of the lasers, and the start of this process.
+One that was held before stands the robot until it is let go: nothing that was asked for during a
+stop is done when the stop ends. The stick's message says since when it is held, so that neither a
+lost message nor a restart of anybody is taken for letting go.
+
 In auto there may be two computers of the command, Osmosis Control and its standby; which of them
 drives, and what they drive when they disagree, is
 `rampart.actors.osmosis.control.pilot.command_pair`. In the paper's unprotected baseline (`Checks`
@@ -25,7 +32,7 @@ from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis.control.pilot.command_pair import CommandPair
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array
-from rampart.actors.osmosis.messages import PilotMode, PilotOrder, Twist
+from rampart.actors.osmosis.messages import PilotMode, PilotOrder, StickTwist, Twist
 
 STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
 """Modes from the most permissive to the strictest; declared here, once."""
@@ -35,6 +42,9 @@ _STANDING_MPS = 1e-3
 
 _SOURCES = 64
 """Of commands, of which the newest one's place in the sequence is remembered."""
+
+HELD_TOO_LONG = "the joystick was held during a stop: let go of it first"
+"""Why a stick has no effect that was taken in hand before the last stop ended."""
 
 _SLOWED = 0.999
 """Below this share of the command the reason says that obstacles slow the robot."""
@@ -127,6 +137,8 @@ class SafetyGate:
         self._standby = _Line()
         self._pair = CommandPair()
         self._stick = _Line()
+        self._stick_since_s = -math.inf
+        self._stopped_s = started_s
         self._manager_heard_s = -math.inf
         self._points: Array = NO_POINTS
         self._scan_s = -math.inf
@@ -143,6 +155,10 @@ class SafetyGate:
     def manager_alive(self, stamp_s: float) -> None:
         """Take note of the manager's sign of life, given at `stamp_s`."""
         self._manager_heard_s = max(self._manager_heard_s, stamp_s)
+
+    def braked(self, stamp_s: float) -> None:
+        """Take note that the base braked at `stamp_s`, by order or by its dead man."""
+        self._stopped_s = max(self._stopped_s, stamp_s)
 
     def scan(self, points: Array, stamp_s: float, fault: str = "") -> None:
         """Take a scan: echoes in `base_link`, shape (n, 2), and when it was measured.
@@ -169,13 +185,21 @@ class SafetyGate:
         stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
         return not stick and bool(self._wanted(stick, now)[1])
 
+    def _held_too_long(self, now: float) -> bool:
+        """Whether a stick is held since before the last stop has ended."""
+        heard = now - self._stick.heard_s <= self._limits.joystick_timeout_s
+        return heard and not self._stopped_s < self._stick_since_s <= now + AHEAD_S
+
     def _offer(self, line: _Line, now: float) -> tuple[tuple[float, float] | None, float]:
         """Return what a line has to offer to the pair, and from when it is."""
         return self._usable(line, now)[0], line.stamp_s
 
-    def joystick(self, command: Twist, header: Header, now: float) -> str:
+    def joystick(self, command: StickTwist, header: Header, now: float) -> str:
         """Offer Teleoperation's command; return why it was refused, or ""."""
-        return self._take(self._stick, command, header, now)
+        refused = self._take(self._stick, command, header, now)
+        if not refused:
+            self._stick_since_s = command.held_since_s
+        return refused
 
     def _take(self, line: _Line, command: Twist, header: Header, now: float) -> str:
         position = (header.incarnation, header.sequence)
@@ -231,7 +255,11 @@ class SafetyGate:
     def output(self, now: float) -> GateOutput:
         """Return what the base is to do now."""
         mode = self.mode
-        reason = self.forbidden(now)
+        reason = self._stop(now)
+        if reason:
+            self._stopped_s = now
+        elif self._held_too_long(now):
+            reason = HELD_TOO_LONG
         if reason:
             return GateOutput(0.0, 0.0, mode, True, reason)
         stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
@@ -275,6 +303,10 @@ class SafetyGate:
 
     def forbidden(self, now: float) -> str:
         """Return why nothing may drive now, not even the joystick, or ""."""
+        return self._stop(now) or (HELD_TOO_LONG if self._held_too_long(now) else "")
+
+    def _stop(self, now: float) -> str:
+        """Return what stops the robot, whoever wants to drive, or ""."""
         limits = self._limits
         if self.mode is PilotMode.STOP:
             return self._why(PilotMode.STOP) or "ordered to stop"

@@ -55,10 +55,18 @@ class SafetyPilot(Actor):
             self._act()
 
     @on(topics.TELEOP_COMMAND)
-    def joystick(self, message: m.Twist, header: Header) -> None:
+    def joystick(self, message: m.StickTwist, header: Header) -> None:
         """Offer the operator's command to the gate and act on the answer at once."""
         self._note(self._gate.joystick(message, header, self.clock.now()), header)
         self._act()
+
+    @on(topics.BASE_STATUS)
+    def base(self, message: m.BaseStatus, header: Header) -> None:
+        """See whether the base brakes by itself, or is made to past this node."""
+        if message.brake_engaged or message.dead_man_tripped:
+            self._gate.braked(min(header.stamp, self.clock.now()))
+            if not self._last.stopped and self._gate.forbidden(self.clock.now()):
+                self._act()
 
     @on(topics.SCAN)
     def scan(self, message: m.LaserScan, header: Header) -> None:

@@ -16,7 +16,7 @@ from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     StickMapping,
 )
 from rampart.actors.osmosis.control.teleoperation.stick_arbitration import Ruling, StickArbiter
-from rampart.actors.osmosis.messages import Joystick, Twist
+from rampart.actors.osmosis.messages import Joystick, StickTwist
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import NonNegative
@@ -28,19 +28,21 @@ _REPLUG_S = 0.5
 """Period in which a device that is not there is looked for."""
 
 
-def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float) -> Twist | None:
+def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float,
+                since_s: float = 0.0) -> StickTwist | None:
     """Return the velocity for a stick position, None while the dead man is released.
 
     Args:
         stick: positions in [-1, 1]; beyond, they are cut; not finite counts as released.
         max_linear_mps: speed at full stick.
         max_angular_radps: turn rate at full stick.
+        since_s: when the stick was taken in hand.
     """
     if not (stick.dead_man and math.isfinite(stick.forward) and math.isfinite(stick.left)):
         return None
     forward = min(max(stick.forward, -1.0), 1.0)
     left = min(max(stick.left, -1.0), 1.0)
-    return Twist(forward * max_linear_mps, left * max_angular_radps)
+    return StickTwist(forward * max_linear_mps, left * max_angular_radps, since_s)
 
 
 class Teleoperation(Actor):
@@ -72,7 +74,7 @@ class Teleoperation(Actor):
         self._linear_mps = robot.top_speed_mps if own.linear_mps is None else own.linear_mps
         self._angular_radps = (
             robot.top_turn_rate_radps if own.angular_radps is None else own.angular_radps)
-        self._arbiter = StickArbiter()
+        self._arbiter = StickArbiter(self.clock.now())
         self._look: Timer | None = None
         self._named = Osmosis.of(context).options.joystick or own.device
         self._device = JoystickDevice(self._named, own, self._moved, self._gone)
@@ -103,11 +105,12 @@ class Teleoperation(Actor):
 
     def _obey(self, ruling: Ruling, stamp_s: float) -> None:
         """Publish the stick's velocity; on release one last zero, so the stop does not wait."""
-        twist = ruling.stick and stick_twist(ruling.stick, self._linear_mps, self._angular_radps)
+        twist = ruling.stick and stick_twist(
+            ruling.stick, self._linear_mps, self._angular_radps, ruling.since_s)
         if twist is not None:
             self.publish(topics.TELEOP_COMMAND, twist, stamp=stamp_s)
         elif ruling.released:
-            self.publish(topics.TELEOP_COMMAND, Twist(0.0, 0.0))
+            self.publish(topics.TELEOP_COMMAND, StickTwist(0.0, 0.0))
         if ruling.told:
             self.report_diagnostic("joystick", ruling.told, ruling.whom)
 
@@ -130,6 +133,8 @@ class Teleoperation(Actor):
         self._missing = missing
         if missing:
             self.call_later(_REPLUG_S, self._plug)
+        else:
+            self._moved()  # a button that is down already counts as let go
 
     def _moved(self) -> None:
         self._offer(self._device.path, self._device.stick, self.clock.now())

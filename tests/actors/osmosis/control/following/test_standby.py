@@ -131,7 +131,8 @@ def test_when_both_are_silent_the_robot_stops():
 
 def test_orders_and_the_stick_stand_above_both():
     bench = Bench().tick(None, (0.7, 0.0), ticks=20)
-    bench.gate.joystick(m.Twist(-0.2, 0.0), Header("teleoperation", 1, 1, bench.now), bench.now)
+    bench.gate.joystick(m.StickTwist(-0.2, 0.0, bench.now),
+                        Header("teleoperation", 1, 1, bench.now), bench.now)
     assert bench.out == (-0.2, 0.0)
     bench.gate.order("RM2", m.PilotOrder(True, PilotMode.STOP, "because"))
     assert bench.out == (0.0, 0.0)

@@ -340,9 +340,9 @@ def test_a_pose_from_the_future_is_not_passed_on_and_shuts_out_none(ahead_s):
 
 
 @pytest.mark.parametrize(("stick", "expected"), [
-    (m.Joystick(1.0, 0.0, True), m.Twist(0.8, 0.0)),
-    (m.Joystick(-0.5, 0.5, True), m.Twist(-0.4, 0.5)),
-    (m.Joystick(7.0, -7.0, True), m.Twist(0.8, -1.0)),
+    (m.Joystick(1.0, 0.0, True), m.StickTwist(0.8, 0.0)),
+    (m.Joystick(-0.5, 0.5, True), m.StickTwist(-0.4, 0.5)),
+    (m.Joystick(7.0, -7.0, True), m.StickTwist(0.8, -1.0)),
     (m.Joystick(1.0, 0.0, False), None),
     (m.Joystick(float("nan"), 0.0, True), None)])
 def test_the_stick_is_a_velocity_only_while_the_dead_man_is_held(stick, expected):

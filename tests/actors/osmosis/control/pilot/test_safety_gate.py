@@ -25,6 +25,7 @@ class Bench:
         self.gate = SafetyGate(LIMITS, checks or Checks(), 0.0)
         self.now = 1.0
         self.sequence = 0
+        self.held_since_s = 1.0
         self.manager = self.scanner = True
         self.points = NO_POINTS
         self.wait(0.0)
@@ -40,7 +41,9 @@ class Bench:
         self.sequence = self.sequence + 1 if sequence is None else sequence
         take = self.gate.joystick if stick else self.gate.command
         source = "teleoperation" if stick else "osmosis_control"
-        return take(m.Twist(linear, angular),
+        twist = m.StickTwist(linear, angular, self.held_since_s) if stick else m.Twist(
+            linear, angular)
+        return take(twist,
                     Header(source, incarnation, self.sequence, self.now - age), self.now)
 
     def out(self):
@@ -334,3 +337,64 @@ def test_an_obstacle_that_appears_1_2_m_ahead_is_not_touched(speed):
     assert changes.max() <= 1.5 * DT_S + 1e-9
     assert len({round(v, 1) for v in speeds}) >= 5, "gradually, no bang-bang"
     assert np.diff(speeds).max() <= 0.1
+
+
+def stopped_by_an_order(bench):
+    bench.gate.order("RM2", m.PilotOrder(True, PilotMode.STOP, "because"))
+    bench.out()
+    bench.gate.order("RM2", m.PilotOrder(False, PilotMode.STOP, ""))
+
+
+def stopped_by_the_brake(bench):
+    bench.gate.braked(bench.now)
+
+
+def stopped_for_want_of_a_scan(bench):
+    bench.gate.scan(NO_POINTS, bench.now, "the laser repeats itself")
+    bench.out()
+    bench.gate.scan(NO_POINTS, bench.now)
+
+
+@pytest.mark.parametrize("checks", [Checks(), BASELINE], ids=["checked", "baseline"])
+@pytest.mark.parametrize("stop", [
+    stopped_by_an_order, stopped_by_the_brake, stopped_for_want_of_a_scan])
+def test_a_stick_held_since_before_a_stop_ended_stands_the_robot_until_it_is_let_go(stop, checks):
+    if checks is BASELINE and stop is stopped_for_want_of_a_scan:
+        return
+    bench = Bench(checks)
+    bench.held_since_s = bench.now
+    bench.send(0.5, stick=True)
+    assert bench.out() == (0.5, 0.0)
+    bench.wait(0.1)
+    stop(bench)
+    for _ in range(20):
+        bench.wait(0.1)
+        bench.send(0.5)
+        bench.send(0.5, stick=True)
+        assert bench.out() == (0.0, 0.0)
+    assert "let go" in bench.reason()
+    assert bench.gate.forbidden(bench.now) == bench.reason()
+    bench.wait(0.31)
+    bench.send(0.4)
+    assert bench.out() == (0.4, 0.0), "let go, the mission goes on"
+    bench.held_since_s = bench.now
+    bench.send(0.5, stick=True)
+    assert bench.out() == (0.5, 0.0)
+
+
+@pytest.mark.parametrize("since_s", [0.0, -math.inf, math.inf, math.nan, 60.0])
+def test_a_stick_that_cannot_be_held_since_then_drives_nothing(since_s):
+    bench = Bench()
+    bench.held_since_s = since_s
+    bench.send(0.5, stick=True)
+    assert bench.out() == (0.0, 0.0)
+
+
+def test_a_hand_over_to_teleoperation_does_not_interrupt_the_stick_that_drives():
+    bench = Bench()
+    bench.held_since_s = bench.now
+    bench.send(0.5, stick=True)
+    bench.wait(0.1)
+    bench.gate.order("RM5", m.PilotOrder(True, PilotMode.TELEOPERATION, "because"))
+    bench.send(0.5, stick=True)
+    assert bench.out() == (0.5, 0.0)

@@ -53,12 +53,14 @@ class Page(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.commands: list[m.Twist] = []
+        self.held_since_s = 0.0
         self.diagnostics: list[bm.Diagnostic] = []
         self.changed = asyncio.Event()
 
     @on(topics.TELEOP_COMMAND)
     def command(self, message: m.Twist, _header: Header) -> None:
-        self.commands.append(message)
+        self.commands.append(m.Twist(message.linear_mps, message.angular_radps))
+        self.held_since_s = message.held_since_s
         self.changed.set()
 
     @on(bus_topics.DIAGNOSTIC)
@@ -127,6 +129,7 @@ async def desk(tmp_path, device="stick", **parameters):
     it = Desk(page, fifo)
     while not {"page", "teleoperation"} <= hub.alive.keys():
         await asyncio.sleep(0)
+    page.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, False))
     try:
         yield it
     finally:

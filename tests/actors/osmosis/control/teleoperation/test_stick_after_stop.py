@@ -1,0 +1,68 @@
+"""A stick that is held while the robot is stopped does nothing when the stop ends."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.teleoperation.stick_arbitration import FIRST_S, StickArbiter
+from rampart.actors.osmosis.messages import Joystick
+from rampart.testing import run
+from tests.actors.osmosis.driven_robot import driven
+
+STANDING_MPS = 0.02
+HELD, FREE = Joystick(0.5, 0.0, True), Joystick(0.0, 0.0, False)
+
+
+@pytest.mark.parametrize("restarted", ["", "safety_pilot", "teleoperation"])
+def test_a_stick_held_all_through_an_emergency_stop_drives_only_after_it_was_let_go(restarted):
+    async def scenario():
+        async with driven() as robot:
+            robot.hold(0.75)
+            await robot.until(lambda: robot.speed_mps > 0.7)
+            robot.system.inject(topics.GPS, "drop", 2.0)
+            await robot.until(lambda: "RM1" in robot.manager.latched)
+            await robot.until(lambda: robot.speed_mps < STANDING_MPS)
+            if restarted:
+                await robot.restart(restarted)
+            await robot.reset()
+            assert await robot.fastest(1.0) < STANDING_MPS
+            robot.let_go()
+            await asyncio.sleep(0.1)
+            robot.hold(0.75)
+            assert await robot.fastest(1.0) > 0.7
+
+    run(scenario)
+
+
+def test_teleoperation_that_dies_in_a_stop_and_is_back_after_it_does_not_follow_a_held_stick():
+    async def scenario():
+        async with driven() as robot:
+            robot.hold(0.75)
+            await robot.until(lambda: robot.speed_mps > 0.7)
+            robot.system.inject(topics.GPS, "drop", 1.0)
+            await robot.until(lambda: "RM1" in robot.manager.latched)
+            await robot.system.kill("teleoperation")
+            await robot.reset()
+            robot.system.start_node("teleoperation")
+            assert await robot.fastest(1.5) < STANDING_MPS
+            robot.let_go()
+            await asyncio.sleep(0.1)
+            robot.hold(0.75)
+            assert await robot.fastest(1.0) > 0.7
+
+    run(scenario)
+
+
+def test_a_fresh_arbiter_follows_who_was_seen_to_rest_and_who_comes_later():
+    arbiter = StickArbiter(started_s=10.0)
+    assert arbiter.offer("page", HELD, 10.1, 10.1).told == "not followed: it has to let go first"
+    assert arbiter.offer("page", HELD, 11.2, 11.2).stick is None
+    arbiter.offer("device", FREE, 10.2, 10.2)
+    assert arbiter.offer("device", HELD, 10.3, 10.3).since_s == 10.3
+    assert arbiter.offer("device", HELD, 10.4, 10.4).since_s == 10.3
+    arbiter.offer("device", FREE, 10.5, 10.5)
+    late_s = 10.0 + FIRST_S
+    assert arbiter.offer("tool", HELD, late_s, late_s).stick == HELD
