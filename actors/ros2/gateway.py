@@ -38,7 +38,7 @@ from rampart.actors.ros2.links import HeardTopic, SaidTopic
 from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import NS, RosClock
-from rampart.actors.ros2.side import NoSide, Side
+from rampart.actors.ros2.side import Mode, NoSide, Side
 from rampart.actors.ros2.stand_in import side_of, wall_ns
 from rampart.actors.ros2.translation.mirror import topic_of
 from rampart.actors.ros2.translation.types import Distribution, Types
@@ -71,6 +71,8 @@ class Gateway(Actor):
 
         Attributes:
             connect: endpoints of its routers.
+            mode: "client", which works from any machine, or "peer", which on the machine of ROS 2
+                goes on when its router ends.
             domain: ROS_DOMAIN_ID.
             distribution: by name.
             node: name of the gateway's node.
@@ -82,6 +84,7 @@ class Gateway(Actor):
         """
 
         connect: tuple[str, ...] = (ROUTER,)
+        mode: Mode = "client"
         domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
         distribution: Distribution = "jazzy"
         node: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,60}\Z")] = "rampart"
@@ -158,7 +161,7 @@ class Gateway(Actor):
         """Enter the graph of ROS 2, and declare everything there."""
         said, run = self.parameters, self.context.run
         self._recorder = RecorderConnection(run.plan.base_port)
-        self._side = side_of(self, self._bus, said.connect, self._recorder.take)
+        self._side = side_of(self, self._bus, said.connect, said.mode, self._recorder.take)
         self.node = RosNode(self._side, self._types, said.node, wall_ns=partial(wall_ns, self),
                             refuse=self.refuse, namespace=said.namespace, domain=said.domain)
         if said.clock == "ros":

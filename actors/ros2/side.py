@@ -3,6 +3,10 @@
 It dials the router that the robot's own nodes have, in the background and again and again, so that
 neither has to be there first; nothing of the system's own bus is reachable by it. What arrives
 is handed over to the event loop.
+
+As a *client* it exchanges everything through the router, from any machine. As a *peer* it needs a
+direct link to each node: the nodes of ROS 2 listen on their own machine alone, and a router passes
+nothing on between two peers. There it goes on without the router.
 """
 
 from __future__ import annotations
@@ -10,8 +14,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import secrets
+import threading
+import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import msgspec
 import zenoh
@@ -20,6 +28,11 @@ from zenoh.handlers import Callback
 
 from rampart.actors.bus.topic import ROS_SIDE
 from rampart.actors.ros2.wire import Qos
+
+Mode = Literal["client", "peer"]
+"""What a session of Zenoh is beside the router."""
+
+_AGAIN_S = 1.0
 
 Deliver = Callable[[bytes, bytes | None], None]
 """Called with payload and attachment of a message."""
@@ -110,25 +123,57 @@ class ZenohSide:
         dial: endpoints of the routers of ROS 2, e.g. "tcp/localhost:7447".
         loop: on which everything is told.
         record: takes each message that is published or heard; None for no one.
+        mode: "client", by which everything passes the router, or "peer", with direct links.
 
     Raises:
         ValueError: an endpoint makes no sense; one line.
     """
 
     def __init__(self, dial: Sequence[str], loop: asyncio.AbstractEventLoop,
-                 record: Record | None = None) -> None:
+                 record: Record | None = None, *, mode: Mode = "client") -> None:
+        self.id = f"{1 << 127 | secrets.randbits(127):032x}"
         try:
-            self._session = zenoh.open(_configured(dial))
+            config = _configured(dial, mode, self.id)
         except zenoh.ZError as error:
             raise ValueError(f"connect = {list(dial)}: {' '.join(str(error).split())}") from None
-        self.id = str(self._session.zid())
         self._loop = loop
         self._record = record
+        self._session: zenoh.Session | None = None
+        self._is_closed = False
+        self._waiting: list[Callable[[zenoh.Session], Any]] = []
         self._held: list[Any] = []
+        # A client's session opens when its router is there, which the loop does not wait for.
+        threading.Thread(target=self._open, args=(config,), daemon=True).start()
+
+    def _open(self, config: zenoh.Config) -> None:
+        while not self._is_closed:
+            try:
+                session = zenoh.open(config)
+            except zenoh.ZError:  # a host without address, say, which may get one
+                time.sleep(_AGAIN_S)
+                continue
+            self._tell(self._opened, session)
+            return
+
+    def _opened(self, session: zenoh.Session) -> None:
+        if self._is_closed:
+            session.close()  # type: ignore[no-untyped-call]
+            return
+        self._session = session
+        for declare in self._waiting:
+            self._held.append(declare(session))
+        self._waiting.clear()
+
+    def _declare(self, declare: Callable[[zenoh.Session], Any]) -> None:
+        """Declare something now, or when the session is open."""
+        if self._session is None:
+            self._waiting.append(declare)
+        else:
+            self._held.append(declare(self._session))
 
     def token(self, key: str) -> None:
         """See `Side.token`."""
-        self._held.append(self._session.liveliness().declare_token(key))
+        self._declare(lambda session: session.liveliness().declare_token(key))
 
     def tokens(self, pattern: str, changed: Callable[[str, bool], None]) -> None:
         """See `Side.tokens`."""
@@ -137,7 +182,7 @@ class ZenohSide:
             key, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
             self._tell(changed, key, there)
 
-        self._held.append(self._session.liveliness().declare_subscriber(
+        self._declare(lambda session: session.liveliness().declare_subscriber(
             pattern, _direct(arrived), history=True))
 
     def publisher(self, key: str, qos: Qos) -> Callable[[bytes, bytes], None]:
@@ -147,22 +192,34 @@ class ZenohSide:
         control = zenoh.CongestionControl.BLOCK if waits else zenoh.CongestionControl.DROP
         reliability = (zenoh.Reliability.RELIABLE if qos.reliable
                        else zenoh.Reliability.BEST_EFFORT)
-        if qos.transient_local:
-            misses = ext.MissDetectionConfig(
-                heartbeat=None, sporadic_heartbeat=0.5) if qos.reliable else None
-            made: Any = ext.declare_advanced_publisher(
-                self._session, key, congestion_control=control, reliability=reliability,
-                cache=ext.CacheConfig(max_samples=qos.depth), publisher_detection=True,
-                sample_miss_detection=misses)
-        else:
-            made = self._session.declare_publisher(
-                key, congestion_control=control, reliability=reliability, express=True)
-        self._held.append(made)
+        made: Any = None
+
+        def declare(session: zenoh.Session) -> Any:
+            nonlocal made
+            if qos.transient_local:
+                misses = ext.MissDetectionConfig(
+                    heartbeat=None, sporadic_heartbeat=0.5) if qos.reliable else None
+                made = ext.declare_advanced_publisher(
+                    session, key, congestion_control=control, reliability=reliability,
+                    cache=ext.CacheConfig(max_samples=qos.depth), publisher_detection=True,
+                    sample_miss_detection=misses)
+                for payload, attachment in kept:
+                    made.put(payload, attachment=attachment)
+            else:
+                made = session.declare_publisher(
+                    key, congestion_control=control, reliability=reliability, express=True)
+            return made
+
+        kept: deque[tuple[bytes, bytes]] = deque(maxlen=qos.depth)
+        self._declare(declare)
 
         where = recorded_key(key)
 
         def publish(payload: bytes, attachment: bytes) -> None:
-            made.put(payload, attachment=attachment)
+            if made is not None:
+                made.put(payload, attachment=attachment)
+            elif qos.transient_local:
+                kept.append((payload, attachment))
             if self._record is not None:
                 self._record(where, packed(payload, attachment))
 
@@ -185,11 +242,11 @@ class ZenohSide:
         if qos.transient_local:
             recovery = ext.RecoveryConfig(
                 periodic_queries=None, heartbeat=True) if qos.reliable else None
-            self._held.append(ext.declare_advanced_subscriber(
-                self._session, key, _direct(arrived), subscriber_detection=True, recovery=recovery,
+            self._declare(lambda session: ext.declare_advanced_subscriber(
+                session, key, _direct(arrived), subscriber_detection=True, recovery=recovery,
                 history=ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth)))
         else:
-            self._held.append(self._session.declare_subscriber(key, _direct(arrived)))
+            self._declare(lambda session: session.declare_subscriber(key, _direct(arrived)))
 
     def serve(self, key: str, asked: Callable[[bytes, bytes | None, Reply], None]) -> None:
         """See `Side.serve`."""
@@ -204,11 +261,15 @@ class ZenohSide:
             self._tell(asked, b"" if payload is None else payload.to_bytes(),
                        None if attached is None else attached.to_bytes(), reply)
 
-        self._held.append(self._session.declare_queryable(key, _direct(arrived), complete=True))
+        self._declare(lambda session: session.declare_queryable(
+            key, _direct(arrived), complete=True))
 
     def ask(self, key: str, payload: bytes, attachment: bytes, timeout_s: float,
             answered: Answered) -> None:
         """See `Side.ask`."""
+        if self._session is None:
+            self._loop.call_soon(answered, None, None, "no router")
+            return
         heard = False
 
         def arrived(reply: zenoh.Reply) -> None:  # runs on a Zenoh thread
@@ -233,12 +294,21 @@ class ZenohSide:
 
     def is_linked(self) -> bool:
         """See `Side.is_linked`."""
-        return bool(self._session.info.routers_zid() or self._session.info.peers_zid())
+        return bool(self.links())
+
+    def links(self) -> set[str]:
+        """Return the ids of the sessions with a direct link, routers among them."""
+        if self._session is None:
+            return set()
+        info = self._session.info
+        return {str(zid) for zid in (*info.routers_zid(), *info.peers_zid())}
 
     def close(self) -> None:
         """See `Side.close`."""
+        self._is_closed = True
         self._held.clear()
-        self._session.close()  # type: ignore[no-untyped-call]
+        if self._session is not None:
+            self._session.close()  # type: ignore[no-untyped-call]
 
     def _tell(self, call: Callable[..., None], *what: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed
@@ -265,12 +335,13 @@ def _direct(call: Callable[[Any], None]) -> Callback[Any]:
     return Callback(call, indirect=False)
 
 
-def _configured(dial: Sequence[str]) -> zenoh.Config:
+def _configured(dial: Sequence[str], mode: Mode, own_id: str) -> zenoh.Config:
     """Return what `rmw_zenoh` sets by default, with routers that need not be there yet."""
     config = zenoh.Config()
     for name, value in {
-            "mode": "peer", "connect/endpoints": list(dial), "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False, "listen/endpoints": ["tcp/127.0.0.1:0"],
+            "mode": mode, "id": own_id, "connect/endpoints": list(dial), "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "listen/endpoints": ["tcp/127.0.0.1:0"] if mode == "peer" else [],
             "scouting/multicast/enabled": False, "scouting/gossip/enabled": True,
             "scouting/delay": 0, "timestamping/enabled": True,
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000,

@@ -19,26 +19,28 @@ from rampart.actors.bus.bus import Bus
 from rampart.actors.ros2.bus_side import BusSide
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import EPOCH_NS, NS
-from rampart.actors.ros2.side import Record, Side, ZenohSide
+from rampart.actors.ros2.side import Mode, Record, Side, ZenohSide
 from rampart.actors.ros2.translation.types import Distribution, Types
 from rampart.actors.ros2.wire import Attachment, Qos
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.manager.spec.ros2 import ROUTER
 
 
-def side_of(actor: Actor, bus: Bus, connect: Sequence[str], record: Record | None = None) -> Side:
+def side_of(actor: Actor, bus: Bus, connect: Sequence[str], mode: Mode,
+            record: Record | None = None) -> Side:
     """Return the side of ROS 2 for an actor: over Zenoh, or in virtual time over its bus.
 
     Args:
         actor: whose it is.
         bus: of the actor.
         connect: endpoints of the routers of ROS 2.
+        mode: of the session of Zenoh.
         record: takes each message, over Zenoh; in virtual time the bus has a recorder of its own.
     """
     context = actor.context
     if context.run.plan.virtual:
         return BusSide(bus, actor.name, context.incarnation)
-    return ZenohSide(connect, asyncio.get_running_loop(), record)
+    return ZenohSide(connect, asyncio.get_running_loop(), record, mode=mode)
 
 
 def wall_ns(actor: Actor) -> int:
@@ -84,7 +86,7 @@ class StandIn(Actor):
 
     def on_start(self) -> None:
         """Enter the graph; a subclass declares its endpoints in `declare`."""
-        self._side = side = side_of(self, self._bus, self.parameters.connect)
+        self._side = side = side_of(self, self._bus, self.parameters.connect, "peer")
         self.ros = RosNode(
             side, self.types, self.node_name or self.name, wall_ns=self.wall_ns,
             refuse=lambda where, why: self.report_diagnostic("ros2", why, where),

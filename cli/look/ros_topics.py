@@ -240,7 +240,8 @@ async def _checked(name: str, said: Gateway.Parameters, spec: SystemSpec) -> lis
             found += [Finding(kind, True, note) for kind, note in types.notes.items()]
             node = RosNode(NoSide(), types, said.node, wall_ns=lambda: 0, refuse=lambda *_: None,
                            namespace=said.namespace, domain=said.domain)
-            found += [_of_link(link, there.graph, node) for link in said.ros2]
+            unlinked = await _unlinked(there, said.connect) if said.mode == "peer" else set()
+            found += [_of_link(link, there.graph, node, unlinked) for link in said.ros2]
             known = there.graph.nodes()
     except NoEffectError as error:
         return [Finding(f"router of {name}", False, str(error))]
@@ -260,7 +261,17 @@ _NOBODY = {"subscribe": "nobody publishes it", "publish": "nobody subscribes to 
            "goal": "no server of this action"}
 
 
-def _of_link(link: Ros2Link, graph: RosGraph, node: RosNode) -> Finding:
+async def _unlinked(there: Onlooker, connect: tuple[str, ...]) -> set[str]:
+    """Return the sessions in the graph to which a peer finds no direct link."""
+    side = ZenohSide(connect, asyncio.get_running_loop(), mode="peer")
+    await asyncio.sleep(_GRAPH_S)
+    try:
+        return {one.session for one in there.graph.of(*EndpointKind)} - side.links()
+    finally:
+        side.close()
+
+
+def _of_link(link: Ros2Link, graph: RosGraph, node: RosNode, unlinked: set[str]) -> Finding:
     way = link.way
     what = f"{way} {link.name}"
     topic, kind = link.name, link.type
@@ -274,6 +285,10 @@ def _of_link(link: Ros2Link, graph: RosGraph, node: RosNode) -> Finding:
         return Finding(what, way == "serve", _NOBODY[link.way])
     if problems := list(dict.fromkeys(misfits([mine], there))):
         return Finding(what, False, problems[0])
+    if far := [one.full_name for one in there if one.session in unlinked]:
+        return Finding(what, False, f"{far[0]} is in the graph, but without a link to it: a peer "
+                                    'receives nothing by a router; mode = "client" of the gateway '
+                                    "exchanges through the router")
     names = ", ".join(dict.fromkeys(one.full_name for one in there))
     if way == "publish":
         others = [one.full_name for one in graph.on(topic, EndpointKind.PUBLISHER)

@@ -80,7 +80,7 @@ class RosDriver(Simulator):
     def on_start(self) -> None:
         """Build the world, and enter the graph."""
         super().on_start()
-        side = self._side = side_of(self, self._bus, self.parameters.connect)
+        side = self._side = side_of(self, self._bus, self.parameters.connect, "peer")
         graph = self._graph = Graph(side.id, NODE, self.parameters.domain)
         side.token(graph.token)
         for topic, where, of in (

@@ -187,14 +187,18 @@ def test_what_passed_the_gateway_is_there_byte_for_byte(tmp_path):
 
 async def test_what_the_gateway_says_and_hears_is_handed_to_the_recorder_as_it_travelled():
     taken, heard = [], asyncio.Event()
-    side = ZenohSide([], asyncio.get_running_loop(), lambda *what: taken.append(what))
+    side = ZenohSide([], asyncio.get_running_loop(), lambda *what: taken.append(what),
+                     mode="peer")
     key = data_key(0, "/cmd_vel", dds_name(TWIST), JAZZY.hash(TWIST))
     side.subscribe(key, Qos(), lambda *_: heard.set())
-    side.publisher(key, Qos())(twist(1.0), b"attached")
+    say = side.publisher(key, Qos())
     async with asyncio.timeout(10):
-        await heard.wait()
+        while not heard.is_set():
+            say(twist(1.0), b"attached")
+            await asyncio.sleep(0.02)
     side.close()
-    assert taken == [(recorded_key(key), packed(twist(1.0), b"attached"))] * 2
+    assert set(taken) == {(recorded_key(key), packed(twist(1.0), b"attached"))}
+    assert len(taken) >= 2
 
 
 def test_definitions_of_a_robot_s_own_are_those_of_its_system(tmp_path, capsys):

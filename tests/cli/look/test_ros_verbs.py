@@ -45,7 +45,7 @@ class Robot:
                             "scouting/multicast/enabled": False}.items():
             config.insert_json5(name, json.dumps(value))
         router = zenoh.open(config)
-        side = ZenohSide([self.where], asyncio.get_running_loop())
+        side = ZenohSide([self.where], asyncio.get_running_loop(), mode="peer")
         node = RosNode(side, self._types, "base", wall_ns=time.time_ns, refuse=lambda *_: None)
         say = node.publisher("/odom", self._publishes, Qos(depth=10))
         node.subscribe("/cmd_vel", "geometry_msgs/msg/Twist", Qos(depth=10), lambda *_: None)
@@ -68,12 +68,12 @@ def impatient(monkeypatch):
 
 @pytest.fixture
 def system(tmp_path):
-    def write(port, distribution="jazzy"):
+    def write(port, distribution="jazzy", mode="client"):
         path = tmp_path / "guarded.toml"
         path.write_text(SYSTEM.replace(
             'actor = "rampart.actors.ros2.gateway:Gateway"\n',
             'actor = "rampart.actors.ros2.gateway:Gateway"\nparameters = { connect = '
-            f'["tcp/127.0.0.1:{port}"], distribution = "{distribution}" }}\n'))
+            f'["tcp/127.0.0.1:{port}"], distribution = "{distribution}", mode = "{mode}" }}\n'))
         return str(path)
 
     return write
@@ -85,10 +85,11 @@ def checked(capsys, path):
     return code, {one["what"]: (one["well"], one["why"]) for one in said["findings"]}
 
 
-def test_a_robot_that_fits(capsys, system):
+@pytest.mark.parametrize("mode", ["client", "peer"])
+def test_a_robot_that_fits(capsys, system, mode):
     port = free_port()
     with Robot(port):
-        code, found = checked(capsys, system(port))
+        code, found = checked(capsys, system(port, mode=mode))
     assert code == 0
     assert found["subscribe /odom"] == (True, "/base, nav_msgs/msg/Odometry")
     assert found["publish /cmd_vel"] == (True, "/base, geometry_msgs/msg/Twist")
