@@ -80,7 +80,7 @@ class Hmi(Actor):
     files: ClassVar[Path | None] = None
     most_spare = "none"
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
-        ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECT)
+        ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECT, ftm_topics.SIGNAL)
     requests: ClassVar[tuple[type[Request], ...]] = REQUESTS
     shown: ClassVar[tuple[Topic[Any], ...]] = (
         ftm_topics.ADAPTED_SYSTEM, ftm_topics.PROCESS_EVENT, bus_topics.DIAGNOSTIC,

@@ -10,6 +10,7 @@ import asyncio
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 from rampart.actors.bus import messages as bm
@@ -20,7 +21,12 @@ from rampart.actors.operator.adaptation import StrategyChoice
 from rampart.actors.operator.injection import Injections, places_of
 from rampart.actors.operator.requests import RefusedError, Request
 from rampart.actors.operator.stick import Stick
-from rampart.actors.supervision.kill_node import SIGNALS, SignalError, signal_node
+from rampart.actors.supervision.kill_node import (
+    SIGNALS,
+    SignalError,
+    UnknownNodeError,
+    signal_node,
+)
 from rampart.manager.spec.panels import Panel
 from rampart.manager.strategies.registry import STRATEGIES
 
@@ -59,6 +65,8 @@ class Operating:
         self._injections = Injections(f"{prefix}.f", run.plan.faults, places_of(run.system),
                                       (*run.application.topics, *actor.context.topics.values()),
                                       overhead_s)
+        self._orders = (f"{prefix}.k{number}" for number in count(1))
+        self._elsewhere: frozenset[str] = frozenset()
         self._has_processes = run.plan.launcher_pid > 0  # a replay has none
         self._strategy = ""
         self._sticks = {panel.title: Stick(actor, panel, partial(self._stick_changed, panel.title))
@@ -139,8 +147,15 @@ class Operating:
                 OWN_DEATH_S, lambda: signal_node(node, name, port))
             told = f"{node}: {name}; the page will be back"
         else:
-            victim = signal_node(node, name, port)
-            told = f"{node} (pid {victim.pid}): {name}"
+            try:
+                victim = signal_node(node, name, port)
+                told = f"{node} (pid {victim.pid}): {name}"
+            except UnknownNodeError:
+                if node not in self._elsewhere:
+                    raise
+                self._actor.publish(
+                    ftm_topics.SIGNAL, fm.SignalOrder(next(self._orders), node, name))
+                told = f"{node}: {name}, by the supervisor of its host"
         self._state.log(self._now(), "note", f"page {page} sent {told}")
         return told
 
@@ -186,7 +201,9 @@ class Operating:
             self.show()
 
     def nodes(self, table: fm.NodeTable) -> None:
-        """Hear the supervisor."""
+        """Hear the supervisor: what runs on other hosts."""
+        own = self._actor.context.run.plan.host
+        self._elsewhere = frozenset(row.name for row in table.nodes if row.host != own)
 
     def diagnostic(self, report: bm.Diagnostic) -> None:
         """Hear a node complain."""

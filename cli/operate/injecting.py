@@ -6,8 +6,6 @@ import argparse
 import asyncio
 import contextlib
 import math
-import os
-import signal
 from collections.abc import Sequence
 
 from rampart.actors.bus import topics as bus_topics
@@ -15,8 +13,9 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import InjectionReport
 from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.runtime.fault_watch import FaultWatch, Order
-from rampart.actors.supervision.kill_node import SignalError, signal_node
+from rampart.actors.supervision.kill_node import SignalError
 from rampart.cli.look.topic_catalogue import check_member
+from rampart.cli.operate.kill_elsewhere import signal_anywhere
 from rampart.cli.output import NoEffectError, UsageError, positive, print_json, refusing, say
 from rampart.cli.session import Session, connect, pause
 
@@ -113,7 +112,7 @@ async def hit_process(options: argparse.Namespace) -> int:
     with refusing(NoRunError):
         run = find_run(options.port)
     with refusing(SignalError):
-        victim = signal_node(node, what.upper(), run.base_port)
+        victim = await signal_anywhere(node, what.upper(), run.base_port)
     if not options.json:
         say(f"{options.fault}: pid {victim.pid}, incarnation {victim.incarnation}"
             + (f", for {lasts_s:g} s" if math.isfinite(lasts_s) else ""))
@@ -121,8 +120,8 @@ async def hit_process(options: argparse.Namespace) -> int:
         try:
             await asyncio.sleep(lasts_s / run.rate)
         finally:
-            with contextlib.suppress(ProcessLookupError):  # it was replaced meanwhile
-                os.kill(victim.pid, signal.SIGCONT)
+            with contextlib.suppress(SignalError):  # it was replaced meanwhile
+                await signal_anywhere(node, "CONT", run.base_port)
     if options.json:
         print_json({"fault": options.fault, "effective": True, "node": node, "pid": victim.pid,
                     "incarnation": victim.incarnation, "duration_s": lasts_s})

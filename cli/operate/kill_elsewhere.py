@@ -18,6 +18,8 @@ from rampart.actors.supervision.kill_node import (
     RunElsewhere,
     SignalError,
     Signalled,
+    UnknownNodeError,
+    signal_node,
 )
 from rampart.cli.session import UsageError, connect
 
@@ -52,6 +54,22 @@ class OtherHosts(Elsewhere):
         """Return what runs on other hosts, of the runs here that have some."""
         return [asyncio.run(_listed(run)) for run in find_runs()
                 if run.hosts and port in {None, run.base_port}]
+
+
+async def signal_anywhere(node: str, name: str, port: int | None) -> Signalled:
+    """Send a signal to a node of this host, or have it sent on another one.
+
+    Raises:
+        SignalError: there is no such node, or it cannot be signalled.
+        UsageError: there is no run.
+    """
+    try:
+        process = signal_node(node, name, port)
+        return Signalled(process.pid, process.incarnation)
+    except UnknownNodeError:
+        if (found := await _signal(node, name, port)) is None:
+            raise
+        return found
 
 
 def main(arguments: list[str] | None = None) -> int:

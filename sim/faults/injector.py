@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import msgspec
@@ -17,6 +18,8 @@ import msgspec
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import InjectionReport
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.messages import ProcessEvent, SignalOrder
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.fault_watch import FaultWatch
@@ -26,6 +29,9 @@ from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import FaultOutcome, OnProcess, PlannedFault, action_of
 
 INJECTOR = "injector"
+
+SIGNALS = {"kill": "KILL", "stop": "STOP", "resume": "CONT", "wedge": "WEDGE"}
+"""What is done to a process, as `kill-node` calls it; how slow one is, is up to the machine."""
 
 _ENDS = {"stop": "resume", "slow": "slow"}
 """What ends that which is done to a process for a while."""
@@ -102,17 +108,21 @@ class Injector(Actor):
         open: the scenarios that the run may still turn out to be, by number.
     """
 
-    outputs: ClassVar[tuple[Topic[Any], ...]] = (bus_topics.INJECT,)
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (bus_topics.INJECT, ftm_topics.SIGNAL)
 
     def __init__(self, context: Context, scenario: Sequence[PlannedFault],
                  processes: ProcessControl, *, nodes: Sequence[str],
                  known: Sequence[Topic[Any]], faults: Faults) -> None:
-        super().__init__(context)
+        event = ftm_topics.PROCESS_EVENT
+        super().__init__(replace(context, topics={**context.topics, event.key: event}))
+        if context.run.system.hosts:
+            self.hear_topic(event.key, self._signalled)
         self._control = processes
         self._nodes, self._known, self._faults = nodes, known, faults
         self.open: dict[int, list[PlannedAction]] = {}
         self._branch: Branch | None = None
         self._begun = 0
+        self._ordered: list[PlannedAction] = []
         self.planned = self._plan(scenario)
 
     def _plan(self, scenario: Sequence[PlannedFault], number: int = 0) -> list[PlannedAction]:
@@ -211,17 +221,31 @@ class Injector(Actor):
             self.carry_out(fault)
 
     def _hit(self, fault: PlannedAction, action: OnProcess) -> None:
-        if not self._do(action.what, action, action.pace_s):
-            fault.reason = f"{action.node} had no running process"
-            return
-        fault.hit = 1
-        if action.what in _ENDS and math.isfinite(action.duration_s):
-            self.call_later(action.duration_s, lambda: self._release(action))
+        self._do(action.what, fault, action, action.pace_s)
+        is_under_way = fault.hit or fault in self._ordered
+        if is_under_way and action.what in _ENDS and math.isfinite(action.duration_s):
+            self.call_later(action.duration_s,
+                            lambda: self._do(_ENDS[action.what], fault, action, 0.0))
 
-    def _release(self, action: OnProcess) -> None:
-        self._do(_ENDS[action.what], action, 0.0)
+    def _do(self, what: str, fault: PlannedAction, action: OnProcess, pace_s: float) -> None:
+        """Do something to one process, or to all; what runs on another host its supervisor hits."""
+        for node in (action.node,) if action.node else self._nodes:
+            if self._control(what, node, pace_s):
+                fault.hit = 1
+            elif self.context.run.system.hosts and what in SIGNALS:
+                fault.reason = f"no host has answered that it runs {node}"
+                self._ordered.append(fault)
+                self.publish(ftm_topics.SIGNAL, SignalOrder(
+                    f"{self.name}-{len(self._ordered)}", node, SIGNALS[what]))
+            else:
+                fault.reason = f"{node} had no running process"
 
-    def _do(self, what: str, action: OnProcess, pace_s: float) -> bool:
-        """Do something to one process, or to all; tell whether there was any."""
-        nodes = (action.node,) if action.node else self._nodes
-        return sum(self._control(what, node, pace_s) for node in nodes) > 0  # each of them
+    def _signalled(self, event: ProcessEvent, _header: Header) -> None:
+        """Note what the supervisor of another host has done to a process."""
+        name, _, number = event.by.rpartition("-")
+        if name == self.name and number.isdecimal() and 0 < int(number) <= len(self._ordered):
+            fault = self._ordered[int(number) - 1]
+            if event.event == "signalled":
+                fault.hit = 1
+            else:
+                fault.reason = f"{event.node}: {event.detail}"

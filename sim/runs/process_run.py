@@ -15,7 +15,7 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.kill_node import SignalError, signal_node
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.unseen import watch
-from rampart.sim.faults.injector import can_be_hit
+from rampart.sim.faults.injector import SIGNALS, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.trial import Trial
@@ -26,14 +26,11 @@ _STALL_S = 0.5
 _RELINK_S = 1.0
 """Wall seconds in which a launcher that was stopped is linked to a router again."""
 
-_SIGNALS = {"kill": "KILL", "stop": "STOP", "resume": "CONT", "wedge": "WEDGE"}
-"""As `kill-node` sends them. How slow a process is, is up to the machine."""
-
 
 def hit(port: int, what: str, node: str, _pace_s: float) -> bool:
     """Do something to the newest process of a node of a run, as a `ProcessControl`."""
     try:
-        signal_node(node, _SIGNALS[what], port)
+        signal_node(node, SIGNALS[what], port)
     except (SignalError, KeyError):
         return False
     return True
@@ -116,7 +113,8 @@ class ProcessRun:
         def context(name: str) -> Context:
             return Context(
                 name, 1, clock, bus if name == OBSERVER else SharedBus(bus),
-                register=register_of(plan.folder), members=frozenset(launcher.names))
+                run=trial.run, register=register_of(plan.folder),
+                members=frozenset(launcher.names))
 
         actors = trial.outside(context, launcher.supervisor_heard, self._scenario,
                                partial(hit, plan.base_port), can_be_hit(spec))

@@ -87,6 +87,12 @@ def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_ba
         killed = kill_node(net, "robot", robot, "camera")
         assert killed.stdout.startswith("camera (pid "), killed.stderr
         robot.wait_for("camera respawned, incarnation 3")
+        struck = subprocess.run(
+            net.command("robot", sys.executable, "-P", "-m", "rampart.cli.main", "inject",
+                        "kill:camera", "--json", "--port", str(robot.port)),
+            capture_output=True, text=True, check=False, timeout=30)
+        assert struck.returncode == 0, struck.stderr
+        robot.wait_for("camera respawned, incarnation 4")
         refused = kill_node(net, "robot", robot, "kamera")
         assert refused.returncode == 2
         assert "kill-node: unknown node 'kamera'" in refused.stderr

@@ -55,6 +55,7 @@ class Driving(Operating):
 
     def nodes(self, table: fm.NodeTable) -> None:
         """Hear the supervisor: whether those between stick and wheels run."""
+        super().nodes(table)
         running = {row.name for row in table.nodes if row.state is fm.NodeState.RUNNING}
         dead = tuple(name for name in _DRIVEN_BY if name not in running)
         if dead != self._dead:

@@ -15,7 +15,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.supervision.kill_node import SignalError
+from rampart.actors.supervision.kill_node import SignalError, UnknownNodeError
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
@@ -209,6 +209,30 @@ async def test_a_strategy_is_asked_for_from_the_page_and_the_answer_shown(world)
                     pass
             assert state["order"]["text"] == (
                 "strategy mission-first refused: not in the middle of a recovery: RM2")
+
+
+async def test_a_signal_to_a_node_of_another_host_is_ordered_of_its_supervisor(world, monkeypatch):
+    def signal_node(node: str, name: str, _port: int) -> RunProcess:
+        raise UnknownNodeError(f"unknown node {node!r}")
+
+    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
+    async with world.hmi(hmi_port=free_port(), launcher_pid=1) as hmi:
+        async with open_page(await served(hmi)) as page:
+            world.others.publish(ftm_topics.NODES, fm.NodeTable((
+                fm.NodeInfo("teleoperation", "control", 7, fm.NodeState.RUNNING, 1, 0, host="g"),
+                fm.NodeInfo("localization", "control", 8, fm.NodeState.RUNNING, 1, 0))))
+            async with asyncio.timeout(5):
+                while "teleoperation" not in str(await hear(page, "state")):
+                    pass
+            told = await ask(page, type="signal", node="localization", signal="KILL")
+            assert (told["type"], world.others.signals) == ("error", [])
+            for name in ("KILL", "STOP"):
+                told = await ask(page, type="signal", node="teleoperation", signal=name)
+                assert told["type"] == "done"
+            await eventually(lambda: [(one.node, one.signal) for one in world.others.signals] == [
+                ("teleoperation", "KILL"), ("teleoperation", "STOP")])
+            first, second = world.others.signals
+            assert first.order != second.order  # the same one twice would be one
 
 
 async def test_a_signal_is_sent_to_a_node_and_to_the_hmi_itself_after_its_answer(

@@ -40,9 +40,14 @@ class Others(Actor):
         self.orders: list[m.MissionOrder] = []
         self.diagnostics: list[bm.Diagnostic] = []
         self.stick: list[m.Joystick] = []
+        self.signals: list[fm.SignalOrder] = []
         self.adaptations: list[fm.AdaptationRequest] = []
         self.injections: list[bm.Injection] = []
         self.actuator_faults: list[m.ActuatorFault] = []
+
+    @on(ftm_topics.SIGNAL)
+    def signal(self, message: fm.SignalOrder, _header: Header) -> None:
+        self.signals.append(message)
 
     @on(topics.MISSION_REQUEST)
     def request(self, message: m.MissionRequest, _header: Header) -> None:
