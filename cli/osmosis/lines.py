@@ -62,7 +62,7 @@ class OsmosisLines(RobotLines):
         if status is not None:
             yield StateSetMetricFamily("rampart_mission_phase", "State of the mission.", value={
                 phase.value: phase is status.phase for phase in m.MissionPhase})
-            yield gauge("mission_step", "Goals reached.", ("mission",), [
+            yield gauge("mission_step", "Goals reached or skipped.", ("mission",), [
                 ((status.name,), status.step)])
             yield gauge("mission_steps", "Goals of the mission.", ("mission",), [
                 ((status.name,), len(status.goals))])

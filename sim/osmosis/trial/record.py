@@ -40,12 +40,13 @@ class LightResult(msgspec.Struct, frozen=True):
 
 
 class StepResult(msgspec.Struct, frozen=True):
-    """A goal of the mission and when it was reached, simulated seconds, or None."""
+    """A goal of the mission: when it was reached, simulated seconds or None; if it was skipped."""
 
     mode: str
     x_m: float
     y_m: float
     reached_s: float | None
+    skipped: bool = False
 
 
 class ObstacleSeen(msgspec.Struct, frozen=True):
@@ -118,6 +119,7 @@ class MissionRecorder(RunRecorder):
         self._believed: list[tuple[float, float, float]] = []
         self._lights: dict[str, m.LightMeasurement] = {}
         self._reached: tuple[float, ...] = ()
+        self._skipped: frozenset[int] = frozenset()
         self._known_lights = frozenset(light.name for light in airport.lights)
         self._obstacles: dict[str, ObstacleSeen] = Remembered(KEPT)
         self._take |= {
@@ -129,7 +131,7 @@ class MissionRecorder(RunRecorder):
     def record(self, duration_s: float, **more: Any) -> MissionRecord:
         """Return the record of the run so far; `more` are at least the verdicts."""
         judge, drawing = self.judge, draw(self._airport)
-        reached = dict(enumerate(self._reached))
+        reached = {i: at_s for i, at_s in enumerate(self._reached) if i not in self._skipped}
         return MissionRecord(
             **self.fields(duration_s), **more,
             airport=drawing, mission_name=self._mission.name,
@@ -137,7 +139,8 @@ class MissionRecorder(RunRecorder):
                            for a, b in zip(self._track, self._track[1:], strict=False)),
             track=tuple(self._track), believed=tuple(self._believed),
             lights=tuple(map(self._light_result, drawing.lights)),
-            steps=tuple(StepResult(str(goal.mode), goal.x_m, goal.y_m, reached.get(i))
+            steps=tuple(StepResult(str(goal.mode), goal.x_m, goal.y_m, reached.get(i),
+                                   i in self._skipped)
                         for i, goal in enumerate(self._mission.goals)),
             obstacles=tuple(self._obstacles.values()),
             collisions=judge.collisions, prohibited_s=judge.prohibited_s,
@@ -159,6 +162,7 @@ class MissionRecorder(RunRecorder):
         self._mode = status.goals[status.step].mode.value if running else ""
         newly = len(status.step_times_s) - len(self._reached)  # negative: it forgot, we do not
         self._reached += (header.stamp,) * newly
+        self._skipped |= frozenset(status.skipped)
 
     def _light(self, light: m.LightMeasurement, _header: Header) -> None:
         if light.light in self._known_lights:

@@ -99,6 +99,20 @@ def test_what_was_measured_and_reached_outlives_a_mission_manager_that_forgets()
     assert sum(light.verdict == "ok" for light in run.lights) == 1
 
 
+def test_a_skipped_goal_is_not_reached():
+    story = Story()
+    story.tell(12.5, topics.MISSION_STATUS, m.MissionStatus(
+        "1", "AB", m.MissionPhase.RUNNING, 1, (), (12.0,), (), "", skipped=(0,)))
+    story.tell(40.0, topics.MISSION_STATUS, m.MissionStatus(
+        "1", "AB", m.MissionPhase.RUNNING, 2, (), (12.0, 27.5), (), "", skipped=(0,)))
+    run = story.end()
+    assert [(s.reached_s, s.skipped) for s in run.steps[:3]] == [
+        (None, True), (40.0, False), (None, False)]
+    page = render(run)
+    assert page.count(">skipped<") == 1
+    assert "step 1 at" not in page
+
+
 def test_a_crash_is_a_bar_from_the_event_to_the_respawn_and_a_restart():
     story = Story()
     crash = fm.ProcessEvent("hmi", "crashed", 7, 1, "supervisor", "SIGKILL")

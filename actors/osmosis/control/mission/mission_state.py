@@ -152,9 +152,9 @@ def routed(state: MissionState, route: m.Route) -> MissionState:
         return enter(state, P.FAILED, f"{what}: {route.reason}")
     if state.phase is P.RETURNING:
         return state
-    if state.home is None and state.step == 0:
+    if state.home is None and state.step == len(state.skipped):
         # The first waypoint of the first way is where the robot was, or the nearest place to it
-        # on the graph: somewhere that a way leads back to.
+        # on the graph: somewhere that a way leads back to. Goals skipped before moved nothing.
         state = replace(state, home=m.Goal(*route.waypoints[0], m.Mode.TAXI))
     if route.reason != state.reason:
         state = replace(state, reason=route.reason)

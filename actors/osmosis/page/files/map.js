@@ -109,7 +109,8 @@ class AirportMap {
     if (changed.has("obstacles")) this.showObstacles(picture.obstacles);
     if (changed.has("mission")) {
       const goals = picture.mission ? picture.mission.goals : [];
-      const key = [goals, picture.mission && [picture.mission.step, picture.mission.phase]];
+      const { step, phase, skipped } = picture.mission || {};
+      const key = [goals, step, phase, skipped];
       this.memory.once("goals", key, () => this.showGoals(goals, picture.mission));
     }
   }
@@ -181,11 +182,13 @@ class AirportMap {
   showGoals(goals, mission) {
     this.goals.replaceChildren();
     goals.forEach((goal, i) => {
-      const done = i < mission.step || mission.phase === "succeeded";
+      const skipped = mission.skipped.includes(i);
+      const done = !skipped && (i < mission.step || mission.phase === "succeeded");
       const now = i === mission.step && ["running", "paused"].includes(mission.phase);
       if (now) make("circle", { class: "goal now", cx: goal.x_m, cy: -goal.y_m, r: .45 }, this.goals);
       make("circle", { class: `goal ${done ? "done" : ""}`, cx: goal.x_m, cy: -goal.y_m, r: 1.1 }, this.goals);
-      make("text", { x: goal.x_m, y: -goal.y_m - 1.5, "font-size": 1.7, "text-anchor": "middle" }, this.goals, done ? `${i + 1} ✓` : i + 1);
+      make("text", { x: goal.x_m, y: -goal.y_m - 1.5, "font-size": 1.7, "text-anchor": "middle" }, this.goals,
+        skipped ? `${i + 1} skipped` : done ? `${i + 1} ✓` : i + 1);
     });
   }
 }

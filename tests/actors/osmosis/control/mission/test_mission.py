@@ -248,6 +248,21 @@ def test_home_is_where_the_mission_began_and_the_mission_ends_there_as_cancelled
         MissionPhase.CANCELLED, "returned home, operator: a reason")
 
 
+def test_a_goal_that_is_skipped_before_the_first_way_does_not_take_the_way_home():
+    state = obeyed(running(), A.SKIP)
+    assert A.HOME not in ms.status(state).orders
+    state = ms.routed(state, m.Route("id-1", 1, Mode.TAXI, True, ((0.5, 0.0), (9.0, 0.0)), ""))
+    assert A.HOME in ms.status(state).orders
+    home, _ = ms.obey(state, m.MissionOrder("order-2", A.HOME, "a reason", "operator"), 15.0)
+    assert ms.goal_order(home).goal == m.Goal(0.5, 0.0, Mode.TAXI)
+
+
+def test_a_way_from_a_goal_that_was_reached_does_not_say_where_home_is():
+    state = ms.catch_up(running(), 1, 14.0)
+    state = ms.routed(state, m.Route("id-1", 1, Mode.TAXI, True, ((5.0, 0.0), (9.0, 0.0)), ""))
+    assert A.HOME not in ms.status(state).orders
+
+
 def test_without_a_way_home_the_mission_has_failed():
     state = situations()["returning"]
     none = m.Route("id-1", 2, Mode.TAXI, True, (), "no way in the graph")
