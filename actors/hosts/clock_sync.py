@@ -18,11 +18,15 @@ DRIFT = 2e-4
 _KEPT = 60
 
 _SLEW_S = 0.002
-"""By which the clock in use is moved at most, for each exchange: it never jumps."""
+"""By which the clock in use is moved at most, for each exchange, while it may be right."""
 
 
 class ClockSync:
     """How far another host's monotonic clock is ahead of this one's.
+
+    Args:
+        tolerated_s: An error that readers of messages tolerate. A larger one that is proven is put
+            right at once: all that is stamped by that clock would be refused meanwhile.
 
     Attributes:
         offset_s: In use, seconds; moves slowly towards the middle of the interval.
@@ -30,7 +34,8 @@ class ClockSync:
         jumps: How often the exchanges contradicted each other, so that it had to begin anew.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, tolerated_s: float = 0.1) -> None:
+        self._tolerated_s = tolerated_s
         self.offset_s = 0.0
         self.bound_s = float("inf")
         self.jumps = 0
@@ -56,7 +61,8 @@ class ClockSync:
             low_s, high_s = newest[1:]
         middle_s = (low_s + high_s) / 2
         step_s = middle_s - self.offset_s
-        if not is_first and len(self._kept) > 1:
+        is_wrong = not low_s - self._tolerated_s <= self.offset_s <= high_s + self._tolerated_s
+        if not (is_first or is_wrong) and len(self._kept) > 1:
             step_s = min(max(step_s, -_SLEW_S), _SLEW_S)
         self.offset_s += step_s
         self.bound_s = max(high_s - self.offset_s, self.offset_s - low_s)

@@ -103,7 +103,7 @@ class OtherHost:
         self._attendance = Attendance(
             own.host, self._where, contents_of(own),
             own.credentials(on_host(OBSERVER, own.host)))
-        self._clocks = ClockSync()
+        self._clocks = ClockSync(self._link.clock_s)
         self._said = ""
         self._is_trusted = True
 

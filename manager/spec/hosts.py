@@ -17,6 +17,10 @@ PORTS = 3
 """Of a host: its two routers, and where the robot's launcher is asked by the others'."""
 
 
+MOST_CLOCK_S = 0.1
+"""The most that the clocks of two hosts may differ: messages stamped further ahead are refused."""
+
+
 class HostSpec(Table, frozen=True):
     """A machine.
 
@@ -38,7 +42,7 @@ class Link(Table, frozen=True):
         delay_s: Longest time that a message takes while the link is up, what is lost and sent
             again included.
         clock_s: How far the clocks of two hosts may be apart; one that is not known as well as
-            that is told of.
+            that is told of. Every reader refuses what is stamped more than `MOST_CLOCK_S` ahead.
         lost_after_s: Nothing was heard of a host for so long: it is lost, and what it ran is
             started on the first host.
         return_after_s: A host has been heard for so long without a break: what was started in its
@@ -46,6 +50,6 @@ class Link(Table, frozen=True):
     """
 
     delay_s: Positive = 0.3
-    clock_s: Positive = 0.1
+    clock_s: Annotated[float, msgspec.Meta(gt=0, le=MOST_CLOCK_S)] = MOST_CLOCK_S
     lost_after_s: Positive = 0.6
     return_after_s: Positive = 0.3

@@ -8,7 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.hosts.clock_sync import DRIFT, ClockSync
+from rampart.manager.spec.specification import parse_specification
+from rampart.manager.spec.tables import SpecificationError
+from tests.two_hosts import two_hosts
 
 
 def exchange(sync: ClockSync, at_s: float, ahead_s: float, there_s: float, back_s: float) -> None:
@@ -50,6 +54,26 @@ def test_it_moves_by_no_more_than_a_step_at_a_time():
         if turn > 1:
             assert abs(sync.offset_s - before_s) <= 0.002 + 1e-9
         before_s = sync.offset_s
+
+
+@pytest.mark.parametrize("slow_way", [0, 1])
+def test_a_way_that_becomes_quicker_does_not_leave_a_clock_that_readers_refuse(slow_way):
+    sync = ClockSync(0.1)
+    ways = [0.001, 0.001]
+    ways[slow_way] = 0.5
+    for turn in range(100):
+        exchange(sync, turn / 4, 5.0, *ways)
+    for turn in range(100, 104):
+        exchange(sync, turn / 4, 5.0, 0.001, 0.001)
+        assert abs(sync.offset_s - 5.0) <= AHEAD_S
+    assert sync.jumps == 0
+
+
+def test_no_bound_of_two_clocks_is_accepted_that_readers_of_messages_do_not_tolerate():
+    text = two_hosts({"robot": "10.0.0.1", "ground": "10.0.0.2"})
+    assert parse_specification(text, "two.toml").link.clock_s <= AHEAD_S
+    with pytest.raises(SpecificationError, match=r"link.*clock_s = 2"):
+        parse_specification(text.replace("[link]\n", "[link]\nclock_s = 2\n"), "two.toml")
 
 
 def test_a_clock_that_jumps_is_noticed_and_it_begins_anew():
