@@ -22,7 +22,7 @@ from typing import Any
 
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.layout import Layout
-from rampart.actors.recording.bag_reader import BagReader, Summary, repair
+from rampart.actors.recording.bag_reader import BagReader, Summary, repair, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.other_hosts import OtherHosts, others_of
 from rampart.actors.recording.process import stop_pipe, told
@@ -233,7 +233,8 @@ def bag_info(options: argparse.Namespace) -> int:
     """Print what is in a file.
 
     Show duration, size, what was run, and each channel with messages and rate.
-    A file that was never closed, or is cut off, is read as far as it goes.
+    A file that was never closed, or is cut off, is read as far as it goes. The
+    exit code is 1 if something in it cannot be read.
 
     Examples:
       rampart bag info run.mcap
@@ -241,9 +242,10 @@ def bag_info(options: argparse.Namespace) -> int:
     """
     with refusing(BagError):
         summary = Summary(BagReader(Path(options.file)))
+    code = 1 if summary.reader.gaps else 0
     if options.json:
         print_json(described(summary))
-        return 0
+        return code
     reader, run = summary.reader, summary.run
     _say(f"file       {options.file}, {reader.size_bytes / 1e6:.1f} MB, {reader.library}")
     if reader.is_recording:
@@ -261,6 +263,8 @@ def bag_info(options: argparse.Namespace) -> int:
     if summary.unheard:
         _say(f"unheard    {_unheard(summary)}")
     _say(f"closed     {_closing(summary)}")
+    for line in left_behind(summary.reader, summary.time_zero_s):
+        _say(f"gone       {line}")
     if summary.files:
         _say(f"attached   {', '.join(name for name, _, _ in summary.files)}")
     say()
@@ -268,14 +272,15 @@ def bag_info(options: argparse.Namespace) -> int:
         (plain_line(row["channel"]), plain_line(row["schema"]), row["messages"],
          f"{row['rate_hz']:.2f} Hz" if row["rate_hz"] is not None else "")
         for row in summary.table()])
-    return 0
+    return code
 
 
 def bag_repair(options: argparse.Namespace) -> int:
     """Write a whole file.
 
     Copy everything that can be read of a torn file into a new one with an
-    index, for viewers that insist on it. The old one stays as it is.
+    index, for viewers that insist on it. The old one stays as it is. The exit
+    code is 1 if something was left behind.
 
     Examples:
       rampart bag repair torn.mcap whole.mcap
@@ -283,8 +288,10 @@ def bag_repair(options: argparse.Namespace) -> int:
     with refusing(BagError):
         reader = BagReader(Path(options.file))
         copied = repair(reader, Path(options.out), overwrite=options.overwrite)
-    say(f"{options.out}: {copied} messages; left behind: {reader.damage or 'nothing'}")
-    return 0
+    lines = left_behind(reader, time_zero_s(reader))
+    say(f"{options.out}: {copied} messages; left behind: "
+        f"{plain_line(', '.join(lines)) or 'nothing'}")
+    return 1 if lines else 0
 
 
 def bag_ros2(options: argparse.Namespace) -> int:
@@ -293,7 +300,8 @@ def bag_ros2(options: argparse.Namespace) -> int:
     A new folder with MCAP, cdr and ros2msg, as `ros2 bag record` makes it: for
     `ros2 bag play`, RViz, PlotJuggler. It has what passed a gateway to ROS 2, byte
     for byte; every topic of the run below /rampart, in types of their own; and
-    what viewers see: /tf, /rosout, /view/scan, /view/map.
+    what viewers see: /tf, /rosout, /view/scan, /view/map. The exit code is 1 if
+    the recording is damaged and something of it was left behind.
 
     Examples:
       rampart bag ros2 run.mcap run-ros2
@@ -303,16 +311,21 @@ def bag_ros2(options: argparse.Namespace) -> int:
     extra("ros2", "xxhash")
     from rampart.cli.record.ros_bags import write  # noqa: PLC0415 of the extra
 
-    bag = write(Path(options.file), Path(options.out), options.system, options.distribution)
+    bag, reader = write(
+        Path(options.file), Path(options.out), options.system, options.distribution)
+    code = 1 if reader.gaps else 0
     left = {plain_line(what): {"times": times, "why": plain_line(why)}
             for what, (times, why) in bag.left_out.items()}
     if options.json:
-        print_json({"folder": options.out, "messages": dict(bag.counts), "left_out": left})
-        return 0
+        print_json({"folder": options.out, "messages": dict(bag.counts), "left_out": left,
+                    "gone": gone(reader, time_zero_s(reader))})
+        return code
     say(f"{options.out}: {bag.counts.total()} messages on {len(bag.counts)} topics")
     for what, one in left.items():
         say(f"left out: {what}: {one['why']} ({one['times']} times)")
-    return 0
+    for line in left_behind(reader, time_zero_s(reader)):
+        say(f"gone: {plain_line(line)}")
+    return code
 
 
 def _say(line: str) -> None:
@@ -326,11 +339,27 @@ def described(summary: Summary) -> dict[str, Any]:
     return {
         "file": str(reader.path), "size_bytes": reader.size_bytes, "profile": reader.profile,
         "library": reader.library, "recording": reader.is_recording, "closed": reader.closed,
-        "damage": reader.damage, "duration_s": round(summary.duration_s, 3),
+        "damage": reader.damage, "gone": gone(reader, summary.time_zero_s),
+        "duration_s": round(summary.duration_s, 3),
         "messages": summary.messages, "time_zero_s": summary.time_zero_s, "run": summary.run,
         "end": summary.end, "lost": _losses(summary),
         "unheard": summary.unheard,
         "attachments": [name for name, _, _ in summary.files], "channels": summary.table()}
+
+
+def gone(reader: BagReader, zero_s: float) -> list[dict[str, Any]]:
+    """Return what could not be read, as plain data; times are simulated seconds, or null."""
+    return [{"what": gap.what, "from_byte": gap.from_byte, "to_byte": gap.to_byte,
+             "from_s": None if gap.from_ns is None else round(gap.from_ns / 1e9 + zero_s, 3),
+             "to_s": None if gap.to_ns is None else round(gap.to_ns / 1e9 + zero_s, 3)}
+            for gap in reader.gaps]
+
+
+def left_behind(reader: BagReader, zero_s: float) -> list[str]:
+    """Return the same in words, one for each gap."""
+    return [f"bytes {one['from_byte']} to {one['to_byte']}" + (
+        f", {one['from_s']:.2f} to {one['to_s']:.2f} s" if one["from_s"] is not None else "")
+        + f": {one['what']}" for one in gone(reader, zero_s)]
 
 
 def _losses(summary: Summary) -> dict[str, int] | None:

@@ -18,7 +18,8 @@ from rampart.manager.spec.ros2 import GATEWAY
 from rampart.manager.spec.schema import SystemSpec
 
 
-def write(file: Path, folder: Path, system: str | None, distribution: str | None) -> RosBag:
+def write(file: Path, folder: Path, system: str | None, distribution: str | None
+          ) -> tuple[RosBag, BagReader]:
     """Write a recording as a bag of ROS 2.
 
     Args:
@@ -28,7 +29,7 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
         distribution: of ROS 2; None for that of the system's gateway.
 
     Returns:
-        What was written, and what was not.
+        What was written and what was not, and the reader of the recording.
 
     Raises:
         UsageError: a file cannot be read or written, or a word is wrong.
@@ -50,7 +51,7 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
         bag.write(reader, folder)
     if not bag.counts:
         raise NoEffectError(f"{file}: no message that could be written")
-    return bag
+    return bag, reader
 
 
 def _types(spec: SystemSpec, distribution: str | None) -> Types:

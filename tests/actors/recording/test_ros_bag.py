@@ -49,8 +49,8 @@ def decoded(folder):
     return found
 
 
-def made(path, folder, *more):
-    assert main(["bag", "ros2", str(path), str(folder), *more]) == 0
+def made(path, folder, *more, code=0):
+    assert main(["bag", "ros2", str(path), str(folder), *more]) == code
     return decoded(folder)
 
 
@@ -265,7 +265,7 @@ def test_a_torn_recording_is_written_as_far_as_it_goes(tmp_path):
     write(path, sample())
     whole = path.read_bytes()
     path.write_bytes(whole[:len(whole) * 2 // 3])
-    found = made(path, tmp_path / "bag", "--json")
+    found = made(path, tmp_path / "bag", "--json", code=1)
     assert 0 < len(found["/rampart/localization/pose"][1]) <= 20
 
 

@@ -1,0 +1,149 @@
+"""Recordings with a damaged byte: what is outside its record is read, nothing is invented."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from rampart.actors.recording.bag_reader import BagReader
+from rampart.cli.main import main
+from tests.actors.recording.samples import sample, write
+
+
+def contents(path):
+    """Return the messages by topic, time and bytes, and the reader that found them."""
+    reader = BagReader(path)
+    return [(channel.topic, message.log_time, message.data)
+            for channel, message in reader.messages()], reader
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A closed recording of eight chunks: its bytes, its messages, and the index of its chunks."""
+    path = tmp_path_factory.mktemp("whole") / "run.mcap"
+    write(path, sample(200), flush_every=25)
+    found, reader = contents(path)
+    assert (reader.damage, reader.gaps) == ("", [])
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    assert len(chunks) >= 8
+    return path.read_bytes(), found, chunks
+
+
+def spoiled(path, data, at, mask):
+    changed = bytearray(data)
+    changed[at] ^= mask
+    path.write_bytes(changed)
+    return contents(path)
+
+
+def test_one_damaged_byte_costs_at_most_the_chunk_that_it_is_in_and_is_reported(
+        tmp_path, recording):
+    data, everything, chunks = recording
+    rng, path = random.Random(37), tmp_path / "run.mcap"
+    spans = [(c.chunk_start_offset, c.chunk_start_offset + c.chunk_length, c.message_start_time,
+              c.message_end_time) for c in chunks]
+    heads = {start + byte for start, *_ in spans for byte in range(9)}
+    positions = sorted({*range(8, len(data), max(1, len(data) // 200)), *heads})
+    lossy = 0
+    for at in positions:
+        found, reader = spoiled(path, data, at, rng.randrange(1, 256))
+        hit = next((span for span in spans if span[0] <= at < span[1]), None)
+        outside = [one for one in everything if not (hit and hit[2] <= one[1] <= hit[3])]
+        assert [one for one in found if not (hit and hit[2] <= one[1] <= hit[3])] == outside, at
+        assert set(found) <= set(everything), at
+        if len(found) < len(everything):
+            lossy += 1
+            [gap] = reader.gaps
+            assert (gap.from_byte, gap.to_byte, gap.from_ns, gap.to_ns) == hit, at
+    assert lossy > 50
+
+
+def test_one_damaged_byte_of_a_recording_without_an_end_makes_no_message(tmp_path):
+    path = tmp_path / "run.mcap"
+    write(path, sample(200), flush_every=25, close=False).abandon()
+    everything, reader = contents(path)
+    data, rng = path.read_bytes(), random.Random(38)
+    assert not reader.closed
+    for at in range(8, len(data), max(1, len(data) // 150)):
+        found, reader = spoiled(path, data, at, rng.randrange(1, 256))
+        assert set(found) <= set(everything), at
+        assert len(found) == len(everything) or reader.gaps, at
+
+
+def test_an_index_of_messages_that_has_become_a_message_is_not_taken_for_one(tmp_path, recording):
+    data, everything, chunks = recording
+    after = chunks[2].chunk_start_offset + chunks[2].chunk_length
+    assert data[after] == 7
+    for index in (data, data[:-1]):  # the second one has no usable end
+        changed = index[:after] + bytes([5]) + index[after + 1:]
+        (tmp_path / "run.mcap").write_bytes(changed)
+        assert contents(tmp_path / "run.mcap")[0] == everything
+
+
+def test_a_damaged_attachment_is_left_out_and_reported(tmp_path, recording):
+    data, everything, _ = recording
+    at = data.index(b"[[node]]")
+    found, reader = spoiled(tmp_path / "run.mcap", data, at, 1)
+    assert found == everything
+    assert [gap.what.split(" (")[0] for gap in reader.gaps] == ["an attachment"]
+
+
+@pytest.fixture
+def torn(tmp_path, recording):
+    """A recording with one damaged chunk, and the index of that chunk."""
+    data, everything, chunks = recording
+    hit = chunks[2]
+    changed = bytearray(data)
+    changed[hit.chunk_start_offset + hit.chunk_length // 2] ^= 0xff
+    (tmp_path / "torn.mcap").write_bytes(changed)
+    return tmp_path / "torn.mcap", everything, hit
+
+
+def test_verbs_report_bytes_and_seconds_that_are_gone_and_exit_with_1(tmp_path, torn, capsys):
+    path, everything, hit = torn
+    assert main(["bag", "info", str(path), "--json"]) == 1
+    [gone] = json.loads(capsys.readouterr().out)["gone"]
+    assert (gone["from_byte"], gone["to_byte"]) == (
+        hit.chunk_start_offset, hit.chunk_start_offset + hit.chunk_length)
+    assert (gone["from_s"], gone["to_s"]) == (
+        round(hit.message_start_time / 1e9, 3), round(hit.message_end_time / 1e9, 3))
+    seconds = f"{gone['from_s']:.2f} to {gone['to_s']:.2f} s"
+    for verb in (["info", str(path)], ["repair", str(path), str(tmp_path / "whole.mcap")]):
+        assert main(["bag", *verb]) == 1
+        assert seconds in capsys.readouterr().out
+    found, reader = contents(tmp_path / "whole.mcap")
+    assert (0 < len(found) < len(everything), reader.gaps) == (True, [])
+    assert main(["bag", "info", str(tmp_path / "whole.mcap")]) == 0
+
+
+def test_a_bag_of_ros_2_reports_what_of_the_recording_is_gone(tmp_path, torn, capsys):
+    pytest.importorskip("rosbags")
+    path, _, hit = torn
+    assert main(["bag", "ros2", str(path), str(tmp_path / "ros"), "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert sum(told["messages"].values()) > 0
+    assert [gone["from_byte"] for gone in told["gone"]] == [hit.chunk_start_offset]
+    shutil.rmtree(tmp_path / "ros")
+    assert main(["bag", "ros2", str(path), str(tmp_path / "ros")]) == 1
+    assert f"bytes {hit.chunk_start_offset} to" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_file_of_others_without_checksums_and_index_is_read_whole(tmp_path, chunked):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, use_chunking=chunked, compression=CompressionType.ZSTD,
+                        enable_crcs=False, use_statistics=False)
+        writer.start("", "others")
+        channel = writer.register_channel("c", "json", 0)
+        for number in range(10):
+            writer.add_message(channel, number, b"{}", number)
+        writer.finish()
+    found, reader = contents(path)
+    assert (len(found), reader.damage, reader.closed) == (10, "", True)
