@@ -62,6 +62,8 @@ class Hmi(Actor):
         shown: topics that are heard for the page alone.
         panels: of the page, besides those that every page has and those of the specification.
         files: folder of the JavaScript and CSS that `panels` need; None for none.
+        badge: what the page calls its connection.
+        refuses: why no page of it may ask for anything; "" if they may.
     """
 
     class Parameters(Actor.Parameters, frozen=True):
@@ -78,6 +80,8 @@ class Hmi(Actor):
     parameters: Parameters
     panels: ClassVar[tuple[Panel, ...]] = ()
     files: ClassVar[Path | None] = None
+    badge: ClassVar[str] = "live"
+    refuses: ClassVar[str] = ""
     most_spare = "none"
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECT, ftm_topics.SIGNAL)
@@ -124,6 +128,7 @@ class Hmi(Actor):
     def _hello(self) -> dict[str, Any]:
         """Return what a page needs to know to begin; what it is not told of, it does not show."""
         return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
+                "badge": self.badge,
                 "system": clip(self.context.run.system.name),
                 "camera": self._camera is not None, "tables": self._state.picture.tables,
                 "panels": _PANELS.fit(self._panels)[0], "past": self._state.past()}
@@ -207,7 +212,8 @@ class Hmi(Actor):
         operating = self._operating
         return PageServer(
             access, Feed(self._state, self.clock.now, self._hello, self._look),
-            Handlers(self.requests, operating.introduction, self._fulfil, operating.left),
+            Handlers(self.requests, operating.introduction, self._fulfil, operating.left,
+                     self.refuses),
             lambda port: Gate(register, secret, port, tls=tls is not None, owner=owner), audit,
             tls=tls, camera=self._camera, files=self.files)
 

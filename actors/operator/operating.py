@@ -62,7 +62,11 @@ class Operating:
         self._state = state
         overhead_s = OVERHEAD_S * actor.clock.rate
         self._choice = StrategyChoice(f"{prefix}.s", "operator", tuple(STRATEGIES), overhead_s)
-        self._injections = Injections(f"{prefix}.f", run.plan.faults, places_of(run.system),
+        try:
+            places = places_of(run.system)
+        except ValueError:  # a replay, where the robot's own classes are not installed
+            places = ()
+        self._injections = Injections(f"{prefix}.f", run.plan.faults, places,
                                       (*run.application.topics, *actor.context.topics.values()),
                                       overhead_s)
         self._orders = (f"{prefix}.k{number}" for number in count(1))

@@ -84,12 +84,14 @@ class Handlers(msgspec.Struct, frozen=True):
         came: returns what a new page is told first.
         fulfil: acts on a page's request and returns what to tell it; raises RefusedError.
         left: hears of a page that was closed.
+        refuses: why no request of any page is met; "" if requests are.
     """
 
     requests: Sequence[type[Request]]
     came: Callable[[int], dict[str, Any]]
     fulfil: Callable[[Request, int], str | dict[str, Any]]
     left: Callable[[int], None]
+    refuses: str = ""
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -226,9 +228,14 @@ class PageServer:
         """Return who the page's visitor is, and what that keeps it from."""
         return {"type": "visitor", "name": visitor.name, "role": visitor.role,
                 "logs_out": self._gate.asks,
-                "barred": {str(kind.__struct_config__.tag): _bars(kind, visitor)
+                "barred": {str(kind.__struct_config__.tag): why
                            for kind in self._handlers.requests
-                           if not visitor.role.may(kind.role)}}
+                           if (why := self._bars(kind, visitor))}}
+
+    def _bars(self, kind: type[Request], visitor: Visitor) -> str:
+        """Return why a visitor may not ask for something; "" if it may."""
+        return self._handlers.refuses or ("" if visitor.role.may(kind.role) else (
+            f"Needs the role {kind.role}: you are {visitor.name}, with the role {visitor.role}"))
 
     async def _talk(self, socket_: WebSocket, fed: PageFeed, page: _Page) -> None:
         loop = asyncio.get_running_loop()
@@ -268,7 +275,7 @@ class PageServer:
             request = self._reader.read(text)
             if not self._gate.still(page.visitor):
                 raise RefusedError("your token is withdrawn, or your role was changed")
-            if why := _bars(type(request), page.visitor):
+            if why := self._bars(type(request), page.visitor):
                 raise RefusedError(why)
             told = self._handlers.fulfil(request, page.number)
         except (RequestError, RefusedError) as error:
@@ -281,12 +288,6 @@ class PageServer:
     def _heard(self, page: _Page, request: Request | None, **more: Any) -> None:
         asked = {} if request is None else msgspec.to_builtins(request)
         self._note(page, asked.pop("type", "message"), asked=asked, **more)
-
-
-def _bars(kind: type[Request], visitor: Visitor) -> str:
-    """Return why a visitor may not ask for something; "" if it may."""
-    return "" if visitor.role.may(kind.role) else (
-        f"Needs the role {kind.role}: you are {visitor.name}, with the role {visitor.role}")
 
 
 async def _until_one_ends(*parts: Coroutine[Any, Any, None]) -> None:

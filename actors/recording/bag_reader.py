@@ -291,9 +291,10 @@ class BagReader:
 _PRIVATE = 0x80
 """Kinds of records from here on are an application's own."""
 
-_WANTED = {Opcode.HEADER: "the header", Opcode.SCHEMA: "a schema", Opcode.CHANNEL: "a channel",
-           Opcode.MESSAGE: "a message", Opcode.CHUNK: "a chunk",
-           Opcode.ATTACHMENT: "an attachment", Opcode.METADATA: "metadata"}
+_WANTED: dict[int, str] = {
+    Opcode.HEADER: "the header", Opcode.SCHEMA: "a schema", Opcode.CHANNEL: "a channel",
+    Opcode.MESSAGE: "a message", Opcode.CHUNK: "a chunk", Opcode.ATTACHMENT: "an attachment",
+    Opcode.METADATA: "metadata"}
 
 
 class _Entry(msgspec.Struct):

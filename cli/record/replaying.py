@@ -13,7 +13,7 @@ import os
 import socket
 import tempfile
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,12 +32,11 @@ from rampart.actors.bus.zenoh_session import endpoint
 from rampart.actors.layout.layout import application_class
 from rampart.actors.layout.wiring import load_class
 from rampart.actors.operator.hmi import Hmi
-from rampart.actors.operator.requests import RefusedError, Request
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import Forms, header_of, renumbered
-from rampart.actors.recording.run_documents import NOT_CHOSEN, SYSTEM, File, Known, restore
+from rampart.actors.recording.run_documents import NOT_CHOSEN, SYSTEM, Known, restore
 from rampart.actors.run import run_info
-from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_context import NO_SYSTEM, RunContext
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
@@ -45,7 +44,7 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.cli import systems
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.session import pause
-from rampart.manager.spec.schema import Kind, SystemSpec
+from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.specification import check_document, read_document
 
 DEFAULT_PORT = 7400
@@ -66,8 +65,8 @@ _LINGER_S = 0.3
 class ReplayPage(Hmi):
     """The operator's page on a replay: it shows everything, and nothing can be asked of it."""
 
-    def _fulfil(self, request: Request, page: int) -> str | dict[str, Any]:  # noqa: ARG002
-        raise RefusedError("this is a replay: there is no robot to obey")
+    badge = "replay"
+    refuses = "This is a replay: there is no robot to obey"
 
     def _look(self) -> None:
         """Measure nothing: the recorded process numbers may be anybody's today."""
@@ -96,7 +95,7 @@ class Replay:
                  wants: Callable[[str], bool] = lambda _key: True, hmi_port: int = 0,
                  said: Callable[[str], None] = lambda _line: None) -> None:
         self.summary = summary = Summary(BagReader(path))
-        self._document, self._known = recorded_system(self.summary.files)
+        self._document, self._known = recorded_system(summary)
         self._forms = Forms(self._known.topics)
         self.played = 0
         self.refused = 0
@@ -275,7 +274,7 @@ class Replay:
         with contextlib.suppress(ValueError, OSError):  # a page without a map shows the rest
             restore(self.summary.files, folder)
             run = replace(run, application=self._known.kind.restored(folder))
-        kind = page_of(self._known.system)
+        kind = page_of(self._known)
         page: type[Hmi] = ReplayPage if kind is Hmi else type("ReplayPage", (ReplayPage, kind), {})
         return page(Context(
             PAGE, 1, clock, SharedBus(bus), {"panels": tuple(
@@ -283,18 +282,22 @@ class Replay:
             topics={topic.key: topic for topic in self._known.topics}))
 
 
-def recorded_system(files: Sequence[File]) -> tuple[dict[str, Any], Known]:
-    """Return the system of a recording, as TOML and read; without an application the shipped one's.
+def recorded_system(summary: Summary) -> tuple[dict[str, Any], Known]:
+    """Return the system of a recording, as TOML and read.
 
-    The former is empty, and the latter the shipped system, if the recorded one cannot be read: a
-    recording of before 0.7 says no application, and one of long ago has another schema.
+    A recording of before 0.7 is of the shipped robot and names no application: its run has an
+    airport. Where its system cannot be read, because its schema is another, the shipped one counts.
+    The TOML is empty if the recorded system cannot be read.
     """
     shipped = systems.load(None)
+    is_shipped = bool(summary.run.get("airport"))
     document: dict[str, Any] = {}
-    found = shipped
+    found = shipped if is_shipped else NO_SYSTEM
     with contextlib.suppress(StopIteration, ValueError):
-        text = next(data for name, _, data in files if name == SYSTEM).decode()
-        document = {"application": dict(shipped.application), **read_document(text, SYSTEM)}
+        text = next(data for name, _, data in summary.files if name == SYSTEM).decode()
+        document = read_document(text, SYSTEM)
+        if is_shipped:
+            document = {"application": dict(shipped.application), **document}
         found = check_document(document, SYSTEM)
     try:
         return document, Known(found, application_class(found))
@@ -302,9 +305,11 @@ def recorded_system(files: Sequence[File]) -> tuple[dict[str, Any], Known]:
         return document, Known(found)
 
 
-def page_of(system: SystemSpec) -> type[Hmi]:
+def page_of(known: Known) -> type[Hmi]:
     """Return the class of the operator's page of a system; before 0.7 it was the shipped one's."""
-    for spec in (system, systems.load(None)):
+    shipped = systems.load(None)
+    is_shipped = known.kind is application_class(shipped)
+    for spec in (known.system, *((shipped,) if is_shipped else ())):
         for node in spec.nodes:
             with contextlib.suppress(ValueError):
                 if node.kind is Kind.NON_CONTROL and issubclass(

@@ -42,7 +42,7 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
             raise UsageError(f"{file}: an MCAP file of {reader.library or 'others'}, not a "
                              "recording of a run")
         if system is None:
-            _, known = recorded_system(summary.files)
+            _, known = recorded_system(summary)
             spec, topics = known.system, known.topics
         else:
             spec = systems.load(system)

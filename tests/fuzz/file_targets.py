@@ -309,7 +309,7 @@ def _foreign(compression: CompressionType) -> bytes:
 def mcap_info(data: bytes) -> None:
     summary = Summary(BagReader(written("bag.mcap", data)))
     msgspec.json.encode(described(summary))
-    recorded_system(summary.files)
+    recorded_system(summary)
     restore([file for file in summary.files if len(file[2]) < 1 << 16], folder())
 
 

@@ -36,6 +36,7 @@ let retryMs = 500;
 let retry = 0;
 let lastHeard = 0;
 let toastTimer = 0;
+let badge = "";              // what the HMI calls this connection: live, or replay
 
 const SILENT_MS = 4000;      // the HMI speaks once a second at least
 const OPENING_MS = 10000;
@@ -101,7 +102,7 @@ function receive(message) {
 // ---- the picture: sections arrive when they changed, and are drawn with the next frame ----------
 
 function take(message) {
-  link("good", "live");
+  link(badge === "live" ? "good" : "warn", badge);
   for (const [name, value] of Object.entries(message)) {
     if (LOGS.includes(name)) fresh[name] = [...fresh[name], ...value].slice(-LINES);
     else if (tables.includes(name)) picture[name] = merged(picture[name], value);
@@ -152,6 +153,7 @@ function toast(text) {
 async function hello(message) {
   const from = socket;
   retryMs = 500;
+  badge = message.badge;
   tables = message.tables;
   picture = {};
   fresh = { decisions: [], events: [] };
