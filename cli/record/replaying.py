@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import re
 import socket
 import tempfile
 import time
@@ -58,6 +59,7 @@ _STRANGE: Topic[Any] = Topic("", Message, Qos.SENSOR, 0, "", "What was recorded 
 _Due = tuple[int, float, str, bytes]
 """Lap, simulated time, key, and payload as it was recorded."""
 
+_BEFORE_0_7 = re.compile(r"0\.[0-6]\b")
 _YIELD_EVERY = 50
 _LINGER_S = 0.3
 
@@ -285,12 +287,12 @@ class Replay:
 def recorded_system(summary: Summary) -> tuple[dict[str, Any], Known]:
     """Return the system of a recording, as TOML and read.
 
-    A recording of before 0.7 is of the shipped robot and names no application: its run has an
-    airport. Where its system cannot be read, because its schema is another, the shipped one counts.
-    The TOML is empty if the recorded system cannot be read.
+    A recording of before 0.7 is of the shipped robot and names no application. Where its system
+    cannot be read, because its schema is another, the shipped one counts. The TOML is empty if the
+    recorded system cannot be read.
     """
     shipped = systems.load(None)
-    is_shipped = bool(summary.run.get("airport"))
+    is_shipped = _BEFORE_0_7.match(summary.run.get("rampart_version", "")) is not None
     document: dict[str, Any] = {}
     found = shipped if is_shipped else NO_SYSTEM
     with contextlib.suppress(StopIteration, ValueError):

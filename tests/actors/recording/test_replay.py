@@ -375,7 +375,8 @@ def test_messages_of_another_version_are_left_out_and_counted(tmp_path, port, ca
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("rampart")
-        writer.add_metadata("rampart.run", {"time_zero_s": "0", "airport": "vallombre"})
+        writer.add_metadata("rampart.run", {
+            "time_zero_s": "0", "rampart_version": "0.6.2"})
         channel = writer.register_channel("localization/pose", "json", 0, {
             "key": topics.POSE.at()})
         writer.add_message(channel, 0, texts[0], 0)
@@ -390,7 +391,7 @@ def test_the_system_of_a_recording_of_0_6_is_that_of_the_shipped_robot():
     head, _, rest = text.partition("[application]")
     old = head + rest[rest.index("\n["):].replace(
         "rampart.actors.osmosis.page.hmi:OsmosisHmi", "actors.hmi:Hmi")
-    run = SimpleNamespace(run={"airport": "vallombre"}, files=[("system.toml", "", old.encode())])
+    run = SimpleNamespace(run={"rampart_version": "0.6.0"}, files=[("system.toml", "", old.encode())])
     document, known = replaying.recorded_system(run)
     assert document["node"][4]["actor"] == "actors.hmi:Hmi"
     assert (known.kind, known.topics) == (Osmosis, topics.ALL)
