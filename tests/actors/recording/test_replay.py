@@ -391,7 +391,8 @@ def test_the_system_of_a_recording_of_0_6_is_that_of_the_shipped_robot():
     head, _, rest = text.partition("[application]")
     old = head + rest[rest.index("\n["):].replace(
         "rampart.actors.osmosis.page.hmi:OsmosisHmi", "actors.hmi:Hmi")
-    run = SimpleNamespace(run={"rampart_version": "0.6.0"}, files=[("system.toml", "", old.encode())])
+    run = SimpleNamespace(run={"rampart_version": "0.6.0"},
+                          files=[("system.toml", "", old.encode())])
     document, known = replaying.recorded_system(run)
     assert document["node"][4]["actor"] == "actors.hmi:Hmi"
     assert (known.kind, known.topics) == (Osmosis, topics.ALL)
