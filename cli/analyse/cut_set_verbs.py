@@ -21,6 +21,7 @@ from rampart.cli.output import (
     say,
     say_text,
     using,
+    warn,
 )
 from rampart.cli.session import connect
 from rampart.cli.verbs import JSON, PORT, add_verb, flag, option, whole, word
@@ -41,7 +42,8 @@ def add(verbs: Any) -> None:
     add_verb(verbs, "cut-sets", "minimal cut sets of a fault tree, and the barriers on them", run,
              PORT, systems.choice("file", ", or Open-PSA .xml"), flag("--count", "only count"),
              word("--top", "GATE", "top gate of an Open-PSA file", ""),
-             whole("--max-order", "K", "no sets with more events"),
+             whole("--max-order", "K", "neither make nor count sets with more events"),
+             flag("--strict", "refuse an Open-PSA file of which there is a warning"),
              whole("--limit", "N", f"list no more than N sets (default {_LIMIT})", _LIMIT),
              option("--active", nargs="+", default=[], metavar="FTM",
                     help="what is left before the top if these mechanisms are active"),
@@ -84,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
         return _show_outlook(spec, options.active, as_json=options.json)
     try:
         with progress() as show:
-            found = CutSets(formula, progress=show)
+            found = CutSets(formula, progress=show, max_order=options.max_order)
         if not options.count:
             return _list(spec, formula, found, options)
     except TooLargeError as error:
@@ -92,15 +94,28 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print_json({"top": formula.top, "minimal_cut_sets": found.count})
     else:
-        say(f"{formula.top}: {found.count} minimal cut sets")
+        say(f"{formula.top}: {found.count} minimal cut sets{_of_order(options)}")
     return 0
+
+
+def _of_order(options: argparse.Namespace) -> str:
+    return "" if options.max_order is None else f" of at most {options.max_order} events"
+
+
+def _refuse(doubt: OpenPsaError) -> None:
+    raise doubt
+
+
+def _warn(doubt: OpenPsaError) -> None:
+    warn(str(doubt))
 
 
 def _load(options: argparse.Namespace) -> tuple[SystemSpec | None, Formula]:
     if options.file and options.file.lower().endswith(".xml"):
         with using(options.file), refusing(OpenPsaError):
             text = read_bytes(Path(options.file), MAX_BYTES)
-            return None, read_open_psa(text, options.file, options.top)
+            return None, read_open_psa(text, options.file, options.top,
+                                       _refuse if options.strict else _warn)
     spec = systems.load(options.file)
     try:
         formula = formula_of(spec.build_fault_tree())
@@ -113,7 +128,7 @@ def _load(options: argparse.Namespace) -> tuple[SystemSpec | None, Formula]:
 
 def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: argparse.Namespace
           ) -> int:
-    sets = list(found.sets(options.limit, options.max_order))
+    sets = list(found.sets(options.limit))
     guarded = guard(spec, sets) if spec is not None and not options.top else ()
     if options.json:
         print_json({
@@ -121,7 +136,7 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
             "coherent": formula.is_monotone,
             "sets": guarded or [{"events": events} for events in sets]})
         return 0
-    say(f"{formula.top}: {found.count} minimal cut sets"
+    say(f"{formula.top}: {found.count} minimal cut sets{_of_order(options)}"
         + ("" if formula.is_monotone else " (not coherent: sets of which exactly these occur)"))
     for size, count in enumerate(found.sizes):
         if count:

@@ -15,6 +15,7 @@ The way, for trees with hundreds of events and millions of cut sets:
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import reduce
@@ -37,6 +38,12 @@ from rampart.manager.analysis.zbdd import (
 
 BOUNDS = (30_000, 300_000, 1_000_000, 5_000_000, 20_000_000)
 """Nodes of a decision diagram: each bound is tried with every variable order before the next."""
+
+_LEVELS = 20_000
+"""Variables of a diagram: the library recurses by level, and ends the process without a stack."""
+
+_STACK = str(64 << 20)
+"""Bytes for each thread of the library, which takes 1 GB of address space unless told otherwise."""
 
 _LISTING_LEVELS = 800
 """Modules within modules, and events in one, for listing; counting has no such limit."""
@@ -74,6 +81,7 @@ class CutSets:
         formula: The fault tree.
         bounds: On the nodes of a decision diagram.
         progress: Told in words what is being done.
+        max_order: Sets with more events are neither made nor counted; None for all.
 
     Attributes:
         sizes: How many minimal cut sets there are of each size, from 0 up.
@@ -83,17 +91,19 @@ class CutSets:
     """
 
     def __init__(self, formula: Formula, bounds: Sequence[int] = BOUNDS,
-                 progress: Progress = lambda _: None) -> None:
+                 progress: Progress = lambda _: None, max_order: int | None = None) -> None:
         self.formula = formula
+        self._max_order = max_order
         self._gates, modules = prepare(formula)
         self._modules: dict[str, _Module] = {}
         self._constants = dict(formula.house)
+        managers = _Managers()
         for number, name in enumerate(modules, 1):
             progress(f"module {number} of {len(modules)}: {name}")
-            module = self._modules[name] = self._solve(name, bounds, progress)
-            if module.family in {EMPTY, UNIT}:  # by house events below it
+            module = self._modules[name] = self._solve(name, bounds, progress, managers)
+            if module.family in {EMPTY, UNIT}:  # by house events below it, or all sets too large
                 self._constants[name] = module.family == UNIT
-        weight = self._weight(formula.top)
+        weight = self._kept(self._weight(formula.top))
         self.sizes = tuple(weight.get(size, 0) for size in range(max(weight, default=-1) + 1))
 
     @property
@@ -101,13 +111,11 @@ class CutSets:
         """How many minimal cut sets there are."""
         return sum(self.sizes)
 
-    def sets(self, limit: int | None = None, max_order: int | None = None
-             ) -> Iterator[tuple[str, ...]]:
+    def sets(self, limit: int | None = None) -> Iterator[tuple[str, ...]]:
         """Yield minimal cut sets, smaller ones first.
 
         Args:
             limit: No more than so many.
-            max_order: None with more events than this.
 
         Raises:
             TooLargeError: The tree is nested too deeply to list its sets; they can be counted.
@@ -121,8 +129,7 @@ class CutSets:
             raise TooLargeError(f"nested {levels} levels deep, too deeply to list the sets; they "
                                 "can be counted, --count")
         found = chain.from_iterable(
-            self._of_size(self.formula.top, size) for size in range(len(self.sizes))
-            if max_order is None or size <= max_order)
+            self._of_size(self.formula.top, size) for size in range(len(self.sizes)))
         for one in islice(found, None if limit is None else max(0, limit)):
             yield tuple(sorted(one))
 
@@ -134,6 +141,10 @@ class CutSets:
         if name in self.formula.house:
             return {0: 1} if self.formula.house[name] else {}
         return {1: 1}
+
+    def _kept(self, sizes: Mapping[int, int]) -> Mapping[int, int]:
+        return {size: count for size, count in sizes.items()
+                if self._max_order is None or size <= self._max_order}
 
     def _of_size(self, name: str, size: int) -> Iterator[frozenset[str]]:
         module = self._modules.get(name)
@@ -166,25 +177,53 @@ class CutSets:
                     known[one] |= known[families.high[one]] << size
         return known[node]
 
-    def _solve(self, top: str, bounds: Sequence[int], progress: Progress) -> _Module:
+    def _solve(self, top: str, bounds: Sequence[int], progress: Progress, managers: _Managers
+               ) -> _Module:
         inside = _Inside(self._gates, self._modules, self._constants, top)
+        if len(inside.leaves) > _LEVELS:
+            raise TooLargeError(f"gate {top!r} with {len(inside.leaves)} inputs and modules: more "
+                                f"than {_LEVELS}")
         for bound in bounds:
             progress(f"{top}: up to {bound} nodes")
             # To build a diagram is cheap, to find its minimal solutions is not: try all orders.
             built = [(diagram, order) for order in inside.orders()
-                     if (diagram := inside.diagram(order, bound)) is not None]
+                     if (diagram := inside.diagram(order, managers.of(bound, len(order))))
+                     is not None]
             for diagram, order in sorted(built, key=lambda found: len(found[0].level)):
-                families = Families(bound)
+                families = Families(bound, self._max_order,
+                                    [min(self._weight(name)) for name in order] or [0])
                 try:
                     with deep_recursion(len(order)):
                         family = diagram.minimal_solutions(
                             len(diagram.level) - 1, families, monotone=self.formula.is_monotone)
                 except TooManyNodesError:
                     continue
-                weight = families.sizes(family, [self._weight(name) for name in order])
+                weight = self._kept(
+                    families.sizes(family, [self._weight(name) for name in order]))
                 return _Module(order, families, family, weight, {EMPTY: 0, UNIT: 1})
         raise TooLargeError(f"gate {top!r} with {len(inside.leaves)} inputs and modules: more than "
                             f"{bounds[-1]} nodes with every variable order tried")
+
+
+class _Managers:
+    """Managers of decision diagrams, one for each bound, used again for each diagram.
+
+    Each has two threads of its own and its stacks, which it keeps for a while after its end.
+    """
+
+    def __init__(self) -> None:
+        self._of: dict[int, BDDManager] = {}
+
+    def of(self, bound: int, variables: int) -> BDDManager:
+        """Return the empty manager of so many nodes, with so many variables at least."""
+        manager = self._of.get(bound)
+        if manager is None:
+            os.environ.setdefault("OXIDD_STACK_SIZE", _STACK)  # read when a manager is made
+            manager = self._of[bound] = BDDManager(bound, max(1024, bound // 4), 1)
+        manager.gc()
+        if (more := variables - manager.num_vars()) > 0:
+            manager.add_vars(more)
+        return manager
 
 
 class _Inside:
@@ -219,16 +258,14 @@ class _Inside:
             lambda inputs: inputs[::-1])
         return dict.fromkeys(self._search(way)[1] for way in ways)
 
-    def diagram(self, order: tuple[str, ...], bound: int) -> Diagram | None:
-        """Return the module's decision diagram, or None if it grows beyond a bound."""
-        manager = BDDManager(bound, max(1024, bound // 4), 1)
+    def diagram(self, order: tuple[str, ...], manager: BDDManager) -> Diagram | None:
+        """Return the module's decision diagram, or None if it grows beyond the manager's bound."""
         try:
             return _as_numbers(self._build(manager, order))
         except DDMemoryError:
             return None
 
     def _build(self, manager: BDDManager, order: tuple[str, ...]) -> BDDFunction:
-        manager.add_vars(len(order))
         value = {name: manager.var(i) for i, name in enumerate(order)}
         for name, state in self._house.items():
             value[name] = manager.true() if state else manager.false()

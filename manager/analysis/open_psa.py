@@ -3,17 +3,18 @@
 Read are fault trees with everything that decides which sets of events make the top occur: gates
 with all standard connectives, nested formulas, components with private names, house events.
 Probabilities, parameters, labels, attributes and event trees are accepted and left aside: cut sets
-do not depend on them. Common-cause groups and substitutions would change the cut sets and are
-refused.
+do not depend on them. Common-cause groups, substitutions and includes would change the cut sets.
+They are refused, and so is every other element, attribute or text that the reader does not know.
 
 XML from strangers is read without document type definitions, entities, or anything external.
 """
 
 from __future__ import annotations
 
+import difflib
 import xml.etree.ElementTree as ET
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from itertools import count
 
@@ -53,31 +54,69 @@ _PATH_SHOWN = 300
 """Characters of a path beyond which nothing is added to it."""
 
 _ASIDE = frozenset({"label", "attributes"})
+_CONTAINERS = ("define-fault-tree", "define-component", "model-data")
 _DEFINITIONS = {"define-gate": "gate", "define-basic-event": "basic-event",
                 "define-house-event": "house-event"}
+_JOIN = "other files are not read; join them first, for example with 'xmllint --xinclude'"
 _UNSUPPORTED = {
     "define-CCF-group": "common-cause groups would change the cut sets",
     "define-substitution": "substitutions would change the cut sets",
-    "include": "other files are not read",
+    "include": _JOIN, "{http://www.w3.org/2001/XInclude}include": _JOIN,
 }
+_OF_EVENT_TREES = frozenset({
+    "define-alignment", "define-consequence", "define-consequence-group", "define-event-tree",
+    "define-functional-event", "define-initiating-event", "define-rule", "define-sequence"})
+_LEFT_ASIDE = _ASIDE | _OF_EVENT_TREES | {
+    "define-parameter", "define-extern-library", "define-extern-function"}
+_ATTRIBUTES = {
+    "constant": {"value"}, "event": {"name", "type"}, "gate": {"name"}, "basic-event": {"name"},
+    "house-event": {"name"}, "atleast": {"min"}, "cardinality": {"min", "max"},
+    "define-gate": {"name", "role"}, "define-basic-event": {"name", "role"},
+    "define-house-event": {"name", "role"}, "define-fault-tree": {"name", "role"},
+    "define-component": {"name", "role"}}
+_XML = "{http://www.w3.org/XML/1998/namespace}"
+_WARNED_OF = 20
+"""Doubts that are reported of a file; more say nothing new."""
+
+_COMPARED = 2000, 60
+"""How many names, and of how many characters, are compared with a misspelt one."""
 
 
 _Path = tuple[str, ...]
 
 
 class OpenPsaError(ValueError):
-    """A file that cannot be read. The message is one line: file, path, what is wrong."""
+    """A file that cannot be read. The message is one line: file, line, path, what is wrong.
 
-    def __init__(self, file: str, path: str, problem: str) -> None:
-        super().__init__(plain_line(f"{file}: {path}: {problem}"))
+    Args:
+        file: Name of the file.
+        path: Of the element.
+        problem: What is wrong with it.
+        line: Of the element in the file; 0 if the problem is the file's.
+    """
+
+    def __init__(self, file: str, path: str, problem: str, line: int = 0) -> None:
+        where = f"{file}:{line}" if line else file
+        super().__init__(plain_line(f"{where}: {path}: {problem}"))
+
+
+class _Element(ET.Element):
+    """An element that knows its line."""
+
+    line = 0
 
 
 class _BoundedBuilder(ET.TreeBuilder):
-    """Makes elements of XML until there are too many, or one lies too deep."""
+    """Makes elements of XML until there are too many, or one lies too deep.
+
+    Attributes:
+        line: Returns the line at which the parser is.
+    """
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(element_factory=_Element)
         self._depth = self._count = 0
+        self.line: Callable[[], int] = int
 
     def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
         """Open an element."""
@@ -88,7 +127,9 @@ class _BoundedBuilder(ET.TreeBuilder):
                             "formulas as gates")
         if self._count > MAX_ELEMENTS:
             raise FileError(f"more than {MAX_ELEMENTS} elements")
-        return super().start(tag, attrs)
+        element = super().start(tag, attrs)
+        element.line = self.line()  # type: ignore[attr-defined]  # made by the factory
+        return element
 
     def end(self, tag: str, /) -> ET.Element:
         """Close an element."""
@@ -103,7 +144,7 @@ class _Definition(msgspec.Struct, frozen=True):
     path: str
     place: _Path
     private: bool
-    element: ET.Element
+    element: _Element
 
     @property
     def name(self) -> str:
@@ -111,21 +152,30 @@ class _Definition(msgspec.Struct, frozen=True):
         return ".".join(self.place) if self.private else self.place[-1]
 
 
-def read_open_psa(text: str | bytes, file: str, top: str = "") -> Formula:
-    """Read a fault tree.
+Doubt = Callable[[OpenPsaError], None]
+
+
+def read_open_psa(text: str | bytes, file: str, top: str = "",
+                  doubt: Doubt = lambda _: None) -> Formula:
+    """Read a fault tree. Spaces around names do not count.
 
     Args:
         text: XML.
         file: Name to use in messages.
         top: Name of the top gate; "" for the only gate that no other one uses.
+        doubt: Called with each thing that is allowed and probably a mistake: an event that is
+            used and not defined, names that differ only in case, an input twice, alignments. To
+            refuse the file it raises what it is given.
 
     Raises:
-        OpenPsaError: The text is no XML, or no MEF, or makes no sense.
+        OpenPsaError: The text is not XML, or not MEF, or has something that is not understood.
     """
     try:
         check_size(text, MAX_BYTES)
-        parser = DefusedXMLParser(target=_BoundedBuilder(), forbid_dtd=True, forbid_entities=True,
+        builder = _BoundedBuilder()
+        parser = DefusedXMLParser(target=builder, forbid_dtd=True, forbid_entities=True,
                                   forbid_external=True)
+        builder.line = lambda: parser.parser.CurrentLineNumber
         parser.feed(text)
         root = parser.close()
     except DefusedXmlException as error:
@@ -137,14 +187,17 @@ def read_open_psa(text: str | bytes, file: str, top: str = "") -> Formula:
         raise OpenPsaError(file, "/", f"not well-formed XML: {error}") from None
     if root.tag != "opsa-mef":
         raise OpenPsaError(file, f"/{root.tag[:60]}", "expected the root element 'opsa-mef'")
-    return _Reader(root, file).formula(top)
+    return _Reader(root, file, doubt).formula(top)
 
 
 class _Reader:
     """Reads one document."""
 
-    def __init__(self, root: ET.Element, file: str) -> None:
+    def __init__(self, root: _Element, file: str, doubt: Doubt) -> None:
         self._error = partial(OpenPsaError, file)
+        self._doubts = 0
+        self._report = doubt
+        self._undeclared: dict[str, tuple[str, int]] = {}
         self._definitions: dict[_Path, _Definition] = {}
         self._public: dict[str, _Definition] = {}
         self._gates: dict[str, Connective] = {}
@@ -154,48 +207,97 @@ class _Reader:
             name = definition.place[-1]
             earlier = self._definitions.get(definition.place) or (
                 None if definition.private else self._public.get(name))
-            # An event may be used in a fault tree and given its probability in the model data.
             if earlier is not None:
                 raise self._error(definition.path,
-                                  f"duplicate name {name!r}, already defined at {earlier.path}")
+                                  f"duplicate name {name!r}, already defined at {earlier.path}",
+                                  definition.element.line)
             self._definitions[definition.place] = definition
             if not definition.private:
                 self._public[name] = definition
 
     # -- definitions ----------------------------------------------------------------------------
 
-    def _find(self, root: ET.Element) -> Iterator[_Definition]:
-        stack: list[tuple[ET.Element, str, _Path, bool]] = [(root, "/opsa-mef", (), False)]
+    def _find(self, root: _Element) -> Iterator[_Definition]:
+        stack: list[tuple[_Element, str, _Path, bool]] = [(root, "/opsa-mef", (), False)]
+        containers: dict[_Path, str] = {}
         while stack:
             parent, path, place, private = stack.pop()
             inner = []
             counts = Counter[str]()
             if len(place) > MAX_CONTAINERS:
                 raise self._error(
-                    path, f"more than {MAX_CONTAINERS} fault trees and components in each other")
-            for element in parent:
-                tag = element.tag
+                    path, f"more than {MAX_CONTAINERS} fault trees and components in each other",
+                    parent.line)
+            self._check_text(parent, path)
+            element: _Element
+            for element in parent:  # type: ignore[assignment]  # made by the factory
+                tag, line = element.tag, element.line
                 counts[tag] += 1
-                name = element.get("name", "")
+                name = element.get("name", "").strip()
                 here = f"{path}/{tag}[{f'@name={shown(name)}' if name else counts[tag]}]"
                 if tag in _UNSUPPORTED:
-                    raise self._error(here, f"not supported: {_UNSUPPORTED[tag]}")
-                role = element.get("role", "")
+                    raise self._error(here, f"not supported: {_UNSUPPORTED[tag]}", line)
+                if tag in _LEFT_ASIDE:
+                    if tag == "define-alignment":
+                        self._doubt(here, "alignments are left aside: each house event has the "
+                                          "state of its definition", line)
+                    continue
+                self._check_known(element, here, (*_CONTAINERS, *_DEFINITIONS))
+                role = element.get("role", "").strip()
+                if role not in {"", "public", "private"}:
+                    raise self._error(here, f"role {shown(role)}: expected 'public' or 'private'",
+                                      line)
                 hidden = role == "private" or (private and role != "public")
-                if tag in {"define-fault-tree", "define-component", "model-data"}:
-                    below = place if tag == "model-data" else (*place, self._checked(name, here))
-                    inner.append((element, here, below, hidden))
-                elif tag in _DEFINITIONS:
-                    yield _Definition(_DEFINITIONS[tag], here,
-                                      (*place, self._checked(name, here)), hidden, element)
+                if tag == "model-data":
+                    inner.append((element, here, place, hidden))
+                    continue
+                own = (*place, self._checked(name, here, line))
+                if tag in _DEFINITIONS:
+                    yield _Definition(_DEFINITIONS[tag], here, own, hidden, element)
+                    continue
+                if own in containers:
+                    raise self._error(here, f"duplicate name {name!r}, already defined at "
+                                            f"{containers[own]}", line)
+                containers[own] = f"{here}, line {line}"
+                inner.append((element, here, own, hidden))
             stack.extend(reversed(inner))
 
-    def _checked(self, name: str, path: str) -> str:
+    def _checked(self, name: str, path: str, line: int) -> str:
         if not name or "." in name:
-            raise self._error(path, f"name {shown(name)}: expected a name without dots")
+            raise self._error(path, f"name {shown(name)}: expected a name without dots", line)
         if len(name) > MAX_NAME:
-            raise self._error(path, f"name {shown(name)}: expected at most {MAX_NAME} characters")
+            raise self._error(path, f"name {shown(name)}: expected at most {MAX_NAME} characters",
+                              line)
         return name
+
+    def _check_known(self, element: _Element, path: str, known: Collection[str],
+                     what: str = "element") -> None:
+        """Refuse an element, or an attribute of one, that the format does not have here."""
+        tag, line = element.tag, element.line
+        if tag not in known:
+            near = difflib.get_close_matches(tag.rpartition("}")[2][:MAX_NAME], known, 1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise self._error(path, f"unknown {what}; {hint}known: {', '.join(known)}", line)
+        allowed = _ATTRIBUTES.get(tag, set())
+        for name in element.attrib:
+            if name not in allowed and not name.startswith(_XML):
+                raise self._error(path, f"unknown attribute {shown(name)}; known: "
+                                        f"{', '.join(sorted(allowed)) or 'none'}", line)
+
+    def _check_text(self, element: _Element, path: str, *, empty: bool = False) -> None:
+        """Refuse text where only elements have a meaning, and where it has to be `empty` these."""
+        texts = (element.text, *(child.tail for child in element))
+        stray = next((text.strip() for text in texts if text and text.strip()), "")
+        if stray:
+            raise self._error(path, f"unexpected text {shown(stray)}", element.line)
+        if empty and len(element):
+            raise self._error(path, f"unexpected element {shown(element[0].tag)} inside",
+                              element.line)
+
+    def _doubt(self, path: str, problem: str, line: int) -> None:
+        self._doubts += 1
+        if self._doubts <= _WARNED_OF:
+            self._report(self._error(path, problem, line))
 
     # -- formulas -------------------------------------------------------------------------------
 
@@ -205,29 +307,54 @@ class _Reader:
             if definition.kind == "gate":
                 self._define_gate(definition)
             elif definition.kind == "house-event":
-                constant = definition.element.find("constant")
-                self._house[definition.name] = (
-                    constant is not None and self._truth(constant, definition.path))
+                self._house[definition.name] = self._state(definition)
             else:
-                self._basic.add(definition.name)
+                self._define_basic_event(definition)
         if top and top not in self._gates:
             raise self._error("/opsa-mef", f"unknown top gate {top!r}; known: "
                                            f"{first_few(self._gates)}")
+        self._warn_of_names()
         try:
             return Formula(self._gates, frozenset(self._basic), self._house, top)
         except FormulaError as error:
             raise self._error("/opsa-mef", str(error)) from None
 
-    def _truth(self, constant: ET.Element, path: str) -> bool:
-        value = constant.get("value", "")
+    def _state(self, definition: _Definition) -> bool:
+        """Return the state of a house event: false, as the format has it, unless it says one."""
+        bodies = self._bodies(definition)
+        for body in bodies:
+            self._check_known(body, f"{definition.path}/{body.tag}", ("constant",))
+        if len(bodies) > 1:
+            raise self._error(definition.path, f"{len(bodies)} constants; a house event has one",
+                              definition.element.line)
+        return bool(bodies) and self._truth(bodies[0], definition.path)
+
+    def _define_basic_event(self, definition: _Definition) -> None:
+        """Note a basic event. Its probability is left aside, and must be one, not a formula."""
+        for inner in definition.element.iter():
+            if inner.tag in REFERENCES:
+                raise self._error(definition.path, f"a basic event has no formula, found "
+                                                   f"{inner.tag!r}", definition.element.line)
+        self._basic.add(definition.name)
+
+    def _bodies(self, definition: _Definition) -> list[_Element]:
+        self._check_text(definition.element, definition.path)
+        return [child for child in definition.element  # type: ignore[misc]  # of the factory
+                if child.tag not in _ASIDE]
+
+    def _truth(self, constant: _Element, path: str) -> bool:
+        self._check_text(constant, f"{path}/constant", empty=True)
+        value = constant.get("value", "").strip()
         if value not in {"true", "false"}:
-            raise self._error(f"{path}/constant", f"value {value!r}: expected 'true' or 'false'")
+            raise self._error(f"{path}/constant", f"value {value!r}: expected 'true' or 'false'",
+                              constant.line)
         return value == "true"
 
     def _define_gate(self, definition: _Definition) -> None:
-        bodies = [child for child in definition.element if child.tag not in _ASIDE]
+        bodies = self._bodies(definition)
         if len(bodies) != 1:
-            raise self._error(definition.path, f"{len(bodies)} formulas; a gate has exactly one")
+            raise self._error(definition.path, f"{len(bodies)} formulas; a gate has exactly one",
+                              definition.element.line)
         name = definition.name
         pending = [(name, bodies[0], definition.path)]
         place = definition.place[:-1]
@@ -235,14 +362,18 @@ class _Reader:
         while pending:  # nested formulas become gates named after the one they are in
             own, body, path = pending.pop()
             here = f"{path}/{body.tag}" if len(path) < _PATH_SHOWN else f"{path[:_PATH_SHOWN]}..."
+            if body.tag not in REFERENCES:
+                self._check_known(body, here[:200], (*CONNECTIVES, "constant"), "connective")
             if body.tag in REFERENCES:
                 self._gates[own] = Connective((self._refer(body, place, here),), 1, 1)
             elif body.tag == "constant":
                 self._house[f"{own}{GENERATED}constant"] = self._truth(body, path)
                 self._gates[own] = Connective((f"{own}{GENERATED}constant",), 1, 1)
-            elif body.tag in CONNECTIVES:
+            else:
+                self._check_text(body, here)
                 inputs = []
-                for child in body:
+                child: _Element
+                for child in body:  # type: ignore[assignment]  # made by the factory
                     if child.tag in REFERENCES:
                         inputs.append(self._refer(child, place, here))
                     elif child.tag not in _ASIDE:
@@ -250,22 +381,22 @@ class _Reader:
                         pending.append((nested, child, here))
                         inputs.append(nested)
                 self._gates[own] = self._connective(own, body, inputs, here)
-            else:
-                raise self._error(
-                    here[:200], f"unknown connective; known: {', '.join(CONNECTIVES)}")
 
-    def _refer(self, element: ET.Element, place: _Path, path: str) -> str:
-        name = element.get("name", "")
+    def _refer(self, element: _Element, place: _Path, path: str) -> str:
+        name = element.get("name", "").strip()
         here = f"{path}/{element.tag}[@name={shown(name)}]"
+        self._check_known(element, here, REFERENCES)
+        self._check_text(element, here, empty=True)
         found = self._resolve(name, place)
-        kind = element.get("type", "") if element.tag == "event" else element.tag
+        kind = element.get("type", "").strip() if element.tag == "event" else element.tag
         if found is None:
             if kind in {"", "basic-event"} and name and "." not in name:
                 self._basic.add(name)  # MEF lets basic events be declared by their use
+                self._undeclared.setdefault(name, (here, element.line))
                 return name
-            raise self._error(here, f"there is no {kind or 'event'} {name!r}")
+            raise self._error(here, f"there is no {kind or 'event'} {name!r}", element.line)
         if kind and kind != found.kind:
-            raise self._error(here, f"{name!r} is a {found.kind}, not a {kind}")
+            raise self._error(here, f"{name!r} is a {found.kind}, not a {kind}", element.line)
         return found.name
 
     def _resolve(self, name: str, place: _Path) -> _Definition | None:
@@ -275,13 +406,42 @@ class _Reader:
         return next((self._definitions[candidate] for candidate in candidates
                      if candidate in self._definitions), self._public.get(name))
 
-    def _connective(self, name: str, element: ET.Element, inputs: list[str], path: str
+    def _warn_of_names(self) -> None:
+        """Report events that are used and not defined, and names that differ only in case."""
+        used = list(self._undeclared)
+        defined = sorted(name for name in (*self._basic, *self._gates, *self._house)
+                         if name not in self._undeclared and GENERATED not in name)
+        if self._undeclared and self._undeclared.keys() >= self._basic:
+            self._doubt("/opsa-mef", f"none of the {len(self._undeclared)} basic events is "
+                                     "defined; a misspelt name counts as another event", 0)
+            self._undeclared.clear()
+        short = [name for name in defined if len(name) <= _COMPARED[1]][:_COMPARED[0]]
+        for name, (path, line) in self._undeclared.items():
+            if self._doubts >= _WARNED_OF:
+                break
+            near = difflib.get_close_matches(name[:_COMPARED[1]], short, 1)
+            self._doubt(path, f"event {name!r} is not defined, and counts as an independent basic "
+                              "event" + (f"; did you mean {near[0]!r}?" if near else ""), line)
+        alike = defaultdict[str, list[str]](list)
+        for name in (*defined, *used):
+            alike[name.casefold()].append(name)
+        for names in alike.values():
+            if len(names) > 1:
+                self._doubt("/opsa-mef", "names that differ only in case: "
+                                         f"{first_few(names)}", 0)
+
+    def _connective(self, name: str, element: _Element, inputs: list[str], path: str
                     ) -> Connective:
-        tag, count = element.tag, len(inputs)
+        tag, count, line = element.tag, len(inputs), element.line
         if not count:
-            raise self._error(path, "empty gate; it needs inputs")
+            raise self._error(path, "empty gate; it needs inputs", line)
         if count != _TAKES.get(tag, count):
-            raise self._error(path, f"{count} inputs; {tag!r} takes {_TAKES[tag]}")
+            raise self._error(path, f"{count} inputs; {tag!r} takes {_TAKES[tag]}", line)
+        if twice := next((entry for entry, times in Counter(inputs).items() if times > 1), ""):
+            problem = f"input {shown(twice)} is there twice"
+            if tag not in {"and", "or", "nand", "nor"}:  # which do not count
+                raise self._error(path, f"{problem}; {tag!r} counts its inputs", line)
+            self._doubt(path, problem, line)
         low, high = 1, count
         match tag:
             case "atleast":
@@ -290,7 +450,7 @@ class _Reader:
                 low = self._number(element, "min", count, path)
                 high = self._number(element, "max", count, path)
                 if low > high:
-                    raise self._error(path, f"min = {low} is more than max = {high}")
+                    raise self._error(path, f"min = {low} is more than max = {high}", line)
             case "imply":
                 self._gates[f"{name}{GENERATED}not"] = Connective((inputs[0],), 1, 1, negated=True)
                 inputs = [f"{name}{GENERATED}not", inputs[1]]
@@ -300,12 +460,12 @@ class _Reader:
                 low = count
         return Connective(tuple(inputs), low, high, negated=tag in _NEGATED)
 
-    def _number(self, element: ET.Element, attribute: str, count: int, path: str) -> int:
-        text = element.get(attribute, "")
+    def _number(self, element: _Element, attribute: str, count: int, path: str) -> int:
+        text = element.get(attribute, "").strip()
         least = 1 if element.tag == "atleast" else 0
         if not text.isdecimal() or len(text) > 9 or not least <= int(text) <= count:
             raise self._error(path, f"{attribute} = {text!r}: expected a number from {least} to "
-                                    f"{count}, the inputs")
+                                    f"{count}, the inputs", element.line)
         return int(text)
 
 
@@ -329,7 +489,8 @@ def write_open_psa(spec: SystemSpec) -> str:
             ET.SubElement(attributes, "attribute", name="barrier", value=barriers[event.name])
         if event.required:
             kind = {1: "or", len(event.of): "and"}.get(event.required, "atleast")
-            gate = ET.SubElement(
+            # Other tools refuse a connective of one input: it is that input.
+            gate = element if len(event.of) == 1 else ET.SubElement(
                 element, kind, {"min": str(event.required)} if kind == "atleast" else {})
             for entry in event.of:
                 ET.SubElement(gate, "gate" if entry in gates else "basic-event", name=entry)

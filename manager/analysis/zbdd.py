@@ -37,15 +37,36 @@ class Diagram:
         return len(self.level) - 1
 
     def minimal_solutions(self, top: int, families: Families, *, monotone: bool) -> int:
-        """Return the family of minimal sets of variables for which a node's function holds."""
+        """Return the family of minimal sets of variables for which a node's function holds.
+
+        Sets beyond the size that the store keeps are dropped where they would be made.
+        """
+        room = self._room(top, families)
         known = {EMPTY: EMPTY, UNIT: UNIT}
         for node in range(2, top + 1):  # inputs come before what uses them
-            low = known[self.low[node]]
-            high = known[self.high[node]]
+            if room and room[node] < 0:
+                known[node] = EMPTY
+                continue
+            level, low, high = self.level[node], known[self.low[node]], known[self.high[node]]
+            if room:
+                low = families.up_to(low, room[node])
+                high = families.up_to(high, room[node] - families.least[level])
             rest = families.outside(high, self, self.low[node]) if monotone \
                 else families.without(high, low)
-            known[node] = families.node(self.level[node], rest, low)
+            known[node] = families.node(level, rest, low)
         return known[top]
+
+    def _room(self, top: int, families: Families) -> list[int]:
+        """Return how many events a set may still have below each node; nothing without a limit."""
+        if families.most is None:
+            return []
+        room = [-1] * (top + 1)
+        room[top] = families.most
+        for node in range(top, 1, -1):
+            for below, taken in ((self.high[node], families.least[self.level[node]]),
+                                 (self.low[node], 0)):
+                room[below] = max(room[below], room[node] - taken)
+        return room
 
 
 class Families:
@@ -53,9 +74,13 @@ class Families:
 
     Args:
         limit: Nodes that may be made.
+        most: Events in a set that is kept; None for any number.
+        least: For each variable, how many events it stands for at least; needed with `most`.
     """
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, most: int | None = None, least: Sequence[int] = ()) -> None:
+        self.most, self.least = most, least
+        self._up_to: dict[tuple[int, int], int] = {}
         self.variable = [1 << 60, 1 << 60]
         self.high = [EMPTY, UNIT]
         self.low = [EMPTY, UNIT]
@@ -83,6 +108,21 @@ class Families:
             self.high.append(high)
             self.low.append(low)
         return found
+
+    def up_to(self, u: int, most: int) -> int:
+        """Return the sets of `u` with so many events at most."""
+        if most < 0 or u == EMPTY:
+            return EMPTY
+        if u == UNIT:
+            return UNIT
+        key = (u, most)
+        if (found := self._up_to.get(key)) is not None:
+            return found
+        x = self.variable[u]
+        result = self.node(x, self.up_to(self.high[u], most - self.least[x]),
+                           self.up_to(self.low[u], most))
+        self._up_to[key] = result
+        return result
 
     def without(self, u: int, v: int) -> int:
         """Return the sets of `u` that include no set of `v` (Rauzy 1993)."""

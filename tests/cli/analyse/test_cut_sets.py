@@ -71,3 +71,19 @@ def test_a_file_that_is_no_open_psa_is_one_line_and_exit_code_2(rampart, tmp_pat
     assert "document type definitions and entities are not read" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert rampart("cut-sets", str(file), "--export", "y.xml").returncode == 2
+
+
+def test_a_doubtful_file_is_analysed_with_a_warning_and_refused_with_strict(tmp_path, rampart):
+    file = tmp_path / "plant.xml"
+    file.write_text(
+        '<opsa-mef><define-fault-tree name="t"><define-gate name="top"><and>\n'
+        '<basic-event name="pump"/><basic-event name="pmup"/></and></define-gate>\n'
+        '<define-basic-event name="pump"/></define-fault-tree></opsa-mef>')
+    loose, strict = (rampart("cut-sets", str(file), "--count", "--json", *more)
+                     for more in ((), ("--strict",)))
+    assert (loose.returncode, json.loads(loose.stdout)["minimal_cut_sets"]) == (0, 1)
+    assert (strict.returncode, strict.stdout) == (2, "")
+    for done in (loose, strict):
+        (line,) = done.stderr.splitlines()
+        assert f"{file}:2: " in line
+        assert "pmup" in line

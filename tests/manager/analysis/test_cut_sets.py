@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import random
+import subprocess
+import sys
 from itertools import combinations
 from math import comb
 
@@ -151,12 +154,63 @@ def test_thousands_of_gates_in_a_chain_are_no_problem():
         list(found.sets())
 
 
-def test_max_order_and_limit_cut_the_list_and_not_the_count():
+def test_limit_cuts_the_list_and_not_the_count():
     tree = formula({"top": any_of("a", "pairs"), "pairs": at_least(2, "b", "c", "d")})
     found = CutSets(tree)
-    assert list(found.sets(max_order=1)) == [("a",)]
     assert list(found.sets(limit=2)) == [("a",), ("b", "c")]
     assert found.count == 4
+
+
+@settings(max_examples=150, deadline=None)
+@given(trees(coherent=True) | trees(coherent=False), st.integers(0, 4))
+def test_max_order_leaves_exactly_the_sets_of_so_many_events(tree, order):
+    found = CutSets(tree, max_order=order)
+    small = {one for one in brute_force(tree) if len(one) <= order}
+    assert {frozenset(one) for one in found.sets()} == small
+    assert found.count == len(small)
+
+
+def test_max_order_counts_modules_within_modules_as_the_events_they_stand_for():
+    gates = {f"pair{i}": all_of(f"a{i}", f"b{i}") for i in range(4)}
+    tree = formula({**gates, "two": all_of("pair0", "pair1"), "top": any_of(
+        "two", "pair2", "pair3", "c")})
+    assert [CutSets(tree, max_order=k).sizes for k in range(5)] == [
+        (), (0, 1), (0, 1, 2), (0, 1, 2), (0, 1, 2, 0, 1)]
+
+
+def test_max_order_saves_the_work_that_larger_sets_make():
+    dice = random.Random(3)
+    events = [f"e{i}" for i in range(30)]
+    gates = {f"g{i}": all_of(*dice.sample(events, 2 + i % 8)) for i in range(60)}
+    tree = formula({**gates, "top": any_of(*gates)})
+
+    def nodes(found: CutSets) -> int:
+        return sum(len(module.families.variable) for module in found._modules.values())
+
+    small, every = CutSets(tree, max_order=2), CutSets(tree)
+    assert small.sizes == every.sizes[:3]
+    assert nodes(small) < nodes(every) / 5
+
+
+def test_a_tree_of_more_variables_than_the_library_can_recurse_through_is_refused():
+    """The process ended with a segmentation fault."""
+    with pytest.raises(TooLargeError, match="more than 20000"):
+        CutSets(formula({"top": all_of(*(f"e{i}" for i in range(30_000)))}))
+
+
+def test_the_diagrams_of_many_modules_share_their_threads_and_little_address_space():
+    """Each had two threads and reserved 1 GB: 25 events aborted within 4 GB."""
+    program = (
+        "import resource; resource.setrlimit(resource.RLIMIT_AS, (2_000_000_000,) * 2)\n"
+        "from rampart.manager.analysis.cut_sets import CutSets\n"
+        "from rampart.manager.analysis.formula import Connective, Formula\n"
+        "gates = {f'g{i}': Connective((f'a{i}', f'b{i}'), 1, 2) for i in range(100)}\n"
+        "gates['top'] = Connective(tuple(gates), 2, 100)\n"
+        "events = frozenset(f'{x}{i}' for x in 'ab' for i in range(100))\n"
+        "print(CutSets(Formula(gates, events, {})).count)\n")
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
+                          timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, f"{comb(100, 2) * 4}\n"), done.stderr
 
 
 def test_a_tree_beyond_every_bound_is_refused_in_one_line():

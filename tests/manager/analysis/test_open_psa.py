@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import xml.etree.ElementTree as ET
 from itertools import combinations
 from typing import Any
 
@@ -133,15 +135,20 @@ HOLDS = {
 LEAVES = st.sampled_from([*"abcde", "top/lone", "top/1", "top/not"])
 
 
+def several(parts: st.SearchStrategy[Any], least: int, most: int) -> st.SearchStrategy[list[Any]]:
+    """Return lists without a name twice, which a connective that counts refuses."""
+    return st.lists(parts, min_size=least, max_size=most, unique_by=repr)
+
+
 def inner(parts: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
     """Return formulas (connective, inputs, k) over parts."""
     return st.one_of(
         st.tuples(st.sampled_from(["and", "or", "nand", "nor"]),
-                  st.lists(parts, min_size=1, max_size=4), st.just(0)),
+                  several(parts, 1, 4), st.just(0)),
         st.tuples(st.just("not"), st.lists(parts, min_size=1, max_size=1), st.just(0)),
         st.tuples(st.sampled_from(["xor", "iff", "imply"]),
-                  st.lists(parts, min_size=2, max_size=2), st.just(0)),
-        st.tuples(st.just("atleast"), st.lists(parts, min_size=2, max_size=4),
+                  several(parts, 2, 2), st.just(0)),
+        st.tuples(st.just("atleast"), several(parts, 2, 4),
                   st.integers(1, 2)))
 
 
@@ -234,7 +241,7 @@ TREE = "f.xml: /opsa-mef/define-fault-tree[@name='ft']/"
      TREE + "define-gate[@name='top']/xor: 1 inputs; 'xor' takes 2"),
     (mef(gate("top", f"<maybe>{events('a')}</maybe>")),
      TREE + "define-gate[@name='top']/maybe: unknown connective; known: and, or, not, xor, nand, "
-            "nor, iff, imply, atleast, cardinality"),
+            "nor, iff, imply, atleast, cardinality, constant"),
     (mef(gate("top", '<or><constant value="maybe"/></or>')),
      TREE + "define-gate[@name='top']/or/constant: value 'maybe': expected 'true' or 'false'"),
     (mef(gate("a", f"<or>{events('x')}</or>"), gate("b", f"<or>{events('x')}</or>")),
@@ -252,7 +259,104 @@ TREE = "f.xml: /opsa-mef/define-fault-tree[@name='ft']/"
 def test_refused(text, message):
     with pytest.raises(OpenPsaError) as caught:
         read_open_psa(text, "f.xml")
-    assert str(caught.value) == message
+    assert re.sub(r"^f\.xml:\d+: ", "f.xml: ", str(caught.value)) == message
+
+
+DECLARED = '<define-basic-event name="{}"/>'
+INCLUDE = ('<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="more.xml" '
+           'xpointer="xpointer(/opsa-mef/*)"/>')
+
+
+def declared(*names: str) -> str:
+    return "".join(map(DECLARED.format, names))
+
+
+@pytest.mark.parametrize(("text", "where"), [
+    (mef(gate("top", '<or><event name="a"/><event name="g"/></or>'), INCLUDE), "include[1]"),
+    (mef(gate("top", '<or><event name="a"/><event name="g"/></or>'),
+         '<define-Gate name="g"><and><event name="b"/><event name="c"/></and></define-Gate>'),
+     "define-Gate[@name='g']"),
+    (mef(gate("top", '<or><event name="a"/><event name="g"/></or>'),
+         '<x:define-gate xmlns:x="urn:x" name="g"><event name="b"/></x:define-gate>'),
+     "{urn:x}define-gate[@name='g']"),
+    (mef('<define-component name="c"><define-gate name="g"><event name="a"/></define-gate>'
+         '</define-component>', '<define-component name="c"/>',
+         gate("top", '<or><gate name="c.g"/></or>')), "define-component[@name='c']"),
+    (mef(gate("top", f'<atleast min="2">{events("a", "a", "b")}</atleast>')), "atleast"),
+    (mef(gate("top", f"<xor>{events('a', 'a')}</xor>")), "xor"),
+    (mef(gate("top", f'<or k="2">{events("a", "b")}</or>')), "or"),
+    (mef(gate("top", f"<or>{events('a')} a b c </or>")), "or"),
+    (mef(gate("top", f"<or>{events('a')}</or>"), "and c"), "define-fault-tree[@name='ft']"),
+    (mef(gate("top", '<or><basic-event name="a"><or/></basic-event></or>')),
+     "basic-event[@name='a']"),
+    (mef(gate("top", '<or><event name="g"/></or>'),
+         f'<define-basic-event name="g"><and>{events("a", "b")}</and></define-basic-event>'),
+     "define-basic-event[@name='g']"),
+    (mef(gate("top", '<and><house-event name="h"/><event name="a"/></and>'),
+         '<define-house-event name="h"><bool value="true"/></define-house-event>'), "bool"),
+    (mef(gate("top", '<or><constant Value="true"/></or>')), "constant"),
+    (mef(gate("top", f"<or>{events('a')}</or>", ' role="privat"')), "define-gate[@name='top']"),
+    (mef(gate("top", '<or><event name="a" typ="gate"/></or>')), "event[@name='a']"),
+])
+def test_what_is_not_understood_is_refused_and_not_skipped(text, where):
+    """Each was read over, with cut sets too few, or too large, and no word of it."""
+    with pytest.raises(OpenPsaError) as caught:
+        read_open_psa(text, "f.xml")
+    assert f"{where}: " in str(caught.value)
+    assert str(caught.value).startswith("f.xml:1: ")
+
+
+def test_the_line_of_a_mistake_is_told():
+    text = mef("\n", gate("top", "\n<or>\n" + events("a") + '\n<gate name="g7"/></or>'))
+    with pytest.raises(OpenPsaError, match=r"^f\.xml:5: "):
+        read_open_psa(text, "f.xml")
+
+
+def test_spaces_around_a_name_do_not_make_it_another_one():
+    left = gate("left", f"<or>{events('pump', 'v')}</or>")
+    right = gate(" right", f"<or>{events(' pump ', 'w')}</or>")
+    text = mef(gate("top", '<and><gate name="left "/><gate name="right"/></and>'), left, right,
+               declared("pump\t", "v", "w"))
+    assert cut_sets(text) == sets("pump", "v w")
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    (mef(gate("top", f"<and>{events('pump', 'pmup')}</and>"), declared("pump")),
+     ("top", "'pmup'", "'pump'")),
+    (mef(gate("top", f"<and>{events('pump', 'pmup')}</and>")), ("none of the 2",)),
+    (mef(gate("top", f"<and>{events('pump', 'Pump')}</and>"), declared("pump", "Pump")),
+     ("Pump, pump",)),
+    (mef(gate("top", f"<and>{events('a', 'a')}</and>"), declared("a")), ("'a'", "twice")),
+    (mef(gate("top", f"<and>{events('a')}</and>"), declared("a"),
+         data='<define-alignment name="day"/>'), ("define-alignment[@name='day']",)),
+])
+def test_what_is_probably_a_mistake_is_reported_and_refused_if_asked_for(text, words):
+    doubts: list[OpenPsaError] = []
+    read_open_psa(text, "f.xml", doubt=doubts.append)
+    (doubt,) = doubts
+    assert all(word in str(doubt) for word in words)
+
+    def refuse(error: OpenPsaError) -> None:
+        raise error
+
+    with pytest.raises(OpenPsaError):
+        read_open_psa(text, "f.xml", doubt=refuse)
+
+
+def test_a_tree_that_is_sound_raises_no_doubt():
+    doubts: list[OpenPsaError] = []
+    read_open_psa(write_open_psa(paper()), "f.xml", doubt=doubts.append)
+    assert not doubts
+
+
+def test_an_export_has_no_connective_of_one_input():
+    spec = paper()  # where a crash alone stops localization
+    text = write_open_psa(spec)
+    for connective in ("or", "and", "atleast"):
+        for found in ET.fromstring(text).iter(connective):
+            assert len(found) > 1
+    assert set(CutSets(read_open_psa(text, "f.xml")).sets()) == set(
+        CutSets(formula_of(spec.build_fault_tree())).sets())
 
 
 def test_an_unknown_top_is_refused_with_those_that_are_known():
