@@ -124,8 +124,8 @@ _OPTIONS = (
          f"{', '.join(NETWORKS)} (default: measured)", "measured"),
     several("--fault", "FAULT[@WHEN][+S]", "a fault to inject into a mission (repeatable): one of "
             "`rampart inject --list`, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, "
-            "slow:all, or of the robot's; WHEN is simulated seconds or goalN (default: 10), S how "
-            "long it lasts"),
+            "hang:NODE, slow:all, stop:all, or of the robot's; WHEN is simulated seconds or goalN "
+            "(default: 10), S how long it lasts"),
     flag("--json", "last line of stdout is one JSON object with the result"))
 
 

@@ -269,8 +269,8 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
         for name in others:
             say(f"  {name}")
         say()
-    say("any process: kill:NODE, stop:NODE, wedge:NODE; and slow:NODE or slow:all in virtual "
-        "time; NODE is one of")
+    say("any process: kill:NODE, stop:NODE, wedge:NODE; with --fault also hang:NODE and stop:all; "
+        "slow:NODE or slow:all in virtual time; NODE is one of")
     say(f"  {', '.join(can_be_hit(spec))}")
 
 

@@ -93,6 +93,9 @@ async def hit_process(options: argparse.Namespace) -> int:
     what, _, node = options.fault.partition(":")
     if "@" in node or "+" in node:
         raise UsageError(f"{options.fault}: here it is injected now; --duration S says how long")
+    if what == "hang":
+        raise UsageError(f"{options.fault}: only of a run that is started with --fault "
+                         f"{options.fault}; here stop:{node} or wedge:{node}")
     if what == "slow":
         raise UsageError(f"{options.fault}: only in virtual time: --virtual --fault "
                          f"{options.fault}; how slow a real process is, is up to the machine")

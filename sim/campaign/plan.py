@@ -16,7 +16,7 @@ from rampart.sim.campaign.defaults import SEEDS
 from rampart.sim.campaign.job import Job
 from rampart.sim.faults.faults import PROCESS_FAULTS, Faults, faults_of
 from rampart.sim.faults.injector import can_be_hit
-from rampart.sim.faults.scenario import PlannedFault
+from rampart.sim.faults.scenario import ALL, PlannedFault
 from rampart.sim.faults.topic_faults import systematic_faults
 
 MOMENTS_S = 2.0, 120.0
@@ -47,7 +47,8 @@ def fault_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
         groups[fault.group] = (*groups.get(fault.group, ()), fault.name)
     for kind, names in {
             "topic": tuple(f.name for f in systematic_faults(keys, system_topics(spec))),
-            "process": tuple(f"{what}:{node}" for what, node in product(PROCESS_FAULTS, nodes)),
+            "process": (*(f"{what}:{node}" for what, node in product(PROCESS_FAULTS, nodes)),
+                        f"stop:{ALL}"),
             **faults.others}.items():
         groups[kind] = (*groups.get(kind, ()), *names)
     return groups

@@ -24,7 +24,7 @@ from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import closed, topic_fault
 from rampart.sim.faults.wrong_numbers import Sizes
 
-PROCESS_FAULTS = ("kill", "stop", "wedge", "slow")
+PROCESS_FAULTS = ("kill", "stop", "wedge", "slow", "hang")
 
 _TOLD_LATER_S = 0.0
 """Of an order in the plan: how long it lasts is filled in when the page orders it."""

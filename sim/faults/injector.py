@@ -33,8 +33,11 @@ INJECTOR = "injector"
 SIGNALS = {"kill": "KILL", "stop": "STOP", "resume": "CONT", "wedge": "WEDGE"}
 """What is done to a process, as `kill-node` calls it; how slow one is, is up to the machine."""
 
-_ENDS = {"stop": "resume", "slow": "slow"}
+_ENDS = {"stop": "resume", "slow": "slow", "hang": "resume"}
 """What ends that which is done to a process for a while."""
+
+_HANGS_WITHIN_S = 0.02
+"""Simulated seconds after its start within which a process that hangs each time is stopped."""
 
 
 ProcessControl = Callable[[str, str, float], bool]
@@ -221,11 +224,23 @@ class Injector(Actor):
             self.carry_out(fault)
 
     def _hit(self, fault: PlannedAction, action: OnProcess) -> None:
-        self._do(action.what, fault, action, action.pace_s)
+        if action.what == "hang":
+            self._hang(fault, action, self.clock.now() + action.duration_s)
+        else:
+            self._do(action.what, fault, action, action.pace_s)
         is_under_way = fault.hit or fault in self._ordered
         if is_under_way and action.what in _ENDS and math.isfinite(action.duration_s):
             self.call_later(action.duration_s,
                             lambda: self._do(_ENDS[action.what], fault, action, 0.0))
+
+    def _hang(self, fault: PlannedAction, action: OnProcess, until_s: float) -> None:
+        """Stop the process of a node of this host, and each that follows, until it is over."""
+        if self.clock.now() < until_s:
+            if self._control("stop", action.node, 0.0):
+                fault.hit = 1
+            elif not fault.hit:
+                fault.reason = f"{action.node} had no running process here"
+            self.call_later(_HANGS_WITHIN_S, lambda: self._hang(fault, action, until_s))
 
     def _do(self, what: str, fault: PlannedAction, action: OnProcess, pace_s: float) -> None:
         """Do something to one process, or to all; what runs on another host its supervisor hits."""

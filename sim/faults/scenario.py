@@ -3,9 +3,11 @@
 A planned fault is written `FAULT[@WHEN][+DURATION]`:
 
 * FAULT is a name of the catalogue (`rampart inject --list`), `MODE:TOPIC` for any topic,
-  `kill:NODE`, `stop:NODE`, `wedge:NODE` or `slow:NODE[:SECONDS]` for any process, `slow:all` for
-  every one at once, as on a machine that is overloaded, or one that the robot declares
-  (`Faults.own`), which may have details behind a colon, too.
+  `kill:NODE`, `stop:NODE`, `wedge:NODE`, `slow:NODE[:SECONDS]` or `hang:NODE` for any process,
+  `slow:all` for every one at once, as on a machine that is overloaded, `stop:all`, as when a
+  container is paused, or one that the robot declares (`Faults.own`), which may have details behind
+  a colon, too. `hang` stops each process of the node that there is or will be, right after its
+  start.
 * WHEN is simulated seconds, or `goalN` for the moment in which goal N of the mission begins,
   or `goalN:SECONDS` for so long after it. Left out it is 10 s.
 * DURATION is simulated seconds, or `inf` for the rest of the run. Left out it is the fault's own.
@@ -29,8 +31,8 @@ DEFAULT_AT_S = 10.0
 _MAX_DIGITS = 9
 _SLOW_S = 0.1
 ALL = "all"
-"""In place of a node, of `slow`: all of them."""
-_LASTS_S = {"kill": 0.0, "wedge": math.inf, "stop": 5.0, "slow": 10.0}
+"""In place of a node, of `slow` and `stop`: all of them."""
+_LASTS_S = {"kill": 0.0, "wedge": math.inf, "stop": 5.0, "slow": 10.0, "hang": math.inf}
 
 
 class ScenarioError(ValueError):
@@ -131,7 +133,7 @@ def action_of(planned: PlannedFault, injection: str, nodes: Collection[str],
     lasts_s = planned.duration_s
     if kind in PROCESS_FAULTS:
         node = details[0] if details else ""
-        if kind == "slow" and node == ALL:
+        if kind in ("slow", "stop") and node == ALL:
             node = ""
         elif node not in nodes:
             raise ScenarioError(f"fault {planned.fault!r}: no node {node!r}; there are: "

@@ -234,6 +234,14 @@ def test_killed_guards_come_back_and_the_mission_goes_on(short):
                                "graph_planner": 1}
 
 
+def test_a_manager_that_hangs_after_each_start_stops_the_robot_until_it_works(short):
+    lost = run_job(job("hang:ftm_manager@12+inf", options=short, patience_s=30.0))
+    assert (lost.success, lost.safe, lost.stopped_for_good) == (False, True, True)
+    record = run_virtually(job("hang:ftm_manager@12+6", options=short)).record
+    assert (record.mission, record.safety) == ("success", "safe")
+    assert record.restarts["ftm_manager"] > 4
+
+
 def test_a_supervisor_that_ends_too_often_waits_until_the_window_of_the_spec_has_room(tmp_path):
     file = tmp_path / "impatient.toml"
     file.write_text((ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")

@@ -92,6 +92,7 @@ def test_a_wheel_and_its_strength_are_named():
 def test_all_processes_are_slow_at_once_and_none_is_killed_by_a_name_that_means_all():
     assert action_of(PlannedFault("slow:all:0.03", duration_s=5.0)) == OnProcess(
         "slow", "", 0.03, 5.0)
+    assert action_of(PlannedFault("stop:all", duration_s=5.0)) == OnProcess("stop", "", 0.0, 5.0)
     with pytest.raises(ScenarioError, match="no node 'all'"):
         action_of(PlannedFault("kill:all"))
 

@@ -33,6 +33,7 @@ from rampart.actors.osmosis.control.pilot.command_pair import CommandPair
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array
 from rampart.actors.osmosis.messages import PilotMode, PilotOrder, StickTwist, Twist
+from rampart.manager.arbitration.silence import Silence
 
 STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
 """Modes from the most permissive to the strictest; declared here, once."""
@@ -73,7 +74,8 @@ class GateLimits(msgspec.Struct, frozen=True):
         command_timeout_s: age at which a command is stale.
         scan_timeout_s: age at which a scan is.
         joystick_timeout_s: silence after which the stick counts as released.
-        manager_timeout_s: silence after which the manager counts as dead.
+        manager_timeout_s: silence after which the manager counts as dead, over all its
+            incarnations; see `Silence`.
         settling_s: a gate that has just started (perhaps again) knows no orders yet; it lets
             nothing pass before each recovery module has had time to repeat its own.
         room: distances of the obstacle stop.
@@ -139,7 +141,7 @@ class SafetyGate:
         self._stick = _Line()
         self._stick_since_s = -math.inf
         self._stopped_s = started_s
-        self._manager_heard_s = -math.inf
+        self._manager = Silence()
         self._points: Array = NO_POINTS
         self._scan_s = -math.inf
         self._scan_fault = ""
@@ -152,9 +154,9 @@ class SafetyGate:
         else:
             self.orders.let_go(recovery)
 
-    def manager_alive(self, stamp_s: float) -> None:
-        """Take note of the manager's sign of life, given at `stamp_s`."""
-        self._manager_heard_s = max(self._manager_heard_s, stamp_s)
+    def manager_alive(self, stamp_s: float, incarnation: int) -> None:
+        """Take note of the manager's status, true at `stamp_s`; see `Silence`."""
+        self._manager = self._manager.heard(stamp_s, incarnation)
 
     def braked(self, stamp_s: float) -> None:
         """Take note that the base braked at `stamp_s`, by order or by its dead man."""
@@ -311,8 +313,7 @@ class SafetyGate:
         if self.mode is PilotMode.STOP:
             return self._why(PilotMode.STOP) or "ordered to stop"
         if self._checks.manager:
-            silence_s = now - self._manager_heard_s
-            if silence_s > limits.manager_timeout_s:
+            if now - self._manager.worked_s > limits.manager_timeout_s:
                 return "the manager is silent"
             if now - self._started_s < limits.settling_s:
                 return "just started, orders may not have arrived yet"

@@ -110,7 +110,7 @@ class SafetyPilot(Actor):
     @on(ftm_topics.MANAGER_STATUS)
     def manager(self, _message: ManagerStatus, header: Header) -> None:
         """Hear that the manager lived when it said so: old news is as good as none."""
-        self._gate.manager_alive(min(header.stamp, self.clock.now()))
+        self._gate.manager_alive(min(header.stamp, self.clock.now()), header.incarnation)
 
     @every(_PERIOD_S)
     def repeat(self) -> None:

@@ -48,7 +48,7 @@ class Bench:
         """Let periods pass; None is silence."""
         for _ in range(ticks):
             self.now += PERIOD_S
-            self.gate.manager_alive(self.now)
+            self.gate.manager_alive(self.now, 1)
             self.gate.scan(NO_POINTS, self.now)
             if active is not None:
                 self.send("osmosis_control", active, age_s)

@@ -27,13 +27,14 @@ class Bench:
         self.sequence = 0
         self.held_since_s = 1.0
         self.manager = self.scanner = True
+        self.incarnation = 1
         self.points = NO_POINTS
         self.wait(0.0)
 
     def wait(self, seconds):
         self.now += seconds
         if self.manager:
-            self.gate.manager_alive(self.now)
+            self.gate.manager_alive(self.now, self.incarnation)
         if self.scanner:
             self.gate.scan(self.points, self.now)
 
@@ -197,6 +198,43 @@ def test_a_silent_manager_stops_the_robot_until_it_is_back():
     assert bench.out() == (0.5, 0.0)
 
 
+def drives_at(statuses, *, until_s):
+    """When the gate lets a command pass, sampled each 0.05 s; statuses as (time, incarnation)."""
+    bench, left = Bench(), sorted(statuses)
+    bench.manager = False
+    start_s, driven = bench.now, []
+    while bench.now - start_s < until_s:
+        while left and left[0][0] <= bench.now - start_s + 1e-9:
+            at_s, incarnation = left.pop(0)
+            bench.gate.manager_alive(start_s + at_s, incarnation)
+        bench.send(0.5)
+        if bench.out()[0] > 0:
+            driven.append(bench.now - start_s)
+        bench.wait(0.05)
+    return driven
+
+
+def test_the_first_word_of_a_manager_that_hangs_after_each_start_is_no_life():
+    driven = drives_at([(0.4 * n, n + 1) for n in range(1, 40)], until_s=15.0)
+    assert max(driven) <= LIMITS.manager_timeout_s + 0.05
+
+
+def test_a_manager_that_hangs_soon_after_each_start_uses_the_budget_up():
+    statuses = [(0.4 * n + extra, n + 1) for n in range(1, 40) for extra in (0.0, 0.05)]
+    assert max(drives_at(statuses, until_s=15.0)) < 2.5
+
+
+def test_a_manager_that_comes_back_and_works_costs_no_stop():
+    works = [(0.3 + 0.1 * n, 2) for n in range(60)]
+    assert len(drives_at(works, until_s=5.0)) == len(drives_at([(0.05 * n, 1) for n in range(100)],
+                                                              until_s=5.0))
+
+
+def test_a_manager_that_was_stopped_and_goes_on_is_believed_at_once():
+    driven = drives_at([(3.0, 1), (3.05, 1)], until_s=3.3)
+    assert min(at for at in driven if at > 1.0) <= 3.1
+
+
 def test_a_missing_or_stale_scan_stops_the_robot():
     bench = Bench()
     bench.scanner = False
@@ -208,7 +246,7 @@ def test_a_missing_or_stale_scan_stops_the_robot():
 
 def test_a_gate_just_started_waits_for_the_orders_it_may_have_missed():
     gate = SafetyGate(LIMITS, Checks(), 10.0)
-    gate.manager_alive(10.1)
+    gate.manager_alive(10.1, 1)
     gate.scan(NO_POINTS, 10.1)
     gate.command(m.Twist(0.5, 0.0), Header("osmosis_control", 1, 1, 10.1), 10.1)
     assert gate.output(10.1).linear_mps == 0.0
@@ -222,9 +260,9 @@ def test_old_news_of_the_manager_is_no_sign_of_life():
     gate = SafetyGate(LIMITS, Checks(), 0.0)
     for tick in range(200):
         now = tick * 0.05
-        gate.manager_alive(min(now, 5.0))
+        gate.manager_alive(min(now, 5.0), 1)
         if tick % 7 == 0:
-            gate.manager_alive(1.0)  # it was overtaken
+            gate.manager_alive(1.0, 1)  # it was overtaken
         gate.scan(NO_POINTS, now)
         gate.command(m.Twist(0.5, 0.0), Header("osmosis_control", 1, tick, now), now)
         assert (gate.output(now).linear_mps > 0) == (
