@@ -69,11 +69,11 @@ class Injection(Message, frozen=True):
     `stuck` repeats its body with fresh stamps; `delay` sends `delay_s` later; `duplicate` sends
     the same payload twice; `restamp` adds `stamp_s` to the stamp, as a clock that goes wrong;
     `corrupt` changes fields. The `*_fields` and `keep_ends` count only with corrupt:
-    `set_fields` overwrites, `ramp_fields` adds rate * elapsed seconds, `add_fields` adds a bias,
-    `noise_fields` adds Gaussian noise of that standard deviation, `keep_ends` shortens
-    sequences to their first and last element. A field of a nested struct is named
-    `outer.inner`, through sequences too; numbers in sequences and `*_f32` arrays are changed
-    element by element, and `*_rad` stays in (-pi, pi].
+    `set_fields` overwrites (one number fills a sequence or an array), `ramp_fields` adds rate *
+    elapsed seconds, `add_fields` adds a bias, `noise_fields` adds Gaussian noise of that standard
+    deviation, `keep_ends` shortens sequences and arrays to their first and last element. A field
+    of a nested struct is named `outer.inner`, through sequences too; numbers in sequences and
+    `*_f32` arrays are changed element by element, and `*_rad` stays in (-pi, pi].
 
     Durations are simulated seconds. `duration_s` 0 ends the injection at once; infinity is
     permanent: it lasts as long as the publishing process. `share` is the probability that a

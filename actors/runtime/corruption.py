@@ -62,7 +62,8 @@ def check_fields(kind: type[Any], order: Injection) -> None:
         for path in getattr(order, what):
             _check_number(kind, path, what, whole=what == "add_fields")
     for path in order.keep_ends:
-        if getattr(bare(field_type(kind, path)), "__origin__", None) not in (tuple, list):
+        declared = field_type(kind, path)
+        if not is_array(path, declared) and _element(declared) is bare(declared):
             raise InjectionError(f"keep_ends {path!r}: not a list")
 
 
@@ -82,7 +83,8 @@ def corrupt(body: Any, order: Injection, elapsed_s: float, draw: Random) -> Any:
     kind: Any = type(body)
     for path, value in order.set_fields.items():
         for holder, name in _places(data, path):
-            fill = is_array(name, type(holder[name])) and not isinstance(value, bytes)
+            fill = _is_number(value) and (
+                is_array(name, type(holder[name])) or isinstance(holder[name], list | tuple))
             holder[name] = _changed(name, holder[name], lambda _: value) if fill else value  # noqa: B023
     changes: tuple[tuple[dict[str, float], Callable[[float, float], float]], ...] = (
         (order.ramp_fields, lambda x, rate: x + rate * elapsed_s),
@@ -96,8 +98,9 @@ def corrupt(body: Any, order: Injection, elapsed_s: float, draw: Random) -> Any:
                     name, holder[name], lambda x: _turned(x, change(x, by), within))  # noqa: B023
     for path in order.keep_ends:
         for holder, name in _places(data, path):
-            if len(holder[name]) > 2:
-                holder[name] = [holder[name][0], holder[name][-1]]
+            size = 4 if is_array(name, type(holder[name])) else 1
+            if len(holder[name]) > 2 * size:
+                holder[name] = holder[name][:size] + holder[name][-size:]
     try:
         return msgspec.convert(data, type(body), builtin_types=(bytes,))
     except msgspec.ValidationError as error:
@@ -211,6 +214,10 @@ def _check_number(kind: type[Any], path: str, what: str, *, whole: bool) -> None
                          f"{'number' if whole else 'float'}")
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def _check_value(kind: type[Any], path: str, value: Any) -> None:
     declared = field_type(kind, path)
     if is_array(path, declared):
@@ -218,6 +225,8 @@ def _check_value(kind: type[Any], path: str, value: Any) -> None:
             raise InjectionError(f"set_fields {path!r} = {value!r}: must be a number that fills "
                                  "the array, or its bytes")
         return
+    if _is_number(value):
+        declared = _element(declared)  # a number fills a sequence
     try:
         msgspec.convert(value, declared, builtin_types=(bytes,))
     except msgspec.ValidationError as error:

@@ -43,10 +43,9 @@ def fault_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
     keys = [key for key in published_keys(spec)
             if not key.removeprefix(f"{ROOT}/").startswith(_DULL)]
     groups: dict[str, tuple[str, ...]] = {}
-    for fault in faults.named.values():
+    for fault in (*faults.named.values(), *systematic_faults(keys, system_topics(spec))):
         groups[fault.group] = (*groups.get(fault.group, ()), fault.name)
     for kind, names in {
-            "topic": tuple(f.name for f in systematic_faults(keys, system_topics(spec))),
             "process": (*(f"{what}:{node}" for what, node in product(PROCESS_FAULTS, nodes)),
                         f"stop:{ALL}"),
             **faults.others}.items():
@@ -115,7 +114,7 @@ def _random_fault(dice: random.Random, groups: dict[str, tuple[str, ...]],
     seed = dice.randrange(1000)
     if kind == "process":  # a killed process stays killed, a wedged one wedged
         return PlannedFault(fault, at_s)
-    if pattern == "intermittent" and (kind == "topic" or fault in faults.named):
+    if pattern == "intermittent" and (kind in {"topic", "reading"} or fault in faults.named):
         on_s, off_s = (round(dice.uniform(*_FLICKER_S), 2) for _ in range(2))
         return PlannedFault(fault, at_s, duration_s=math.inf, on_s=on_s, off_s=off_s, seed=seed)
     return PlannedFault(fault, at_s, seed=seed,

@@ -21,7 +21,7 @@ from rampart.actors.layout.wiring import import_class
 from rampart.actors.runtime.injection import flaw
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
-from rampart.sim.faults.topic_faults import closed, topic_fault
+from rampart.sim.faults.topic_faults import NONSENSE, READING, closed, topic_fault
 from rampart.sim.faults.wrong_numbers import Sizes
 
 PROCESS_FAULTS = ("kill", "stop", "wedge", "slow", "hang")
@@ -49,7 +49,8 @@ class Faults:
     others: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     titled: ClassVar[Mapping[str, tuple[str, str]]] = {}
     kinds: Mapping[str, str] = {"none": "no fault", "topic": "topics",
-                                          "process": "processes", "several": "several at once"}
+                                "reading": "nonsense readings", "process": "processes",
+                                "several": "several at once"}
     sizes: ClassVar[Sizes] = Sizes()
     intruder: ClassVar[tuple[str, float, float] | None] = None
 
@@ -100,6 +101,8 @@ class Faults:
         prefix = name.partition(":")[0]
         if prefix in PROCESS_FAULTS:
             return "process"
+        if prefix in NONSENSE:
+            return READING
         return next((kind for kind, names in self.others.items()
                      if any(other.partition(":")[0] == prefix for other in names)), "topic")
 

@@ -10,6 +10,10 @@ by it, and a wrong one may be a stranger's process.
 
 `restamp:TOPIC` is a clock that is wrong by a constant, ahead or behind, drawn as well.
 
+A *nonsense reading* (`NONSENSE`) is one that no sound device gives: zeros, numbers that are
+negative or beyond all measure, arrays of another length. Every topic that carries measurements,
+and every one that a device publishes, has them: `nan:TOPIC`.
+
 The topics below `world/` are left out, because the judge goes by them and a fault there would
 falsify the verdict, and so are those that carry the injections themselves.
 """
@@ -17,19 +21,21 @@ falsify the verdict, and so are those that carry the injections themselves.
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterable, Sequence
 from random import Random
 from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.layout.system_topics import find_topic
+from rampart.actors.runtime.corruption import InjectionError, check_fields, is_array
 from rampart.actors.runtime.injection import MODES, UNTOUCHED
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.wrong_numbers import Sizes, numbers, plausible_offsets
 
-GROUP = "topic"
+GROUP, READING = "topic", "reading"
 DURATION_S = 10.0
 
 DELAY_S = 1.5
@@ -49,17 +55,24 @@ _TITLES = {
     "restamp": "the stamps on {} are wrong by a constant",
     "corrupt": "each number on {} is wrong by a constant"}
 
+_NUMBERS = {"zero": 0, "negative": -1, "huge": 10**6, "infinite": math.inf, "nan": math.nan}
+_ARRAYS = {"tiny": 0.01, "single": struct.pack("<f", 0.0), "short": None}
+NONSENSE = (*_NUMBERS, *_ARRAYS)
+"""Readings that no sound device gives. The last three are of arrays: smaller than any range,
+a single element, no more than the first and the last element."""
+
 
 def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]],
                 sizes: Sizes = Sizes()) -> Fault:  # noqa: B008 a constant
     """Return the fault `MODE:TOPIC`.
 
     Args:
-        mode: one of `MODES`.
+        mode: one of `MODES` or `NONSENSE`.
         key: of a declared topic or one member of a family, with or without `rampart/`.
         seed: of what `restamp` and `corrupt` draw, and of the gate's chance. An even one corrupts
             every number of a message, as a wrong sender does; an odd one only one of them, which
-            leaves whatever the others can be checked by.
+            leaves whatever the others can be checked by. So it is with nonsense, but that an even
+            one leaves all but the arrays alone in a message that has some: a ray is a reading.
         known: all topics of the system, see `system_topics`.
         sizes: how wrong a number of the robot's can be, where its field does not say.
 
@@ -67,16 +80,23 @@ def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]],
         UnknownFaultError: no such mode or topic, or the two do not go together.
     """
     short = key.removeprefix("/").removeprefix(f"{ROOT}/")
-    if mode not in MODES:
+    if mode not in (*MODES, *NONSENSE):
         raise UnknownFaultError(f"unknown fault {f'{mode}:{key}'!r}: the mode must be one of "
-                                f"{', '.join(MODES)}")
+                                f"{', '.join((*MODES, *NONSENSE))}")
     topic = find_topic(short, known)
     if topic is None:
         raise UnknownFaultError(f"unknown fault {f'{mode}:{key}'!r}: no topic has this key; "
                                 "see `rampart topic list`")
-    if reason := closed(short) or _senseless(mode, topic.type):
+    if reason := closed(short) or _senseless(mode, topic):
         raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
     draw = Random(f"{short} {seed}")  # noqa: S311 no secret
+    if mode in NONSENSE:
+        what = _nonsense(mode, topic.type, draw if seed % 2 else None)
+        assert what is not None, "it makes sense"  # noqa: S101
+        fields = ", ".join((*what.set_fields, *what.keep_ends))
+        return Fault(f"{mode}:{short}", f"nonsense on {short}, {mode}: {fields}",
+                     (msgspec.structs.replace(what, topic=short, seed=seed),), (), DURATION_S,
+                     READING)
     title, offsets = _TITLES[mode].format(short), {}
     if mode == "corrupt":
         offsets = plausible_offsets(topic.type, draw, sizes)
@@ -117,7 +137,7 @@ def modes_of(key: str, known: Sequence[Topic[Any]]) -> tuple[str, ...]:
         raise UnknownFaultError(f"no topic has the key {key!r}; see `rampart topic list`")
     if closed(key):
         return ()
-    return tuple(mode for mode in MODES if not _senseless(mode, topic.type))
+    return tuple(mode for mode in (*MODES, *NONSENSE) if not _senseless(mode, topic))
 
 
 def stamp_error_s(draw: Random) -> float:
@@ -126,10 +146,48 @@ def stamp_error_s(draw: Random) -> float:
     return round(draw.choice((-1.0, 1.0)) * size_s, 3)
 
 
-def _senseless(mode: str, kind: type[msgspec.Struct]) -> str:
-    """Return why a message type cannot fail in a mode, or an empty text."""
-    if mode == "corrupt" and kind.__struct_config__.array_like:
+def _nonsense(mode: str, kind: type[msgspec.Struct], draw: Random | None) -> Disturbance | None:
+    """Return the disturbance, without a topic; None if no number in a message can be so.
+
+    Args:
+        mode: one of `NONSENSE`.
+        kind: of the messages.
+        draw: chooses one number; None changes all readings.
+    """
+    value = {**_NUMBERS, **_ARRAYS}[mode]
+    found: dict[str, Disturbance] = {}
+    for path, of, _ in numbers(kind):
+        change = Disturbance("", "corrupt", keep_ends=(path,)) if mode == "short" else Disturbance(
+            "", "corrupt", set_fields={path: value})
+        if (mode in _NUMBERS or is_array(path, of)) and _fits(change, kind):
+            found[path] = change
+    if not found:
+        return None
+    if draw is not None:
+        return draw.choice(list(found.values()))
+    arrays = [path for path in found if path.endswith("_f32")] or list(found)
+    if mode == "short":
+        return Disturbance("", "corrupt", keep_ends=tuple(arrays))
+    return Disturbance("", "corrupt", set_fields=dict.fromkeys(arrays, value))
+
+
+def _fits(change: Disturbance, kind: type[msgspec.Struct]) -> bool:
+    try:
+        check_fields(kind, change.order("", 0.0))
+    except InjectionError:
+        return False
+    return True
+
+
+def _senseless(mode: str, topic: Topic[Any]) -> str:
+    """Return why a topic's messages cannot fail in a mode, or an empty text."""
+    kind = topic.type
+    if mode in {"corrupt", *NONSENSE} and kind.__struct_config__.array_like:
         return f"{kind.__name__} is array_like: its fields have no names on the way"
+    if mode in NONSENSE and topic.qos is not Qos.SENSOR and not topic.outside:
+        return f"{topic.key} carries no readings"
+    if mode in NONSENSE and _nonsense(mode, kind, None) is None:
+        return f"no number in a {kind.__name__} can be so"
     if mode == "corrupt" and next(numbers(kind), None) is None:
         return f"there is no number to corrupt in a {kind.__name__}"
     if mode == "stuck" and not msgspec.structs.fields(kind):

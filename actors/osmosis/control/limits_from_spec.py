@@ -6,7 +6,7 @@ What a spec does not say (gains, look-ahead distances) keeps the default of its 
 from __future__ import annotations
 
 from rampart.actors.osmosis.control.following.path_follower import MotionLimits
-from rampart.actors.osmosis.control.pilot.laser_pair import LaserReach
+from rampart.actors.osmosis.control.pilot.laser_pair import TOLERANCE_M, LaserReach
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom
 from rampart.actors.osmosis.control.polyline import Hull
@@ -45,7 +45,9 @@ def gate_of(system: SystemSpec) -> GateLimits:
 def reach_of(system: SystemSpec) -> LaserReach:
     """Return what every sweep of a laser has to cover."""
     robot = system.robot
-    return LaserReach(robot.sensing_range_m, robot.sensing_field_rad, robot.sensing_gap_rad)
+    within_m = min(robot.length_m, robot.width_m) / 2 - TOLERANCE_M
+    return LaserReach(robot.sensing_range_m, robot.sensing_field_rad, robot.sensing_gap_rad,
+                      max(0.0, within_m))
 
 
 def checks_of(system: SystemSpec) -> Checks:

@@ -64,30 +64,9 @@ class Hull(msgspec.Struct, frozen=True):
         return np.asarray(outside + np.minimum(np.maximum(ahead, aside), 0.0))
 
 
-@lru_cache(maxsize=4)
-def scan_points(ranges_f32: bytes, angle_min_rad: float, angle_increment_rad: float,
-                range_max_m: float) -> Array:
-    """Return the echoes of a laser sweep as points in `base_link`, shape (n, 2).
-
-    A range that is not finite, not positive or at `range_max_m` is no echo. A payload that is
-    not a whole number of float32 is cut to whole ones.
-
-    The array is read-only: a sweep that comes again, as one without any echo does all the time,
-    gets the same one.
-    """
-    ranges = np.frombuffer(ranges_f32[: len(ranges_f32) // 4 * 4], dtype="<f4")
-    echo = (ranges > 0.0) & (ranges < range_max_m * (1 - 1e-6))  # no NaN passes a comparison
-    if not np.count_nonzero(echo):
-        return NO_POINTS
-    rays = _rays(len(ranges), angle_min_rad, angle_increment_rad)
-    points = np.asarray(ranges[echo, None] * rays[echo])
-    points.flags.writeable = False
-    return points
-
-
 @lru_cache(maxsize=16)
-def _rays(count: int, angle_min_rad: float, angle_increment_rad: float) -> Array:
-    """Unit vectors of a sweep's rays, shape (count, 2)."""
+def ray_directions(count: int, angle_min_rad: float, angle_increment_rad: float) -> Array:
+    """Return the unit vectors of a sweep's rays in `base_link`, shape (count, 2)."""
     angles = angle_min_rad + angle_increment_rad * np.arange(count)
     return np.column_stack((np.cos(angles), np.sin(angles)))
 

@@ -24,6 +24,7 @@ from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.readings import is_base_status, is_fix
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.manager.spec.tables import NonNegative
 
@@ -108,16 +109,12 @@ class ActuatorMonitor(Finding):
 
     def moved(self, velocity_x_mps: float, velocity_y_mps: float, now_s: float) -> None:
         """Take a velocity over ground, measured without the wheels (GPS, Doppler)."""
-        speed_mps = math.hypot(velocity_x_mps, velocity_y_mps)
-        if math.isfinite(speed_mps):
-            self._speed_mps, self._speed_s = speed_mps, now_s
+        self._speed_mps, self._speed_s = math.hypot(velocity_x_mps, velocity_y_mps), now_s
 
     def status(self, wheels_radps: tuple[float, float, float, float], *, braking: bool,
                now_s: float) -> None:
         """Take the state of the base: wheel speeds in the order of `WHEELS`, brake."""
         self.known = True
-        if not all(map(math.isfinite, wheels_radps)):
-            return
         treads = [speed * self.limits.wheel_radius_m for speed in wheels_radps]
         found = self._brake(treads, now_s) if braking else self._drive(treads, now_s)
         if not braking:
@@ -191,11 +188,13 @@ class ActuatorFailure(DetectionModule):
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, _header: Header) -> None:
         """Hear how fast it is over ground."""
-        self.monitor.moved(message.velocity_x_mps, message.velocity_y_mps, self.clock.now())
+        if is_fix(message):
+            self.monitor.moved(message.velocity_x_mps, message.velocity_y_mps, self.clock.now())
 
     @on(topics.BASE_STATUS)
     def status(self, message: m.BaseStatus, _header: Header) -> None:
         """Hear how the wheels turn, and judge."""
-        self.monitor.status(message.wheel_speeds_radps, braking=message.brake_engaged,
-                            now_s=self.clock.now())
-        self.follow()
+        if is_base_status(message):
+            self.monitor.status(message.wheel_speeds_radps, braking=message.brake_engaged,
+                                now_s=self.clock.now())
+            self.follow()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rampart.actors.osmosis.messages import LaserScan
+from rampart.actors.osmosis.readings import ray_distances
 
 POINTS = 91
 """At most so many are shown of a sweep."""
@@ -32,12 +33,10 @@ def thin(scan: LaserScan | None) -> dict[str, Any] | None:
             or not all(map(math.isfinite, (scan.angle_min_rad, scan.angle_increment_rad))) \
             or not 0 < scan.range_max_m < math.inf:
         return None
-    ranges = np.frombuffer(scan.ranges_f32, dtype="<f4").astype(np.float64)
+    ranges = ray_distances(scan.ranges_f32, scan.range_max_m)
     rays = -(-len(ranges) // POINTS)
-    with np.errstate(invalid="ignore"):
-        ranges[~(ranges >= 0)] = np.inf  # NaN and negative ranges are no echoes
     padded = np.full(-(-len(ranges) // rays) * rays, np.inf)
-    padded[:len(ranges)] = ranges
+    padded[:len(ranges)] = np.nan_to_num(ranges, nan=np.inf, posinf=np.inf)
     nearest = padded.reshape(-1, rays).min(axis=1)
     echo = nearest < min(scan.range_max_m, MAX_RANGE_M) - 0.005
     centimetres = np.where(echo, np.round(100 * np.where(echo, nearest, 0)), -1).astype(int)

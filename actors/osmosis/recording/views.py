@@ -13,6 +13,7 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.osmosis.readings import ray_distances
 from rampart.actors.osmosis.recording import scene
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.views import View, Views, line
@@ -134,11 +135,9 @@ def _finite(pose: m.Pose) -> bool:
 
 def _sweep(channel: str, _key: str, _header: Header, sweep: m.LaserScan, at_ns: int) -> list[View]:
     count = len(sweep.ranges_f32) // 4
-    ranges = np.frombuffer(sweep.ranges_f32, dtype="<f4", count=count)
+    distances = ray_distances(sweep.ranges_f32, sweep.range_max_m)
     # No echo: at the laser itself, where the robot hides it. JSON has no number that says "none".
-    with np.errstate(over="ignore", invalid="ignore"):  # a range may be anything
-        echo = np.isfinite(ranges) & (ranges < sweep.range_max_m)
-    seen = np.round(np.where(echo, ranges, 0.0).astype(np.float64), 3)
+    seen = np.round(np.where(np.isfinite(distances), distances, 0.0), 3)
     end_rad = sweep.angle_min_rad + max(0, count - 1) * sweep.angle_increment_rad
     if not (math.isfinite(sweep.angle_min_rad) and math.isfinite(end_rad)):
         return []

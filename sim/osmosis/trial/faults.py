@@ -197,7 +197,8 @@ class OsmosisFaults(Faults):
             "actuator", f"the {name} wheel has a fifth of its torque and speed left")
            for wheel, name in _WHEELS.items()},
         "brake-failure": ("actuator", "the brakes do not brake")}
-    kinds = {"none": "no fault", "paper": "paper's faults", "topic": "topics", "sensor": "sensors",
+    kinds = {"none": "no fault", "paper": "paper's faults", "topic": "topics",
+             "reading": "nonsense readings", "sensor": "sensors",
              "process": "processes", "actuator": "actuators", "world": "the world",
              "several": "several at once"}
     intruder = (OBSTACLE, 1.2, 6.0)

@@ -108,7 +108,7 @@ def test_a_sample_draws_each_kind_by_the_square_root_of_how_many_faults_it_has()
         assert kinds[kind] / 3000 == pytest.approx(root / sum(roots.values()), rel=0.3), kind
     assert 0.4 < sum(job.options["obstacles"] == 2 for job in jobs) / 3000 < 0.6
     messages = [j.faults[0] for j in jobs
-                if kind_of[j.faults[0].fault] in {"paper", "sensor", "topic"}]
+                if kind_of[j.faults[0].fault] in {"paper", "sensor", "topic", "reading"}]
     permanent = sum(f.duration_s == math.inf and not f.on_s for f in messages)
     intermittent = sum(f.on_s > 0 for f in messages)
     assert permanent / len(messages) == pytest.approx(1 / 3, abs=0.05)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from random import Random
 from typing import Any
 
 import msgspec
@@ -12,14 +13,16 @@ import pytest
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.envelope import Header, decode, encode
+from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.system_topics import published_keys
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.runtime.corruption import corrupt
 from rampart.actors.runtime.injection import MODES, FaultGate, flaw
 from rampart.cli.look.topic_catalogue import resolve, uses
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
-from rampart.sim.faults.topic_faults import DELAY_S, modes_of, systematic_faults
+from rampart.sim.faults.topic_faults import DELAY_S, NONSENSE, modes_of, systematic_faults
 from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
 from rampart.sim.osmosis.sensors import Gps
 from rampart.sim.osmosis.trial.faults import (
@@ -213,6 +216,39 @@ def test_offsets_stay_within_what_their_unit_makes_plausible(seed):
     assert 0.1 <= abs(offsets["lights.ratio"]) <= 0.5
 
 
+@pytest.mark.parametrize("mode", NONSENSE)
+def test_nonsense_of_a_laser_is_of_all_rays_or_of_one_number(mode):
+    (all_rays,) = topic_fault(mode, "summit_xl/scan").disturbances
+    assert {*all_rays.set_fields, *all_rays.keep_ends} == {"ranges_f32"}
+    drawn = {path for seed in range(1, 60, 2)
+             for d in topic_fault(mode, "summit_xl/scan", seed).disturbances
+             for path in (*d.set_fields, *d.keep_ends)}
+    assert drawn == {"ranges_f32"} if mode in {"tiny", "single", "short"} else (
+        drawn > {"ranges_f32", "range_max_m", "angle_min_rad", "reference_m"})
+
+
+def test_nonsense_comes_from_what_measures_and_not_from_what_decides():
+    measured = {name.partition(":")[2] for name in SYSTEMATIC if name.startswith("zero:")}
+    assert measured >= {t.key for t in (
+        topics.SCAN, topics.UPPER_SCAN, topics.GPS, topics.IMU, topics.ODOMETRY, topics.LIGHT,
+        topics.ABSOLUTE_POSE, topics.BASE_STATUS, topics.JOYSTICK, topics.POSE)}
+    assert not measured & {"mission/goal", "plan/route", "manager/status", "supervisor/nodes"}
+    with pytest.raises(UnknownFaultError, match="carries no readings"):
+        find_fault("zero:plan/route")
+
+
+def test_a_number_fills_a_sequence_and_an_array_is_shortened_to_its_ends():
+    order = Injection("i", "summit_xl/status", "corrupt", 1.0,
+                      set_fields={"wheel_speeds_radps": 0})
+    assert flaw(order, m.BaseStatus) == ""
+    status = corrupt(m.BaseStatus(False, False, 0.0, (1.0, 2.0, 3.0, 4.0)), order, 0.0, Random(1))
+    assert status.wheel_speeds_radps == (0.0,) * 4
+    order = Injection("i", "summit_xl/scan", "corrupt", 1.0, keep_ends=("ranges_f32",))
+    assert flaw(order, m.LaserScan) == ""
+    sweep = m.LaserScan(0.0, 0.1, 8.0, np.array([1, 2, 3], "<f4").tobytes())
+    assert np.frombuffer(corrupt(sweep, order, 0.0, Random(1)).ranges_f32, "<f4").tolist() == [1, 3]
+
+
 def test_a_wrong_stamp_comes_from_its_seed_ahead_as_often_as_behind_small_as_often_as_large():
     errors_s = [topic_fault("restamp", "summit_xl/scan", seed).disturbances[0].stamp_s
                 for seed in range(400)]
@@ -299,7 +335,7 @@ def test_a_fault_is_found_by_its_name_and_makes_sense(name):
     assert fault.name == name
     assert "\n" not in fault.title
     assert fault.title
-    assert fault.group in ("paper", "sensor", "topic")
+    assert fault.group in ("paper", "sensor", "topic", "reading")
     for order in fault.orders("i"):
         assert order.duration_s > 0
         assert flaw(order, resolve(order.topic, topics.ALL)[0].type) == ""
@@ -358,7 +394,8 @@ def test_an_order_survives_the_wire_also_a_permanent_one():
 
 def test_a_topic_of_the_robot_s_own_fails_like_any_other():
     known = (*topics.ALL, LOAD, AXLE)
-    assert modes_of("porter/load", known) == MODES
+    assert modes_of("porter/load", known) == (
+        *MODES, "zero", "negative", "huge", "infinite", "nan")
     assert find_fault("drop:porter/axle/front", known=known).disturbances[0].topic == (
         "porter/axle/front")
     (disturbance,) = find_fault("corrupt:porter/load", 3, known).disturbances

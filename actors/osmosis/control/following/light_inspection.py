@@ -95,8 +95,7 @@ class LightInspection:
 
     def sample(self, stamp_s: float, illuminance_lux: float) -> None:
         """Take a reading of the light sensor and when it was measured."""
-        if math.isfinite(illuminance_lux):
-            self._waiting.append((stamp_s, illuminance_lux))
+        self._waiting.append((stamp_s, illuminance_lux))
 
     def take(self, *, ended: bool = False) -> list[LightMeasurement]:
         """Return the measurements of lights passed since the last call.

@@ -23,6 +23,7 @@ from rampart.actors.osmosis.control.following.route_control import (
     RouteControl,
 )
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER
+from rampart.actors.osmosis.readings import is_light
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.spec.tables import NonNegative
 
@@ -112,7 +113,8 @@ class OsmosisControl(Actor):
     @on(topics.LIGHT)
     def light(self, message: m.LightSample, header: Header) -> None:
         """Take a reading of the light sensor."""
-        self._lights.inspection.sample(header.stamp, message.illuminance_lux)
+        if is_light(message):
+            self._lights.inspection.sample(header.stamp, message.illuminance_lux)
 
     @on(topics.GOAL)
     def goal(self, message: m.GoalOrder, _header: Header) -> None:

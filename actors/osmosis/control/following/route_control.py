@@ -30,6 +30,7 @@ from rampart.actors.osmosis.control.following.path_follower import Motion, PathF
 from rampart.actors.osmosis.control.limits_from_spec import hull_of, motion_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LaserPair
 from rampart.actors.osmosis.control.polyline import Array, Point, Polyline, Pose2
+from rampart.actors.osmosis.readings import is_odometry, is_pose
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.spec.schema import SystemSpec
 
@@ -162,11 +163,11 @@ class RouteControl:
 
     def pose(self, pose: m.Pose, stamp_s: float, now_s: float) -> None:
         """Take a pose in `map`."""
+        if not is_pose(pose):
+            return
         place = (pose.x_m, pose.y_m, pose.yaw_rad)
         if self._bridge:
             self._bridge.pose(stamp_s, place, now_s)
-        if not is_sane(*place):
-            return
         self._pose = place
         self._lights.inspection.pose(stamp_s, *place)
         if self._loop:
@@ -175,7 +176,7 @@ class RouteControl:
     def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> None:
         """Take the way that the wheels make."""
         pose = odometry.pose
-        if self._bridge:
+        if self._bridge and is_odometry(odometry):
             self._bridge.odometry(stamp_s, (pose.x_m, pose.y_m, pose.yaw_rad), now_s)
 
     def scan(self, laser: int, sweep: m.LaserScan, stamp_s: float, now_s: float) -> None:

@@ -11,13 +11,13 @@ import math
 from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import Pose
+from rampart.actors.osmosis.readings import is_pose
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 
 
 def is_newer(pose: Pose, stamp_s: float, last_stamp_s: float, now_s: float) -> bool:
     """Whether a measurement is usable and later than the last one passed on."""
-    return stamp_s > last_stamp_s and is_possible(stamp_s, now_s) and all(
-        map(math.isfinite, (pose.x_m, pose.y_m, pose.yaw_rad)))
+    return stamp_s > last_stamp_s and is_possible(stamp_s, now_s) and is_pose(pose)
 
 
 class Localization(Actor):

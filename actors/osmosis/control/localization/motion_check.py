@@ -19,9 +19,10 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from rampart.actors.ftm.plausible import is_possible, is_sane
+from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.osmosis.control.polyline import wrap_angle
 from rampart.actors.osmosis.messages import Imu, Odometry
+from rampart.actors.osmosis.readings import is_imu, is_odometry
 
 BACK_AFTER_S = 1.0
 """How long a device must have been without a flaw to be believed again."""
@@ -122,7 +123,7 @@ class OdometryCheck(Source):
         """
         pose = x_m, y_m, yaw_rad = reading.pose.x_m, reading.pose.y_m, reading.pose.yaw_rad
         linear_mps = reading.twist.linear_mps
-        if not stamp_s > self.stamp_s or not is_sane(*pose, linear_mps):
+        if not stamp_s > self.stamp_s or not is_odometry(reading):
             return None
         then_s, was = self.stamp_s, self._pose
         self.stamp_s, self._pose, self.speed_mps = stamp_s, pose, linear_mps
@@ -170,7 +171,7 @@ class ImuCheck(Source):
         yaw_rad, rate_radps = reading.yaw_rad, reading.yaw_rate_radps
         acceleration = reading.accel_x_mps2, reading.accel_y_mps2
         if not stamp_s > self.stamp_s or not is_possible(stamp_s, now_s) \
-                or not is_sane(yaw_rad, rate_radps, *acceleration):
+                or not is_imu(reading):
             return
         then_s, then_yaw = self.stamp_s, self.yaw_rad
         same = (rate_radps == self.rate_radps and yaw_rad == then_yaw

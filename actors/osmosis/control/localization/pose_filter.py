@@ -27,13 +27,13 @@ import math
 from typing import NamedTuple
 
 from rampart.actors.bus.envelope import AHEAD_S
-from rampart.actors.ftm.plausible import is_sane
 from rampart.actors.osmosis.control.localization import position_source as positions
 from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
 from rampart.actors.osmosis.control.polyline import wrap_angle
 from rampart.actors.osmosis.messages import GpsFix, LocalizationStatus, Odometry, Pose
+from rampart.actors.osmosis.readings import is_fix, is_pose
 
 _MAX_AGE_S = 0.3
 """A reading that arrives later is not used: the robot has moved on."""
@@ -162,7 +162,7 @@ class PoseFilter:
         """Take an absolute pose."""
         source, (x_m, y_m, yaw_rad) = self._pose, (pose.x_m, pose.y_m, pose.yaw_rad)
         if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s \
-                or not is_sane(x_m, y_m, yaw_rad):
+                or not is_pose(pose):
             return
         then_s, was, limits, ekf = source.stamp_s, source.reading, self.limits, self._ekf
         source.stamp_s, source.reading = stamp_s, (x_m, y_m, yaw_rad)
@@ -190,8 +190,7 @@ class PoseFilter:
         """Take a GPS fix."""
         source, x_m, y_m = self._gps, fix.x_m, fix.y_m
         velocity, accuracy_m = (fix.velocity_x_mps, fix.velocity_y_mps), fix.accuracy_m
-        if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s or not accuracy_m >= 0 \
-                or not is_sane(x_m, y_m, accuracy_m) or not math.hypot(*velocity) <= _FASTEST_MPS:
+        if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s or not is_fix(fix):
             return
         then_s, limits, ekf = source.stamp_s, self.limits, self._ekf
         same = (x_m, y_m, 0.0) == source.reading and velocity == source.velocity
@@ -366,7 +365,7 @@ _OTHER_SPEED_MPS = 0.3
 _GYRO_RAD2_PER_S = 1e-6
 _WHEEL_TURN_SHARE, _WHEEL_RAD2_PER_S = 0.15, 1e-5
 _UNKNOWN_TURN_RADPS, _UNKNOWN_SPEED_MPS = 1.0, 0.3
-_CREEP_MPS, _TOP_SPEED_MPS, _FASTEST_MPS = 0.05, 1.0, 100.0
+_CREEP_MPS, _TOP_SPEED_MPS = 0.05, 1.0
 _GPS_REPEATS, _STRAIGHT_RADPS = 2, 0.1
 _APART_GAIN, _CLEARLY, _MORE_THAN_CHANCE = 0.3, 2.0, 3
 _WHEELS_ASTRAY_M, _GYRO_ASTRAY_RAD = 0.25, 0.1

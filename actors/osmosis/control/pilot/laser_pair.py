@@ -14,19 +14,23 @@ time base or receiver has an error shows it in the reference. (Self-monitoring o
 IEC 61496-3 asks of such devices; here it is done by who depends on it.)
 
 A sweep that covers less than the robot's spec says is not believed either: where it does not look,
-or not that far, it shows nothing, and nothing looks like free space.
+or not that far, it shows nothing, and nothing looks like free space. A ray that means nothing
+(`rampart.actors.osmosis.readings`) does not look either. The other laser's ray takes its place;
+where neither knows anything in an angle wider than the spec's gap, there is no view.
 """
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import msgspec
 import numpy as np
 
 from rampart.actors.ftm.plausible import is_possible
-from rampart.actors.osmosis.control.polyline import NO_POINTS, Array, scan_points
+from rampart.actors.osmosis.control.polyline import NO_POINTS, Array, ray_directions
 from rampart.actors.osmosis.messages import LaserScan
+from rampart.actors.osmosis.readings import ray_distances
 
 LOWER, UPPER = 0, 1
 
@@ -57,18 +61,25 @@ class LaserReach(msgspec.Struct, frozen=True):
         range_m: It shows everything up to this distance.
         field_rad: In this angle, half of it on either side of straight ahead.
         gap_rad: With rays no farther apart.
+        near_m: Nearer than this a laser has no echo: it would lie within the robot.
     """
 
     range_m: float
     field_rad: float
     gap_rad: float
+    near_m: float = 0.0
+
+    @property
+    def edge_rad(self) -> float:
+        """Angle to either side at which there has to be a ray, or beyond."""
+        return (self.field_rad - self.gap_rad) / 2
 
     def lack(self, sweep: LaserScan) -> str:
         """Return what a sweep does not cover, or an empty text."""
         count, odd = divmod(len(sweep.ranges_f32), 4)
         first_rad, step_rad = sweep.angle_min_rad, sweep.angle_increment_rad
         last_rad = first_rad + (count - 1) * step_rad
-        edge_rad = (self.field_rad - self.gap_rad) / 2
+        edge_rad = self.edge_rad
         if odd or not 0 < step_rad <= self.gap_rad:
             return f"the laser's rays are {step_rad:.3g} rad apart, not up to {self.gap_rad:.3g}"
         if not (-math.pi <= first_rad <= -edge_rad and edge_rad <= last_rad <= math.pi):
@@ -161,8 +172,10 @@ class LaserPair:
             return None if partner else LaserView(NO_POINTS, stamp_s, self._faults[laser])
         if laser == UPPER and partner:
             return None  # the lower one's sweeps make the view: twice as often is of no use
-        self._seen_s = max(stamp_s, self._seen_s)
-        return LaserView(_echoes(sweep, partner), stamp_s, "")
+        points, hole = _seen(self._reach, _rays(sweep), partner and _rays(partner))
+        if not hole:
+            self._seen_s = max(stamp_s, self._seen_s)
+        return LaserView(points, stamp_s, hole)
 
     def _partner(self, laser: int, now_s: float) -> LaserScan | None:
         """Return the last sweep of the other laser if it is of now and can be believed."""
@@ -171,21 +184,59 @@ class LaserPair:
         return self._sweeps[laser]
 
 
-def _echoes(sweep: LaserScan, partner: LaserScan | None) -> Array:
-    if partner is None or (sweep.ranges_f32 == partner.ranges_f32 and _same_rays(sweep, partner)):
-        return _points(sweep)
-    if not _same_rays(sweep, partner):
-        return np.concatenate((_points(sweep), _points(partner)))
-    nearest = np.fmin(np.frombuffer(sweep.ranges_f32, "<f4"),
-                      np.frombuffer(partner.ranges_f32, "<f4"))
-    return _points(sweep, nearest.tobytes())
+_Rays = tuple[float, float, float, bytes]
+"""Of a sweep all that says where echoes are: first angle, step, greatest range, ranges."""
 
 
-def _points(sweep: LaserScan, ranges_f32: bytes | None = None) -> Array:
-    return scan_points(sweep.ranges_f32 if ranges_f32 is None else ranges_f32, sweep.angle_min_rad,
-                       sweep.angle_increment_rad, sweep.range_max_m)
+def _rays(sweep: LaserScan) -> _Rays:
+    return sweep.angle_min_rad, sweep.angle_increment_rad, sweep.range_max_m, sweep.ranges_f32
 
 
-def _same_rays(a: LaserScan, b: LaserScan) -> bool:
-    return (len(a.ranges_f32), a.angle_min_rad, a.angle_increment_rad, a.range_max_m) == (
-        len(b.ranges_f32), b.angle_min_rad, b.angle_increment_rad, b.range_max_m)
+@lru_cache(maxsize=8)
+def _seen(reach: LaserReach, sweep: _Rays, partner: _Rays | None) -> tuple[Array, str]:
+    """Return the echoes of one sweep or two, and where nothing is known, or an empty text.
+
+    The array is read-only: sweeps that come again, as those without any echo do all the time,
+    get the same one.
+    """
+    looks = [(_distances(reach, sweep), *sweep[:2])]
+    if partner is not None and partner != sweep:
+        other = _distances(reach, partner)
+        if sweep[:3] == partner[:3] and len(other) == len(looks[0][0]):
+            looks = [(np.fmin(looks[0][0], other), *sweep[:2])]  # of a number and NaN the number
+        else:
+            looks.append((other, *partner[:2]))
+    if hole := _hole(reach, looks):
+        return NO_POINTS, hole
+    echoes = []
+    for distances, *angles in looks:
+        echo = np.isfinite(distances)
+        if echo.any():
+            echoes.append(distances[echo, None] * ray_directions(len(distances), *angles)[echo])
+    if not echoes:
+        return NO_POINTS, ""
+    points = echoes[0] if len(echoes) == 1 else np.concatenate(echoes)
+    points.flags.writeable = False
+    return points, ""
+
+
+def _distances(reach: LaserReach, rays: _Rays) -> Array:
+    return ray_distances(rays[3], rays[2], reach.near_m)
+
+
+def _hole(reach: LaserReach, looks: list[tuple[Array, float, float]]) -> str:
+    """Return in which angle, wider than the reach allows, nothing is known; else an empty text."""
+    unknown = [np.isnan(distances) for distances, *_ in looks]
+    if not all(nothing.any() for nothing in unknown):
+        return ""  # one sweep is whole, as nearly always
+    known = np.sort(np.concatenate([
+        first_rad + step_rad * np.flatnonzero(~nothing)
+        for nothing, (_, first_rad, step_rad) in zip(unknown, looks, strict=True)]))
+    ends = np.concatenate(((-math.inf,), known, (math.inf,)))
+    wide = (np.diff(ends) > reach.gap_rad * (1 + 1e-6)) \
+        & (ends[:-1] < reach.edge_rad) & (ends[1:] > -reach.edge_rad)
+    if not wide.any():
+        return ""
+    first = int(np.argmax(wide))
+    return (f"the laser's ranges mean nothing between {max(ends[first], -math.pi):.2f} and "
+            f"{min(ends[first + 1], math.pi):.2f} rad")

@@ -7,13 +7,13 @@ import math
 import msgspec
 
 from rampart.actors.bus.bounds import clip
-from rampart.actors.ftm.plausible import is_sane
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Point, show
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.planning.closures import Closures, without
 from rampart.actors.osmosis.control.planning.route_search import PlannedRoute, plan_route
 from rampart.actors.osmosis.messages import Blockage, ControlStatus, GoalOrder, Mode, Pose, Route
+from rampart.actors.osmosis.readings import is_pose
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.spec.tables import NonNegative
@@ -85,7 +85,7 @@ class GraphPlanner(Actor):
     @on(topics.POSE)
     def pose(self, message: Pose, _header: Header) -> None:
         """Keep the latest pose, if it is one; plan if a goal was waiting for it."""
-        if not is_sane(message.x_m, message.y_m, message.yaw_rad):
+        if not is_pose(message):
             return
         self._pose = message
         if self._route is None:

@@ -13,10 +13,10 @@ import math
 
 from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.module import DetectionModule, Waiting
-from rampart.actors.ftm.plausible import is_sane
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.position_vote import PositionVote
+from rampart.actors.osmosis.readings import is_pose
 from rampart.actors.runtime.actor import Context, Header, on
 
 _POSE = "localization"
@@ -42,7 +42,7 @@ class EstimationMonitor(Finding):
 
     def pose(self, pose: m.Pose, stamp_s: float, now_s: float, suspect: str) -> None:
         """Take the pose under test; `suspect` is the incarnation of the node that says it."""
-        if is_sane(pose.yaw_rad) and self.vote.see_position(stamp_s, (pose.x_m, pose.y_m), now_s):
+        if is_pose(pose) and self.vote.see_position(stamp_s, (pose.x_m, pose.y_m), now_s):
             self._yaw_rad = pose.yaw_rad
             if not self.active:
                 self.nodes = (suspect,)

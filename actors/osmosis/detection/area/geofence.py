@@ -19,8 +19,9 @@ from dataclasses import dataclass
 
 from rampart.actors.detection.freshness import FreshnessMonitor
 from rampart.actors.detection.lasting import Lasting
-from rampart.actors.ftm.plausible import is_possible, is_sane
+from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.osmosis.messages import GpsFix
+from rampart.actors.osmosis.readings import is_fix
 
 ProhibitedDistance = Callable[[float, float], float]
 """Signed distance (m) from a point in `map` to the prohibited area, negative inside it."""
@@ -30,9 +31,6 @@ _LEAST_STEP_M = 0.02
 
 _ROUNDING_M = 1e-6
 """Far more than the rounding errors of distances."""
-
-_FASTEST_MPS = 100.0
-"""Nothing that drives on an airport is faster: a receiver that says so says nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +48,6 @@ class FenceLimits:
     reaction_s: float
     braking_mps2: float
     hysteresis_m: float = 0.1
-
-
-def is_usable(fix: GpsFix) -> bool:
-    """Whether all of a fix are numbers, and ones that can be."""
-    return fix.accuracy_m >= 0 and is_sane(fix.x_m, fix.y_m, fix.accuracy_m) \
-        and math.hypot(fix.velocity_x_mps, fix.velocity_y_mps) <= _FASTEST_MPS
 
 
 class DistanceBound:
@@ -177,7 +169,7 @@ class FenceMonitor:
 
     def fix(self, fix: GpsFix, stamp_s: float, now_s: float) -> None:
         """Take note of a fix in `map`, measured at `stamp_s`."""
-        if not is_usable(fix) or not is_possible(stamp_s, now_s):
+        if not is_fix(fix) or not is_possible(stamp_s, now_s):
             return
         self._freshness.heard(stamp_s, now_s)
         extra_m = self._limits.hysteresis_m if self._intrusion else 0.0

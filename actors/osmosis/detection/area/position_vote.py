@@ -23,7 +23,7 @@ import math
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.detection.area.geofence import is_usable
+from rampart.actors.osmosis.readings import is_fix, is_imu, is_odometry
 
 GPS = "GPS"
 WHEELS = "dead reckoning"
@@ -80,8 +80,7 @@ class Track:
 
     def imu(self, imu: m.Imu, stamp_s: float, now_s: float) -> None:
         """Take the IMU's heading."""
-        if stamp_s > self._imu[0] and is_possible(stamp_s, now_s) \
-                and is_sane(imu.yaw_rad, imu.yaw_rate_radps):
+        if stamp_s > self._imu[0] and is_possible(stamp_s, now_s) and is_imu(imu):
             self._imu = (stamp_s, imu.yaw_rad, imu.yaw_rate_radps)
 
     @property
@@ -96,7 +95,7 @@ class Track:
         """Take odometry; return the way made since the last, m."""
         yaw_rad, linear_mps = odometry.pose.yaw_rad, odometry.twist.linear_mps
         if not stamp_s > self.stamp_s or not is_possible(stamp_s, now_s) \
-                or not is_sane(yaw_rad, linear_mps):
+                or not is_odometry(odometry):
             return 0.0
         dt_s = stamp_s - self.stamp_s
         self.stamp_s = stamp_s
@@ -212,7 +211,7 @@ class PositionVote:
 
     def see_gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> bool:
         """Take a fix and compare; return whether it could be used."""
-        if not is_usable(fix) or not self._usable(self.gps, stamp_s, (fix.x_m, fix.y_m), now_s):
+        if not is_fix(fix) or not self._usable(self.gps, stamp_s, (fix.x_m, fix.y_m), now_s):
             return False
         track = self.track
         self.gps.see(stamp_s, (fix.x_m, fix.y_m), track, self._forget_s(self.gps))

@@ -16,6 +16,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
 from rampart.actors.osmosis.detection.area.prohibited_area import GPS_PERIOD_S, fence_of
+from rampart.actors.osmosis.readings import is_pose
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.manager.spec.tables import NonNegative, Positive
 
@@ -113,7 +114,9 @@ class VotedArea(DetectionModule):
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, message: m.Pose, header: Header) -> None:
         """Hear the absolute pose."""
-        self._where.vote.see_position(header.stamp, (message.x_m, message.y_m), self.clock.now())
+        if is_pose(message):
+            self._where.vote.see_position(
+                header.stamp, (message.x_m, message.y_m), self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:

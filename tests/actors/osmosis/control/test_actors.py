@@ -19,6 +19,7 @@ from rampart.actors.osmosis.control.localization.localization import Localizatio
 from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.osmosis.control.planning.graph_planner import GraphPlanner
+from rampart.actors.osmosis.control.polyline import wrap_angle
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
 from rampart.actors.osmosis.messages import Mode
 from rampart.actors.runtime.actor import Actor, Context, every, on
@@ -85,7 +86,8 @@ class Base(Actor):
         world = self.world
         world.move(self.command.linear_mps, self.command.angular_radps)
         if self.localized:
-            self.publish(topics.ABSOLUTE_POSE, m.Pose(world.x_m, world.y_m, world.yaw_rad))
+            self.publish(topics.ABSOLUTE_POSE, m.Pose(
+                world.x_m, world.y_m, wrap_angle(world.yaw_rad)))
         points = world.scan(rays=181, range_max_m=5.0)
         ranges = np.full(181, 5.0)
         where = np.round((np.arctan2(points[:, 1], points[:, 0]) + 0.75 * math.pi)

@@ -19,12 +19,12 @@ from rampart.actors.osmosis.detection.area.geofence import (
     FenceLimits,
     FenceMonitor,
     intrusion,
-    is_usable,
     stopping_distance_m,
 )
 from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea, half_diagonal_m
 from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.messages import GpsFix
+from rampart.actors.osmosis.readings import is_fix
 from rampart.actors.runtime.actor import Actor
 from rampart.testing import Ear, play, run, table
 from tests.actors.osmosis.detection.sources import Source
@@ -151,8 +151,8 @@ def test_fence_timeline(events, expected):
 
 @pytest.mark.parametrize("speed_mps", [1e6, 1e155, 1.7e308, math.inf, math.nan])
 def test_a_velocity_that_cannot_be_makes_a_fix_unusable_and_raises_nothing(speed_mps):
-    assert not is_usable(GpsFix(0.0, 0.0, speed_mps, 0.0, 0.05))
-    assert not is_usable(GpsFix(0.0, 0.0, 0.0, -speed_mps, 0.05))
+    assert not is_fix(GpsFix(0.0, 0.0, speed_mps, 0.0, 0.05))
+    assert not is_fix(GpsFix(0.0, 0.0, 0.0, -speed_mps, 0.05))
     monitor = fence()
     monitor.fix(GpsFix(0.0, 0.0, speed_mps, speed_mps, 0.05), 0.0, 0.0)
     assert not monitor.active

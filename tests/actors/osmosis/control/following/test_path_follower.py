@@ -9,7 +9,7 @@ from rampart.actors.osmosis.control.following.escape import Escape, EscapeLimits
 from rampart.actors.osmosis.control.following.path_follower import PathFollower
 from rampart.actors.osmosis.control.following.potential_field import clusters, field, repulsion
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
-from rampart.actors.osmosis.control.polyline import Polyline, scan_points, wrap_angle
+from rampart.actors.osmosis.control.polyline import Polyline, wrap_angle
 from tests.actors.osmosis.control.world import HULL, Circle, World, drive
 
 LINE = [(0.0, 0.0), (20.0, 0.0)]
@@ -181,12 +181,6 @@ def test_repulsion_does_not_depend_on_the_number_of_echoes():
 def test_the_field_never_turns_the_robot_about(y_m, x_m):
     x, _ = field(1.0, 0.0, np.array(((x_m, y_m),)), HULL)
     assert x > 0.0
-
-
-def test_a_scan_without_echo_or_with_nonsense_gives_no_points():
-    ranges = np.array([5.0, np.nan, np.inf, -1.0, 0.0, 2.0], dtype="<f4").tobytes()
-    points = scan_points(ranges + b"\x01", 0.0, math.pi / 2, 5.0)
-    assert points == pytest.approx(np.array(((0.0, 2.0),)), abs=1e-6)
 
 
 @given(st.floats(-50.0, 50.0))

@@ -1,0 +1,190 @@
+"""A sensor that reports nonsense is a sensor that reports nothing."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.control.limits_from_spec import reach_of
+from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
+from rampart.actors.osmosis.page.laser import thin
+from rampart.actors.osmosis.readings import (
+    is_base_status,
+    is_fix,
+    is_imu,
+    is_light,
+    is_odometry,
+    is_pose,
+    ray_distances,
+)
+from rampart.sim.campaign.job import Job, run_job
+from rampart.sim.faults.scenario import parse_fault
+from tests.actors.osmosis.control.laser_sweeps import RAYS, full_sweep
+from tests.osmosis_system import shipped_system
+
+REACH = reach_of(shipped_system())
+NO_RAY = [0.0, -1.0, -math.inf, math.nan, 0.01, 8.5, 1e6]
+FREE = [8.0, math.inf]
+
+
+def as_bytes(ranges):
+    return np.array(ranges, "<f4").tobytes()
+
+
+def with_rays(sweep, *changed):
+    """Return a sweep with other ranges, each given by index or slice, and m."""
+    ranges = np.frombuffer(sweep.ranges_f32, "<f4").copy()
+    for where, range_m in changed:
+        ranges[where] = range_m
+    return msgspec.structs.replace(sweep, ranges_f32=as_bytes(ranges))
+
+
+def view_of(lower, upper=None):
+    pair = LaserPair(REACH)
+    if upper is not None:
+        pair.take(UPPER, upper, 0.0, 0.0)
+    return pair.take(LOWER, lower, 0.0, 0.0)
+
+
+def nearest_m(view):
+    return np.hypot(*view.points.T).min() if len(view.points) else math.inf
+
+
+# ---- rays ---------------------------------------------------------------------------------------
+
+
+def test_a_ray_is_an_echo_or_free_or_nothing():
+    meaning = ray_distances(as_bytes([3.0, *FREE, *NO_RAY]) + b"\1", 8.0, near_m=0.25)
+    assert meaning[0] == 3.0
+    assert np.isinf(meaning[1:3]).all()
+    assert np.isnan(meaning[3:]).all()
+
+
+@pytest.mark.parametrize("range_m", NO_RAY)
+@pytest.mark.parametrize("bad", [LOWER, UPPER])
+def test_rays_that_mean_nothing_hide_no_echo_of_the_other_laser(bad, range_m):
+    sound = with_rays(full_sweep(8.0, 1), (90, 3.0))
+    wrong = full_sweep(range_m, 2)
+    view = view_of(wrong, sound) if bad == LOWER else view_of(sound, wrong)
+    assert (view.fault, nearest_m(view)) == ("", 3.0)
+
+
+@pytest.mark.parametrize("range_m", NO_RAY)
+@pytest.mark.parametrize("where", [slice(None), slice(85, 95), slice(0, 3), slice(-3, None), 90])
+def test_where_no_laser_knows_anything_there_is_no_view(where, range_m):
+    wrong = with_rays(full_sweep(8.0, 1), (where, range_m))
+    assert "mean nothing" in view_of(wrong).fault
+    assert "mean nothing" in view_of(wrong, with_rays(full_sweep(8.0, 2), (where, -1.0))).fault
+
+
+def test_two_lasers_with_holes_in_different_places_make_a_whole_view():
+    lower = with_rays(full_sweep(8.0, 1), (slice(0, 90), 0.0), (120, 2.0))
+    upper = with_rays(full_sweep(8.0, 2), (slice(100, RAYS), math.nan), (30, 4.0))
+    view = view_of(lower, upper)
+    assert view.fault == ""
+    assert sorted(np.hypot(*view.points.T).round(3)) == [2.0, 4.0]
+
+
+def test_a_finer_laser_may_lose_rays_between_which_nothing_can_hide():
+    fine = m.LaserScan(-2.4, 0.01, 8.0, as_bytes(np.full(481, 8.0)), 0.1)
+    assert view_of(with_rays(fine, (slice(0, None, 2), 0.0))).fault == ""
+    assert "mean nothing" in view_of(with_rays(fine, (slice(200, 203), 0.0))).fault
+
+
+def test_lasers_whose_rays_differ_fill_each_other_s_holes():
+    lower = with_rays(full_sweep(8.0, 1), (slice(None), 0.0))
+    upper = m.LaserScan(-2.4, 0.01, 8.0, as_bytes(np.full(481, 5.0)), 0.1)
+    assert (view_of(lower, upper).fault, len(view_of(lower, upper).points)) == ("", 481)
+    holed = with_rays(upper, (slice(100, 200), math.nan))
+    assert "mean nothing" in view_of(lower, holed).fault
+    filled = with_rays(lower, (slice(None), 8.0))
+    assert view_of(filled, holed).fault == ""
+
+
+@given(st.lists(st.sampled_from([8.0, 3.0, *NO_RAY]), min_size=RAYS, max_size=RAYS),
+       st.lists(st.sampled_from([8.0, 3.0, *NO_RAY]), min_size=RAYS, max_size=RAYS))
+def test_whatever_the_rays_a_view_shows_every_echo_of_either(a, b):
+    lower, upper = (with_rays(full_sweep(8.0, i), (slice(None), ranges))
+                    for i, ranges in enumerate((a, b)))
+    view = view_of(lower, upper)
+    if not view.fault:
+        assert len(view.points) == sum(3.0 in pair for pair in zip(a, b, strict=True))
+
+
+def test_the_page_shows_no_echo_where_a_ray_means_nothing():
+    shown = thin(with_rays(full_sweep(8.0, 1), (90, 0.0), (20, 3.0)))
+    assert set(shown["cm"]) == {-1, 300}
+
+
+# ---- other sensors -------------------------------------------------------------------------------
+
+
+POSE, TWIST = m.Pose(1.0, 2.0, 3.0), m.Twist(0.5, 0.1)
+SOUND = [
+    (is_pose, POSE), (is_odometry, m.Odometry(POSE, TWIST)), (is_imu, m.Imu(0.1, 0.0, 0.2, -0.1)),
+    (is_fix, m.GpsFix(1.0, 2.0, 0.5, 0.0, 0.02)), (is_light, m.LightSample(0.0)),
+    (is_base_status, m.BaseStatus(False, False, 0.0, (8.0, 8.0, 8.0, 8.0)))]
+
+
+@pytest.mark.parametrize(("can_be", "reading"), SOUND)
+def test_a_sound_reading_is_one(can_be, reading):
+    assert can_be(reading)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e9])
+@pytest.mark.parametrize(("can_be", "reading"), SOUND)
+def test_a_reading_with_one_number_that_cannot_be_is_none(can_be, reading, wrong):
+    for changed in changes(reading, wrong):
+        assert not can_be(changed), changed
+
+
+def changes(reading, wrong):
+    """Yield the reading with each of its measured numbers wrong."""
+    for name in reading.__struct_fields__:
+        value = getattr(reading, name)
+        if isinstance(value, msgspec.Struct):
+            for inner in changes(value, wrong):
+                yield msgspec.structs.replace(reading, **{name: inner})
+        elif isinstance(value, tuple):
+            for i in range(len(value)):
+                yield msgspec.structs.replace(
+                    reading, **{name: (*value[:i], wrong, *value[i + 1:])})
+        elif isinstance(value, float) and name != "command_age_s":
+            yield msgspec.structs.replace(reading, **{name: wrong})
+
+
+def test_readings_beyond_what_a_device_can_say_are_none():
+    assert not is_light(m.LightSample(-1.0))
+    assert not is_pose(m.Pose(0.0, 0.0, 7.0))
+    assert not is_fix(m.GpsFix(0.0, 0.0, 0.0, 0.0, 0.0))  # as a receiver without a fix says
+    assert not is_fix(m.GpsFix(1.0, 2.0, 0.0, 0.0, -1.0))
+
+
+# ---- whole runs ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", [
+    "zero:summit_xl/scan@5+inf",
+    *(pytest.param(f"{way}:summit_xl/{laser}@5+inf", marks=pytest.mark.slow) for way, laser in (
+        ("zero", "upper_scan"), ("negative", "scan"), ("tiny", "scan"), ("nan", "upper_scan")))])
+def test_a_laser_of_nonsense_costs_the_full_system_nothing(fault):
+    result = run_job(Job(row="x", system="osmosis", options={"mission": "A", "obstacles": 2},
+                         seed=3, faults=(parse_fault(fault),)))
+    assert result.effective
+    assert (result.safe, result.success) == (True, True), result.reasons
+
+
+@pytest.mark.parametrize("way", [
+    "zero", *(pytest.param(way, marks=pytest.mark.slow) for way in (
+        "negative", "tiny", "huge", "nan", "single", "short"))])
+def test_the_paper_s_system_with_one_laser_of_nonsense_stands(way):
+    result = run_job(Job(row="x", system="paper", options={"mission": "A", "obstacles": 2}, seed=3,
+                         faults=(parse_fault(f"{way}:summit_xl/scan@5+inf"),)))
+    assert result.effective
+    assert (result.safe, result.success) == (True, False)
