@@ -26,7 +26,7 @@ from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
 from rampart.sim.faults.injector import can_be_hit
-from rampart.sim.faults.topic_faults import modes_of, systematic_faults
+from rampart.sim.faults.topic_faults import NONSENSE, modes_of, systematic_faults
 
 _DEFAULT_DURATION_S = 5.0
 _SECONDS = "must be seconds above 0"
@@ -262,6 +262,11 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
             say()
     say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}:")
     print_table(("topic", "modes"), list(_modes_by_topic(keys, known).items()))
+    say()
+    say(f"nonsense readings, as MODE:TOPIC; MODE is one of {', '.join(NONSENSE)}:")
+    print_table(("topic", "modes"), [
+        (key, ", ".join(nonsense)) for key in keys
+        if (nonsense := [mode for mode in modes_of(key, known) if mode in NONSENSE])])
     say()
     others = [name for names in faults.others.values() for name in names]
     if others:
