@@ -4,7 +4,10 @@
 import sys
 from pathlib import Path
 
-from rampart.cli.run import main
+from rampart.files import interrupts
 
 if __name__ == "__main__":
+    interrupts.end_at_once()
+    from rampart.cli.run import main
+
     sys.exit(main(reports=Path(__file__).resolve().parent / "reports"))

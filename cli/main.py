@@ -51,7 +51,7 @@ from rampart.cli.operate import (
 from rampart.cli.output import NoEffectError, UsageError, warn
 from rampart.cli.record import record_verbs
 from rampart.cli.verbs import FORMATTER, PORT, help_of
-from rampart.files import streams, working_folder
+from rampart.files import interrupts, streams, working_folder
 
 _OF_A_RUN = (node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs,
              adapt_verb, record_verbs, keys_verb, token_verbs)
@@ -94,6 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         arguments = sys.argv[1:]
     if arguments[:1] == ["run"]:
+        interrupts.end_at_once()
         from rampart.cli.run import main as run  # noqa: PLC0415 physics and all: other verbs need not
 
         return run(arguments[1:], "rampart run")

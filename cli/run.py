@@ -32,7 +32,7 @@ from rampart.actors.supervision.launcher import LaunchError
 from rampart.cli.host import HostRun
 from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.run_options import ERROR_LOG, MAX_RATE, parse, plan_of, refuse
-from rampart.files import streams, working_folder
+from rampart.files import interrupts, streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.faults import faults_of
@@ -101,11 +101,12 @@ class Run:
             if self._options.rate == MAX_RATE:
                 asyncio.run(self._find_rate())
             run = ProcessRun(self._trial, self._scenario)
-            run.begin()
-            try:
-                return asyncio.run(self._on_processes(run))
-            finally:
-                run.launcher.abort()
+            with _interruptible_between_bytecodes(run, signal.SIGINT):  # until the loop turns
+                run.begin()
+                try:
+                    return asyncio.run(self._on_processes(run))
+                finally:
+                    run.launcher.abort()
 
     def _made(self, plan: RunPlan, stream: TextIO | None) -> Trial:
         options, kind = self._options, self._kind
@@ -145,7 +146,7 @@ class Run:
             raise TypeError("a run from the command line tells its story")
         console.banner(self._trial.about, self._plan, self._trial.run.system, virtual=True)
         try:
-            with _interruptible_between_bytecodes(run):
+            with _interruptible_between_bytecodes(run, *_ends()):
                 result = run.run()
         finally:
             console.close()
@@ -263,15 +264,17 @@ def _ends() -> list[signal.Signals]:
 
 
 @contextlib.contextmanager
-def _interruptible_between_bytecodes(run: VirtualRun) -> Iterator[None]:
-    """As `_interruptible`, for a loop that never waits and so reads no signals from its pipe."""
+def _interruptible_between_bytecodes(run: VirtualRun | ProcessRun, *ends: signal.Signals
+                                     ) -> Iterator[None]:
+    """As `_interruptible`, where no loop reads signals from its pipe; what is ignored stays so."""
 
     def interrupt(number: int, _frame: object) -> None:
         if run.interrupted:
             raise KeyboardInterrupt
         run.interrupted = f"interrupted by {signal.Signals(number).name}"
 
-    before = {number: signal.signal(number, interrupt) for number in _ends()}
+    before = {number: signal.signal(number, interrupt) for number in ends
+              if signal.getsignal(number) is not signal.SIG_IGN}
     try:
         yield
     finally:
@@ -299,11 +302,14 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
     streams.secure()
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
-        options, kind = parse(arguments, program)
-        plan, spec = plan_of(options, kind, _say)
-        if plan.host:
-            return _on_another_host(options, plan, reports)
-        return Run(options, plan, spec, reports).run()
+        interrupts.end_at_once()
+        try:
+            options, kind = parse(arguments, program)
+            plan, spec = plan_of(options, kind, _say)
+            run = Run(options, plan, spec, reports) if not plan.host else None
+        finally:
+            interrupts.raise_again()
+        return run.run() if run else _on_another_host(options, plan, reports)
     except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
         _say(str(error))
         return EXIT_USAGE

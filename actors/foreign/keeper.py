@@ -311,12 +311,14 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     with control.makefile("rb", buffering=0) as lines:
         text = b""
-        while not text.endswith(b"\n"):
+        while b"\n" not in text:
             part = lines.read(1 << 16)
             if not part:
                 return
             text += part
-    Keeper(control, Order(**json.loads(text))).run()
+    order, _, more = text.partition(b"\n")
+    if not more:  # else its end was asked for before its start
+        Keeper(control, Order(**json.loads(order))).run()
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import ROUTERS, is_here, process_of, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
+from rampart.actors.foreign.child import CommandError
 from rampart.actors.layout.layout import Layout, router
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Actor, Context
@@ -196,7 +197,8 @@ async def live(layout: Layout, role: Role, run: RunContext, lifeline: int,
     def tell(error: Exception) -> None:  # at once: what replaces this process may kill it
         told.append(error)
         complain(f"{who} failed: {type(error).__name__}: {error}")
-        _log_traceback(layout.plan.error_log, who, error)
+        if not isinstance(error, CommandError):  # of a command that ended this code has no more
+            _log_traceback(layout.plan.error_log, who, error)
 
     try:
         if not role.waits:

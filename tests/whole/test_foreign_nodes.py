@@ -148,6 +148,7 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
         assert (none.returncode, none.stderr) == (1, (
             "rampart: driver: no command, or its output is not kept; there is output of: forking, "
             "wheels\n"))
+        assert not list(tmp_path.rglob("errors.log"))  # what a command does is no traceback of ours
     tug.wait_until(lambda: gone(*pids) and find_strays(folder) == [], 3, "something is left")
     assert "wheels #1 ended: signal SIGKILL" in (tmp_path / "report/logs/wheels.log").read_text()
 

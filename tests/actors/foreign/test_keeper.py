@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import socket
+import subprocess
+import sys
 from functools import partial
 
 import pytest
@@ -17,6 +21,19 @@ def clock(monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr(keeper.time, "monotonic", lambda: now_s[0])
     return now_s
+
+
+def test_a_command_whose_end_is_asked_for_before_its_start_is_not_started(tmp_path):
+    order = keeper.Order("it", ["/bin/touch", str(tmp_path / "started")], "/", {}, {}, [],
+                         str(tmp_path / "it.log"), 0.1)
+    mine, other = socket.socketpair()
+    with mine, other:
+        mine.sendall(json.dumps(order._asdict()).encode() + b"\nstop\n")
+        done = subprocess.run([sys.executable, "-I", "-S", keeper.__file__, str(other.fileno())],
+                              pass_fds=[other.fileno()], capture_output=True, text=True,
+                              timeout=20, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert not (tmp_path / "started").exists()
 
 
 def test_output_goes_on_in_a_second_file_and_never_beyond(tmp_path, clock):
