@@ -215,7 +215,7 @@ class Hmi(Actor):
             Handlers(self.requests, operating.introduction, self._fulfil, operating.left,
                      self.refuses),
             lambda port: Gate(register, secret, port, tls=tls is not None, owner=owner), audit,
-            tls=tls, camera=self._camera, files=self.files)
+            tls=tls, camera=self._camera, files=self.files, tell=complain)
 
     def _complain(self, why: str) -> None:
         self.report_diagnostic("operator's page", clip(why), f"port {self._port}")

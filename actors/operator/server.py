@@ -24,7 +24,7 @@ from starlette.middleware import Middleware
 from starlette.requests import Request as HttpRequest
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from rampart.actors.operator.camera_eye import CameraError, CameraEye
 from rampart.actors.operator.feed import SEND_TIMEOUT_S, Feed, PageFeed
@@ -43,6 +43,8 @@ from rampart.actors.web.gate import Gate
 from rampart.actors.web.server import WebServer, served
 from rampart.actors.web.tls import Tls
 from rampart.actors.web.visitors import Visitor
+from rampart.files.plain_text import one_line
+from rampart.files.streams import complain
 
 NOT_LOGGED_IN = 4401
 """Close code of a WebSocket of nobody who is known, or not any more; its page asks for a token."""
@@ -131,6 +133,7 @@ class PageServer:
         tls: what it is encrypted with, or None.
         camera: where pictures come from, or None.
         files: folder of the robot's own JavaScript and CSS, or None.
+        tell: called with one line for each error of a handler.
 
     Raises:
         PortError: the address cannot be bound.
@@ -138,8 +141,10 @@ class PageServer:
 
     def __init__(self, access: Access, feed: Feed, handlers: Handlers,
                  gate: Callable[[int], Gate], audit: AuditLog, *, tls: Tls | None = None,
-                 camera: CameraEye | None = None, files: Path | None = None) -> None:
+                 camera: CameraEye | None = None, files: Path | None = None,
+                 tell: Callable[[str], None] = complain) -> None:
         self._feed = feed
+        self._tell = tell
         self._camera = camera
         self._handlers = handlers
         self._audit = audit
@@ -164,7 +169,8 @@ class PageServer:
                 Door, access=access, gate=self._gate, public=frozenset(public))]),
             listening, refusal="" if asks else _REFUSAL, known=not asks,
             tls=tls.context if tls else None,
-            not_plain=f"This page is encrypted: {access.url}", ws_max_size=MAX_MESSAGE_BYTES)
+            not_plain=f"This page is encrypted: {access.url}", tell=tell,
+            ws_max_size=MAX_MESSAGE_BYTES)
         self._server.start()
 
     @property
@@ -218,11 +224,20 @@ class PageServer:
                 await _send(socket_, self._handlers.came(page.number))
                 await _until_one_ends(self._talk(socket_, fed, page), self._push(socket_, fed),
                                       self._watch(socket_, page))
-        except (WebSocketDisconnect, RuntimeError, TimeoutError):
+        except (WebSocketDisconnect, TimeoutError):
             return  # the page has gone while it was being answered
+        except Exception as error:
+            if WebSocketState.DISCONNECTED in {socket_.client_state, socket_.application_state}:
+                return  # the same
+            await _close(socket_, 1011, self._failed("this page", error))
         finally:
             self._handlers.left(page.number)
             self._note(self._open.pop(page.number), "close")
+
+    def _failed(self, what: str, error: Exception) -> str:
+        """Tell of an error in what deals with a page, and return what its visitor is told."""
+        self._tell(one_line(f"{what}: {type(error).__name__}: {error}"))
+        return f"{what} failed; the log of the run says why"
 
     def _introduction(self, visitor: Visitor) -> dict[str, Any]:
         """Return who the page's visitor is, and what that keeps it from."""
@@ -263,7 +278,7 @@ class PageServer:
         await _close(socket_, NOT_LOGGED_IN, "your token is withdrawn, or your role was changed")
 
     async def _push(self, socket_: WebSocket, page: PageFeed) -> None:
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        with contextlib.suppress(WebSocketDisconnect):
             try:
                 await self._feed.push(page, socket_.send_text)
             except TimeoutError:
@@ -281,6 +296,11 @@ class PageServer:
         except (RequestError, RefusedError) as error:
             self._heard(page, request, why=str(error), refused=True)
             return {"type": "error", "text": str(error)}
+        except Exception as error:  # of a robot's own panel, say: the page goes on
+            kind = "a message" if request is None else str(request.__struct_config__.tag)
+            why = self._failed(kind, error)
+            self._heard(page, request, why=why)
+            return {"type": "error", "text": why}
         if not isinstance(request, StickRequest):  # it comes twenty times a second; see `drove`
             self._heard(page, request, why=told if isinstance(told, str) else "")
         return {"type": "done", "text": told} if isinstance(told, str) else told

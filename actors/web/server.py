@@ -26,7 +26,7 @@ from functools import partial
 from typing import Any, Protocol
 
 import uvicorn
-from starlette.types import ASGIApp, Scope
+from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
@@ -34,6 +34,8 @@ from uvicorn.server import ServerState
 from rampart.actors.web import guests
 from rampart.actors.web.guests import Bucket, Guest, Guests
 from rampart.actors.web.tcp_peer import plain_address, user_of_peer
+from rampart.files.plain_text import one_line
+from rampart.files.streams import complain
 
 QUEUE = 1024
 """Connections that wait in the kernel. Beyond, one is lost and tried again in a second."""
@@ -241,12 +243,14 @@ class WebServer:
         known: see `Reception`.
         tls: returns what the next connection is encrypted with; None for plain HTTP.
         not_plain: what who speaks plain HTTP is told then.
+        tell: called with one line for each error of the application, which answers 500 or closes.
         settings: of `uvicorn.Config`.
     """
 
     def __init__(self, app: ASGIApp, listening: socket.socket, *, refusal: str = "",
                  known: bool = False, tls: Callable[[], ssl.SSLContext] | None = None,
-                 not_plain: str = "", **settings: Any) -> None:
+                 not_plain: str = "", tell: Callable[[str], None] = complain,
+                 **settings: Any) -> None:
         self.reception = Reception(refusal, known=known)
         self._listening = listening
         self._tls = tls
@@ -255,8 +259,8 @@ class WebServer:
         self._arriving: set[asyncio.Task[None]] = set()
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)  # inherited
         self._config = uvicorn.Config(
-            app, log_config=None, log_level="critical", access_log=False, lifespan="off",
-            server_header=False, date_header=False, http=_Http, ws=_WebSocket,
+            _telling(app, tell), log_config=None, log_level="critical", access_log=False,
+            lifespan="off", server_header=False, date_header=False, http=_Http, ws=_WebSocket,
             timeout_keep_alive=KEEP_ALIVE_S, ws_ping_interval=PING_S, ws_ping_timeout=PING_S,
             ws_per_message_deflate=False, **settings)
         self._config.load()
@@ -323,6 +327,19 @@ class WebServer:
 
     def _protocol(self, state: dict[str, Any]) -> _Http:
         return _Http(self._config, self._state, {_RECEPTION: self.reception, **state})
+
+
+def _telling(app: ASGIApp, tell: Callable[[str], None]) -> ASGIApp:
+    """Return an application whose errors are told; uvicorn's own log is silent."""
+
+    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await app(scope, receive, send)
+        except Exception as error:
+            tell(one_line(f"{scope.get('path', '')}: {type(error).__name__}: {error}"))
+            raise
+
+    return answer
 
 
 async def _first_byte(connection: socket.socket) -> int:

@@ -79,6 +79,54 @@ async def test_the_emergency_stop_is_reset_from_the_page(world):
             await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
 
 
+@pytest.mark.parametrize("error", [KeyError("a\nb"), RuntimeError("dry"), RecursionError()])
+async def test_a_handler_that_fails_is_told_in_one_line_and_the_page_goes_on(
+        world, monkeypatch, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(OsmosisHmi, "_fulfil", fail)
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with websockets.connect(f"ws://{at}/ws") as page:
+            await page.send('{"type": "reset", "recovery": "RM1"}')
+            assert "reset failed" in (await hear(page, "error"))["text"]
+            await eventually(lambda: bool(world.others.diagnostics))
+            reason = world.others.diagnostics[0].reason
+            assert reason.startswith(f"reset: {type(error).__name__}")
+            assert "\n" not in reason
+            await hear(page, "state")
+
+
+async def test_a_page_that_cannot_be_shown_is_closed_with_a_reason_and_told(world, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no introduction")
+
+    monkeypatch.setattr(hmi_feed.Feed, "push", fail)
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with websockets.connect(f"ws://{at}/ws") as page:
+            await page.wait_closed()
+            assert page.close_code == 1011
+            assert "failed" in page.close_reason
+        await eventually(lambda: bool(world.others.diagnostics))
+        assert "RuntimeError: no introduction" in world.others.diagnostics[0].reason
+        assert hmi._server.pages == 0
+
+
+async def test_a_picture_that_fails_is_told_and_the_page_goes_on(world, monkeypatch):
+    async def fail(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(hmi_server.PageServer, "_picture", fail)
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with httpx.AsyncClient() as client:
+            assert (await client.get(f"http://{at}/camera.jpg")).status_code == 500
+        await eventually(lambda: bool(world.others.diagnostics))
+        assert "/camera.jpg: ZeroDivisionError" in world.others.diagnostics[0].reason
+
+
 async def test_a_mission_is_started_from_the_page_unless_one_runs(world):
     async with world.hmi(hmi_port=free_port()) as hmi:
         at = await served(hmi)
