@@ -39,13 +39,13 @@ _MARK = re.compile(r'''
 closed reaches to its end: there `tomllib` stops as well."""
 
 
-def parse(text: str) -> dict[str, Any]:
+def parse(text: str, most: int = MAX_SIZE) -> dict[str, Any]:
     """Return a document; a byte order mark at its beginning is no part of it.
 
     Raises:
         FileError: it is no TOML, or beyond the limits of this module.
     """
-    check_size(text, MAX_SIZE)
+    check_size(text, most)
     _check_shape(text)
     try:
         document = tomllib.loads(text.removeprefix("\ufeff"))

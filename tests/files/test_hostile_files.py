@@ -81,7 +81,7 @@ AIRPORTS = {
     "a header of dotted parts": (f"[{'.'.join('a' * 50_000)}]", "more than 6 dotted parts"),
     "dots behind a string that looks closed": ('x = "\\""\n' + DOTTED, "more than 6 dotted"),
     "a key that is long": (f'["{"k" * 5000}"]\nx = 1', "a key of more than 200 characters"),
-    "longer than any airport": (TOML + "#" * (1 << 20), "longer than 512 kB"),
+    "longer than any airport": (TOML + "#" * (5 << 20), "longer than 4 MB"),
     "a coordinate of 400 digits": (edited("T = [30.0", f"T = [1{'0' * 400}"),
                                    "nodes.T[0]: 1000000000"),
     "a coordinate of 5,000 digits": (edited("T = [30.0", f"T = [1{'0' * 5000}"),
@@ -98,7 +98,7 @@ AIRPORTS = {
         "prohibited: 2000: at most 1000"),
     "two combs": (TOML + crossing_combs(150), "too many of them lie within 0 m of each other"),
     "a scribble as wide as a runway": (TOML + scribble(400), "lie within 200 m of each other"),
-    "more corners than airports have": (TOML + scribble(12_000), "points of all outlines: 12002"),
+    "more corners than airports have": (TOML + scribble(60_000), "points of all outlines: 60002"),
     "a mission with more goals than are searched": (edited(
         "goals = [", "goals = [" + "{x_m=1,y_m=0,mode='taxi'}," * 1500), "goals of all missions"),
     "a name that steers the terminal": (edited(

@@ -49,6 +49,8 @@ class AirportDrawing(msgspec.Struct, frozen=True):
 def draw(airport: Airport, tolerance_m: float = 0.02) -> AirportDrawing:
     """Return the drawing of an airport; what is rounder than the tolerance has more points."""
     x0, y0, x1, y1 = airport.bounds_m
+    nodes = {name: (round(float(x), _DECIMALS), round(float(y), _DECIMALS))
+             for name, (x, y) in airport.nodes.items()}
     return AirportDrawing(
         name=airport.name,
         bounds_m=(x0 - FRAME_M, y0 - FRAME_M, x1 + FRAME_M, y1 + FRAME_M),
@@ -56,8 +58,7 @@ def draw(airport: Airport, tolerance_m: float = 0.02) -> AirportDrawing:
         surfaces=tuple((s.kind, svg_path(s.polygon, tolerance_m)) for s in sorted(
             airport.surfaces, key=lambda surface: surface.kind == "runway")),
         buildings=tuple((b.name, svg_path(b.polygon, tolerance_m)) for b in airport.buildings),
-        nodes={name: (float(x), float(y)) for name, (x, y) in airport.nodes.items()},
-        edges=tuple((*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges),
+        nodes=nodes, edges=tuple((*nodes[a], *nodes[b]) for a, b in airport.edges),
         lights=airport.lights,
         start=(airport.start.x_m, airport.start.y_m))
 
@@ -65,13 +66,14 @@ def draw(airport: Airport, tolerance_m: float = 0.02) -> AirportDrawing:
 def svg_path(shape: Any, tolerance_m: float = 0.02) -> str:
     """Return SVG path data, in metres, of a shapely geometry made of polygons.
 
-    Parts without area (a union may leave lines) are not drawn.
+    Parts without area (a union may leave lines) are not drawn, nor parts and holes that are smaller
+    than a square of the tolerance.
     """
     rings: list[str] = []
     for part in shapely.get_parts(shapely.simplify(shape, tolerance_m)):
-        if part.geom_type != "Polygon" or part.is_empty:
-            continue
-        rings += [_ring(ring) for ring in (part.exterior, *part.interiors)]
+        if part.geom_type == "Polygon" and not part.is_empty:
+            rings += [_ring(ring) for ring in (part.exterior, *part.interiors)
+                      if shapely.Polygon(ring).area >= tolerance_m**2]
     return "".join(rings)
 
 

@@ -23,7 +23,10 @@ MAX_NUMBER = 1e6
 MAX_NAME = 200
 """Characters of a name."""
 
-MAX_COUNTS = {"surface": 1000, "prohibited": 1000, "building": 1000, "row": 1000, "obstacle": 1000,
+MAX_FILE_BYTES = 4 << 20
+"""Of an airport's file."""
+
+MAX_COUNTS = {"surface": 5000, "prohibited": 1000, "building": 5000, "row": 5000, "obstacle": 1000,
               "missions": 1000, "nodes": 5000, "edges": 10_000}
 """Of the tables and lists of an airport's file."""
 
@@ -34,7 +37,7 @@ MAX_GOALS = 1000
 MAX_GOALS_BY_EDGES = 1_000_000
 """The place on the graph is looked for edge by edge, for each goal."""
 
-MAX_POINTS = 10_000
+MAX_POINTS = 50_000
 """Corners of all outlines, and points of all centre lines."""
 
 MAX_NEAR_IN_STRIPS = 50_000

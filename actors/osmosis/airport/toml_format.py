@@ -124,7 +124,7 @@ def read_mission(path: Path) -> model.Mission:
 
 def _convert(path: Path, kind: Any) -> Any:
     with readable(path, "see https://toml.io"):
-        table = toml.parse(read_text(path, toml.MAX_SIZE))
+        table = toml.parse(read_text(path, limits.MAX_FILE_BYTES), limits.MAX_FILE_BYTES)
     _check_numbers(table, "", str(path))
     try:
         return msgspec.convert(table, kind)

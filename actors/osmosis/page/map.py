@@ -14,17 +14,17 @@ from rampart.actors.operator.bounds import MAX_NAME, clip
 from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
 from rampart.actors.osmosis.airport.model import Airport, Light
 
-MAX_PATHS_BYTES = 100_000
+MAX_PATHS_BYTES = 150_000
 """Of the prohibited area, the pavement and the buildings together."""
 
-MAX_GRAPH = 1500
+MAX_GRAPH = 2500
 """Nodes, and edges."""
 
-MAX_BUILDINGS = 300
 MAX_LIGHTS = 1500
 """So many lights are shown of an airport: an SVG with more is slow on a telephone."""
 
-_TOLERANCES_M = (0.02, 0.1, 0.5, 2.0)
+_FINEST_M, _COARSER = 0.02, 4.0
+"""Tolerance of the outlines, and by how much it grows until they fit."""
 
 
 class PageMap(msgspec.Struct, frozen=True):
@@ -40,28 +40,30 @@ class PageMap(msgspec.Struct, frozen=True):
 
 
 def page_map(airport: Airport) -> PageMap:
-    """Return the map of an airport."""
-    for tolerance_m in _TOLERANCES_M:
-        drawn = draw(airport, tolerance_m)
-        if (size := _paths_bytes(drawn)) <= MAX_PATHS_BYTES:
-            break
-    fits = size <= MAX_PATHS_BYTES
+    """Return the map of an airport, as fine as there is room for."""
+    tolerance_m = _FINEST_M
+    while _paths_bytes(drawn := draw(airport, tolerance_m)) > MAX_PATHS_BYTES:
+        tolerance_m *= _COARSER
     shown = msgspec.structs.replace(
         drawn, name=clip(drawn.name, MAX_NAME),
-        prohibited=drawn.prohibited if fits else "", surfaces=drawn.surfaces if fits else (),
+        surfaces=tuple(filter(_is_seen, drawn.surfaces)),
         buildings=tuple((clip(name, MAX_NAME), path)
-                        for name, path in drawn.buildings[:MAX_BUILDINGS]) if fits else (),
+                        for name, path in filter(_is_seen, drawn.buildings)),
         nodes={clip(name, MAX_NAME): at for name, at in islice(drawn.nodes.items(), MAX_GRAPH)},
         edges=drawn.edges[:MAX_GRAPH],
         lights=tuple(islice(filter(_is_plain, drawn.lights), MAX_LIGHTS)))
-    missing = {"prohibited areas": int(shown.prohibited != drawn.prohibited),
-               "pieces of pavement": len(drawn.surfaces) - len(shown.surfaces),
+    missing = {"pieces of pavement": len(drawn.surfaces) - len(shown.surfaces),
                "buildings": len(drawn.buildings) - len(shown.buildings),
                "nodes of the graph": len(drawn.nodes) - len(shown.nodes),
                "edges of the graph": len(drawn.edges) - len(shown.edges),
                "lights": len(drawn.lights) - len(shown.lights)}
     return PageMap(msgspec.Raw(msgspec.json.encode(shown)),
                    {what: count for what, count in missing.items() if count})
+
+
+def _is_seen(named: tuple[str, str]) -> bool:
+    """Tell whether something is left of a shape at the drawing's tolerance."""
+    return bool(named[1])
 
 
 def lights_shown(airport: Airport) -> frozenset[str]:
@@ -75,4 +77,10 @@ def _is_plain(light: Light) -> bool:
 
 
 def _paths_bytes(drawn: AirportDrawing) -> int:
-    return len(drawn.prohibited) + sum(len(path) for _, path in (*drawn.surfaces, *drawn.buildings))
+    return len(drawn.prohibited) + sum(
+        len(kind) + len(path) + _SHAPE_BYTES
+        for kind, path in filter(_is_seen, (*drawn.surfaces, *drawn.buildings)))
+
+
+_SHAPE_BYTES = 6
+"""Of JSON around a name and a path."""

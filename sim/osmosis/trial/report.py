@@ -25,13 +25,19 @@ def render(run: MissionRecord) -> str:
     pages.filters["clearance"] = clearance
     template = pages.get_template("osmosis/trial/report.html")
     x0, y0, x1, y1 = _bounds(run)
+    unit = max(x1 - x0, y1 - y0) / _UNITS
     counts = Counter(light.verdict for light in run.lights)
     return template.render(
         run=run, headline=headline(run), view_box=f"{x0:g} {-y1:g} {x1 - x0:g} {y1 - y0:g}",
+        unit=unit, dot=min(unit, max(unit / 4, 1.0)),
         track=points(run.track), believed=points(run.believed) if _apart(run) else "",
         rows=_rows(run.lights), counts=counts, measured=counts.total() - counts["not measured"],
         lanes=lanes_of(run), ticks=ticks_of(run.duration_s),
         marked=[("Goals reached", _reached(run))])
+
+
+_UNITS = 90
+"""Width of the map in units of a mark, so that marks have the same size on every map."""
 
 
 def headline(run: MissionRecord) -> str:

@@ -69,9 +69,10 @@ async def speaking_world():
 
 
 @asynccontextmanager
-async def page(world, **look):
-    """A page on an HMI that knows the system."""
-    async with world.hmi(hmi_port=free_port(), system=SPEC) as hmi, browser() as tab:
+async def page(world, airport=AIRPORT, **look):
+    """A page on an HMI that knows the system and an airport."""
+    async with (world.hmi(hmi_port=free_port(), system=SPEC, airport=airport) as hmi,
+                browser() as tab):
         await tab.show(f"http://{await served(hmi)}/", **look)
         await tab.until(LIVE)
         await tab.until("document.querySelectorAll('#tree .event').length > 0")

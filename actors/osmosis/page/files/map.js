@@ -1,9 +1,19 @@
 // The airport's map as SVG: metres, y turned over so that north is up.
+//
+// Ground, obstacles, sweeps and the robot's body have their true size. Marks (lights, nodes, goals, the
+// robot's ring) and lines have the same size on the screen however large the airport is: CSS scales what
+// is in `.mark` by `--mark`, the metres of a mark's unit, and what is in `.dot` by `--dot`, which becomes
+// smaller where many of them lie close together.
 
 import { Memory, element, say, svg as make } from "../dom.js";
 
-const FOLLOW_M = 22;  // what is shown round the robot when the map follows it
+const FOLLOW_M = 22;  // what is shown around the robot when the map begins to follow it
+const MIN_M = 4;      // width of the closest look
+const STEP = 1.5;     // of a zoom button or key
+const MARK_PX = 9;   // a mark's unit on the screen
+const DOT = .25;      // least size of a dot, of its full size
 const TRACK_STEP_M = .25;
+const TRACK_POINTS = 6000;
 
 function points(list) {
   return list.map(([x, y]) => `${x},${-y}`).join(" ");
@@ -19,6 +29,94 @@ class AirportMap {
     this.memory = new Memory();
     this.at = null;
     this.following = false;
+    this.view = null;  // centre and width of what is shown, m; null for the whole airport
+    this.onLook = () => {};
+    this.pointers = new Map();
+    this.listen();
+    new ResizeObserver(() => this.look()).observe(svg);
+  }
+
+  /** Zoom with wheel and two fingers, move by dragging, both with keys. */
+  listen() {
+    this.svg.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(event.deltaY * (event.deltaMode ? .05 : .0015)), this.place(event));
+    }, { passive: false });
+    this.svg.addEventListener("pointerdown", (event) => {
+      if (event.button) return;
+      this.pointers.set(event.pointerId, this.place(event));
+    });
+    this.svg.addEventListener("pointermove", (event) => this.drag(event));
+    for (const end of ["pointerup", "pointercancel"]) {
+      this.svg.addEventListener(end, (event) => this.pointers.delete(event.pointerId));
+    }
+    this.svg.addEventListener("keydown", (event) => {
+      const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+      if (by) this.move(by[0] * this.shown().width / 8, by[1] * this.shown().width / 8);
+      else if (event.key === "+" || event.key === "=") this.zoom(1 / STEP);
+      else if (event.key === "-") this.zoom(STEP);
+      else if (event.key === "0") this.fit();
+      else return;
+      event.preventDefault();
+    });
+  }
+
+  /** Return the place on the map of an event, m east and north. */
+  place(event) {
+    const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
+    return [at.x, -at.y];
+  }
+
+  drag(event) {
+    const from = this.pointers.get(event.pointerId);
+    if (!from) return;
+    if (this.pointers.size === 1 && !this.view && event.pointerType === "touch") return;  // the page scrolls
+    this.svg.setPointerCapture(event.pointerId);
+    const to = this.place(event);
+    const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
+    if (other) {
+      const apart = (one) => Math.hypot(one[0] - other[0], one[1] - other[1]);
+      if (apart(to) > 0) this.zoom(apart(from) / apart(to), other);
+    } else {
+      this.move(from[0] - to[0], from[1] - to[1]);
+    }
+    this.pointers.set(event.pointerId, this.place(event));
+  }
+
+  /** Return centre and width of what is shown, m. */
+  shown() {
+    const [x0, y0, x1, y1] = this.bounds;
+    const view = this.view || { x: (x0 + x1) / 2, y: (y0 + y1) / 2, width: x1 - x0 };
+    return this.following && this.at ? { ...view, x: this.at[0], y: this.at[1] } : view;
+  }
+
+  /** Show more (above 1) or less, and leave a place where it is on the screen. */
+  zoom(factor, [x, y] = [this.shown().x, this.shown().y]) {
+    const view = this.shown();
+    const whole = this.bounds[2] - this.bounds[0];
+    const width = Math.max(Math.min(MIN_M, whole), view.width * factor);
+    if (width >= whole && !this.following) {
+      this.fit();
+      return;
+    }
+    const by = Math.min(width, whole) / view.width;
+    this.view = { x: x + (view.x - x) * by, y: y + (view.y - y) * by, width: view.width * by };
+    this.look();
+  }
+
+  move(x, y) {
+    const view = this.shown();
+    const [x0, y0, x1, y1] = this.bounds;
+    this.following = false;
+    this.view = { x: Math.min(Math.max(view.x + x, x0), x1), y: Math.min(Math.max(view.y + y, y0), y1), width: view.width };
+    this.look();
+  }
+
+  /** Show the whole airport. */
+  fit() {
+    this.view = null;
+    this.following = false;
+    this.look();
   }
 
   /** Draw what does not move; `map` is an AirportDrawing or null, `track` the way driven so far,
@@ -28,10 +126,11 @@ class AirportMap {
     this.lights.clear();
     this.memory.forget();
     this.at = null;
-    this.bounds = map ? map.bounds_m : [-50, -50, 50, 50];
-    this.look();
-    const hatch = make("pattern", { id: "hatch", width: 1, height: 1,
-      patternUnits: "userSpaceOnUse", patternTransform: "rotate(45)" }, make("defs", {}, this.svg));
+    const bounds = map ? map.bounds_m : [-50, -50, 50, 50];
+    if (String(bounds) !== String(this.bounds)) this.view = null;  // else a connection has come back
+    this.bounds = bounds;
+    const hatch = this.hatch = make("pattern", { id: "hatch", width: 1, height: 1,
+      patternUnits: "userSpaceOnUse" }, make("defs", {}, this.svg));
     make("rect", { class: "hatch-ground", width: 1, height: 1 }, hatch);
     make("line", { class: "hatch-line", y2: 1 }, hatch);
     const ground = make("g", { transform: "scale(1,-1)" }, this.svg);
@@ -41,7 +140,7 @@ class AirportMap {
       make("line", { class: "edge", x1: ax, y1: -ay, x2: bx, y2: -by }, this.edges);
     }
     for (const [name, [x, y]] of Object.entries(map ? map.nodes : {})) {
-      make("title", {}, make("circle", { class: "node", cx: x, cy: -y, r: .28 }, this.edges), name);
+      make("title", {}, make("circle", { class: "node", r: .28 }, this.mark(x, y, this.edges, "dot")), name);
     }
     this.route = make("polyline", { class: "route" }, this.svg);
     this.trackLine = make("polyline", { class: "track" }, this.svg);
@@ -51,11 +150,13 @@ class AirportMap {
     this.obstacles = make("g", {}, this.svg);
     this.robot = make("g", { class: "robot", visibility: "hidden" }, this.svg);
     this.sweeps = { laser: this.addSweep("lower"), upper_laser: this.addSweep("upper") };
-    make("circle", { class: "robot-ring", r: 1.7 }, this.robot);
-    make("path", { class: "robot-heading", d: "M1.7 0L2.7 0M2.35 -.3L2.75 0L2.35 .3" }, this.robot);
+    const ring = make("g", { class: "mark" }, this.robot);
+    make("circle", { class: "robot-ring", r: 1.7 }, ring);
+    make("path", { class: "robot-heading", d: "M1.7 0L2.7 0M2.35 -.3L2.75 0L2.35 .3" }, ring);
     const [length, width] = footprint || [.72, .614];
     make("rect", { class: "robot-body", x: -length / 2, y: -width / 2, width: length, height: width, rx: .1 }, this.robot);
     make("path", { class: "robot-front", d: `M${length / 2 - .2} ${-width / 2 + .1}L${length / 2 - .05} 0L${length / 2 - .2} ${width / 2 - .1}Z` }, this.robot);
+    this.look();
     this.track = track.filter((p) => p.every(Number.isFinite));
     this.trackLine.setAttribute("points", points(this.track));
   }
@@ -69,8 +170,13 @@ class AirportMap {
     }
   }
 
+  /** Return a group whose content keeps its size on the screen; its unit is that of a mark. */
+  mark(x, y, parent, kind = "mark") {
+    return make("g", { class: kind }, make("g", { transform: `translate(${x} ${-y})` }, parent));
+  }
+
   addLight(light) {
-    const group = make("g", { transform: `translate(${light.x_m} ${-light.y_m})` }, this.lightLayer);
+    const group = this.mark(light.x_m, light.y_m, this.lightLayer, "dot");
     const dot = make("circle", { class: "light none", r: .55 }, group);
     const cross = make("path", { class: "cross", d: "M-.8 -.8L.8 .8M.8 -.8L-.8 .8", visibility: "hidden" }, group);
     const title = make("title", {}, group, `${light.name}: not measured`);
@@ -82,19 +188,24 @@ class AirportMap {
     return { area: make("path", { class: "sweep-area" }, group), echoes: make("path", { class: "sweep-echoes" }, group) };
   }
 
-  /** Show the whole airport, or what is round the robot. */
+  /** Show what the view says: the whole airport, a part of it, or what is around the robot. */
   look() {
+    if (!this.bounds) return;
     const [x0, y0, x1, y1] = this.bounds;
-    if (!this.following || !this.at) {
-      this.svg.setAttribute("viewBox", `${x0} ${-y1} ${x1 - x0} ${y1 - y0}`);
-      return;
-    }
-    const height = FOLLOW_M * Math.min(1, (y1 - y0) / (x1 - x0));
-    this.svg.setAttribute("viewBox", `${this.at[0] - FOLLOW_M / 2} ${-this.at[1] - height / 2} ${FOLLOW_M} ${height}`);
+    const { x, y, width } = this.shown();
+    const height = width * (y1 - y0) / (x1 - x0);
+    this.svg.setAttribute("viewBox", `${x - width / 2} ${-y - height / 2} ${width} ${height}`);
+    const mark = MARK_PX * Math.max(width / (this.svg.clientWidth || 1), height / (this.svg.clientHeight || 1));
+    this.svg.style.setProperty("--mark", mark);
+    this.svg.style.setProperty("--dot", Math.min(mark, Math.max(mark * DOT, 1)));
+    this.svg.style.touchAction = this.view || this.following ? "none" : "pan-y";
+    this.hatch?.setAttribute("patternTransform", `rotate(45) scale(${mark})`);
+    this.onLook();
   }
 
   follow(on) {
     this.following = on;
+    this.view = on ? { x: 0, y: 0, ...this.shown(), width: Math.min(FOLLOW_M, this.shown().width) } : null;
     this.look();
   }
 
@@ -152,7 +263,7 @@ class AirportMap {
     const last = this.track[this.track.length - 1];
     if (!last || Math.hypot(last[0] - x, last[1] - y) > TRACK_STEP_M) {
       this.track.push([x, y]);
-      if (this.track.length > 6000) this.track.splice(0, 1000);
+      if (this.track.length > TRACK_POINTS) this.track = this.track.filter((_, i) => i % 2 === 0);
       this.trackLine.setAttribute("points", points(this.track));
     }
   }
@@ -185,9 +296,10 @@ class AirportMap {
       const skipped = mission.skipped.includes(i);
       const done = !skipped && (i < mission.step || mission.phase === "succeeded");
       const now = i === mission.step && ["running", "paused"].includes(mission.phase);
-      if (now) make("circle", { class: "goal now", cx: goal.x_m, cy: -goal.y_m, r: .45 }, this.goals);
-      make("circle", { class: `goal ${done ? "done" : ""}`, cx: goal.x_m, cy: -goal.y_m, r: 1.1 }, this.goals);
-      make("text", { x: goal.x_m, y: -goal.y_m - 1.5, "font-size": 1.7, "text-anchor": "middle" }, this.goals,
+      const group = this.mark(goal.x_m, goal.y_m, this.goals);
+      if (now) make("circle", { class: "goal now", r: .45 }, group);
+      make("circle", { class: `goal ${done ? "done" : ""}`, r: 1.1 }, group);
+      make("text", { y: -1.5, "font-size": 1.7, "text-anchor": "middle" }, group,
         skipped ? `${i + 1} skipped` : done ? `${i + 1} ✓` : i + 1);
     });
   }
@@ -204,9 +316,16 @@ export default class MapPanel {
     this.name = Object.assign(element("span", "quiet"), { id: "airport" });
     this.button = Object.assign(element("button", "small", "Follow robot"), { id: "follow", type: "button" });
     this.button.setAttribute("aria-pressed", "false");
-    room.title.append(" ", this.name, element("span", "grow"), this.button);
-    const canvas = make("svg", { id: "map", role: "img",
-      "aria-label": "Map of the airport with the robot, its track, the laser and the lights" });
+    const zooms = [["−", "out", "Zoom out", (map) => map.zoom(STEP)], ["+", "in", "Zoom in", (map) => map.zoom(1 / STEP)],
+      ["Fit", "fit", "Show the whole airport", (map) => map.fit()]].map(([text, id, label, act]) => {
+      const button = Object.assign(element("button", "small", text), { id: `map-${id}`, type: "button", title: label });
+      button.setAttribute("aria-label", label);
+      button.addEventListener("click", () => act(this.map));
+      return button;
+    });
+    room.title.append(" ", this.name, element("span", "grow"), ...zooms, this.button);
+    const canvas = make("svg", { id: "map", role: "img", tabindex: 0,
+      "aria-label": "Map of the airport with the robot, its track, the laser and the lights; arrows move it, plus and minus zoom, 0 shows all" });
     this.where = element("p", "quiet where");
     this.where.id = "where";
     const legend = element("ul", "legend");
@@ -218,11 +337,8 @@ export default class MapPanel {
     }
     room.body.append(canvas, this.where, legend);
     this.map = new AirportMap(canvas);
-    this.button.addEventListener("click", () => {
-      const on = this.button.getAttribute("aria-pressed") !== "true";
-      this.button.setAttribute("aria-pressed", String(on));
-      this.map.follow(on);
-    });
+    this.map.onLook = () => this.button.setAttribute("aria-pressed", String(this.map.following));
+    this.button.addEventListener("click", () => this.map.follow(!this.map.following));
   }
 
   begin(hello) {
