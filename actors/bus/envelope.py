@@ -29,6 +29,10 @@ a text which is no UTF-8; nesting without end is the other."""
 AHEAD_S = 0.1
 """A stamp this far ahead of now (simulated seconds) is no jitter of a clock but wrong."""
 
+_PAUSE_S = 0.25
+"""After a pause of so many simulated seconds it is looked up again which process of a source
+counts: the host of this one may have been lost, and another process started in its place."""
+
 _REMEMBERED_COMMANDS = 64
 
 STRANGERS = 512
@@ -103,11 +107,13 @@ class _Heard:
 
     Attributes:
         incarnation: which.
+        at_s: when, simulated seconds.
         newest: newest sequence number by key, of the topics of which only the newest counts.
         recent: of commands, by key, the last numbers.
     """
 
     incarnation: int
+    at_s: float = 0.0
     newest: dict[str, int] = field(default_factory=dict)
     recent: dict[str, deque[int]] = field(default_factory=dict)
 
@@ -162,17 +168,21 @@ class ArrivalGuard:
             except UNREADABLE as error:
                 refuse(key, f"not a {kind}: {error}")
                 return
-            ahead_s = message.stamp - now()  # which may be no number
+            now_s = now()
+            ahead_s = message.stamp - now_s  # which may be no number
             if not ahead_s <= AHEAD_S or (is_command and ahead_s < -age_s):
                 refuse(key, f"stamped {ahead_s:.2f} s ahead of now" if not ahead_s <= AHEAD_S
                        else f"a command, given {-ahead_s:.2f} s ago")
                 return
             heard = heard_of.get(message.source)
-            if heard is None or heard.incarnation != message.incarnation:
+            if heard is None or heard.incarnation != message.incarnation or (
+                    now_s - heard.at_s > _PAUSE_S):
                 if objection := object_to(heard, message):
                     refuse(key, objection)
                     return
-                heard = meet(message.source, message.incarnation)
+                if heard is None or heard.incarnation != message.incarnation:
+                    heard = meet(message.source, message.incarnation)
+            heard.at_s = now_s
             sequence = message.sequence
             if is_command:
                 recent = heard.recent.get(key)

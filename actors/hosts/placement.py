@@ -39,6 +39,22 @@ _TABLE_S = 1.5
 """A table of the first host is repeated each half second; older, it says nothing any more."""
 
 
+_SETTLES_S = 4.0
+"""What was started in another place is not replaced again for so long, simulated seconds at a rate
+below 1: a detection module that is new is silent until it knows, up to some seconds, and silence
+twice as long stops the robot."""
+
+_STEADY_S = 60.0
+"""A host that is lost again so soon after it was back flaps, ..."""
+
+_FLAPPING_S = 10.0
+"""... and then is back when it has been heard without a break for so long, each time for twice as
+long, ..."""
+
+_FLAPPING_MAX_S = 60.0
+"""... and for so long at most."""
+
+
 class Home(NamedTuple):
     """Where a unit belongs.
 
@@ -60,12 +76,18 @@ class _Other:
     Attributes:
         heard_s: When any of its guards was heard.
         since_s: Since when they have been heard without a break.
+        lost_s: When it was lost last.
+        back_s: When it was back last.
+        steady_s: For how long it has to be heard to be back.
         told_s: When its supervisor said what it runs.
         runs: That, each node with its incarnation.
     """
 
     heard_s: float
     since_s: float
+    steady_s: float
+    lost_s: float = -math.inf
+    back_s: float = -math.inf
     told_s: float = -1e12
     is_lost: bool = False
     runs: dict[str, NodeInfo] = field(default_factory=dict)
@@ -113,9 +135,10 @@ class Placement:
         self._guards = guards
         slow = max(1.0, 1.0 / rate)
         self._lost_after_s, self._table_s = slow * link.lost_after_s, slow * _TABLE_S
-        self._return_after_s = link.return_after_s
-        self._others = {name: _Other(now_s + _GRACE_S - self._lost_after_s, now_s)
-                        for name in others}
+        self._return_after_s, self._settles_s = link.return_after_s, slow * _SETTLES_S
+        self._others = {
+            name: _Other(now_s + _GRACE_S - self._lost_after_s, now_s, self._return_after_s)
+            for name in others}
         self._highest: dict[str, int] = {}
 
     def is_lost(self, host: str) -> bool:
@@ -205,11 +228,13 @@ class Placement:
         for host, other in self._others.items():
             is_silent = now_s - other.heard_s > self._lost_after_s
             if not other.is_lost and is_silent:
-                other.is_lost = True
+                other.is_lost, other.lost_s = True, now_s
+                other.steady_s = self._return_after_s if now_s - other.back_s > _STEADY_S else min(
+                    max(2 * other.steady_s, _FLAPPING_S), _FLAPPING_MAX_S)
                 lost.append(host)
-            elif (other.is_lost and not is_silent
-                  and now_s - other.since_s >= self._return_after_s):
-                other.is_lost = False
+            elif (other.is_lost and not is_silent and now_s - other.since_s >= other.steady_s
+                  and now_s - other.lost_s >= self._settles_s):
+                other.is_lost, other.back_s = False, now_s
                 back.append(host)
             if self._own != FIRST:
                 continue

@@ -378,6 +378,7 @@ def test_a_long_last_state_is_waited_for_as_long_as_some_of_it_comes_but_ten_sec
     async def scenario() -> None:
         async with world(tmp_path) as made:
             await made.taken_over()
+            await asyncio.sleep(4.0)  # else it is sent before the camera is given back
             made.robot.files.keep("camera", record(EPOCH + 1, 3, size))
             made.is_cut, made.delay_s = False, delay_s
             await eventually(lambda: not made.robot.of("camera"), 20)

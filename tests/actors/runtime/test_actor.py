@@ -207,6 +207,28 @@ def test_an_incarnation_that_was_not_issued_last_makes_nobody_deaf_to_the_real_o
     assert len(refused) == 2
 
 
+def test_after_a_pause_a_source_is_not_believed_that_has_a_successor_which_was_not_heard_yet():
+    now_s, register, taken, refused = [10.0], {"talker": 2}, [], []
+    receive = ArrivalGuard(lambda: now_s[0], register=register.get).receiver(
+        topics.POSE, lambda _key, message: taken.append(message.sequence),
+        lambda _key, reason: refused.append(reason))
+
+    def say(sequence: int, incarnation: int = 2) -> None:
+        header = Header("talker", incarnation, sequence, now_s[0])
+        receive("k", encode(header, m.Pose(0.0, 0.0, 0.0)))
+
+    say(1)
+    now_s[0] = 15.0
+    say(2)
+    register["talker"] = 1_000_001  # its host was lost
+    now_s[0] = 17.0
+    say(3)
+    say(4)
+    say(1, 1_000_001)
+    assert taken == [1, 2, 1]
+    assert refused == 2 * ["incarnation 2 of talker, of which 1000001 was issued last"]
+
+
 @pytest.mark.parametrize(("given_s", "obeyed"), [(10.0, True), (9.31, True), (9.29, False),
                                                  (-1.0, False)])
 def test_a_command_that_was_under_way_for_too_long_is_not_obeyed(given_s, obeyed):
