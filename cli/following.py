@@ -14,12 +14,14 @@ from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.run.run_info import RunInfo, find_runs
 from rampart.actors.supervision.process_title import process_state
 from rampart.cli import systems
-from rampart.cli.output import UsageError, warn
+from rampart.cli.output import NoEffectError, UsageError, warn
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.cli.session import Session, connect, pause
 
 LOOK_S = 0.25
 """Real seconds between two looks whether a run has ended or begun."""
+
+_AGAIN_S = 5.0
 
 _USAGE_EVERY = 4
 """Looks between two at /proc: its clock ticks 100 times a second, the observer expects one."""
@@ -54,6 +56,7 @@ async def sessions(port: int | None, stop: asyncio.Event, *, follow: bool, optio
 
     Raises:
         UsageError: there is no run and `follow` is not set, or it must be chosen.
+        NoEffectError: its routers let nothing through, and `follow` is not set.
     """
     while not follow or await wait_for_run(port, stop):
         try:
@@ -62,6 +65,11 @@ async def sessions(port: int | None, stop: asyncio.Event, *, follow: bool, optio
         except UsageError as error:
             if not follow or len(find_runs()) > 1:
                 raise UsageError(str(error).replace("--port", option)) from None
+        except NoEffectError as error:
+            if not follow:
+                raise
+            warn(str(error))
+            await pause(stop, _AGAIN_S)
         if not follow:
             return
 

@@ -23,12 +23,13 @@ from rampart.actors.access.rights import OPERATOR, VIEWER
 from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode, encode
 from rampart.actors.bus.recorder_connection import RecorderConnection
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, key_file
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.actors.runtime.clock import Clock
-from rampart.cli.output import UsageError, refusing
+from rampart.cli.output import NoEffectError, UsageError, refusing
 
 T = TypeVar("T")
 
@@ -36,6 +37,9 @@ KEY_VARIABLE = "RAMPART_KEY"
 
 RESEND_S = 0.1
 """Real seconds between copies of a command whose effect does not show."""
+
+_TRIES = 15
+"""A router may be starting meanwhile."""
 
 OVERHEAD_S = 0.5
 """Real seconds granted for what does not run in simulated time: sockets, scheduling."""
@@ -205,12 +209,69 @@ def tools_credentials(run: RunInfo) -> tuple[Credentials | None, str]:
                      f"--viewer NAME` issues one, or {KEY_VARIABLE} names the file of one")
 
 
+async def _is_answered(bus: Bus) -> bool:
+    """Whether any node of the run answers: by its certificate a tool may hear all of them."""
+    replies: list[str] = []
+    for _ in range(_TRIES):
+        done = asyncio.Event()
+
+        def replied(key: str, _payload: bytes, done: asyncio.Event = done) -> None:
+            replies.append(key)
+            done.set()
+
+        bus.latest(f"{ROOT}/**", replied, done.set)
+        await done.wait()
+        if replies:
+            return True
+        await asyncio.sleep(RESEND_S)
+    return False
+
+
+def _why_unanswered(run: RunInfo, shown: Credentials) -> str:
+    name = Path(shown.own).stem
+    known = read_register(Path(run.keys)).identities.get(name)
+    why = ("its certificate is revoked" if known and known.revoked else
+           "it is no operator's and no viewer's" if known and known.kind not in {OPERATOR, VIEWER}
+           else "it was issued after the routers started, is revoked, or another one replaces it")
+    return (f"{shown.own}: the routers of the run let {name} hear nothing: {why}; they take the "
+            "register when they start: kill-node router_a; kill-node router_b")
+
+
+def days_left(run: RunInfo) -> dict[str, tuple[float, str]]:
+    """Return for each process of a run with keys how long its certificate is valid.
+
+    Returns:
+        Name → days, and until when, UTC as ISO 8601 has it. Empty without keys, or where the
+        folder of keys or `cryptography` is missing.
+    """
+    if not run.keys:
+        return {}
+    try:
+        from rampart.actors.access import key_folder  # noqa: PLC0415 of an extra
+
+        found = key_folder.lifetimes(Path(run.keys), (*ROUTERS, *run.nodes))
+    except (ImportError, KeysError, OSError):
+        return {}
+    return {name: (round(key_folder.days_left(until), 2), until.isoformat())
+            for name, until in found.items()}
+
+
+def first_to_expire(run: RunInfo) -> dict[str, Any]:
+    """Return `name`, `days_left` and `not_after` of the certificate that expires first; or {}."""
+    found = days_left(run)
+    if not found:
+        return {}
+    name = min(found, key=lambda one: found[one])
+    return {"name": name, "days_left": found[name][0], "not_after": found[name][1]}
+
+
 @contextlib.asynccontextmanager
 async def connect(port: int | None = None) -> AsyncIterator[Session]:
     """Join the run on this machine (on base port `port` if there are several).
 
     Raises:
         UsageError: there is no run, or it must be chosen.
+        NoEffectError: its routers let nothing through to the certificate that is shown.
     """
     with refusing(NoRunError, BusError, KeysError):
         run = find_run(port)
@@ -219,6 +280,8 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
                        credentials=shown)
         await bus.open()
     try:
+        if shown is not None and not await _is_answered(bus):
+            raise NoEffectError(_why_unanswered(run, shown))
         yield Session(run, bus, Clock(run.origin_s, run.rate), may_order=kind != VIEWER)
     finally:
         await bus.close()

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -26,6 +26,8 @@ _BACK = dt.timedelta(minutes=5)
 """A certificate is valid from so long ago, for hosts whose clocks are behind."""
 
 _AUTHORITY = "Rampart authority"
+_RSA_BITS = 2048
+_CURVES = (ec.SECP256R1, ec.SECP384R1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,7 @@ class Certificate:
         addresses: alternative names.
         is_ours: whether the authority has signed it.
         has_key: whether the private key with it is its own.
+        refused_key: what its key is, if no router takes such a one; else "".
     """
 
     common_name: str
@@ -50,6 +53,7 @@ class Certificate:
     addresses: tuple[str, ...]
     is_ours: bool
     has_key: bool
+    refused_key: str
 
 
 def new_authority(now: dt.datetime, days: float) -> bytes:
@@ -128,7 +132,17 @@ def read_certificate(pem: bytes, authority: bytes) -> Certificate:
     return Certificate(
         _said(found, NameOID.COMMON_NAME), _said(found, NameOID.ORGANIZATIONAL_UNIT_NAME),
         found.not_valid_before_utc, found.not_valid_after_utc,
-        found.fingerprint(hashes.SHA256()).hex(), addresses, is_ours, has_key)
+        found.fingerprint(hashes.SHA256()).hex(), addresses, is_ours, has_key, _refused(found))
+
+
+def _refused(certificate: x509.Certificate) -> str:
+    """Return what a certificate's key is, if rustls takes no such key; else ""."""
+    key = certificate.public_key()
+    if isinstance(key, rsa.RSAPublicKey):
+        return f"RSA of {key.key_size} bits" if key.key_size < _RSA_BITS else ""
+    if isinstance(key, ec.EllipticCurvePublicKey):
+        return "" if isinstance(key.curve, _CURVES) else f"of the curve {key.curve.name}"
+    return "" if isinstance(key, ed25519.Ed25519PublicKey) else type(key).__name__.strip("_")
 
 
 def check_address(text: str) -> None:

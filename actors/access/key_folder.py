@@ -19,7 +19,7 @@ import contextlib
 import datetime as dt
 import fcntl
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +45,8 @@ from rampart.actors.access.register import (
 from rampart.actors.bus.zenoh_session import AUTHORITY, key_file
 from rampart.files.reading import FileError, read_bytes
 
-__all__ = ["check", "check_address", "entries", "init", "issue", "revoke", "rotate"]
+__all__ = ["check", "check_address", "days_left", "entries", "expired", "init", "issue",
+           "lifetimes", "revoke", "rotate"]
 
 AUTHORITY_DAYS = 1826.0
 DAYS: dict[str, float] = {"router": 30.0, "node": 30.0, "operator": 7.0, "viewer": 7.0}
@@ -202,6 +203,9 @@ def entries(folder: Path) -> list[Entry]:
 def _trouble(name: str, identity: Identity, certificate: Certificate) -> str:
     if not certificate.is_ours:
         return "of another authority"
+    if certificate.refused_key:
+        return (f"its key is {certificate.refused_key}, which no router takes; one of the curve "
+                "P-256 or P-384, Ed25519, or RSA of 2048 bits is right")
     if not certificate.has_key:
         return "without its private key"
     if certificate.common_name != identity.common_name(name):
@@ -238,6 +242,30 @@ def check(folder: Path, names: Sequence[str]) -> dt.datetime:
                             f"{now:%Y-%m-%d %H:%M}; `rampart keys rotate` renews it")
         until = min(until, entry.certificate.not_after)
     return until
+
+
+def lifetimes(folder: Path, names: Iterable[str]) -> dict[str, dt.datetime]:
+    """Return until when the certificate of each is valid, of those that have one here.
+
+    Raises:
+        KeysError: the folder is none, or has no certificate of an authority.
+    """
+    wanted = set(names)
+    return {entry.name: entry.certificate.not_after for entry in entries(folder)
+            if entry.name in wanted and entry.certificate is not None}
+
+
+def days_left(until: dt.datetime) -> float:
+    """Return for how many days a certificate is still valid; negative if it has expired."""
+    return (until - _now()) / dt.timedelta(days=1)
+
+
+def expired(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return who has a certificate here that has expired → one line that names its file."""
+    return {name: f"{_file(folder, name)}: the certificate of {name} expired at "
+                  f"{until:%Y-%m-%d %H:%M:%S} UTC, and no router takes it; `rampart keys rotate "
+                  f"{name}` renews it"
+            for name, until in lifetimes(folder, names).items() if days_left(until) <= 0}
 
 
 def _check_private(folder: Path) -> None:

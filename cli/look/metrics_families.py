@@ -18,6 +18,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.machine.process_usage import ProcessCount
 from rampart.actors.run.run_info import RunInfo
 from rampart.cli.run_picture import RunPicture
+from rampart.cli.session import days_left
 
 Row = tuple[tuple[str, ...], float]
 """Values of the labels, and the value."""
@@ -50,6 +51,9 @@ def families(now: Exposition | None) -> Iterator[Metric]:
         "run_id": run.run_id, "title": run.title, "port": str(run.base_port),
         "rate": f"{run.rate:g}"})
     yield gauge("simulated_seconds", "Simulated time of the run.", (), [((), now.time_s)])
+    if left := days_left(run):
+        yield gauge("certificate_days_left", "For how long the certificate of a process is valid.",
+                    ("process",), [((name,), days) for name, (days, _) in sorted(left.items())])
     yield from _nodes(now)
     yield from _mechanisms(now.picture)
     yield from now.picture.lines.families(now.picture.latest)

@@ -42,7 +42,7 @@ from rampart.cli.output import (
 )
 from rampart.cli.robot_lines import RobotLines
 from rampart.cli.run_picture import manager_in_words
-from rampart.cli.session import connect
+from rampart.cli.session import connect, first_to_expire
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag, option, whole
 from rampart.files.plain_text import printable
 from rampart.manager.spec.ros2 import GATEWAY
@@ -187,7 +187,8 @@ async def status(options: argparse.Namespace) -> int:
             "run_id": run.run_id, "title": run.title, "port": run.base_port, "pid": run.pid,
             "rate": run.rate, "system": run.system_file, "time_s": round(time_s, 3),
             **lines.status_data(latest), "manager": manager, "holders": held.holders,
-            "nodes": nodes.nodes if nodes else None, **({"ros2": graph} if has_gateway else {})})
+            "nodes": nodes.nodes if nodes else None, **({"ros2": graph} if has_gateway else {}),
+            **({"keys": left} if (left := first_to_expire(run)) else {})})
         return 0
     page = f", page {run.page}" if run.page else ""
     say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
@@ -202,6 +203,9 @@ async def status(options: argparse.Namespace) -> int:
             f"rampart reset {name} lets go")
     if has_gateway:
         say(f"ros2      {_in_ros2(graph)}")
+    if left := first_to_expire(run):
+        say(f"keys      {left['days_left']} days left, of {left['name']} first, until "
+            f"{left['not_after'][:16].replace('T', ' ')} UTC")
     say(f"nodes     {_nodes(nodes)}")
     return 0
 

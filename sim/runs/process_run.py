@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 
+from rampart.actors.access.register import KeysError
 from rampart.actors.bus.bus import SharedBus
 from rampart.actors.bus.run_folder import register_of
 from rampart.actors.hosts.launchers import FirstLauncher
@@ -22,6 +24,9 @@ from rampart.sim.runs.trial import Trial
 
 _LOOK_S = 0.05
 _STALL_S = 0.5
+
+_KEYS_S = 5.0
+"""Wall seconds between two looks at the certificates."""
 
 _RELINK_S = 1.0
 """Wall seconds in which a launcher that was stopped is linked to a router again."""
@@ -123,6 +128,8 @@ class ProcessRun:
             watch(task, f"the launcher's {actor.name}", launcher.failed)
         if trial.console:
             trial.console.banner(trial.about, plan, spec)
+        if plan.keys:
+            tasks.append(asyncio.create_task(self._watch_keys()))
         try:
             why = None
             while why is None and not self.interrupted and not launcher.failure:
@@ -137,7 +144,25 @@ class ProcessRun:
         finally:
             for actor in reversed(actors):
                 actor.stop()
+            for task in tasks[len(actors):]:
+                task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             if trial.console:
                 trial.console.close()
         return trial.conclude(clock.now(), self.interrupted or why or "ended")
+
+    async def _watch_keys(self) -> None:
+        """Tell of each certificate that expires: without it a process is only gone, then hung."""
+        from rampart.actors.access import key_folder  # noqa: PLC0415 of the extra
+
+        plan, told = self.launcher.plan, set[str]()
+        names = [*plan.routers, *self.launcher.names]
+        while True:
+            try:
+                found = await asyncio.to_thread(key_folder.expired, Path(plan.keys), names)
+            except (KeysError, OSError) as error:
+                found = {plan.keys: str(error)}
+            for name in found.keys() - told:
+                self.launcher.guard.report(found[name])
+            told = set(found)
+            await asyncio.sleep(_KEYS_S)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -95,8 +96,28 @@ def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
             back(run, router)
         refused = rampart(run, "inject", "drop:localization/pose", key=stolen)
         assert refused.returncode != 0
-        assert rampart(run, "status", key=keys / "bob.pem").returncode == 0
+        for words in (("status",), ("node", "list"), ("top", "--once")):
+            refused = rampart(run, *words, key=stolen)
+            assert (refused.returncode, refused.stdout) == (1, ""), words
+            assert "ada hear nothing: its certificate is revoked" in refused.stderr
+            assert refused.stderr.count("\n") == 1
+        looking = rampart(run, "status", key=keys / "bob.pem")
+        assert looking.returncode == 0
+        assert "days left" in looking.stdout
+        left = json.loads(rampart(run, "status", "--json", key=keys / "bob.pem").stdout)["keys"]
+        assert left["days_left"] == pytest.approx(30, abs=0.1)
+        key_folder.issue(keys, ("eve",), "viewer")  # the routers do not know her yet
+        early = rampart(run, "status", key=keys / "eve.pem")
+        assert early.returncode == 1
+        assert "eve hear nothing: it was issued after the routers started" in early.stderr
         assert run.process.poll() is None
+
+
+def test_a_node_whose_certificate_expires_is_told_with_its_file(tmp_path, keys):
+    key_folder.issue(keys, ("DM4",), "node", days=20 / 86_400)
+    with RealRun(tmp_path, "paper", "--mission", "A", "--keys", str(keys)) as run:
+        run.wait_for(f"{keys / 'DM4.pem'}: the certificate of DM4 expired at", 60)
+        assert "`rampart keys rotate DM4` renews it" in run.story
 
 
 @pytest.mark.slow  # tests/actors/access/test_strangers.py has the same without a mission

@@ -9,16 +9,19 @@ import signal
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import msgspec
 import pytest
+from cryptography.hazmat.primitives.asymmetric import dsa, ec, ed25519, rsa
 
-from rampart.actors.access import key_folder
+from rampart.actors.access import certificates, key_folder
 from rampart.actors.access.certificates import check_address, new_authority, read_certificate
 from rampart.actors.access.key_folder import check, entries, init, issue, revoke, rotate
 from rampart.actors.access.register import Identity, KeysError, Register, read_register
 
+GENERATED = ec.generate_private_key
 NOW = dt.datetime.now(dt.UTC)
 
 
@@ -46,6 +49,42 @@ def test_private_keys_are_their_users_alone(keys):
     assert mode(keys) == 0o700
     assert mode(keys / "authority.key") == mode(keys / "DM4.pem") == 0o600
     assert b"PRIVATE" not in (keys / "ca.crt").read_bytes() + (keys / "register.json").read_bytes()
+
+
+KINDS = {
+    "RSA of 1024 bits": lambda: rsa.generate_private_key(65537, 1024),
+    "RSA of 1536 bits": lambda: rsa.generate_private_key(65537, 1536),
+    "curve secp521r1": lambda: GENERATED(ec.SECP521R1()),
+    "curve secp256k1": lambda: GENERATED(ec.SECP256K1()),
+    "DSA": lambda: dsa.generate_private_key(2048),
+    "": lambda: rsa.generate_private_key(65537, 2048), " ": lambda: GENERATED(ec.SECP384R1()),
+    "  ": ed25519.Ed25519PrivateKey.generate}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_key_that_no_router_takes_is_refused_before_a_run(keys, monkeypatch, kind):
+    with monkeypatch.context() as patched:
+        patched.setattr(certificates.ec, "generate_private_key", lambda _: KINDS[kind]())
+        issue(keys, ["DM4"], "node")
+    if kind.strip():
+        with pytest.raises(KeysError, match=rf"DM4.pem: its key is [^\n]*{kind}") as raised:
+            check(keys, ["DM4"])
+        assert "rampart keys issue DM4" in str(raised.value)
+    else:
+        check(keys, ["DM4"])
+
+
+def test_of_expired_certificates_each_is_named_with_its_file(keys):
+    issue(keys, ["DM4"], "node", days=1 / 86_400)
+    issue(keys, ["DM5"], "node", days=3)
+    assert key_folder.lifetimes(keys, ["DM4", "DM5", "DM6"]).keys() == {"DM4", "DM5"}
+    until = key_folder.lifetimes(keys, ["DM5"])["DM5"]
+    assert key_folder.days_left(until) == pytest.approx(3, 0.01)
+    time.sleep(1.1)
+    found = key_folder.expired(keys, ["DM4", "DM5", "DM6"])
+    assert list(found) == ["DM4"]
+    assert str(keys / "DM4.pem") in found["DM4"]
+    assert "rampart keys rotate DM4" in found["DM4"]
 
 
 def test_a_certificate_says_who_and_for_how_long(keys):
