@@ -323,6 +323,29 @@ class Joystick(Message, frozen=True):
     dead_man: bool
 
 
+class WayOutRequest(Message, frozen=True):
+    """An operator's word that a robot inside a prohibited area may be driven out, once.
+
+    The same `order` twice is one request.
+    """
+
+    order: Name
+    by: Name
+    reason: Text
+
+
+class WayOutAnswer(Message, frozen=True):
+    """Whether the way out is granted, and why not; or, after it was, why it has ended.
+
+    `is_out`: it has ended because the robot is far enough from the area to be released.
+    """
+
+    order: Name
+    granted: bool
+    reason: Text
+    is_out: bool = False
+
+
 class PilotMode(StrEnum):
     """Whose commands the Safety Pilot passes on."""
 
@@ -331,16 +354,27 @@ class PilotMode(StrEnum):
     TELEOPERATION = "teleoperation"
 
 
+class Way(StrEnum):
+    """In which directions the robot may drive; whatever it is, it may turn."""
+
+    ANY = "any"
+    FORWARDS = "forwards"
+    BACKWARDS = "backwards"
+    NEITHER = "neither"
+
+
 class PilotOrder(Message, frozen=True):
     """A recovery module's order to the Safety Pilot, in force while `engaged`.
 
-    `top_speed_mps` bounds the speed of what passes; 0 leaves the bound of the robot.
+    `top_speed_mps` bounds the speed of what passes; 0 leaves the bound of the robot. An order whose
+    `way` is not any is one to stop if it is not renewed.
     """
 
     engaged: bool
     mode: PilotMode
     reason: Text
     top_speed_mps: float = 0.0
+    way: Way = Way.ANY
 
 
 class PilotStatus(Message, frozen=True):

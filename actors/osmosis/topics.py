@@ -64,6 +64,12 @@ PILOT_ORDER = Topic("pilot/order/{name}", m.PilotOrder, Qos.STATE, 5, "",
 PILOT_STATUS = Topic("pilot/status", m.PilotStatus, Qos.STATE, 5, "",
                      "What the Safety Pilot does, and why.")
 
+WAY_OUT = Topic("way_out/request", m.WayOutRequest, Qos.COMMAND, 0, "",
+                "Let a robot be driven out of a prohibited area, with the emergency stop in force.",
+                outside=True)
+WAY_OUT_ANSWER = Topic("way_out/answer", m.WayOutAnswer, Qos.COMMAND, 0, "",
+                       "Whether the way out is granted, and when it has ended, why.")
+
 # World: ground truth is for the judge, never for the controller.
 TRUTH = Topic("world/truth", m.GroundTruth, Qos.STATE, 20, "map", "Ground truth.")
 OBSTACLE = Topic("world/obstacle", m.ObstacleCommand, Qos.COMMAND, 0, "map",

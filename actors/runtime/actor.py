@@ -136,6 +136,10 @@ class Actor(Declared):
         self._chosen.setdefault(key, []).append(handler)
         return topic
 
+    def hear_after_all(self, topic: Topic[Any], handler: Callable[[Any, Header], None]) -> None:
+        """Hear from now on one of its inputs that `listens` has left out."""
+        self._hear(topic, topic.at(), handler)
+
     def hear_field(self, name: str, handler: Callable[[Any, Header], None]) -> None:
         """Hear a field that the node's parameters name, likewise; of type `FieldName`.
 

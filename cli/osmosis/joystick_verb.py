@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import math
 import sys
+import uuid
 from typing import Any
 
 from rampart.actors.bus import messages as bm
@@ -21,6 +22,7 @@ from rampart.actors.osmosis.messages import Joystick
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
+from rampart.cli.osmosis.mission_verb import checked_reason
 from rampart.cli.output import NoEffectError, UsageError, refusing, say
 from rampart.cli.session import Latest, Session, connect, pause
 from rampart.cli.terminal import END, keys
@@ -37,12 +39,17 @@ _ANSWER_S = 1.0
 
 _RELEASES = 3
 
+_GRANT_S = 3.0
+"""Simulated seconds within which a way out is granted or refused."""
+
 
 def add(verbs: Any, _formatter: Any, _common: Any) -> None:
     """Add the verb to the parser."""
     add_verb(verbs, "joystick", "drive from the keyboard, or with a joystick", joystick, PORT,
              number("--speed", "SHARE", "share of full speed to begin with, 0.1 to 1 (default 0.5)",
                     0.5),
+             option("--way-out", metavar="REASON",
+                    help="drive a robot that stands in a prohibited area out of it; why"),
              option("--device", nargs="?", const=AUTO, metavar="DEVICE",
                     help="a joystick instead of the keyboard; hold its dead-man button"))
 
@@ -60,19 +67,31 @@ async def joystick(options: argparse.Namespace) -> int:
 
     One stick is followed at a time: who holds first, drives; others are told.
 
+    A robot that stands in a prohibited area keeps its emergency stop. With
+    --way-out it can be driven out of it, at 0.2 m/s at most and only where that
+    leads out. Letting go ends that, and so does the robot when it is out: then
+    rampart reset RM1 releases it. Reason and name are recorded.
+
     Examples:
       rampart joystick
       rampart joystick --speed 0.2
       rampart joystick --device            the first joystick plugged in here
       rampart joystick --device /dev/input/js1
+      rampart joystick --way-out "localization was wrong, the grass is dry"
+
+    exit code: 1 no effect, way out refused, or the robot is not out
     """
     if not 0.1 <= options.speed <= 1.0:
         raise UsageError(f"--speed {options.speed:g}: must be between 0.1 and 1")
     if options.device is None and not sys.stdin.isatty():
         raise UsageError("standard input is no terminal, so there are no keys to drive by; "
                          "a joystick is used with --device")
+    reason = checked_reason(options.way_out, "--way-out") if options.way_out is not None else ""
     stop = asyncio.Event()
     async with connect(options.port) as session:
+        if reason:
+            way_out = _WayOut(session, reason, stop)
+            await way_out.ask()
         drive = _Drive(session, None if options.device else KeyboardStick(options.speed), stop)
         device = _open(options.device, session, drive) if options.device else None
         with stopped_by_signals(stop):
@@ -90,7 +109,53 @@ async def joystick(options: argparse.Namespace) -> int:
             raise NoEffectError(drive.ended)
         if drive.tried and not drive.answered:
             raise NoEffectError("no effect: teleoperation did not answer")
+        if reason:
+            way_out.conclude()
     return 0
+
+
+class _WayOut:
+    """The operator's request to drive out of a prohibited area, and what became of it."""
+
+    def __init__(self, session: Session, reason: str, stop: asyncio.Event) -> None:
+        self._session = session
+        self._request = m.WayOutRequest(f"rampart-{uuid.uuid4().hex[:10]}", session.name, reason)
+        self._answer: m.WayOutAnswer | None = None
+        self._stop = stop
+        session.listen(topics.WAY_OUT_ANSWER, topics.WAY_OUT_ANSWER.at(), self._hear)
+
+    async def ask(self) -> None:
+        """Ask for the way out.
+
+        Raises:
+            NoEffectError: it is refused, or not answered.
+        """
+        await self._session.command(topics.WAY_OUT, self._request,
+                                    lambda: self._answer is not None,
+                                    self._session.real_s(_GRANT_S))
+        if self._answer is None:
+            raise NoEffectError("no effect: the emergency stop did not answer")
+        if not self._answer.granted:
+            raise NoEffectError(f"way out refused: {self._answer.reason}")
+        say(f"way out granted: {self._answer.reason}; letting go ends it")
+
+    def conclude(self) -> None:
+        """Say how it has ended.
+
+        Raises:
+            NoEffectError: the robot is not out.
+        """
+        ended = "" if self._answer is None or self._answer.granted else self._answer.reason
+        if self._answer is None or not self._answer.is_out:
+            raise NoEffectError(f"the robot is not out: {ended or 'the operator ended it'}")
+        say(f"{ended}; rampart reset releases the emergency stop")
+
+    def _hear(self, _key: str, _header: Header, answer: m.WayOutAnswer) -> None:
+        if answer.order == self._request.order:
+            ended = self._answer is not None and self._answer.granted and not answer.granted
+            self._answer = answer
+            if ended:
+                self._stop.set()
 
 
 def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:

@@ -85,7 +85,7 @@ async def mission(options: argparse.Namespace) -> int:
     return 0
 
 
-def checked_reason(text: str) -> str:
+def checked_reason(text: str, option: str = "--reason") -> str:
     """Return a reason that fits into a status line.
 
     Raises:
@@ -93,7 +93,7 @@ def checked_reason(text: str) -> str:
     """
     reason = text.strip()
     if not reason or len(reason) > MAX_REASON or not reason.isprintable():
-        raise UsageError(f"--reason {text[:40]!r}: must be one line of 1 to {MAX_REASON} printable "
+        raise UsageError(f"{option} {text[:40]!r}: must be one line of 1 to {MAX_REASON} printable "
                          "characters")
     return reason
 

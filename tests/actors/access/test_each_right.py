@@ -29,8 +29,8 @@ MEMBERS = members_of(LAYOUT)
 KEYS = every_key(LAYOUT)
 NODES = sorted(set(MEMBERS) - set(LAYOUT.routers))
 OPERATED = {"inject/order", "manager/adapt", "manager/reset", "mission/order", "mission/request",
-            "stub/trigger", "supervisor/signal", "teleoperation/joystick", "world/actuator_fault",
-            "world/obstacle"}
+            "stub/trigger", "supervisor/signal", "teleoperation/joystick", "way_out/request",
+            "world/actuator_fault", "world/obstacle"}
 COMMANDS = {topic.key for m in MEMBERS.values() for topic in (*m.actor.outputs, *m.actor.inputs())
             if topic.qos is Qos.COMMAND} | {"inject/order", "inject/report"}
 

@@ -110,7 +110,8 @@ def test_the_same_attempts_succeed_with_a_key(keyed):
         assert set(accepted) == {"rampart/" + key for key in (
             "inject/order", "manager/adapt", "manager/reset", "mission/order", "mission/request",
             "stub/trigger", "supervisor/signal",
-            "teleoperation/joystick", "world/actuator_fault", "world/obstacle")}
+            "teleoperation/joystick", "way_out/request", "world/actuator_fault",
+            "world/obstacle")}
 
 
 @pytest.fixture

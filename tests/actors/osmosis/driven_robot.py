@@ -94,12 +94,13 @@ class Driven:
 
 
 @asynccontextmanager
-async def driven(system_name: str = "paper", *, seed: int = 1, **options: Any):
+async def driven(system_name: str = "paper", *, without: tuple[str, ...] = (), seed: int = 1,
+                 **options: Any):
     """Start a shipped system; without a mission the robot stands and waits for its operator."""
     async with VirtualSystem.load(system_name, seed=seed, waits=True, options=options) as system:
         robot = Driven(system)
         for name in system.layout.members:
-            if name != "supervisor":
+            if name not in ("supervisor", *without):
                 system.start_node(name)
         await asyncio.sleep(1.5)
         try:

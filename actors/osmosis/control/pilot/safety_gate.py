@@ -32,7 +32,7 @@ from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis.control.pilot.command_pair import CommandPair
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array
-from rampart.actors.osmosis.messages import PilotMode, PilotOrder, StickTwist, Twist
+from rampart.actors.osmosis.messages import PilotMode, PilotOrder, StickTwist, Twist, Way
 from rampart.manager.arbitration.silence import Silence
 
 STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
@@ -43,6 +43,12 @@ _STANDING_MPS = 1e-3
 
 _SOURCES = 64
 """Of commands, of which the newest one's place in the sequence is remembered."""
+
+_RENEWED_S = 0.35
+"""Age at which an order that bounds the way is none: it stops the robot."""
+
+_WAY_TURN_RADPS = 0.5
+"""Largest turn rate while an order bounds the way."""
 
 HELD_TOO_LONG = "the joystick was held during a stop: let go of it first"
 """Why a stick has no effect that was taken in hand before the last stop ended."""
@@ -135,6 +141,7 @@ class SafetyGate:
         self._started_s = started_s
         self.orders: Holders[PilotOrder] = Holders(recoveries, PilotOrder(
             True, PilotMode.STOP, "too many unknown modules order something"))
+        self._ordered_s: dict[str, float] = {}
         self._auto = _Line()
         self._standby = _Line()
         self._pair = CommandPair()
@@ -147,12 +154,30 @@ class SafetyGate:
         self._scan_fault = ""
         self.refused = 0
 
-    def order(self, recovery: str, order: PilotOrder) -> None:
-        """Take note of a recovery module's order; it is in force until that module ends it."""
+    def order(self, recovery: str, order: PilotOrder, stamp_s: float = math.inf) -> None:
+        """Take note of a recovery module's order; it is in force until that module ends it.
+
+        Args:
+            recovery: name of the module.
+            order: what it orders.
+            stamp_s: when, which counts for an order that bounds the way.
+        """
+        self._ordered_s.pop(recovery, None)
         if order.engaged:
             self.orders.hold(recovery, order)
+            if order.way is not Way.ANY and recovery in self.orders:
+                self._ordered_s[recovery] = stamp_s
         else:
             self.orders.let_go(recovery)
+
+    def _expire(self, now: float) -> None:
+        """Turn orders that bound the way and were not renewed into orders to stop."""
+        for recovery, stamp_s in list(self._ordered_s.items()):
+            if not now - stamp_s <= _RENEWED_S:
+                del self._ordered_s[recovery]
+                if recovery in self.orders:
+                    self.orders[recovery] = PilotOrder(
+                        True, PilotMode.STOP, "the way out is not renewed")
 
     def manager_alive(self, stamp_s: float, incarnation: int) -> None:
         """Take note of the manager's status, true at `stamp_s`; see `Silence`."""
@@ -256,6 +281,7 @@ class SafetyGate:
 
     def output(self, now: float) -> GateOutput:
         """Return what the base is to do now."""
+        self._expire(now)
         mode = self.mode
         reason = self._stop(now)
         if reason:
@@ -290,6 +316,13 @@ class SafetyGate:
                  ) -> tuple[tuple[float, float], str]:
         """Return a command no faster than orders and eyes allow; the turn rate is kept."""
         top_mps, reverse_mps = self.top_speed_mps, self._limits.reverse_mps
+        ways = {order.way for order in self.orders.values()} - {Way.ANY}
+        if ways:
+            along = Way.FORWARDS if wanted[0] > 0 else Way.BACKWARDS
+            linear = wanted[0] if ways == {along} else 0.0
+            turn = min(max(wanted[1], -_WAY_TURN_RADPS), _WAY_TURN_RADPS)
+            passing = passing or ("" if (linear, turn) == wanted else "the way out only, slowly")
+            wanted = (linear, turn)
         if self._checks.inputs and wanted[0] < -reverse_mps:
             wanted, passing = (-reverse_mps, wanted[1]), passing or "slowly: no laser looks back"
         if not top_mps or abs(wanted[0]) <= top_mps:

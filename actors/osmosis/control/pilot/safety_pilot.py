@@ -81,7 +81,7 @@ class SafetyPilot(Actor):
     @on(topics.PILOT_ORDER)
     def order(self, message: m.PilotOrder, header: Header) -> None:
         """Obey a recovery module, and others as well; a change acts at once."""
-        self._gate.order(header.source, message)
+        self._gate.order(header.source, message, min(header.stamp, self.clock.now()))
         if message.engaged and header.source not in self._recoveries:
             self.report_diagnostic("pilot order", f"given by {header.source!r}, no recovery module "
                                    "of this system; rampart reset ends it", header.source)
