@@ -24,6 +24,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout
+from rampart.actors.layout.wiring import heard, published
 from rampart.actors.run.run_plan import tailor
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
@@ -181,7 +182,10 @@ class FtmManager(Actor):
         plan = replace(self.context.run.plan, system_file=file)
         system = tailor(plan, system)
         check_change(self._system, system)
-        Layout(plan, system)
+        layout = Layout(plan, system)
+        if plan.keys and (names := _with_other_topics(Layout(plan, self._system), layout)):
+            return (f"{', '.join(names)}: would need other topics than the credentials of this run "
+                    "permit; start it again with the changed system")
         if busy := self.arbiter_state.busy:
             return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
         text = msgspec.json.encode(document).decode()
@@ -261,6 +265,12 @@ class FtmManager(Actor):
     def _show(self) -> None:
         self._shown = self._status()
         self.publish(topics.MANAGER_STATUS, self._shown)
+
+
+def _with_other_topics(before: Layout, after: Layout) -> list[str]:
+    """Return the actors that would hear or publish what they do not now."""
+    return [name for name, new in after.members.items() for old in [before.members[name]]
+            if (heard(new), published(new)) != (heard(old), published(old))]
 
 
 def _says_all_is_well(event: Input) -> bool:

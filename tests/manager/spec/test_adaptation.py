@@ -327,3 +327,20 @@ def test_a_mechanism_that_is_disabled_does_not_recover():
         assert system.incarnations["hmi"] == 2
 
     in_adaptable_system(scenario)
+
+
+def test_with_credentials_a_change_that_they_do_not_permit_is_refused():
+    async def begin() -> None:
+        async with Whole() as system:
+            system.run = replace(system.run, document=copy.deepcopy(DOCUMENT),
+                                 plan=msgspec.structs.replace(system.run.plan, keys="keys"))
+            await system.begin()
+            engineer = system.start("engineer", Engineer)
+            await asyncio.sleep(0.1)
+            answer = await engineer.ask(
+                "retune", "DM5", '{"watch": ["hmi", "teleoperation", "localization"]}')
+            assert not answer.accepted
+            assert answer.reason.startswith("DM5: would need other topics")
+            assert (await engineer.ask("retune", "DM1", '{"margin_m": 0.7}')).accepted
+
+    run(begin)
