@@ -74,6 +74,28 @@ def encode(header: Header, body: msgspec.Struct) -> bytes:
     return pack((header.source, header.incarnation, header.sequence, header.stamp, body))
 
 
+def strange_value(body: msgspec.Struct) -> str:
+    """Return which field of a message has a value that no message can have, "" if none has."""
+    waiting: list[tuple[str, Any]] = [("", body)]
+    while waiting:
+        path, value = waiting.pop()
+        if isinstance(value, msgspec.Struct):
+            waiting += [(f"{path}.{name}".lstrip("."), getattr(value, name))
+                        for name in value.__struct_fields__]
+        elif isinstance(value, tuple | list):
+            waiting += [(f"{path}[{place}]", item) for place, item in enumerate(value)]
+        elif isinstance(value, dict):
+            waiting += [(f"{path}[{key!r}]", item) for key, item in value.items()]
+        else:
+            try:
+                msgspec.msgpack.encode(value)
+            except TypeError:
+                kind = type(value)
+                return (f"field {path}: {kind.__module__}.{kind.__qualname__} cannot be sent; "
+                        "expected plain values: float(), int(), bool() or .tolist() of numpy's")
+    return ""
+
+
 def decode(topic: Topic[Any], payload: bytes) -> tuple[Header, Any]:
     """Return header and body of a payload.
 

@@ -48,19 +48,31 @@ class Field:
             raise ValueError(f"{path}: not a number, a text or a truth value")
         self.kind = kind
 
+    def beyond(self, message: Any) -> str:
+        """Return which item a list of a message is too short for, "" if none is."""
+        value = message
+        for step in self._steps:
+            if isinstance(step, int) and value is not None and not -len(value) <= step < len(value):
+                return f"{self.path}: [{step}] of a list of {len(value)} items"
+            value = _taken(value, step)
+        return ""
+
     def __call__(self, message: Any) -> Any:
         """Return the field of a message; None where an optional part or an item is missing."""
         value = message
         for step in self._steps:
-            if value is None:
-                return None
-            if isinstance(step, int):
-                value = value[step] if -len(value) <= step < len(value) else None
-            elif step in _FOLDS:
-                value = _FOLDS[step](value) if len(value) or step == "len" else None
-            else:
-                value = getattr(value, step)
+            value = _taken(value, step)
         return value.value if isinstance(value, Enum) else value
+
+
+def _taken(value: Any, step: str | int) -> Any:
+    if value is None:
+        return None
+    if isinstance(step, int):
+        return value[step] if -len(value) <= step < len(value) else None
+    if step in _FOLDS:
+        return _FOLDS[step](value) if len(value) or step == "len" else None
+    return getattr(value, step)
 
 
 def _steps(path: str) -> list[str | int]:
@@ -94,7 +106,14 @@ def _follow(info: inspect.Type, step: str | int, path: str) -> inspect.Type:
             raise ValueError(f"{path}: [{step}] of what is no list")
         if step == "len":
             return inspect.IntType()
-        return info.item_types[0] if isinstance(info, inspect.TupleType) else info.item_type
+        fixed = info.item_types if isinstance(info, inspect.TupleType) else ()
+        most = len(fixed) if isinstance(info, inspect.TupleType) else info.max_length
+        if isinstance(step, int) and most is not None and not -most <= step < most:
+            raise ValueError(f"{path}: [{step}]: the list has at most {most} items, expected "
+                             f"{-most} to {most - 1}")
+        if isinstance(info, inspect.TupleType):
+            return fixed[step if isinstance(step, int) else 0]
+        return info.item_type
     if not isinstance(info, inspect.StructType):
         raise ValueError(f"{path}: {step} of what has no fields")
     known = {field.name: field.type for field in info.fields}

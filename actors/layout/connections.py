@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from functools import cache
 from typing import Any
 
 import msgspec
+from msgspec import inspect
 
 from rampart.actors.bus.topic import Members, Qos, Topic
 from rampart.actors.layout.wiring import Member, heard, panels_of, published
+from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import BASE_OUTPUTS
-from rampart.manager.spec.schema import Kind
+from rampart.manager.spec.schema import Kind, SystemSpec
 
 Published = Mapping[str, list[tuple[Member, Members]]]
 """Topic key → who publishes it, and which members of a family."""
@@ -103,6 +106,37 @@ def check_connections(members: Collection[Member], said: Published, known: Itera
     return declared
 
 
+def check_repairs(members: Mapping[str, Member], spec: SystemSpec, file: str) -> None:
+    """Check that what a detection module names can be restarted by what answers to it.
+
+    Args:
+        members: all actors of a system, by name.
+        spec: the system.
+        file: name of the spec, for messages.
+
+    Raises:
+        ValueError: a module that restarts nodes answers to a detection module, and neither it nor
+            another one that answers has a node that this watches or suspects.
+    """
+    for mechanism in spec.mechanisms:
+        repairs = {name: members[name].parameters for name in mechanism.recoveries
+                   if name in members and issubclass(members[name].actor, Respawn)}
+        mendable = {node for said in repairs.values()
+                    if isinstance(said, Respawn.Parameters) for node in said.nodes}
+        for name in mechanism.detections if repairs else ():
+            if name not in members:
+                continue
+            for parameter in ("watch", "suspects"):
+                for node in getattr(members[name].parameters, parameter, ()):
+                    if node not in mendable:
+                        by = " or ".join(repairs)
+                        raise ValueError(
+                            f"{file}: detection {name}: parameters.{parameter}: {by} answers to "
+                            f"{mechanism.name} and does not restart {node}; expected "
+                            f"respawn = {next(iter(repairs))!r} in node {node}, or {node} in the "
+                            f"parameters.nodes of {by}")
+
+
 def check_heard(who: str, topic: Topic[Any], names: Members, said: Published) -> None:
     """Check that somebody publishes what is heard.
 
@@ -173,4 +207,32 @@ def flaw(topic: Topic[Any]) -> str:
         return "one {name} at most is right"
     if not (isinstance(topic.type, type) and issubclass(topic.type, msgspec.Struct)):
         return f"type = {topic.type!r}: must be derived from rampart.actors.bus.messages.Message"
+    return unsendable(topic.type)
+
+
+@cache
+def unsendable(message: type[msgspec.Struct]) -> str:
+    """Return which field of a message has a type that no message can have, "" if none has."""
+    try:
+        waiting = [("", inspect.type_info(message))]
+    except (TypeError, NameError) as error:
+        return str(error)
+    seen: set[type] = set()
+    while waiting:
+        path, info = waiting.pop()
+        match info:
+            case inspect.CustomType(cls=kind):
+                return (f"field {path}: {kind.__module__}.{kind.__qualname__} cannot be sent; "
+                        "expected plain types, e.g. tuple[float, ...]")
+            case inspect.Metadata(type=inner):
+                waiting.append((path, inner))
+            case inspect.UnionType(types=several) | inspect.TupleType(item_types=several):
+                waiting += [(path, one) for one in several]
+            case inspect.DictType(key_type=key, value_type=value):
+                waiting += [(path, key), (path, value)]
+            case inspect.StructType(cls=kind, fields=fields) if kind not in seen:
+                seen.add(kind)
+                waiting += [(f"{path}.{f.name}".lstrip("."), f.type) for f in fields]
+            case inspect.CollectionType(item_type=item):
+                waiting.append((f"{path}[]", item))
     return ""

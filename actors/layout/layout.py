@@ -13,7 +13,12 @@ from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.chosen_topics import choose_topics, with_pages
-from rampart.actors.layout.connections import check_connections, check_heard, publishers_of
+from rampart.actors.layout.connections import (
+    check_connections,
+    check_heard,
+    check_repairs,
+    publishers_of,
+)
 from rampart.actors.layout.hosts import Hosts
 from rampart.actors.layout.wiring import (
     SPARES,
@@ -146,6 +151,7 @@ class Layout:
         everyone = choose_topics((*members, *others), (*known, *self.topics.values()), file)[0]
         said = publishers_of(everyone.values())
         declared = check_connections(members, said, known, silent, file)
+        check_repairs(self.members, self.spec, file)
         if judge is None:
             return
         if application_class(self.spec).trial:

@@ -21,7 +21,15 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
-from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
+from rampart.actors.bus.envelope import (
+    STRANGERS,
+    ArrivalGuard,
+    Envelope,
+    Header,
+    pack,
+    strange_value,
+    too_long,
+)
 from rampart.actors.bus.fields import Field
 from rampart.actors.bus.limits import ReportLimit
 from rampart.actors.bus.messages import ON_TIME, Diagnostic, Heartbeat, Injection
@@ -148,7 +156,14 @@ class Actor(Declared):
         """
         key, _, path = name.partition(":")
         field = Field(self.chosen_topic(key).type, path)
-        self.hear_topic(key, lambda message, header: handler(field(message), header))
+
+        def take(message: Any, header: Header) -> None:
+            value = field(message)
+            if value is None and (why := field.beyond(message)):
+                self.report_diagnostic("no such item", why, key)
+            handler(value, header)
+
+        self.hear_topic(key, take)
 
     def chosen_topic(self, key: str) -> Topic[Any]:
         """Return a topic that the node's parameters name.
@@ -368,7 +383,10 @@ class Actor(Declared):
         """Send a message as it is, past all fault injections; `publish` is what actors call."""
         self._sequence = sequence = self._sequence + 1
         self._last_sent[key] = (body, stamp)
-        payload = pack((self.name, self._incarnation, sequence, stamp, body))
+        try:
+            payload = pack((self.name, self._incarnation, sequence, stamp, body))
+        except TypeError as error:
+            raise TypeError(f"topic {topic.key}: {strange_value(body) or error}") from None
         if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
             self.report_diagnostic("not sent", too_long(payload), key)
             return

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import numpy as np
 import pytest
+from msgspec import Meta
 
 from rampart.actors.bus.fields import Field
+from rampart.actors.bus.messages import Message
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
-from tests.tank import Level, Phase, Pump
+from rampart.actors.runtime.actor import Actor
+from rampart.testing import VirtualSystem, run
+from tests.tank import LEVEL, TOPICS, Level, Phase, Pump
 
 
 @pytest.mark.parametrize(("message", "path", "value", "kind"), [
@@ -26,6 +33,57 @@ def test_a_field_is_read(message, path, value, kind):
     field = Field(type(message), path)
     assert field(message) == value
     assert field.kind == kind
+
+
+class Gauge(Actor):
+    """What publishes a level."""
+
+    outputs = (LEVEL,)
+
+
+@pytest.mark.parametrize(("message", "where"), [
+    (Level(np.float64(1.0)), "field height_m: numpy.float64"),
+    (Level(1.0, np.zeros(2)), "field cells: numpy.ndarray"),
+    (Level(1.0, (0.0, np.float32(1.0))), "field cells[1]: numpy.float32")])
+def test_a_value_of_numpy_is_refused_by_topic_and_field(message, where):
+    async def scenario() -> None:
+        async with VirtualSystem(topics=TOPICS) as system:
+            with pytest.raises(TypeError, match=r"^topic tank/level: ") as caught:
+                system.start("gauge", Gauge).publish(LEVEL, message)
+            assert where in str(caught.value)
+
+    run(scenario)
+
+
+class Arm(Message):
+    """Seven joints."""
+
+    angles_rad: Annotated[tuple[float, ...], Meta(max_length=7)]
+
+
+class Fixed(Message):
+    """Six numbers and a text."""
+
+    angles: tuple[float, float, float, float, float, float, str]
+
+
+@pytest.mark.parametrize(("kind", "path"), [
+    (Arm, "angles_rad[9]"), (Arm, "angles_rad[7]"), (Arm, "angles_rad[-8]"), (Fixed, "angles[7]")])
+def test_an_index_beyond_a_list_of_known_length_is_refused(kind, path):
+    with pytest.raises(ValueError, match=r"at most 7 items, expected -7 to 6"):
+        Field(kind, path)
+
+
+def test_the_last_item_of_a_list_of_known_length_is_a_field():
+    assert Field(Arm, "angles_rad[6]")(Arm((0.5,) * 7)) == 0.5
+    assert Field(Arm, "angles_rad[-7]").kind == "number"
+    assert Field(Fixed, "angles[6]").kind == "text"
+
+
+def test_an_item_that_a_list_lacks_is_named():
+    field = Field(Level, "cells[7]")
+    assert field.beyond(Level(1.5, (1.0, 2.0))) == "cells[7]: [7] of a list of 2 items"
+    assert field.beyond(Level(1.5, (1.0,) * 8)) == ""
 
 
 @pytest.mark.parametrize(("kind", "path", "words"), [

@@ -292,6 +292,21 @@ def test_a_pump_that_leaves_out_a_step():
     assert found[1][2] == "tank/pump:phase is 'draining' after 'idle'; right is 'filling'"
 
 
+def test_a_list_that_is_too_short_for_a_parameter_s_index_is_reported():
+    """The module was silent about it, and idle for the whole run."""
+    async def scenario() -> None:
+        async with VirtualSystem(topics=TOPICS) as system:
+            reported = system.hear(bus_topics.DIAGNOSTIC, "D")
+            system.start("D", Threshold, value="tank/level:cells[7]", above=2.0)
+            await asyncio.sleep(0.1)
+            system.say(LEVEL, Level(3.0, (1.0, 2.0)), "gauge")
+            await asyncio.sleep(0.1)
+            await system.settle()
+            assert "cells[7]" in reported[-1].message.reason
+
+    run(scenario)
+
+
 def test_suspects_are_named_by_the_incarnation_that_was_heard():
     async def scenario() -> None:
         async with VirtualSystem(topics=TOPICS) as system:

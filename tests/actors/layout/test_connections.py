@@ -115,6 +115,29 @@ def test_each_member_of_a_family_that_is_heard_has_to_be_published(tank):
         "'tank/valve/valve'? ")
 
 
+@pytest.mark.parametrize(("field", "where"), [
+    ("angles: np.ndarray", "field angles: numpy.ndarray"),
+    ("speed: np.float64", "field speed: numpy.float64"),
+    ("inner: Level\n    all: tuple[np.ndarray, ...] = ()", "field all[]: numpy.ndarray")])
+def test_a_field_that_cannot_be_sent_is_refused_by_topic_and_name(tank, field, where):
+    code = (f"import numpy as np\nclass Pose(Message):\n    {field}\n"
+            'POSE = Topic("tank/pose", Pose, Qos.SENSOR, 10, "", "Pose.")\n'
+            "class Eye(Actor):\n    outputs = (POSE,)\n")
+    line = line_of(tank, code, "Eye")
+    assert line.startswith(f"node eye: topic 'tank/pose': {where} cannot be sent")
+
+
+def test_a_repair_has_to_reach_the_nodes_that_its_detection_watches(tmp_path):
+    text = system_file("paper").read_text()
+    assert 'respawn = "RM3"' in text
+    file = tmp_path / "paper.toml"
+    # One control node is the supervisor's now, and DM4, to which RM3 answers, watches it still.
+    file.write_text(text.replace('respawn = "RM3"', 'respawn = "supervisor"', 1))
+    plan = RunPlan(system_file=str(file))
+    with pytest.raises(ValueError, match=r"parameters\.watch: RM3 answers .* mission_manager"):
+        Layout(plan, load_system(plan))
+
+
 def test_one_key_with_two_types(tank):
     assert line_of(tank, HEARS.format("AGAIN"), "Gauge", "Reader") == (
         "node reader: topic 'tank/level' is tank_here:Flow of qos sensor, and tank_here:Level of "
