@@ -27,8 +27,9 @@ _CHOICE = (
     whole("--runs", "N", "N random faults of all kinds"),
     several("--fault", "FAULT[@WHEN][+S]",
             "this fault; may be repeated, and be a pattern of names: 'kill:*'"),
-    whole("--together", "K", "with --runs: K faults in each (default 1)", 1),
-    word("--kinds", "K,...", "with --runs: only these kinds of faults, of those that --list shows"),
+    whole("--together", "K", "with --runs or --search: K faults in each (default 1)", 1),
+    word("--kinds", "K,...", "with --runs or --search: only these kinds of faults, of those that "
+         "--list shows"),
     whole("--search", "N", "N runs of an optimiser that looks for the smallest safety margin"),
     word("--replay", "RUN", "repeat a run of --out by its key"),
     flag("--list", "list the faults that there are"))
@@ -40,6 +41,7 @@ _CONDITIONS = (
     word("--network", "NAME", f"{', '.join(NETWORKS)} (default: measured)", "measured"),
     whole("--seed", "N", "default: 1", 1),
     whole("--seeds", "N", "with --fault: so many runs of each, from --seed on (default: 1); with "
+          "--search: so many among the runs (default: 1); with "
           f"--runs: so many seeds among them (default: {SEEDS})"),
     number("--patience", "S", "simulated seconds without progress that end a run "
            f"(default: {PATIENCE_S:g})", PATIENCE_S),

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
 
-import joblib
 import msgspec
 from tqdm import tqdm
 
@@ -40,7 +39,6 @@ from rampart.sim.campaign.execute import BackendError, JobError, execute
 from rampart.sim.campaign.job import (
     Job,
     RunResult,
-    run_job,
     run_virtually,
     virtual_run,
 )
@@ -331,34 +329,37 @@ def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
     with refusing(ValueError):
         bases = with_content(_base_jobs(options, spec))
     space = Space(tuple(bases), _groups(options, spec), faults_of(spec).intruder,
-                  _moments(spec, bases[0], searched=True))
+                  _moments(spec, bases[0], searched=True), options.together)
     directory = Path(options.out or "reports/campaign-search")
     with refusing(StoreError):
         store = Store(directory)
     unit = trial_class(spec).margin_unit
     workers = options.jobs or os.cpu_count() or 1
-    with joblib.Parallel(n_jobs=workers, batch_size=1) as pool, tqdm(
-            total=options.search, unit="run", file=sys.stderr,
-            disable=None) as bar:  # no bar into a file
+    with tqdm(total=options.search, unit="run", file=sys.stderr,
+              disable=None) as bar:  # no bar into a file
 
         def run(jobs: Sequence[Job]) -> Sequence[RunResult]:
-            return list(pool(joblib.delayed(run_job)(job) for job in jobs))
+            try:
+                execute(jobs, store, workers=workers, backend=options.backend,
+                        address=options.address)
+                made = {r.job.key: r.result for r in store.runs({job.key for job in jobs})}
+            except (StoreError, JobError, BackendError) as error:
+                raise UsageError(f"{error}; what was finished is in {directory}, and the same "
+                                 "command goes on from there") from None
+            return [made[job.key] for job in jobs]
 
         smallest = math.inf
 
         def seen(job: Job, result: RunResult) -> None:
             nonlocal smallest
-            try:
-                store.add(job, result)
-            except StoreError as error:
-                raise UsageError(f"{error}; what was finished is in {directory}") from None
             if margin(result) < smallest:
                 smallest = margin(result)
                 bar.write(f"{smallest:8.3f} {unit}  {job.key}  {job.text()}", file=sys.stderr)
             bar.update()
 
         try:
-            made = search(space, options.search, run, seed=options.seed, at_once=workers, seen=seen)
+            made = search(space, options.search, run, seed=options.seed,
+                          seeds=options.seeds or 1, at_once=workers, seen=seen)
         except ImportError:
             raise UsageError("--search: Optuna is not installed; pip install 'rampart[search]'"
                              ) from None

@@ -8,6 +8,7 @@ run is then shrunk: everything that it does not need is taken away.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -37,29 +38,36 @@ class Space:
         groups: Names of faults by kind.
         intruder: What may come on top of a fault, see `Faults`.
         moments: Between which simulated times faults are injected.
+        together: How many faults at once.
     """
 
     bases: tuple[Job, ...]
     groups: Mapping[str, tuple[str, ...]]
     intruder: tuple[str, float, float] | None = None
     moments: tuple[float, float] = MOMENTS_S
+    together: int = 1
 
     def job(self, trial: optuna.Trial, seed: int) -> Job:
         """Return the run that the optimiser asks for."""
         base = self.bases[trial.suggest_int("base", 0, len(self.bases) - 1)]
-        kind = trial.suggest_categorical("kind", sorted(self.groups))
-        fault = trial.suggest_categorical(f"fault of {kind}", self.groups[kind])
-        at_s = round(trial.suggest_float("at_s", *self.moments), 2)
-        lasts_s = None if kind == "process" else round(
-            trial.suggest_float("lasts_s", *_LASTS_S, log=True), 2)
-        faults = [PlannedFault(fault, at_s, duration_s=lasts_s)]
+        faults = [self._fault(trial, f"{number} " if number > 1 else "")
+                  for number in range(1, self.together + 1)]
         if self.intruder and trial.suggest_categorical("intruder", [False, True]):
             name, *limits = self.intruder
             size = round(trial.suggest_float("intruder_size", *limits), 2)
             after_s = round(trial.suggest_float("intruder_after_s", 0.0, 10.0), 2)
-            faults.append(PlannedFault(f"{name}:{size:g}", round(at_s + after_s, 2)))
+            faults.append(
+                PlannedFault(f"{name}:{size:g}", round(faults[0].at_s + after_s, 2)))
         return msgspec.structs.replace(
             base, row=" + ".join(f.fault for f in faults), faults=tuple(faults), seed=seed)
+
+    def _fault(self, trial: optuna.Trial, which: str) -> PlannedFault:
+        kind = trial.suggest_categorical(f"{which}kind", sorted(self.groups))
+        fault = trial.suggest_categorical(f"{which}fault of {kind}", self.groups[kind])
+        at_s = round(trial.suggest_float(f"{which}at_s", *self.moments), 2)
+        lasts_s = None if kind == "process" else round(
+            trial.suggest_float(f"{which}lasts_s", *_LASTS_S, log=True), 2)
+        return PlannedFault(fault, at_s, duration_s=lasts_s)
 
 
 def margin(result: RunResult) -> float:
@@ -69,7 +77,7 @@ def margin(result: RunResult) -> float:
     return -result.severity
 
 
-def search(space: Space, budget: int, run: Run, *, seed: int, at_once: int = 1,
+def search(space: Space, budget: int, run: Run, *, seed: int, seeds: int = 1, at_once: int = 1,
            seen: Callable[[Job, RunResult], None] = lambda _job, _result: None
            ) -> list[tuple[Job, RunResult]]:
     """Look for small margins; return all runs made, the worst first.
@@ -78,7 +86,8 @@ def search(space: Space, budget: int, run: Run, *, seed: int, at_once: int = 1,
         space: Where to look.
         budget: How many runs to make.
         run: See `Run`.
-        seed: Of the optimiser and the runs.
+        seed: Of the optimiser and the first run.
+        seeds: How many seeds the runs take turns with, from `seed` on.
         at_once: How many runs are asked for before the first of them is back.
         seen: Called after each run.
 
@@ -97,9 +106,12 @@ def search(space: Space, budget: int, run: Run, *, seed: int, at_once: int = 1,
     made: list[tuple[Job, RunResult]] = []
     while len(made) < budget:
         trials = [study.ask() for _ in range(min(at_once, budget - len(made)))]
-        jobs = [space.job(trial, seed) for trial in trials]
+        jobs = [space.job(trial, seed + trial.number % seeds) for trial in trials]
         for trial, job, result in zip(trials, jobs, run(jobs), strict=True):
-            study.tell(trial, margin(result) if result.counts else 2.0)
+            if result.counts and math.isfinite(margin(result)):
+                study.tell(trial, margin(result))
+            else:  # without effect, or without a margin: worse than any that has one
+                study.tell(trial, state=optuna.trial.TrialState.PRUNED)
             made.append((job, result))
             seen(job, result)
     return sorted(made, key=lambda pair: margin(pair[1]))

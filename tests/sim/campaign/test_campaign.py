@@ -529,14 +529,41 @@ def test_the_search_goes_where_the_margin_is_small():
 def test_the_search_is_told_of_an_unsafe_run_though_its_fault_had_no_effect(monkeypatch):
     optuna = pytest.importorskip("optuna")
     told = []
-    monkeypatch.setattr(optuna.Study, "tell", lambda _self, _trial, value: told.append(value))
+    monkeypatch.setattr(optuna.Study, "tell",
+                        lambda _self, _trial, value=None, **_: told.append(value))
     nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
     results = iter([result(outcomes=nothing),
                     result(outcomes=nothing, safe=False, severity=1.0)])
     search(Space(tuple(BASES), {"sensor": ("gps-bias",)}), 2,
            lambda _jobs: [next(results)], seed=1)
-    assert told == [2.0, -1.0]
+    assert told == [None, -1.0]
 
+
+def test_a_fault_without_effect_does_not_attract_the_search_whatever_the_unit_of_margins():
+    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
+
+    def fake(jobs):  # margins of tens of metres; one of the two faults has no effect
+        return [result(outcomes=nothing) if job.faults[0].fault == "gps-bias" else
+                result(margins={"obstacle_m": 50.0}) for job in jobs]
+
+    pytest.importorskip("optuna")
+    last = search_order(Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift")}), fake)
+    assert last.count("gps-drift") > 2 * last.count("gps-bias")
+
+
+def search_order(space: Space, fake) -> list[str]:
+    """Return the faults of the last 40 of 80 runs, in the order in which they were asked for."""
+    order: list[str] = []
+    search(space, 80, fake, seed=1, seen=lambda job, _result: order.append(job.faults[0].fault))
+    return order[-40:]
+
+
+def test_the_search_has_as_many_faults_and_seeds_as_are_asked_for():
+    pytest.importorskip("optuna")
+    space = Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift")}, together=2)
+    made = search(space, 6, lambda jobs: [result() for _ in jobs], seed=7, seeds=3)
+    assert {len(job.faults) for job, _ in made} == {2}
+    assert sorted(job.seed for job, _ in made) == [7, 7, 8, 8, 9, 9]
 
 def test_what_is_unsafe_for_longer_is_further_down():
     assert margin(result(safe=False, severity=3.0)) < margin(
