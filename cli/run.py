@@ -16,7 +16,7 @@ from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import msgspec
 
@@ -127,9 +127,13 @@ class Run:
         self._trial = self._made(self._plan, sys.stderr)
 
     async def _on_processes(self, run: ProcessRun) -> int:
-        with _recorded(self._options, self._plan, self._trial.run.system):
+        with _recorded(self._options, self._plan, self._trial.run.system) as recorder:
+            if recorder is not None:
+                run.launcher.recording = lambda: (recorder.path, recorder.problem())
             _interruptible(run)
-            return self._conclude(await run.run(), run.failure)
+            record = await run.run()
+        return self._conclude(record, run.failure,
+                              recording=_recording(*run.launcher.recording()))
 
     def _in_virtual_time(self) -> int:
         recording = None
@@ -161,9 +165,10 @@ class Run:
                     log.write(result.tracebacks)
             except OSError as error:
                 _say(f"{self._plan.error_log}: tracebacks are lost: {in_words(error)}")
-        return self._conclude(result.record, trace=result.trace)
+        return self._conclude(result.record, trace=result.trace, recording=_recording(
+            self._options.record or "", recording.problem if recording else ""))
 
-    def _conclude(self, record: RunRecord, failure: str = "", **more: str | None) -> int:
+    def _conclude(self, record: RunRecord, failure: str = "", **more: Any) -> int:
         """Tell what came of the run; no disk and no reader that fails changes the verdict."""
         report = self._trial.report(record, self._directory)
         if self._trial.console:
@@ -190,6 +195,11 @@ class Run:
         if record.safety != "safe":
             return EXIT_UNSAFE if record.safety == "unsafe" else EXIT_NOT_KNOWN
         return EXIT_SUCCESS if record.mission == "success" and not broken else EXIT_FAILED
+
+
+def _recording(file: str, problem: str) -> dict[str, str] | None:
+    """Return what the result of a run has of its recording; None if there is none."""
+    return {"file": file, "problem": problem} if file else None
 
 
 def _say(text: str) -> None:
@@ -223,17 +233,18 @@ def _kept(directory: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> Iterator[None]:
+def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
+              ) -> Iterator[RecorderProcess | None]:
     """Have what runs meanwhile recorded, if that is asked for, by a process of its own."""
     if not options.record:
-        yield
+        yield None
         return
     recorder = RecorderProcess(Order(
         options.port, str(Path(options.record).resolve()), os.getpid(), options.overwrite,
         others_of(Layout(plan, spec))))
     recorder.start()
     try:
-        yield
+        yield recorder
     finally:
         recorder.end()
 

@@ -12,8 +12,10 @@ readers of MCAP alike.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -44,6 +46,9 @@ KEY = "key"
 """Channel metadata that only channels of the bus have: the full key."""
 
 _MAX_NS = (1 << 64) - 1
+
+RESERVE_BYTES = 256 << 20
+"""Of a disk, left free for checkpoints and reports: a twentieth of it, at most so much."""
 
 _LATE = 1024
 """So many missing messages may still come."""
@@ -212,9 +217,18 @@ class BagWriter:
         """Close the chunk and hand everything to the kernel, which keeps it if this process dies.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: it cannot be written, or the disk has no more room than others need.
         """
         self._writer.flush()
+        disk = os.fstatvfs(self._file.fileno())
+        reserve = min(RESERVE_BYTES, disk.f_blocks * disk.f_frsize // 20)
+        if disk.f_bavail * disk.f_frsize < reserve:
+            raise OSError(errno.ENOSPC, f"less than {reserve >> 20} MB are free on its disk")
+
+    @property
+    def written_bytes(self) -> int:
+        """How large the file is by now."""
+        return self._file.tell()
 
     def close(self, end: Mapping[str, str] | None = None) -> None:
         """Write the end, with what came of the recording, and close the file.

@@ -51,6 +51,24 @@ class RecorderProcess:
     def __init__(self, order: Order) -> None:
         self._order = order
         self._process: subprocess.Popen[str] | None = None
+        self._problem = ""
+
+    @property
+    def path(self) -> str:
+        """Of the file."""
+        return self._order.path
+
+    def problem(self) -> str:
+        """Return why nothing is recorded any more before it was told to end; "" if all is well."""
+        if self._process is not None and not self._problem and self._process.poll() is not None:
+            self._problem = self._last_words() or "the recorder has died"
+        return self._problem
+
+    def _last_words(self) -> str:
+        """Return what the recorder says when it starts, or why it could not go on."""
+        assert self._process is not None  # noqa: S101 for the type checker
+        assert self._process.stdout is not None  # noqa: S101
+        return self._process.stdout.readline().strip().removeprefix("error: ")
 
     def start(self) -> None:
         """Start it and wait until nodes can find it.
@@ -63,31 +81,39 @@ class RecorderProcess:
              msgspec.json.encode(self._order).decode()],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
             env=working_folder.environment())
-        assert self._process.stdout is not None  # noqa: S101 for the type checker
-        with self._process.stdout as answers:
-            if not select.select([answers], [], [], _START_S)[0]:
-                self._process.kill()
-                self._process.wait()
-                raise BagError(f"the recorder did not start within {_START_S:g} s")
-            answer = answers.readline().strip()
+        if not select.select([self._process.stdout], [], [], _START_S)[0]:
+            self._process.kill()
+            self._let_go()
+            raise BagError(f"the recorder did not start within {_START_S:g} s")
+        answer = self._last_words()
         if answer != _READY:
-            self._process.wait(_END_S)
-            raise BagError(answer.removeprefix("error: ") or "the recorder ended as it started")
+            self._let_go()
+            raise BagError(answer or "the recorder ended as it started")
 
     def end(self) -> None:
         """Have it write the end of the file. Harmless when it has ended already."""
-        process, self._process = self._process, None
+        process = self._process
         if process is None:
             return
-        for number in (signal.SIGCONT, RUN_ENDED):
-            with contextlib.suppress(ProcessLookupError):
-                process.send_signal(number)
-        try:
-            process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            with contextlib.suppress(subprocess.TimeoutExpired):  # as one that waits for its disk
+        if not self.problem():
+            for number in (signal.SIGCONT, RUN_ENDED):
+                with contextlib.suppress(ProcessLookupError):
+                    process.send_signal(number)
+            try:
                 process.wait(_END_S)
+                self._problem = self._last_words()
+            except subprocess.TimeoutExpired:
+                process.kill()
+                self._problem = "the recorder did not end"
+        self._let_go()
+
+    def _let_go(self) -> None:
+        process, self._process = self._process, None
+        if process is None or process.stdout is None:
+            return
+        with contextlib.suppress(subprocess.TimeoutExpired):  # as one that waits for its disk
+            process.wait(_END_S)
+        process.stdout.close()
 
 
 def stop_pipe() -> int:
@@ -124,6 +150,7 @@ def record(order: Order) -> int:
         recorder.run(stop)
     except (BagError, ValueError, OSError) as error:
         streams.complain(str(error))
+        _answer(f"error: {error}")
         return 1
     if recorder.writer is not None:
         streams.complain(told(recorder))
@@ -137,16 +164,19 @@ def _launchers(run: RunInfo) -> Credentials | None:
 
 def told(recorder: Recorder) -> str:
     """Return one line on what came of a recording."""
-    writer = recorder.writer
-    if writer is None:
+    if recorder.writer is None:
         return f"{recorder.path}: nothing was recorded"
     if not recorder.path.exists():
         return f"{recorder.path}: was taken away while it was written: nothing is recorded"
-    lost = sum(writer.gaps.lost().values())
-    garbage = f", {writer.garbage} of them garbage" if writer.garbage else ""
+    files = recorder.files
+    lost = sum(sum(file.gaps.lost().values()) for file in files)
+    found = sum(file.garbage for file in files)
+    garbage = f", {found} of them garbage" if found else ""
     silent = "".join(f"; {host} could not be heard all the time, see `rampart bag info`"
-                     for host, spans in writer.unheard.items() if spans != "[]")
-    return (f"recorded {writer.messages} messages in {recorder.path}{garbage}, "
+                     for host, spans in recorder.writer.unheard.items() if spans != "[]")
+    more = f" and {len(files) - 1} more files" if len(files) > 1 else ""
+    return (f"recorded {sum(file.messages for file in files)} messages in {recorder.path}{more}"
+            f"{garbage}, "
             f"{lost or 'none'} lost{silent}")
 
 

@@ -42,6 +42,9 @@ FLUSH_S = 0.8
 LAST_S = 2.0
 """Real seconds that nodes have to end after their launcher, while their sockets are still read."""
 
+FILE_BYTES = 1 << 30
+"""A recording that is larger goes on in another file: three to four hours of a robot."""
+
 RUN_ENDED = signal.SIGUSR1
 """What the launcher of a run sends its recorder when all nodes have ended."""
 
@@ -69,6 +72,7 @@ class Recorder:
                  shown: Callable[[RunInfo], Credentials | None] = lambda _run: None) -> None:
         self.path = path
         self.writer: BagWriter | None = None
+        self.earlier: list[BagWriter] = []
         self._port = port
         self._overwrite = overwrite
         self._wants = wants
@@ -134,7 +138,7 @@ class Recorder:
                 self._turn()
             self._finish(why, run_is_over=over)
         except OSError as error:
-            written = self.writer.messages if self.writer else 0
+            written = sum(file.messages for file in self.files)
             raise BagError(f"{self.path}: {error.strerror or error}: the recording ends after "
                            f"{written} messages, the robot goes on") from None
         finally:
@@ -142,6 +146,11 @@ class Recorder:
                 os.close(pidfd)
             self.close()
         return why
+
+    @property
+    def files(self) -> list[BagWriter]:
+        """What was written, file by file."""
+        return [*self.earlier, *([self.writer] if self.writer else [])]
 
     def close(self) -> None:
         """Let go of all sockets, and of the file as it is."""
@@ -180,6 +189,8 @@ class Recorder:
         if now_s >= self._next_flush_s:
             self._next_flush_s = now_s + FLUSH_S
             writer.flush()
+            if writer.written_bytes > FILE_BYTES:
+                self._begin_file(info, now_s)
 
     def _finish(self, why: str, *, run_is_over: bool) -> None:
         deadline = time.monotonic() + LAST_S
@@ -206,18 +217,27 @@ class Recorder:
         if info is None or self._launcher not in {None, info.pid}:
             return
         self._info, self._launcher = info, info.pid
-        documents = collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
-                            nodes=tuple(info.nodes), started=_wall())
         begun_s = min((f[0] for f in self._waiting), default=now_s)
-        begin_s = (begun_s - info.origin_s) * info.rate
-        zero_s = min(0.0, float(math.floor(begin_s)))
-        file = open_target(self.path, overwrite=self._overwrite)
-        self.writer = BagWriter(
-            file, documents, time_zero_s=zero_s, begin_s=begin_s, wants=self._wants,
-            views=documents.known.views(), from_start=self._from_start)
+        self._begin_file(info, begun_s)
         if self._others is not None:
             self._elsewhere = _Elsewhere(
                 self._others, Ear(self._others, info.endpoints, self._shown(info)), begun_s)
+
+    def _begin_file(self, info: RunInfo, begun_s: float) -> None:
+        """Begin the file; if there is one already, the next one, with a number in its name."""
+        path = self.path
+        if self.writer is not None:
+            path = path.with_stem(f"{path.stem}-{len(self.files) + 1}")
+            self.writer.close({"ended": f"it goes on in {path.name}", "stopped": _wall()})
+            self.earlier.append(self.writer)
+        documents = collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
+                            nodes=tuple(info.nodes), started=_wall())
+        begin_s = (begun_s - info.origin_s) * info.rate
+        zero_s = min(0.0, float(math.floor(begin_s)))
+        file = open_target(path, overwrite=self._overwrite)
+        self.writer = BagWriter(
+            file, documents, time_zero_s=zero_s, begin_s=begin_s, wants=self._wants,
+            views=documents.known.views(), from_start=self._from_start and not self.earlier)
 
     # -- sockets --------------------------------------------------------------------------------
 

@@ -45,6 +45,11 @@ class VirtualRecording:
             file.close()
             raise BagError(f"{path}: {error.strerror or error}") from None
 
+    @property
+    def problem(self) -> str:
+        """Why it does not reach to the end of the run; "" if it does."""
+        return self._failed
+
     def take(self, at_s: float, key: str, payload: bytes) -> None:
         """Write a message down, sent at a simulated time."""
         if self._failed:

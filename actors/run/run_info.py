@@ -36,7 +36,8 @@ class RunInfo(msgspec.Struct, frozen=True):
     which of the run's machines this is, "" the first, and the only one. `keys` is the folder of
     keys of a run that has one, and `ports` are those of loopback on which its routers are spoken
     with then. `hosts` are all machines of a run on several, the first one first, by name: each with
-    what its supervisor is called.
+    what its supervisor is called. `recording` is the file of `--record`, "" without one;
+    `recording_problem` is why nothing more is written to it, "" if all is well.
     """
 
     pid: int
@@ -56,6 +57,18 @@ class RunInfo(msgspec.Struct, frozen=True):
     keys: str = ""
     ports: tuple[int, ...] = ()
     hosts: dict[str, str] = {}
+    recording: str = ""
+    recording_problem: str = ""
+
+    def recording_data(self) -> dict[str, str] | None:
+        """Return file and problem of the recording as plain data, None without a recording."""
+        return {"file": self.recording, "problem": self.recording_problem
+                } if self.recording else None
+
+    @property
+    def recording_in_words(self) -> str:
+        """What becomes of the recording; "" without one."""
+        return f"ENDED: {self.recording_problem}" if self.recording_problem else self.recording
 
     @property
     def own_host(self) -> str:

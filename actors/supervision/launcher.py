@@ -19,6 +19,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -94,6 +95,7 @@ class Launcher:
         self._first: subprocess.Popen[bytes] | None = None
         self._loaded: BinaryIO | None = None
         self._begun_s = self._load_s = 0.0
+        self.recording: Callable[[], tuple[str, str]] = lambda: ("", "")
         self._info: socket.socket | None = None
         self._kept_ports: list[socket.socket] = []
         self._descriptors = 0
@@ -267,11 +269,13 @@ class Launcher:
 
     def info(self) -> run_info.RunInfo:
         """Return what tools need to know of this run."""
+        recording, problem = self.recording()
         return run_info.RunInfo(
             os.getpid(), self.plan.base_port, self.plan.rate, self.plan.origin_s,
             self.plan.system_file, self.plan.folder, self.names, self.plan.run_id,
             self.plan.hmi_port, self._title, self.plan.hmi_page, self.plan.description,
-            host=self.plan.host, keys=self.plan.keys, ports=self.plan.ports)
+            host=self.plan.host, keys=self.plan.keys, ports=self.plan.ports,
+            recording=recording, recording_problem=problem)
 
     # -- end ------------------------------------------------------------------------------------
 

@@ -50,6 +50,9 @@ def families(now: Exposition | None) -> Iterator[Metric]:
     yield InfoMetricFamily("rampart_run", "What runs.", value={
         "run_id": run.run_id, "title": run.title, "port": str(run.base_port),
         "rate": f"{run.rate:g}"})
+    if run.recording:
+        yield gauge("recording", "Whether the run is being recorded; 0 if the recorder has ended.",
+                    (), [((), float(not run.recording_problem))])
     yield gauge("simulated_seconds", "Simulated time of the run.", (), [((), now.time_s)])
     if left := days_left(run):
         yield gauge("certificate_days_left", "For how long the certificate of a process is valid.",

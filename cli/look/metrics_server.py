@@ -20,6 +20,7 @@ from starlette.routing import Route
 
 from rampart.actors.ftm import topics
 from rampart.actors.machine.process_usage import read_count
+from rampart.actors.run.run_info import ask
 from rampart.actors.web.server import WebServer
 from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
 from rampart.cli.look.metrics_families import Exposition, families
@@ -88,7 +89,7 @@ class Exporter:
         pids = {node.name: node.pid for node in nodes} | {
             row["name"]: row["pid"] for row in self._watch.used["guards"]}
         return Exposition(
-            session.run, session.clock.now(), picture,
+            ask(session.run.base_port) or session.run, session.clock.now(), picture,
             {name: count for name, pid in pids.items() if (count := read_count(pid)) is not None})
 
     def collect(self) -> Iterator[Metric]:

@@ -12,6 +12,7 @@ import sys
 from rich.console import Console, Group
 from rich.live import Live
 
+from rampart.actors.run import run_info
 from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
 from rampart.cli.look import top_view
 from rampart.cli.output import print_json, say
@@ -55,8 +56,10 @@ class _Screen:
     def frame(self) -> top_view.Frame:
         """Look, and return what is to be shown."""
         run, now_s, used = self.watch.session.run, self.watch.look(), self.watch.used
+        run = run_info.ask(run.base_port) or run
         return top_view.Frame(run.title, run.base_port, run.rate, now_s, self.watch.picture,
-                              used["nodes"], used["guards"], self.skip, self.by_cpu)
+                              used["nodes"], used["guards"], self.skip, self.by_cpu,
+                              run.recording_in_words)
 
     def press(self, key: str, stop: asyncio.Event) -> None:
         """Do what a key is for."""

@@ -43,6 +43,7 @@ class Frame:
         guards: rows of processes that are in no table of the supervisor, as dicts.
         skip: so many processes are scrolled away.
         by_cpu: whether the busiest process comes first.
+        recording: what becomes of the run's recording; "" without one.
     """
 
     title: str
@@ -54,6 +55,7 @@ class Frame:
     guards: Sequence[Mapping[str, Any]] = ()
     skip: int = 0
     by_cpu: bool = False
+    recording: str = ""
 
 
 def lines(frame: Frame, width: int, height: int) -> list[Text]:
@@ -109,6 +111,8 @@ def _state(frame: Frame, width: int) -> list[Text]:
         Row("manager", manager_in_words(manager), "yellow" if busy else "",
             ftm_topics.MANAGER_STATUS),
         Row("detection", *_detections(picture))]
+    if frame.recording:
+        rows.append(Row("recording", frame.recording))
     shown = []
     for label, text, style, topic in rows:
         line = Text(f"{label:<{_LABEL}}", style="bold")

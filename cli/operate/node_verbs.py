@@ -188,7 +188,8 @@ async def status(options: argparse.Namespace) -> int:
             "rate": run.rate, "system": run.system_file, "time_s": round(time_s, 3),
             **lines.status_data(latest), "manager": manager, "holders": held.holders,
             "nodes": nodes.nodes if nodes else None, **({"ros2": graph} if has_gateway else {}),
-            **({"keys": left} if (left := first_to_expire(run)) else {})})
+            **({"keys": left} if (left := first_to_expire(run)) else {}),
+            "recording": run.recording_data()})
         return 0
     page = f", page {run.page}" if run.page else ""
     say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
@@ -206,6 +207,8 @@ async def status(options: argparse.Namespace) -> int:
     if left := first_to_expire(run):
         say(f"keys      {left['days_left']} days left, of {left['name']} first, until "
             f"{left['not_after'][:16].replace('T', ' ')} UTC")
+    if run.recording:
+        say(f"recording {run.recording_in_words}")
     say(f"nodes     {_nodes(nodes)}")
     return 0
 

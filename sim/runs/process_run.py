@@ -62,6 +62,7 @@ class ProcessRun:
     Attributes:
         interrupted: Setting it ends the run for this reason.
         failure: Why it could not go on; "" if it could.
+        unrecorded: Why it is not recorded to its end, although it was to be; "" if it is.
     """
 
     def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = ()) -> None:
@@ -69,6 +70,7 @@ class ProcessRun:
                          else Launcher(trial.run.plan, trial.title))
         self.interrupted = ""
         self.failure = ""
+        self.unrecorded = ""
         self._trial = trial
         self._scenario = tuple(scenario)
         self._begun = False
@@ -137,6 +139,11 @@ class ProcessRun:
                 await asyncio.sleep(_LOOK_S)
                 if wall_s := excused_s((clock.now() - looked_s) / plan.rate - _LOOK_S):
                     trial.excuse(wall_s * plan.rate)
+                recording, problem = launcher.recording()
+                if problem and not self.unrecorded:
+                    self.unrecorded = problem
+                    actors[0].report_diagnostic("recording", problem, recording)
+                    trial.not_recorded(problem, clock.now())
                 why = trial.over(clock.now())
             if launcher.failure:  # before its observer is told to end
                 why = self.failure = launcher.failure

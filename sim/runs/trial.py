@@ -40,6 +40,7 @@ from rampart.sim.runs.record import RunRecord, RunRecorder, Safety
 from rampart.sim.runs.report import Written, margin_text, render, try_report
 
 LAUNCHER = "launch.py"
+RECORDER = "recorder"
 
 _SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
 
@@ -151,6 +152,11 @@ class Trial:
         event = ProcessEvent(name, "respawned", 0, self._brought_back, LAUNCHER, "")
         self.recorder.feed(
             topics.PROCESS_EVENT, event, Header(LAUNCHER, 1, self._brought_back, now_s))
+
+    def not_recorded(self, why: str, now_s: float) -> None:
+        """Note that the recording of the run has ended before it."""
+        self.recorder.feed(topics.PROCESS_EVENT, ProcessEvent(RECORDER, "crashed", 0, 1, "", why),
+                           Header(LAUNCHER, 1, 1, now_s))
 
     def excuse(self, stall_s: float) -> None:
         """Do not count simulated seconds in which the launcher heard nothing, being stopped."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 
 import pytest
@@ -62,6 +63,8 @@ async def test_an_airport_of_8_km_is_drawn_and_its_marks_are_seen_at_every_zoom(
 
 async def test_wheel_drag_and_keys_zoom_and_move_the_map(large):
     async with speaking_world() as world, page(world, airport=large) as tab:
+        await tab.until("document.querySelectorAll('#map .pavement').length > 1000")
+        await asyncio.sleep(0.5)  # panels find their places
         at = await tab.value("(() => { const r = document.getElementById('map')"
                              ".getBoundingClientRect(); return [r.x + r.width / 4,"
                              " r.y + r.height / 4]; })()")

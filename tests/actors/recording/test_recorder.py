@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -25,15 +26,15 @@ from rampart.actors.bus import recorder_connection as wire
 from rampart.actors.bus.recorder_connection import RecorderConnection, frame, parse_frame
 from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
-from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of
-from rampart.actors.recording.process import Order, RecorderProcess
+from rampart.actors.recording.process import Order, RecorderProcess, told
 from rampart.actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
 from rampart.actors.run.run_info import RunInfo
 from rampart.cli.main import main
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port, wait_until
 from tests import ROOT
-from tests.actors.recording.samples import AnsweringLauncher, pose
+from tests.actors.recording.samples import AnsweringLauncher, documents, pose
 from tests.porter_actors import write_porter_system
 
 
@@ -247,7 +248,7 @@ def test_a_recorder_that_does_not_start_is_not_waited_for(port, tmp_path, monkey
     recorder = RecorderProcess(Order(port, str(tmp_path / "run.mcap"), os.getpid()))
     with pytest.raises(BagError, match=r"the recorder did not start within 0\.2 s"):
         recorder.start()
-    assert recorder._process.returncode == -signal.SIGKILL
+    assert recorder_pid(port) is None
     recorder.end()
 
 
@@ -293,10 +294,65 @@ def test_a_full_disk_is_said_and_ends_only_the_recording(port, launcher, capfd):
         robot.send(10)
         wait_until(lambda: recorder_pid(port) is None, 15, "it lives")
         robot.send(10)
+        wait_until(lambda: "No space left" in process.problem(), 5, "it does not say why")
         process.end()
+        assert "No space left" in process.problem()
     error = capfd.readouterr().err
     assert "/dev/full: No space left on device: the recording ends after" in error
     assert error.count("\n") == 1
+
+
+def test_a_recorder_that_dies_is_noticed_and_one_that_ends_in_order_is_no_problem(
+        recording, port):
+    process, robot, path = recording
+    robot.send(10)
+    wait_until(lambda: numbers(path), 10, "nothing is written")
+    assert process.problem() == ""
+    os.kill(recorder_pid(port), signal.SIGKILL)
+    wait_until(process.problem, 5, "it is not noticed")
+    problem = process.problem()
+    process.end()
+    assert problem == process.problem() != ""
+
+
+def test_a_recording_that_becomes_large_goes_on_in_another_file(
+        port, launcher, tmp_path, monkeypatch):
+    monkeypatch.setattr("rampart.actors.recording.recorder.FILE_BYTES", 30_000)
+    monkeypatch.setattr("rampart.actors.recording.recorder.FLUSH_S", 0.05)
+    recorder = Recorder(port, tmp_path / "run.mcap", launcher=launcher.pid)
+    recorder.open()
+    read_end, write_end = os.pipe()
+    with AnsweringLauncher(port, time.monotonic(), launcher.pid):
+        thread = threading.Thread(target=recorder.run, args=(read_end,))
+        thread.start()
+        robot = Robot(port)
+        wait_until(lambda: bool(robot.send(20)) or len(recorder.files) > 2, 20, "one file")
+        os.write(write_end, b"x")
+        thread.join()
+        robot.connection.close()
+    os.close(read_end)
+    os.close(write_end)
+    files = [tmp_path / "run.mcap", *sorted(tmp_path.glob("run-*.mcap"))]
+    assert len(files) >= 3
+    assert [n for file in files for n in numbers(file)] == list(range(1, robot.sent + 1))
+    for file in files:
+        summary = Summary(BagReader(file))
+        assert (summary.reader.closed, summary.reader.damage) == (True, "")
+        assert summary.end["lost"] == "{}"
+    assert "run-2.mcap" in Summary(BagReader(files[0])).end["ended"]
+    assert f"recorded {robot.sent} messages" in told(recorder)
+
+
+def test_a_disk_without_room_for_others_ends_the_recording(tmp_path, monkeypatch):
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = BagWriter(file, documents())
+        writer.take(*pose(1, 0.0))
+        whole = os.fstatvfs(file.fileno())
+        monkeypatch.setattr(os, "fstatvfs", lambda _fd: SimpleNamespace(
+            f_blocks=whole.f_blocks, f_frsize=whole.f_frsize, f_bavail=1))
+        with pytest.raises(OSError, match="are free on its disk"):
+            writer.flush()
+    assert numbers(tmp_path / "run.mcap") == [1]
 
 
 def test_strangers_at_the_socket_are_not_recorded_and_do_no_harm(recording, port):
@@ -463,8 +519,8 @@ def test_a_real_run_is_recorded_whole_with_a_node_killed_on_the_way(tmp_path):
         run.sleep_until(4)
         run.kill("localization")
         run.wait_until(lambda: (run.pid("localization") or 0) > 0, 5, "it does not come back")
-        told = run.tool("topic", "echo", "localization/pose", "-n", "1")
-        assert told.returncode == 0, told.stderr
+        heard = run.tool("topic", "echo", "localization/pose", "-n", "1")
+        assert heard.returncode == 0, heard.stderr
         run.sleep_until(8)
         run.process.send_signal(signal.SIGTERM)
         run.result()
@@ -485,3 +541,25 @@ def test_a_real_run_is_recorded_whole_with_a_node_killed_on_the_way(tmp_path):
         reader = make_reader(file, validate_crcs=True)
         assert reader.get_summary().statistics.message_count == summary.messages
         assert sum(1 for _ in reader.iter_messages(topics=["view/tf"])) > 20
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+def test_a_recorder_that_dies_in_a_run_is_seen_by_status_result_and_report(tmp_path):
+    path = tmp_path / "run.mcap"
+    with RealRun(tmp_path, "paper", "--record", str(path), "--rate", "2") as run:
+        run.sleep_until(3)
+        os.kill(recorder_pid(run.port), signal.SIGKILL)
+        found = {}
+
+        def seen():
+            found.update(json.loads(run.tool("status", "--json").stdout)["recording"])
+            return found["problem"]
+
+        run.wait_until(seen, 10, "status does not show it")
+        assert found["file"] == str(path)
+        run.process.send_signal(signal.SIGTERM)
+        _, result = run.result()
+    assert result["recording"] == found
+    kept = json.loads(Path(result["record"]).read_text())
+    assert any("recorder" in event["text"] for event in kept["events"])
