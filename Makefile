@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements
+.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements
 
 run: setup
 	$(BIN)/python launch.py
@@ -18,6 +18,10 @@ test: setup
 # Long missions on real processes that the suite has shorter relatives of; three minutes.
 test-slow: setup
 	$(BIN)/python -m pytest -m slow
+
+# Every case of which the suite tries a sample: each byte of a recording damaged, for example.
+test-nightly: setup
+	$(BIN)/python -m pytest -m nightly
 
 lint: setup
 	$(BIN)/python -m ruff check .

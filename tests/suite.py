@@ -29,9 +29,9 @@ from pathlib import Path
 from tests.conftest import VIRTUAL
 
 _PYTEST = (sys.executable, "-m", "pytest", "-m")
-_CROWD = "not slow and not alone and (not virtual or processes)"
-_ALONE = "alone and not slow"
-_COMPUTES = "virtual and not slow and not alone and not processes"
+_CROWD = "not slow and not nightly and not alone and (not virtual or processes)"
+_ALONE = "alone and not slow and not nightly"
+_COMPUTES = "virtual and not slow and not nightly and not alone and not processes"
 _LOWEST = 19
 _SOME_FAILED = 1
 """Exit code of pytest; others say that it could not work."""
