@@ -81,6 +81,7 @@ class RecorderProcess:
              msgspec.json.encode(self._order).decode()],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
             env=working_folder.environment())
+        assert self._process.stdout is not None  # noqa: S101 for the type checker
         if not select.select([self._process.stdout], [], [], _START_S)[0]:
             self._process.kill()
             self._let_go()

@@ -1,17 +1,21 @@
-"""The reader of recordings on the files of MCAP's conformance suite, and a copy by `repair`."""
+"""The reader of recordings, and `repair`, on MCAP's conformance suite and on bags of rosbag2."""
 
 from __future__ import annotations
 
 import hashlib
 import struct
+from pathlib import Path
 
+import pytest
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from mcap.records import Attachment, Message, Metadata
 
 from rampart.actors.recording.bag_reader import BagReader, repair
 from tests.actors.recording.mcap_conformance import DIGEST, variants
 
 FILES = list(variants())
+BAGS = Path(__file__).with_name("rosbag2")
 
 
 def found(path):
@@ -46,3 +50,15 @@ def test_every_file_of_the_suite_is_read_whole_and_copied_by_repair(tmp_path):
         again, more, copied = found(copy)
         assert ([one[2:] for one in again], more) == ([one[2:] for one in messages], others), name
         assert copied.damage == "", name
+
+
+@pytest.mark.parametrize("path", sorted(BAGS.glob("*.mcap")), ids=lambda path: path.stem)
+def test_a_bag_of_rosbag2_is_read_as_the_independent_reader_reads_it(tmp_path, path):
+    messages, _, reader = found(path)
+    with path.open("rb") as file:
+        expected = [(channel.topic, message.log_time, message.data) for _, channel, message in
+                    make_reader(file).iter_messages(log_time_order=False)]
+    assert [(reader.channels[one.channel_id].topic, one.log_time, one.data)
+            for one in reader.records() if isinstance(one, Message)] == expected
+    assert (reader.closed, reader.damage, len(messages)) == (True, "", len(expected))
+    assert repair(reader, tmp_path / "copy.mcap") == len(expected)
