@@ -25,6 +25,7 @@ from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout
 from rampart.actors.layout.wiring import heard, published
+from rampart.actors.machine.absence import ABSENT_S, Absence
 from rampart.actors.run.run_plan import tailor
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
@@ -59,9 +60,6 @@ DECISIONS_PER_INCARNATION = 10_000
 _CALM_REPEATS = 5
 """While nothing is active or activated, each so many-th time is what is wanted repeated."""
 
-ABSENCE_S = 0.3
-"""Three ticks missed: the manager itself was stopped, or the machine hung."""
-
 
 class FtmManager(Actor):
     """Hears all detection and recovery modules, commands the recovery modules."""
@@ -80,6 +78,7 @@ class FtmManager(Actor):
         self.arbiter_state = self._arbiter.initial(
             now_s, (context.incarnation - 1) * DECISIONS_PER_INCARNATION)
         self._ran_s = now_s
+        self._absence = Absence(now_s)
         self._shown: m.ManagerStatus | None = None
         self._remembered: tuple[int, tuple[str, ...]] | None = None
         self._replaced: dict[str, int] = {}
@@ -205,7 +204,8 @@ class FtmManager(Actor):
     def _step(self, event: Input) -> None:
         now_s = self.clock.now()
         # Before simulated time 0 the system is starting: silence means nothing yet.
-        missed_s = now_s - self._ran_s - (ABSENCE_S if now_s > 0 else 0.0)
+        missed_s = self._absence.note(now_s) or (
+            now_s - self._ran_s - (ABSENT_S if now_s > 0 else 0.0))
         self._ran_s = now_s
         state = self.arbiter_state
         if missed_s > 0:
@@ -232,9 +232,11 @@ class FtmManager(Actor):
     def _replace_the_overdue(self) -> None:
         """Ask for a restart of a detection module that is not heard, once for each incarnation.
 
-        Not while something explains why it is late.
+        Not while something explains why it is late, nor soon after the manager itself was stopped.
         """
-        if not set(self._arbiter.mechanisms.explaining).isdisjoint(self.arbiter_state.active):
+        explaining = set(self._arbiter.mechanisms.explaining)
+        if self._absence.excuses(self.clock.now()) or not explaining.isdisjoint(
+                self.arbiter_state.active):
             return
         silent = overdue(self.arbiter_state.detections, self._arbiter.rules, self.clock.now())
         if silent is not None and self._replaced.get(silent.name) != silent.incarnation:

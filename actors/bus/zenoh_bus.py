@@ -41,6 +41,7 @@ from rampart.actors.bus.zenoh_session import (
     session_config,
 )
 from rampart.actors.machine.process_ends import LocalProcess, ProcessEnds
+from rampart.actors.machine.unix_peer import is_alive
 
 PATIENCE_S = 10.0
 """Real seconds that a client looks for a router when it starts."""
@@ -292,6 +293,9 @@ class ZenohBus:
     def _left(self, which: tuple[str, int, PeerChange]) -> None:
         node, incarnation, changed = which
         del self._leaving[which]
+        process = self._process_of(node, incarnation)
+        if process is not None and is_alive(process.id):
+            return  # its link was closed, it was paused perhaps; its heartbeats show how it is
         if self._session is not None:
             changed(node, incarnation, False)
 

@@ -14,8 +14,8 @@ What is not heard is no fault of those who say it, if the module could not have 
 Neither counts again within a second. Two more subtleties, about a module that was away for longer:
 
 * A module that was itself stopped and goes on, or a machine that hung, finds every deadline
-  passed while the proof to the contrary still waits unread. A module that finds that it has not
-  run for a while reads its mail first, and judges a little later.
+  passed while the proof to the contrary is still under way. A module that finds that it has not
+  run for a while (`Absence`) becomes active a little later, if there is still a reason.
 * A respawned module does not know yet whether the fault is there. Had it reported idle from its
   first moment, the manager would let go of a robot whose fault persists. So from its second
   incarnation on it is silent until it knows, and the manager takes silence for activity.
@@ -31,6 +31,7 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
+from rampart.actors.machine.absence import Absence
 from rampart.actors.runtime.actor import Actor, Context, Header, every
 from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import FAILOVER_S, NonNegative
@@ -38,11 +39,8 @@ from rampart.manager.spec.tables import FAILOVER_S, NonNegative
 LATE_S = 0.02
 """A timer that is so late, simulated seconds, shows a lack of processor time."""
 
-ABSENCE_S = 0.3
-"""A module that has not run for so long, though it repeats its report each 0.2 s, was stopped."""
-
 EXCUSE_S = 0.1
-"""How long it then reads its mail before it judges: one period of the slowest input."""
+"""How long one that was late reads its mail before it judges: a period of the slowest input."""
 
 NEXT_EXCUSE_S = 1.0
 """Not sooner does another absence count: a module that is always late is not excused for ever."""
@@ -118,7 +116,7 @@ class DetectionModule(Actor):
         self._wake_s = math.inf
         self._alarm: Timer | None = None
         self._senders: dict[str, int] = Remembered(MANY)
-        self._ran_s = self.clock.now()
+        self._absence = Absence(self.clock.now())
         self._judges_from_s = 0.0  # before that the system is starting, see `Launcher.start`
 
     def grace_s(self, timeout_s: float) -> float:
@@ -169,9 +167,9 @@ class DetectionModule(Actor):
     @every(0.2)
     def repeat(self) -> None:
         """Say it again, for nodes that have joined since."""
-        self._note_absence()
+        self.note_absence()
         self._note_move()
-        if self._told or self.first_life:
+        if (self._told or self.first_life) and not self._is_withheld():
             self.publish(topics.DETECTION, self._report)
 
     def accused(self, suspects: tuple[str, ...], header: Header) -> tuple[str, ...]:
@@ -209,7 +207,10 @@ class DetectionModule(Actor):
         monitor = self._monitor
         if monitor is None:
             return
-        self._note_absence()
+        self.note_absence()
+        if self._is_withheld():
+            self._sleep_until(self._absence.until_s)
+            return
         if monitor.active:
             self.activate(monitor.reason, monitor.nodes)
         elif monitor.known or self.state is DetectionState.ACTIVE:
@@ -231,7 +232,7 @@ class DetectionModule(Actor):
         if monitor is None:
             return
         due_s, self._wake_s, self._alarm = self._wake_s, math.inf, None
-        self._note_absence()
+        self.note_absence()
         now_s = self.clock.now()
         if monitor.due_s <= now_s:
             self._note_move()
@@ -242,11 +243,19 @@ class DetectionModule(Actor):
             monitor.expire(now_s)
             self.follow()
 
-    def _note_absence(self) -> None:
-        now_s = self.clock.now()
-        if now_s - self._ran_s > ABSENCE_S:
-            self._read_mail_until(now_s + EXCUSE_S)
-        self._ran_s = now_s
+    def missed(self) -> None:
+        """React to having been stopped: of what was said meanwhile only the newest is there."""
+
+    def note_absence(self) -> None:
+        """Note that it runs, and whether it did not for a while; before what counts is judged."""
+        if self._absence.note(self.clock.now()):
+            self._judges_from_s = max(self._judges_from_s, self._absence.until_s)
+            self.missed()
+
+    def _is_withheld(self) -> bool:
+        """Whether its monitor has found what may only be missing because it was absent itself."""
+        return self.state is DetectionState.IDLE and self._monitor is not None and (
+            self._monitor.active and self._absence.excuses(self.clock.now()))
 
     def _note_lateness(self, late_s: float) -> None:
         if late_s > LATE_S:

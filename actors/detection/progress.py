@@ -51,6 +51,7 @@ class ProgressMonitor(Finding):
         self._at: Any = None
         self._since_s = math.inf
         self._busy_until_s = -math.inf
+        self._has_missed = False
         self.accused: tuple[str, ...] = ()
 
     @property
@@ -69,10 +70,12 @@ class ProgressMonitor(Finding):
     def heard(self, at: Any, now_s: float) -> None:
         """Take note of where the task is."""
         self.known = True
+        before = None if self._has_missed else self._at
+        self._has_missed = False
         if at == self._at:
             self.expire(now_s)
             return
-        before, self._at, self._since_s = self._at, at, now_s
+        self._at, self._since_s = at, now_s
         if at not in self._steps:
             self._accuse(f"{self._what} is {at!r}, which is no step")
         elif before in self._steps and at not in self._next[before]:
@@ -80,6 +83,10 @@ class ProgressMonitor(Finding):
             self._accuse(f"{self._what} is {at!r} after {before!r}; right is {right}")
         else:
             self.clear()
+
+    def missed(self) -> None:
+        """Take note that the task may have gone on by several steps unheard."""
+        self._has_missed = True
 
     def busy(self, until_s: float) -> None:
         """Take note that the step says it is busy until then; what is no time counts as not."""
@@ -140,8 +147,13 @@ class Progress(DetectionModule):
             self.hear_field(said.busy_until, self.busy)
         self.hear_field(said.value, self.heard)
 
+    def missed(self) -> None:
+        """Take the next step that is heard for right, whichever it is."""
+        self.monitor.missed()
+
     def heard(self, value: Any, header: Header) -> None:
         """Take note of where the task is."""
+        self.note_absence()
         self.monitor.accused = self.accused(self.parameters.suspects, header)
         self.monitor.heard(value, self.clock.now())
         self.follow()

@@ -67,6 +67,11 @@ class RateMonitor(Sustained):
         self._heard.append(now_s)
         self.expire(now_s)
 
+    def missed(self, now_s: float) -> None:
+        """Count anew: messages may have come unheard."""
+        self._heard.clear()
+        self._from_s = now_s + self._window_s
+
     def expire(self, now_s: float) -> None:
         """Forget what has left the window, and judge."""
         while self._heard and self._heard[0] <= now_s - self._window_s + 1e-9:
@@ -123,8 +128,13 @@ class Rate(DetectionModule):
         self.monitor.accused = said.suspects
         self.hear_topic(said.topic, self.heard)
 
+    def missed(self) -> None:
+        """Count anew."""
+        self.monitor.missed(self.clock.now())
+
     def heard(self, _message: Any, header: Header) -> None:
         """Count a message."""
+        self.note_absence()
         self.monitor.accused = self.accused(self.parameters.suspects, header)
         self.monitor.heard(self.clock.now())
         self.follow()

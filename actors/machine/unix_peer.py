@@ -68,6 +68,11 @@ def process_id(pid: int) -> ProcessId | None:
     return ProcessId(pid, int(stat[_STARTED])) if stat else None
 
 
+def is_alive(process: ProcessId) -> bool:
+    """Whether a process is there and has not ended; a zombie has."""
+    return process_id(process.pid) == process and process_state(process.pid) not in "ZX"
+
+
 def _stat(pid: int) -> list[bytes]:
     """Return the fields of /proc/PID/stat after the name; none if there is no such process."""
     try:  # a third of what pathlib takes; of the routers it is asked 66 times a second

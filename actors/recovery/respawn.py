@@ -35,6 +35,9 @@ from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import NodeNames
 
 _REQUESTS_PER_INCARNATION = 1_000_000
+_BLOCKS = 1 << 32
+"""After so many incarnations request numbers begin again: they have to stay below 2^53."""
+
 _OVERDUE_S, _OVERDUE = 0.25, 0.57
 """Age at which a heartbeat is overdue: this, or in a faster system this share of its timeout."""
 
@@ -255,7 +258,7 @@ class Respawn(RecoveryModule):
         # Whoever is silent for long enough to be reported is overdue here as well.
         overdue_s = min(_OVERDUE_S, _OVERDUE * context.run.system.timing.heartbeat_timeout_s)
         self._core = RespawnCore(
-            self.parameters.nodes, context.incarnation * _REQUESTS_PER_INCARNATION,
+            self.parameters.nodes, context.incarnation % _BLOCKS * _REQUESTS_PER_INCARNATION,
             self.clock.now(), overdue_s)
 
     @classmethod

@@ -353,6 +353,7 @@ class SqliteCheckpoints(CheckpointStore):
                 try:
                     self.sync()
                 except Exception as error:  # whatever it is, the thread tries again
+                    self._unsynced = True
                     self._trouble = f"{self._file}: not synced to the disk: {disk.words(error)}"
 
     def _cut_log(self) -> None:

@@ -31,6 +31,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.lateness import Lateness
 from rampart.actors.layout.layout import Layout, Unit, adapted_system
+from rampart.actors.machine.absence import Absence
 from rampart.actors.machine.patience import Patience
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
@@ -97,6 +98,7 @@ class Supervisor(Actor):
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
         self._checked_s = self._loop.time()
+        self._absence = Absence(self._checked_s)
         self._lateness = Lateness()
 
     @classmethod
@@ -220,6 +222,7 @@ class Supervisor(Actor):
         # hung spawner has mail to read first), and not if the router died over which it hears all.
         now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
         stall_s, self._checked_s = now - self._checked_s - period_s, now
+        self._absence.note(now)
         missed_s = FAILOVER_S if self._bus.moved() else stall_s if stall_s > _LATE_S else 0.0
         for process in self._processes.values() if missed_s else ():
             process.excuse(now, missed_s)
@@ -234,7 +237,8 @@ class Supervisor(Actor):
 
     def _look_at_routers(self) -> None:
         """Find routers that are stopped at once: who is linked to one hears and says nothing."""
-        for name in self._routers:
+        self._absence.note(self._loop.time())
+        for name in self._routers if not self._absence.excuses(self._loop.time()) else ():
             process = self._processes[name]
             if process.state is State.RUNNING and process.handle.stopped():
                 self._on(process, Event.SILENT_STOPPED, detail="stopped")

@@ -35,6 +35,7 @@ from rampart.actors.supervision.processes import (
 )
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.supervisor import Supervisor
+from rampart.manager.spec.nodes import Kind
 from rampart.sim.virtual.network import drawer, measured
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
@@ -132,6 +133,7 @@ class VirtualMachine:
         self._slow: dict[str, float] = {}
         self._known: dict[str, int] = {}
         self._supervisor = 0
+        self._spared = {node.name for node in layout.spec.nodes if node.kind is Kind.WORLD}
         self._policy = RestartPolicy(layout.spec.supervision)
         self._supervisor_heard_s = 0.0
         self._down = False
@@ -176,8 +178,15 @@ class VirtualMachine:
         if self._down:
             return
         self._loop.call_later(PERIOD_S, self._guard)
+        if self._is_paused():  # the launcher with it
+            self._supervisor_heard_s = self._loop.time()
         if self._loop.time() - self._supervisor_heard_s > SUPERVISOR_PATIENCE_S:
             self.hit("kill", SUPERVISOR)
+
+    def _is_paused(self) -> bool:
+        """Whether whoever can be hit is stopped."""
+        return all(process.condition is Condition.STOPPED for process in self._processes.values()
+                   if not self._spared.issuperset(process.names))
 
     def shut_down(self) -> None:
         """End everything at once: the run is over."""

@@ -234,6 +234,20 @@ def test_killed_guards_come_back_and_the_mission_goes_on(short):
                                "graph_planner": 1}
 
 
+@pytest.mark.parametrize("lasts_s", [1, 30])
+def test_after_a_pause_of_everybody_nothing_is_restarted_and_the_mission_goes_on(short, lasts_s):
+    record = run_virtually(job(f"stop:all@20+{lasts_s}", system="osmosis", options=short)).record
+    assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
+    assert not [d for d in record.decisions if "RM1" in d.recoveries]
+
+
+def test_what_dies_during_a_pause_of_everybody_is_restarted_after_it(short):
+    record = run_virtually(job("stop:all@20+5", "kill:localization@22", "wedge:graph_planner@25.1",
+                               system="osmosis", options=short)).record
+    assert (record.mission, record.safety) == ("success", "safe")
+    assert record.restarts == {"localization": 1, "graph_planner": 1}
+
+
 def test_a_manager_that_hangs_after_each_start_stops_the_robot_until_it_works(short):
     lost = run_job(job("hang:ftm_manager@12+inf", options=short, patience_s=30.0))
     assert (lost.success, lost.safe, lost.stopped_for_good) == (False, True, True)

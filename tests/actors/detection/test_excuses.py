@@ -57,6 +57,28 @@ def test_silence_counts_as_soon_as_it_lasts():
     assert found(lambda _: None) == pytest.approx(TIMEOUT_S, abs=1e-3)
 
 
+def test_one_that_was_stopped_does_not_blame_those_that_go_on_a_little_later():
+    async def scenario() -> None:
+        async with System() as system:
+            ear, source = system.start("ear", Ear), system.start("localization", Source)
+            module = system.start("DM6", Freshness, **POSE, timeout_s=TIMEOUT_S)
+            for _ in range(40):
+                source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+                await asyncio.sleep(0.05)
+            module.hold(True)
+            await asyncio.sleep(5.0)
+            module.hold(False)
+            await asyncio.sleep(0.4)
+            for _ in range(40):
+                source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+                await asyncio.sleep(0.05)
+            assert not [report for _, report in ear.heard if report.reason]
+            await asyncio.sleep(1.0)
+            assert [report for _, report in ear.heard if report.reason], "then it is stale"
+
+    run(scenario)
+
+
 class Earlier(Freshness):
     """Has a deadline that comes to lie earlier, as a watchdog's may; counts its timers."""
 

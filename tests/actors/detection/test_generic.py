@@ -73,6 +73,18 @@ def test_a_rate_that_was_too_high_is_in_order_again_after_a_while_of_silence():
     assert found == "--AAAAAA----"
 
 
+def test_a_rate_of_which_nothing_could_be_heard_is_counted_from_the_start():
+    monitor = RateMonitor(10.0, math.inf, 0.3, 0.0, 0.5)
+    for tick in range(10):
+        monitor.heard(0.1 * tick)
+    monitor.missed(5.0)
+    for tick in range(10):
+        monitor.heard(5.0 + 0.1 * tick)
+        assert not monitor.active
+    monitor.expire(7.0)
+    assert monitor.active
+
+
 def followed(monitor: ProgressMonitor):
     def handle(event: str, now_s: float) -> None:
         if event == "b":
@@ -108,6 +120,16 @@ STEPS = (Step("1", 0.4), Step("2", 0.3, ("3", "1")), Step("3"))
 def test_steps(events, expected):
     monitor = ProgressMonitor("task", STEPS, busy_at_most_s=1.0)
     assert play(monitor, followed(monitor), events) == expected
+
+
+def test_after_steps_that_could_not_be_heard_any_step_may_be_the_next():
+    monitor = ProgressMonitor("task", STEPS, busy_at_most_s=1.0)
+    monitor.heard("1", 0.0)
+    monitor.missed()
+    monitor.heard("3", 5.0)
+    assert not monitor.active
+    monitor.heard("2", 5.1)
+    assert monitor.active, "only the first one after it is believed"
 
 
 def test_a_step_is_not_busy_for_longer_than_it_may_be():
