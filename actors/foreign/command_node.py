@@ -30,6 +30,10 @@ from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.parameters import TopicsHeard, TopicsPublished
 from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits
 
+_EXTEND = "EXTEND_TIMEOUT_USEC="
+_DIGITS, _MOST_S = 12, 3600.0
+"""Of what it may ask for, and real seconds that it gets at most."""
+
 _ANYTHING = Topic("", msgspec.Struct, Qos.STATE, 0.0, "", "What is not decoded.")
 
 
@@ -107,7 +111,10 @@ class CommandNode(Actor):
         """Whether the command is heard as often as it has to be."""
         if self._pulse is None or self._pulse.is_well(self.clock.now()):
             return True
-        self.report_diagnostic("command", f"not heard for {self._pulse.limit_s:g} s", self.name)
+        how = "" if self._pulse.heard else (
+            " after its start; a larger startup_grace_s in [timing] gives it more time")
+        self.report_diagnostic(
+            "command", f"not heard for {self._pulse.limit_s:g} s{how}", self.name)
         return False
 
     def on_stop(self) -> None:
@@ -159,8 +166,11 @@ class CommandNode(Actor):
                 pulse.beat()
             elif said == "WATCHDOG=trigger":
                 pulse.trigger()
-            elif said == "STOPPING=1":  # its end is awaited, no heartbeat
-                self._pulse = None
+            elif said == "STOPPING=1":
+                pulse.stopping()
+            elif said.startswith(_EXTEND) and said.removeprefix(_EXTEND).isdecimal():
+                pulse.extend(min(float(said.removeprefix(_EXTEND)[:_DIGITS]) * 1e-6, _MOST_S)
+                             * self.clock.rate)
 
     def _log(self) -> Path:
         """Return the file for its output; the folder of the run says to tools where that is."""

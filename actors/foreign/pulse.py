@@ -31,16 +31,29 @@ class Pulse:
     look_s: float
     silent_s: float = 0.0
     heard: bool = False
+    _extended_s: float = 0.0
+    _ends: bool = False
     _at_s: float | None = None
 
     @property
     def limit_s(self) -> float:
         """How long it may be silent now."""
-        return self.timeout_s if self.heard else max(self.first_s, self.timeout_s)
+        usual_s = self.timeout_s if self.heard else max(self.first_s, self.timeout_s)
+        return max(usual_s, self._extended_s)
 
     def beat(self) -> None:
-        """It was heard."""
-        self.silent_s, self.heard = 0.0, True
+        """It was heard; one that ends shows by its end that it does."""
+        if not self._ends:
+            self.silent_s, self.heard, self._extended_s = 0.0, True, 0.0
+
+    def extend(self, seconds: float) -> None:
+        """It may be silent for so long from now on, before its next beat."""
+        self.silent_s, self._extended_s = 0.0, seconds
+
+    def stopping(self) -> None:
+        """It ends by itself, within its timeout."""
+        self.beat()
+        self._ends = True
 
     def trigger(self) -> None:
         """It has said itself that something is wrong."""

@@ -223,7 +223,8 @@ class Supervisor(Actor):
         now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
         stall_s, self._checked_s = now - self._checked_s - period_s, now
         self._absence.note(now)
-        missed_s = FAILOVER_S if self._bus.moved() else stall_s if stall_s > _LATE_S else 0.0
+        missed_s = max(FAILOVER_S if self._bus.moved() else 0.0,
+                       stall_s if stall_s > _LATE_S else 0.0)
         for process in self._processes.values() if missed_s else ():
             process.excuse(now, missed_s)
         late = sum(process.is_late(now, self._timeout_s) for process in self._processes.values())

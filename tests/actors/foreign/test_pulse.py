@@ -41,6 +41,29 @@ def test_it_may_say_itself_that_something_is_wrong():
     assert not pulse.is_well(0.0)
 
 
+@pytest.mark.parametrize("started", [False, True])
+def test_it_may_ask_for_more_time_until_its_next_beat(started):
+    pulse = Pulse(timeout_s=0.5, first_s=1.0, look_s=0.2)
+    if started:
+        pulse.beat()
+    pulse.extend(3.0)
+    wells = [pulse.is_well(n / 10) for n in range(40)]
+    assert wells == [True] * 31 + [False] * 9
+    pulse.beat()
+    assert [pulse.is_well(4.0 + n / 10) for n in range(8)][-1] is False, "the usual time again"
+
+
+def test_one_that_says_that_it_ends_has_to_end():
+    pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
+    pulse.stopping()
+    wells = []
+    for n in range(10):
+        pulse.beat()
+        wells.append(pulse.is_well(n / 10))
+    assert wells[:5] == [True] * 5
+    assert not wells[-1]
+
+
 @pytest.fixture
 def notify():
     made = NotifySocket("wheels")
