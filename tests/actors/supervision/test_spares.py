@@ -127,8 +127,8 @@ async def test_whatever_starts_after_a_change_knows_it_and_spares_are_used_as_be
             there = await spares(port, *both, other_than=there)
             os.kill(witness.pid("DM2"), signal.SIGKILL)
             await eventually(lambda n=number: witness.state("DM2") == ("running", n + 2))
-            assert witness.pid("DM2") == there["spare_a"]
-            there = {"used": there["spare_a"]}
+            assert witness.pid("DM2") in there.values()  # of whichever spawner was not slow before
+            there = {"used": witness.pid("DM2")}
         os.kill(pids(port, "supervisor")["supervisor"], signal.SIGKILL)
         await eventually(lambda: witness.state("supervisor") == ("running", 2))
         os.kill(witness.pid("DM3"), signal.SIGKILL)
