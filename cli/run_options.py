@@ -8,7 +8,8 @@ while it runs, from another shell:
   rampart inject --list                             the faults that can be injected
   rampart status                                    what the robot and its nodes are doing
 exit code: 0 success and safe, 1 mission failed but safe, or a node was given up or kept failing,
-2 bad usage or spec, 3 unsafe, 4 safety not known: no ground truth ever came. A report that cannot
+2 bad usage or spec, 3 unsafe, 4 safety not known: no ground truth, or
+physics unstable. A report that cannot
 be written and output that nobody reads change none of them; with --json, "report_error" says why
 there is no "report"
 """

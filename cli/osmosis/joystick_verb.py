@@ -22,6 +22,7 @@ from rampart.actors.osmosis.messages import Joystick
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
+from rampart.cli.osmosis.lines import pilot_in_words
 from rampart.cli.osmosis.mission_verb import checked_reason
 from rampart.cli.output import NoEffectError, UsageError, refusing, say
 from rampart.cli.session import Latest, Session, connect, pause
@@ -198,6 +199,8 @@ class _Drive:
         self._releases = 0
         self.tried = False
         self._pilot = Latest[m.PilotStatus]()
+        self._base = Latest[m.BaseStatus]()
+        session.listen(topics.BASE_STATUS, topics.BASE_STATUS.at(), self._base.keep)
         session.listen(topics.PILOT_STATUS, topics.PILOT_STATUS.at(), self._pilot.keep)
         session.listen(topics.TELEOP_COMMAND, topics.TELEOP_COMMAND.at(), self._hear_command)
         session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, self._hear_diagnostic)
@@ -262,8 +265,7 @@ class _Drive:
         if self._keyboard is not None:
             text += f"  speed {self._keyboard.speed:.0%}"
         if pilot is not None:
-            text += f"  pilot {pilot.mode.value}, {'stopped' if pilot.stopped else 'driving'}"
-            text += f": {pilot.reason}" if pilot.reason else ""
+            text += f"  pilot {pilot_in_words(pilot, self._base.value)}"
         sys.stdout.write(f"\r{printable(text)[:78]:<78}")
         sys.stdout.flush()
 

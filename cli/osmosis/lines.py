@@ -17,16 +17,17 @@ class OsmosisLines(RobotLines):
     """Mission, robot, Safety Pilot, and what the ground truth says of safety."""
 
     read = (topics.MISSION_STATUS, topics.CONTROL_STATUS, topics.POSE, topics.PILOT_STATUS,
-            topics.TRUTH)
-    status_read = (topics.MISSION_STATUS, topics.PILOT_STATUS)
+            topics.BASE_STATUS, topics.TRUTH)
+    status_read = (topics.MISSION_STATUS, topics.PILOT_STATUS, topics.BASE_STATUS)
 
     def status(self, latest: Latest, plan: Mapping[str, Any], kinds: Collection[str]
                ) -> list[tuple[str, str]]:
         """Return mission and Safety Pilot, where there is one or was heard."""
         mission, pilot = latest(topics.MISSION_STATUS), latest(topics.PILOT_STATUS)
+        driving = pilot_in_words(pilot, latest(topics.BASE_STATUS))
         return [(label, text) for label, text, there in (
             ("mission", mission_in_words(mission), mission or plan.get("mission", True)),
-            ("pilot", pilot_in_words(pilot), pilot or "pilot" in kinds)) if there]
+            ("pilot", driving, pilot or "pilot" in kinds)) if there]
 
     def status_data(self, latest: Latest) -> dict[str, Any]:
         """Return the same as data."""
@@ -35,12 +36,14 @@ class OsmosisLines(RobotLines):
     def rows(self, latest: Latest, width: int) -> list[Row]:
         """Return the lines of `rampart top`."""
         pilot: m.PilotStatus | None = latest(topics.PILOT_STATUS)
+        base: m.BaseStatus | None = latest(topics.BASE_STATUS)
         safety = _safety(latest(topics.TRUTH))
         return [
             Row("mission", _mission(latest(topics.MISSION_STATUS), width), "",
                 topics.MISSION_STATUS),
             Row("robot", _robot(latest), "", topics.POSE),
-            Row("pilot", pilot_in_words(pilot), "yellow" if pilot and pilot.stopped else "",
+            Row("pilot", pilot_in_words(pilot, base),
+                "yellow" if (pilot and pilot.stopped) or (base and base.brake_engaged) else "",
                 topics.PILOT_STATUS),
             Row("safety", safety or "not known: nobody tells the ground truth",
                 "bold red" if "UNSAFE" in safety else "", topics.TRUTH)]
@@ -100,11 +103,13 @@ def mission_in_words(status: m.MissionStatus | None) -> str:
     return f"{text}: {status.reason}" if status.reason else text
 
 
-def pilot_in_words(status: m.PilotStatus | None) -> str:
-    """Return whose commands the Safety Pilot passes, and whether it holds the robot."""
+def pilot_in_words(status: m.PilotStatus | None, base: m.BaseStatus | None = None) -> str:
+    """Return whose commands the Safety Pilot passes; whether it or a brake holds the robot."""
     if status is None:
         return SILENT
-    text = f"{status.mode.value}, {'STOPPED' if status.stopped else 'driving'}"
+    braked = base is not None and base.brake_engaged
+    doing = "BRAKED" if braked else "STOPPED" if status.stopped else "driving"
+    text = f"{status.mode.value}, {doing}"
     return f"{text}: {status.reason}" if status.reason else text
 
 

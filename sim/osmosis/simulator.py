@@ -32,6 +32,7 @@ from rampart.sim.osmosis.actuator_faults import FaultNews
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.sensors import LaserSpec
 from rampart.sim.osmosis.world import World
+from rampart.sim.runs.physics import report_instability
 
 WAKE_UP_S = 0.02
 MAX_CATCH_UP_S = 1.0
@@ -190,6 +191,8 @@ class Simulator(Actor):
             topic, read = self._readings[job]
             if self.has_readers(topic):
                 self._world.step_to(due_s)
+                if report_instability(self, self._world.data):
+                    return
                 self.publish(topic, read(), stamp=due_s)
         self._world.step_to(now_s)
         self._report_faults()

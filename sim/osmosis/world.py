@@ -108,6 +108,11 @@ class World:
         self._bring_obstacles()
         self._examine()
 
+    @property
+    def data(self) -> mujoco.MjData:
+        """What MuJoCo knows of the state."""
+        return self._data
+
     # -- actuators ------------------------------------------------------------------------------
 
     def command(self, linear_mps: float, angular_radps: float, stamp_s: float | None = None

@@ -113,12 +113,21 @@ class Console:
 
     def conclusion(self, record: RunRecord, report: Path | None) -> None:
         """Say how it ended, and where the report is, if there is one."""
+        for line in self.verdict(record):
+            self.say(line)
         for reason in record.reasons:
             self.say(f"  {reason}")
         if (kept_up := record.keeping_up) and kept_up.behind_s:
             self.say(f"  for {kept_up.behind_s:.0f} s of {record.duration_s:.0f} s {kept_up}")
         if report is not None:
             self.say(f"Report: {report}")
+
+    def verdict(self, record: RunRecord) -> list[str]:
+        """Return the verdict of a run that was judged, in lines."""
+        if record.mission is None:
+            return []
+        safety = "safety not known" if record.safety == "not known" else record.safety
+        return [f"{record.mission}, {safety}, {record.duration_s:.1f} s simulated."]
 
     def _take_detection(self, report: fm.DetectionReport, header: Header) -> None:
         before = self._detections.get(header.source, fm.DetectionState.IDLE)

@@ -19,6 +19,9 @@ import msgspec
 
 from rampart.actors.runtime.declaration import Handlers
 
+UNSTABLE = "physics unstable"
+"""Context of the diagnostic by which a world ends a run that nobody can judge."""
+
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """What a run was worth.

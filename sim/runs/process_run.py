@@ -144,7 +144,7 @@ class ProcessRun:
                     self.unrecorded = problem
                     actors[0].report_diagnostic("recording", problem, recording)
                     trial.not_recorded(problem, clock.now())
-                why = trial.over(clock.now())
+                why = trial.ended(clock.now())
             if launcher.failure:  # before its observer is told to end
                 why = self.failure = launcher.failure
                 launcher.guard.report(why)

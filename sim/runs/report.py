@@ -85,7 +85,7 @@ def _headline(run: RunRecord) -> str:
     if run.safety == "unsafe":
         return "The system was not safe in this run."
     if run.safety == "not known":
-        return "Nothing was heard by which safety could be judged."
+        return f"Safety cannot be judged: {'; '.join(run.reasons) or 'nothing was heard'}."
     return ("The task was done, and the system was safe." if run.mission == "success"
             else "The task was not done; the system was safe.")
 

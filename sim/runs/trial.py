@@ -16,6 +16,7 @@ from typing import Any, ClassVar, TextIO
 
 import msgspec
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeTable, ProcessEvent
@@ -33,7 +34,7 @@ from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import INJECTOR, Injector, ProcessControl
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.console import Console
-from rampart.sim.runs.judge import Judge, Verdict
+from rampart.sim.runs.judge import UNSTABLE, Judge, Verdict
 from rampart.sim.runs.keeping_up import KeepingUp
 from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord, RunRecorder, Safety
@@ -96,14 +97,21 @@ class Trial:
         self.recorder = RunRecorder(run.plan, self.strategy)
         self.injects: Injector | None = None
         self._brought_back = 0
+        self._worlds = frozenset(n.name for n in run.system.nodes if n.kind is Kind.WORLD)
+        self._unstable = ""
         self._keeping_up = None if run.plan.virtual else KeepingUp(
-            run.system.timing, [n.name for n in run.system.nodes if n.kind is Kind.WORLD],
-            run.plan.rate)
+            run.system.timing, sorted(self._worlds), run.plan.rate)
 
     def sinks(self, clock: Clock) -> list[Sink]:
         """Return what wants to hear the run's messages."""
         del clock
-        return [self.recorder.feed, *([self.console.take] if self.console else ())]
+        return [self._look_at_world, self.recorder.feed,
+                *([self.console.take] if self.console else ())]
+
+    def _look_at_world(self, topic: Topic[Any], message: Any, header: Header) -> None:
+        if topic is bus_topics.DIAGNOSTIC and message.context == UNSTABLE \
+                and header.source in self._worlds and not self._unstable:
+            self._unstable = f"{UNSTABLE}: {message.reason}"
 
     def outside(self, context: Callable[[str], Context], heard: Callable[[NodeTable], None],
                 scenario: Sequence[PlannedFault], control: ProcessControl, nodes: Sequence[str],
@@ -161,6 +169,21 @@ class Trial:
     def excuse(self, stall_s: float) -> None:
         """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
 
+    def ended(self, now_s: float) -> str | None:
+        """Return why the run is over, or None: also because its world has blown up."""
+        return self._unstable or self.over(now_s)
+
+    def settled(self, verdict: Verdict) -> Verdict:
+        """Return a verdict on the run; what came after the world had blown up counts for nothing.
+
+        An unsafe run stays unsafe; any other cannot be judged.
+        """
+        if not self._unstable:
+            return verdict
+        return msgspec.structs.replace(
+            verdict, success=False, safe=None if verdict.safe else verdict.safe,
+            reasons=(self._unstable, *verdict.reasons))
+
     def over(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
         is_over = self.limit_s is not None and now_s >= self.limit_s
@@ -184,6 +207,7 @@ class Trial:
 
     def concluded(self, verdict: Verdict, now_s: float, why: str) -> RunRecord:
         """Return the record of a run that has ended for a reason, and was judged."""
+        verdict = self.settled(verdict)
         return self.recorder.record(
             now_s, **self._seen_to(now_s),
             mission="success" if verdict.success else "fail",
@@ -271,7 +295,7 @@ class JudgedTrial(Trial):
     def judgement(self, record: RunRecord) -> Verdict:
         """Return the judge's verdict."""
         del record
-        return self._judge.verdict()
+        return self.settled(self._judge.verdict())
 
 
 def trial_class(spec: SystemSpec) -> type[Trial]:

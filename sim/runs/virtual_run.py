@@ -199,7 +199,7 @@ class VirtualRun:
         why = None
         while why is None and not any(task.done() for task in watching):
             await asyncio.sleep(_LOOK_S)
-            why = self.interrupted or self.trial.over(clock.now())
+            why = self.interrupted or self.trial.ended(clock.now())
             if injector is not None and not (injector.planned or injector.open):
                 why = "all branches have departed"
         if injector is not None:

@@ -79,6 +79,11 @@ class Physics:
         while self._start_s + (self._steps + 1) * STEP_S <= time_s + 1e-9:
             self._step()
 
+    @property
+    def data(self) -> mujoco.MjData:
+        """What MuJoCo knows of the state."""
+        return self._data
+
     def skip(self, time_s: float) -> None:
         """Let time pass in which nothing moves: the process was stopped."""
         self._start_s += max(0.0, time_s - self.now_s)

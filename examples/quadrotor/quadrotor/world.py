@@ -27,6 +27,7 @@ from rampart import (
     every,
     on,
 )
+from rampart.sim.runs.physics import report_instability
 
 _TICK_S = 0.01
 _MOST_BEHIND_S = 0.5
@@ -97,6 +98,8 @@ class World(Actor):
         if now_s - physics.now_s > _MOST_BEHIND_S:
             physics.skip(now_s - _TICK_S)
         physics.step_to(now_s)
+        if report_instability(self, physics.data):
+            return
         self._ticks += 1
         for each, topic, read in self._readings:
             if self._ticks % each == 0:

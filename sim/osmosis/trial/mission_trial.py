@@ -55,13 +55,13 @@ class MissionConsole(Console):
         elif isinstance(message, m.GroundTruth):
             self._show(message, header.stamp)
 
-    def conclusion(self, record: RunRecord, report: Path | None) -> None:
-        """Say how it ended, and where the report is, if there is one."""
+    def verdict(self, record: RunRecord) -> list[str]:
+        """Return the verdict on the mission, in lines."""
         if isinstance(record, MissionRecord):
-            self.say(f"Mission {record.mission_name}: {record.mission}, {record.safety}, "
-                     f"{record.duration_s:.1f} s simulated, {record.distance_m:.0f} m driven.")
-            self.say(headline(record))
-        super().conclusion(record, report)
+            return [f"Mission {record.mission_name}: {record.mission}, {record.safety}, "
+                    f"{record.duration_s:.1f} s simulated, {record.distance_m:.0f} m driven.",
+                    headline(record)]
+        return super().verdict(record)
 
     def _take_mission(self, status: m.MissionStatus, at: float) -> None:
         self._mission = status
@@ -150,7 +150,7 @@ class MissionTrial(Trial):
     def judgement(self, record: RunRecord) -> Verdict:
         """Return what ground truth shows: clearances, and when it became unsafe."""
         del record
-        return self.recorder.judge.verdict()
+        return self.settled(self.recorder.judge.verdict())
 
     @classmethod
     def moments(cls, spec: SystemSpec, *, searched: bool = False) -> tuple[float, float]:

@@ -47,7 +47,7 @@ def headline(run: MissionRecord) -> str:
     if run.safety == "unsafe":
         return "The robot was not safe in this run."
     if run.safety == "not known":
-        return "No ground truth ever came: neither mission nor safety can be judged."
+        return f"Neither mission nor safety can be judged: {run.reasons[0]}."
     if run.mission == "fail":
         return "The mission was not completed; the robot stayed safe."
     if not run.lights:

@@ -14,6 +14,7 @@ from rampart.actors.runtime.actor import Header
 from rampart.manager.spec.specification import parse_specification
 from rampart.sim.osmosis.trial.mission_trial import MissionConsole
 from rampart.sim.runs.console import Console
+from rampart.sim.runs.record import RunRecorder
 from tests import system_file
 
 PLAN = RunPlan("r")
@@ -47,3 +48,14 @@ def test_where_no_recovery_brings_a_node_back_none_is_offered():
     alone = msgspec.structs.replace(system("cell"), nodes=())
     Console(stream).banner("a mission", PLAN, alone)
     assert "kill-node" not in stream.getvalue()
+
+
+@pytest.mark.parametrize(("mission", "safety", "told"), [
+    ("success", "safe", True), ("fail", "unsafe", True), (None, None, False)])
+def test_the_verdict_on_a_run_that_was_judged_is_told_also_if_it_is_a_success(
+        mission, safety, told):
+    stream = StringIO()
+    record = RunRecorder(PLAN, "").record(12.0, mission=mission, safety=safety)
+    Console(stream).conclusion(record, None)
+    assert (stream.getvalue() == f"{mission}, {safety}, 12.0 s simulated.\n") is told
+    assert bool(stream.getvalue()) is told
