@@ -16,6 +16,8 @@ SYSTEM = Path(__file__).resolve().parents[1] / "warehouse.toml"
     (None, None, None), ("localization-jump@12", "M_JUMP", "R_STOP"),
     ("costmap-stale@10", "M_COSTMAP", "R_LIFECYCLE"),
     ("drop:nav/command@10+5", "M_SILENT", "R_RESTART"),
+    ("stuck:guard/velocity@10+inf", "M_GUARD_STUCK", "R_RESTART"),
+    ("drop:guard/velocity@10+inf", "M_GUARD_SILENT", "R_RESTART"),
     ("kill:controller_server@10", "M_CRASH", "R_RESTART"),
     pytest.param("kill:amcl@10", "M_CRASH", "R_RESTART", marks=pytest.mark.slow),
     pytest.param("wedge:planner_server@10", "M_CRASH", "R_RESTART", marks=pytest.mark.slow)])
@@ -27,8 +29,15 @@ def test_the_round_is_made_all_the_same_and_the_mechanism_against_it_acts(
     first = done.record.decisions[0] if done.record.decisions else None
     assert (first is None) is (fault is None)
     if first is not None:
-        assert mechanism in first.active
+        # A node of ROS 2 that is killed is missed twice, in the same millisecond.
+        assert any(mechanism in decision.active for decision in done.record.decisions)
         assert recovery in first.recoveries
+
+
+def test_a_command_that_is_stuck_ends_before_the_next_obstacle_and_is_told():
+    done = virtual_run(SYSTEM, "stuck:nav/command@10+inf", seconds=40.0)
+    assert done.judgement.safe is True
+    assert any("M_STANDS" in decision.active for decision in done.record.decisions)
 
 
 @pytest.mark.parametrize("node", ["gateway", "guard"])

@@ -71,12 +71,14 @@ class Guard(Actor):
             linear, angular = 0.0, angular if self._why.endswith("obstacle") else 0.0
         linear = max(-said.top_mps, min(said.top_mps, linear))
         angular = max(-said.top_radps, min(said.top_radps, angular))
-        self.publish(topics.CHECKED, Velocity(linear, angular), stamp=header.stamp)
+        self.publish(topics.CHECKED, Velocity(linear, angular, header.stamp),
+                     stamp=header.stamp)
 
     @every(0.1)
     def look(self) -> None:
         """Stop when the navigation is silent, and say what it does."""
-        if self.clock.now() - self._told_s > self.parameters.stale_s:
+        now_s = self.clock.now()
+        if now_s - self._told_s > self.parameters.stale_s:
             self._why = "the navigation is silent"
-            self.publish(topics.CHECKED, Velocity(0.0, 0.0))
+            self.publish(topics.CHECKED, Velocity(0.0, 0.0, now_s))
         self.publish(topics.STATE, GuardState(bool(self._why), self._why))

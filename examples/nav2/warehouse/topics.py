@@ -6,10 +6,14 @@ from rampart import Message, Qos, Topic
 
 
 class Velocity(Message, frozen=True):
-    """Velocity of `base_link` in its own axes."""
+    """Velocity of `base_link` in its own axes, and the stamp of the command that it follows.
+
+    Without a command `command_s` is now. So it never stays the same unless the guard is stuck.
+    """
 
     linear_mps: float
     angular_radps: float
+    command_s: float
 
 
 class Order(Message, frozen=True):
