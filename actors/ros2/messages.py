@@ -7,7 +7,7 @@ from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 
 
-class RosGraphReport(Message, frozen=True):
+class RosGraphReport(Message, frozen=True, omit_defaults=True):
     """Who is there in ROS 2: full names of nodes, those of which there are several, and problems.
 
     `bypassed` counts publishers of others on topics that the gateway publishes: what they say

@@ -96,6 +96,10 @@ parameters = {{ connect = ["tcp/127.0.0.1:{port}"], distribution = "kilted" }}
             peer.ask("stop")
             wait_until(lambda: "told" in peer.said("answer"), 10)
             wait_until(lambda: "passed on: 20" in run.story, 10)
+            shown = run.tool("status")
+            assert "ros2      linked, 2 nodes, 0 messages refused" in shown.stdout, shown
+            told = json.loads(run.tool("status", "--json").stdout)["ros2"]
+            assert set(told["nodes"]) == {"/rampart", "/sdk_base"}
             before = run.pid("gateway")
             run.kill("gateway")
             wait_until(lambda: run.pid("gateway") not in {None, before}, 10)
