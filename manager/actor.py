@@ -78,7 +78,7 @@ class FtmManager(Actor):
         self.arbiter_state = self._arbiter.initial(
             now_s, (context.incarnation - 1) * DECISIONS_PER_INCARNATION)
         self._ran_s = now_s
-        self._absence = Absence(now_s)
+        self._absence = Absence(now_s, self.clock.rate)
         self._shown: m.ManagerStatus | None = None
         self._remembered: tuple[int, tuple[str, ...]] | None = None
         self._replaced: dict[str, int] = {}

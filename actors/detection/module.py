@@ -116,7 +116,7 @@ class DetectionModule(Actor):
         self._wake_s = math.inf
         self._alarm: Timer | None = None
         self._senders: dict[str, int] = Remembered(MANY)
-        self._absence = Absence(self.clock.now())
+        self._absence = Absence(self.clock.now(), self.clock.rate)
         self._judges_from_s = 0.0  # before that the system is starting, see `Launcher.start`
 
     def grace_s(self, timeout_s: float) -> float:

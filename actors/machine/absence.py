@@ -25,10 +25,12 @@ class Absence:
 
     Args:
         now_s: Now.
+        rate: Seconds of that clock in a real one: the others need real time to go on.
     """
 
-    def __init__(self, now_s: float) -> None:
+    def __init__(self, now_s: float, rate: float = 1.0) -> None:
         self._ran_s = now_s
+        self._grace_s = GRACE_S * max(1.0, rate)
         self._until_s = -math.inf
 
     def note(self, now_s: float) -> float:
@@ -36,7 +38,7 @@ class Absence:
         gap_s, self._ran_s = now_s - self._ran_s, now_s
         if gap_s <= ABSENT_S or now_s <= self._until_s + AGAIN_S:
             return 0.0
-        self._until_s = now_s + GRACE_S
+        self._until_s = now_s + self._grace_s
         return gap_s
 
     def excuses(self, now_s: float) -> bool:

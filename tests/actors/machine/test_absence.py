@@ -28,3 +28,10 @@ def test_one_that_is_always_late_is_not_always_excused():
         absence.note(now_s)
         excused += absence.excuses(now_s)
     assert 0 < excused < 50
+
+
+def test_the_grace_is_in_real_seconds_on_a_clock_that_is_faster():
+    absence = Absence(0.0, rate=4.0)
+    absence.note(30.0)
+    assert absence.excuses(30.0 + 3.9 * GRACE_S)
+    assert not absence.excuses(30.0 + 4.0 * GRACE_S)
