@@ -19,7 +19,7 @@ test: setup
 test-slow: setup
 	$(BIN)/python -m pytest -m slow
 
-# Every case of which the suite tries a sample: each byte of a recording damaged, for example.
+# More cases of what the suite samples: 5,000 bytes of a recording damaged one by one, for example.
 test-nightly: setup
 	$(BIN)/python -m pytest -m nightly
 
