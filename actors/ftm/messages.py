@@ -292,6 +292,16 @@ class ProcessEvent(Message, frozen=True):
     by: Name
     detail: Text
 
+    @property
+    def news(self) -> str:
+        """Return "clear" or "fault"; "" of what is routine, or published a second time."""
+        if self.event in _ROUTINE or self.detail == "already":
+            return ""
+        return "clear" if self.event in _GOOD_NEWS else "fault"
+
+
+_ROUTINE = ("started", "running")
+_GOOD_NEWS = ("respawned", "resumed", "adopted", "back")
 
 _Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]
 

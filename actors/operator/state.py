@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -17,7 +17,7 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.bounds import SHOWN, Bounds, clip
 from rampart.actors.operator.picture import Picture
-from rampart.manager.strategies.registry import decision_in_words
+from rampart.manager.strategies.registry import decision_in_words, named
 
 STALE_S = 1.5
 """A state that was not heard for so long is shown as stale (simulated seconds)."""
@@ -30,9 +30,6 @@ TRACE_POINTS = 240
 
 LARGEST = 1e15
 """Numbers beyond are not drawn."""
-
-_ROUTINE = ("started", "running")
-_GOOD_NEWS = ("respawned", "resumed", "adopted")
 
 
 class Heard(msgspec.Struct):
@@ -81,6 +78,7 @@ class HmiState:
 
     Attributes:
         picture: what pages are shown.
+        titles: of modules, mechanisms and recoveries.
     """
 
     def __init__(self) -> None:
@@ -90,6 +88,7 @@ class HmiState:
         self._patience_s: dict[str, float] = {}
         self._traces: dict[str, Trace] = {}
         self._detections: dict[str, fm.DetectionView] = {}
+        self.titles: Mapping[str, str] = {}
         self._outcomes = 0
         picture.section("system", bounds=_SYSTEM)
         picture.section("order", {"number": 0, "text": ""})
@@ -149,7 +148,8 @@ class HmiState:
         self._show_detections(False)
         for name, view in self._detections.items():
             if view.active != (name in before and before[name].active):
-                text = f"{name} detects: {view.reason}" if view.active else f"{name} is idle again"
+                what = named(name, self.titles)
+                text = f"{what}: {view.reason}" if view.active else f"{what} is idle again"
                 self.log(now_s, "fault" if view.active else "clear", text)
 
     def decision(self, record: fm.DecisionRecord, now_s: float) -> None:
@@ -158,18 +158,18 @@ class HmiState:
         self.picture.add("decisions", {
             "t": round(now_s, 2), "number": r.decision, "active": r.active, "block": r.rule,
             "strategy": r.strategy, "recoveries": r.recoveries, "path": r.path,
-            "words": decision_in_words(r.active, r.rule, r.recoveries, r.strategy),
+            "words": decision_in_words(r.active, r.rule, r.recoveries, r.strategy,
+                                       self.titles),
             "rule": f"{r.rule} of {r.strategy}",
             "rejected": [f"{name}: {why}" for name, why in r.rejected]})
 
     def process_event(self, event: fm.ProcessEvent, now_s: float) -> None:
         """Log what happened to a process; that all start at the start is no news."""
-        if event.event in _ROUTINE:
+        if not event.news:
             return
         by = f" by {event.by}" if event.event == "respawned" and event.by else ""
         detail = f": {event.detail}" if event.detail else ""
-        kind = "clear" if event.event in _GOOD_NEWS else "fault"
-        self.log(now_s, kind, f"{event.node} {event.event}{by}{detail}")
+        self.log(now_s, event.news, f"{event.node} {event.event}{by}{detail}")
 
     def announce(self, text: str, now_s: float, about: str = "") -> None:
         """Log what became of something the operator asked for, and keep it to be shown."""

@@ -85,8 +85,8 @@ def draw_system(spec: SystemSpec) -> dict[str, Any]:
     ranks = draw(spec, "order", order, spec.criteria, Situation())
     note = (f"The fault tree has {len(tree.boxes)} events; up to {MAX_BOXES} are drawn."
             if len(tree.boxes) > MAX_BOXES else "")
-    return {"title": spec.title or spec.name, "strategy": spec.strategy, "criteria": spec.criteria,
-            "note": note,
+    return {"title": spec.title or spec.name, "titles": spec.titles,
+            "strategy": spec.strategy, "criteria": spec.criteria, "note": note,
             "tree": _fault_tree(spec, tree) if 0 < len(tree.boxes) <= MAX_BOXES else None,
             "order": _order(ranks) if 0 < len(ranks.boxes) <= MAX_BOXES else None}
 

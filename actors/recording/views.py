@@ -34,9 +34,6 @@ Shown = list[View]
 Translator = Callable[[str, Header, Any, int], list[View]]
 """Makes views of key, header and body of a message, and the time of the recording."""
 
-_ROUTINE = ("started", "running")
-_GOOD_NEWS = ("respawned", "resumed", "adopted")
-
 
 class Views:
     """Translates one run, message by message; an application may name a class derived from this.
@@ -56,7 +53,8 @@ class Views:
 
     def __init__(self, application: Application | None = None,
                  system: SystemSpec = NO_SYSTEM) -> None:
-        del application, system
+        del application
+        self._titles = system.titles
         self._seen: dict[str, Any] = Remembered(MANY)
         self.translators: dict[Topic[Any], Translator] = {
             ftm_topics.DECISION: self._decision, ftm_topics.PROCESS_EVENT: self._process,
@@ -84,14 +82,15 @@ class Views:
     # -- the log --------------------------------------------------------------------------------
 
     def _decision(self, key: str, header: Header, body: fm.DecisionRecord, at_ns: int) -> Shown:
-        words = decision_in_words(body.active, body.rule, body.recoveries, body.strategy)
+        words = decision_in_words(body.active, body.rule, body.recoveries, body.strategy,
+                                  self._titles)
         level = fg.LogLevel.WARNING if body.active else fg.LogLevel.INFO
         return self._event(key, header, at_ns, level, f"decision {body.decision}: {words}")
 
     def _process(self, key: str, header: Header, body: fm.ProcessEvent, at_ns: int) -> list[View]:
-        if body.event in _ROUTINE:
+        if not body.news:
             return []
-        level = fg.LogLevel.INFO if body.event in _GOOD_NEWS else fg.LogLevel.WARNING
+        level = fg.LogLevel.INFO if body.news == "clear" else fg.LogLevel.WARNING
         by = f" by {body.by}" if body.by else ""
         detail = f": {body.detail}" if body.detail else ""
         return self._event(key, header, at_ns, level, f"{body.node} {body.event}{by}{detail}")

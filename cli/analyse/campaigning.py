@@ -215,7 +215,7 @@ def _execute(options: argparse.Namespace, jobs: Sequence[Job], store: Store) -> 
 
         def progress(job: Job, result: RunResult) -> None:
             nonlocal unsafe
-            if job.ftm and not result.safe:
+            if not result.safe:
                 unsafe += 1
                 bar.write(f"unsafe: {job.key} {job.text()}", file=sys.stderr)
             bar.set_postfix(unsafe=unsafe, refresh=False)
@@ -258,7 +258,7 @@ class ProgressLog:
             minutes = (now_s - self._begun_s) / (self._done - self._before) * left / 60
             more = f", {minutes:.0f} min left"
         self._told_s = now_s
-        return f"{self._done} of {self._total} runs, {unsafe} unsafe with FTM{more}"
+        return f"{self._done} of {self._total} runs, {unsafe} unsafe{more}"
 
 
 def _replay(options: argparse.Namespace) -> int:

@@ -58,7 +58,8 @@ def show_decision(options: argparse.Namespace) -> int:
             "rejected": [{"name": name, "reason": why} for name, why in decision.rejected],
             "explained": explained, "strategy": strategy})
         return 0
-    say(decision_in_words(decision.active, decision.rule, decision.recoveries, strategy))
+    say(decision_in_words(decision.active, decision.rule, decision.recoveries, strategy,
+                          spec.titles))
     if explained:
         say(f"  explained {', '.join(explained)}")
     for chain in decision.path:

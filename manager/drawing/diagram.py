@@ -103,7 +103,8 @@ class Situation(msgspec.Struct, frozen=True):
         if not self.active:
             return ""
         active = [m.name for m in spec.mechanisms if m.name in self.active]
-        return decision_in_words(active, self.rule, self.recoveries, self.strategy)
+        return decision_in_words(active, self.rule, self.recoveries, self.strategy,
+                                 spec.titles)
 
 
 def draw(spec: SystemSpec, what: str, order: PartialOrder, criteria: Sequence[str],

@@ -257,6 +257,14 @@ class SystemSpec(Table, frozen=True):
     panels: tuple[Panel, ...] = msgspec.field(name="panel", default=())
     ros2: tuple[Ros2Link, ...] = ()
 
+    @property
+    def titles(self) -> dict[str, str]:
+        """Titles of modules and mechanisms by name; a mechanism's are those of its detections."""
+        found = {one.name: one.title for one in self.detections}
+        found |= {one.name: one.title for one in self.recoveries}
+        return found | {one.name: " / ".join(found[name] for name in one.detections
+                                             if name in found) for one in self.mechanisms}
+
     def without_disabled(self) -> SystemSpec:
         """Return the spec without the mechanisms that are disabled; itself if none is.
 

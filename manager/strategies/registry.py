@@ -11,8 +11,9 @@ recovery module, which know nothing of each other. Each has a file of its own:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
+from types import MappingProxyType
 
 from rampart.manager.model.mechanisms import Mechanisms
 from rampart.manager.model.order import PartialOrder, Tree
@@ -94,24 +95,39 @@ def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,  # noqa: P
 _decider = lru_cache(maxsize=64)(Decider)
 
 
+def named(name: str, titles: Mapping[str, str]) -> str:
+    """Return what a mechanism, module or recovery is called: title first, code in brackets."""
+    title = titles.get(name, "")
+    return f"{title} ({name})" if title and title != name else name
+
+
 def decision_in_words(active: Sequence[str], rule: int, recoveries: Sequence[str],
-                      strategy: str = "safety-first") -> str:
-    """Return one sentence: what is active, what is done about it, and by which rule.
+                      strategy: str = "safety-first",
+                      titles: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return one sentence: what is done, about what, and by which rule.
 
     Of a strategy that is not known here (a recording may name one) the rule has a number only.
+
+    Args:
+        active: Mechanisms.
+        rule: Of the strategy.
+        recoveries: That are run.
+        strategy: Name of the strategy.
+        titles: Of mechanisms and recoveries, see `SystemSpec.titles`; without one its code stands
+            alone.
     """
+    active, recoveries = ([named(name, titles) for name in names] for names in (active, recoveries))
     if not active and recoveries:
         return (f"No mechanism is active any more; {listing(recoveries)} "
                 f"{'stays' if len(recoveries) == 1 else 'stay'} in force until reset.")
     if not active:
         return "No mechanism is active: there is nothing to recover from."
-    verb = "is" if len(active) == 1 else "are"
-    taken = f"run {listing(recoveries)}" if recoveries else "no recovery"
+    taken = listing(recoveries) if recoveries else "No recovery"
     known = STRATEGIES.get(strategy)
     reason = known.rules.get(rule) if known else None
     because = f", because {reason}" if reason else ""
     block = f"block {rule}" if strategy == "safety-first" else f"{strategy}, rule {rule}"
-    return f"{listing(active)} {verb} active: {taken}{because} ({block})."
+    return f"{taken}: {listing(active)}{because} ({block})."
 
 
 def listing(names: Sequence[str]) -> str:

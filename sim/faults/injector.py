@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -16,6 +17,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.bounds import NAME_CHARS, clip
 from rampart.actors.bus.messages import InjectionReport
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics as ftm_topics
@@ -130,8 +132,11 @@ class Injector(Actor):
 
     def _plan(self, scenario: Sequence[PlannedFault], number: int = 0) -> list[PlannedAction]:
         planned = []
+        times = Counter(fault.fault for fault in scenario)
         for i, fault in enumerate(scenario, start=1):
-            action = action_of(fault, f"f{i}", self._nodes, self._known, self._faults)
+            name = fault.fault if times[fault.fault] == 1 else f"{fault.fault} ({i})"
+            action = action_of(
+                fault, clip(name, NAME_CHARS), self._nodes, self._known, self._faults)
             planned.append(PlannedAction(
                 fault, action, FaultWatch(action if isinstance(action, tuple) else ()), number))
         self._may_publish.update(  # a robot orders its own faults on topics of its own

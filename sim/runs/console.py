@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
@@ -17,10 +17,8 @@ from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.files.plain_text import LINE_CHARS, printable
 from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.strategies.registry import named
 from rampart.sim.runs.record import RunRecord
-
-_QUIET_EVENTS = frozenset({"started", "running", "adopted"})
-
 
 REPORTS_PER_S = 10
 """Error reports shown in a real second."""
@@ -52,6 +50,7 @@ class Console:
         self._stream = stream
         self._clock = clock
         self._is_limited = True
+        self._titles: Mapping[str, str] = {}
         self._reports = RateLimit(REPORTS_PER_S)
         self._others = RateLimit(LINES_PER_S)
         self._live = stream.isatty()
@@ -63,6 +62,7 @@ class Console:
     def banner(self, what: str, plan: RunPlan, spec: SystemSpec, *, virtual: bool = False) -> None:
         """Say what is about to run, and in real time how to disturb it."""
         self._is_limited = not virtual
+        self._titles = spec.titles
         mode = spec.strategy if plan.ftm else "no fault tolerance"
         time_is = f"virtual time, seed {plan.seed}" if virtual else f"rate {plan.rate:g}"
         self.say(f"Rampart: {what}, {mode}, {time_is}")
@@ -85,7 +85,7 @@ class Console:
         if count := self._reports.left_out(now_s) + self._others.left_out(now_s):
             self.say(f"[{at:7.2f} s] {count} more lines were left out")
         if isinstance(message, fm.ProcessEvent):
-            if message.event not in _QUIET_EVENTS and message.detail != "already":
+            if message.news and message.event != "adopted":
                 detail = f" ({message.detail})" if message.detail else ""
                 which = f"incarnation {message.incarnation}"
                 self.line(at, f"{message.node} {message.event}, {which}{detail}")
@@ -94,17 +94,21 @@ class Console:
         elif isinstance(message, fm.ManagerStatus):
             self._take_silence(message.silent, at)
         elif isinstance(message, fm.DecisionRecord):
-            what = " and ".join(message.recoveries) or "nothing to recover"
+            what = " and ".join(map(self._named, message.recoveries)) or "nothing to recover"
             word = "block" if message.strategy == "safety-first" else "rule"  # figure 7's word
             block = f", {word} {message.rule}" if message.rule else ""
+            active = ", ".join(map(self._named, message.active))
             self.line(at, f"decision {message.decision}: {what}{block}"
-                      + (f" for {', '.join(message.active)}" if message.active else ""))
+                      + (f" for {active}" if active else ""))
         elif isinstance(message, fm.ShadowRecord):
             self.line(at, f"  in shadow {message.strategy} would run "
-                          f"{' and '.join(message.recoveries) or 'nothing'}")
+                          f"{' and '.join(map(self._named, message.recoveries)) or 'nothing'}")
         elif isinstance(message, Diagnostic):
             self.line(at, f"{message.node}: {message.context}: {message.reason} "
                       f"[{message.offender}]", self._reports)
+
+    def _named(self, name: str) -> str:
+        return named(name, self._titles)
 
     def line(self, at_s: float, text: str, limit: RateLimit | None = None) -> None:
         """Write one line with its simulated time, unless there are too many of its kind."""
@@ -134,13 +138,13 @@ class Console:
         self._detections[header.source] = report.state
         if report.state is not before:
             what = report.reason if report.state is fm.DetectionState.ACTIVE else "clear"
-            self.line(header.stamp, f"{header.source}: {what}")
+            self.line(header.stamp, f"{self._named(header.source)}: {what}")
 
     def _take_silence(self, silent: tuple[str, ...], at: float) -> None:
         for name in (n for n in silent if n not in self._silent):
-            self.line(at, f"{name} silent: it counts as active")
+            self.line(at, f"{self._named(name)} silent: it counts as active")
         for name in (n for n in self._silent if n not in silent):
-            self.line(at, f"{name}: no longer silent")
+            self.line(at, f"{self._named(name)}: no longer silent")
         self._silent = silent
 
     def show_live(self, text: str, at_s: float) -> None:

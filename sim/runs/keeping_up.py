@@ -61,7 +61,10 @@ class KeptUp(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         world = f", the world {1e3 * self.world_late_s:.0f} ms behind" if self.world_late_s else ""
-        return (f"this machine keeps up with rate {self.with_rate:.2g}, not {self.rate:g}: loops "
+        found = f"{self.with_rate:.2g}"
+        what = (f"rate {self.rate:g} most of the time" if float(found) >= self.rate
+                else f"rate {found}, not {self.rate:g}")
+        return (f"this machine keeps up with {what}: loops "
                 f"are up to {1e3 * self.late_s:.0f} ms late ({self.node}){world}; simulated time, "
                 f"{1e3 * self.allowed_s:.0f} ms are in order")
 

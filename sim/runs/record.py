@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Mapping, Sized
+from types import MappingProxyType
 from typing import Any, Literal
 
 import msgspec
@@ -29,6 +30,7 @@ Safety = Literal["safe", "unsafe", "not known"]
 
 _CRASHES = ("crashed", "stopped", "wedged", "given up")
 _RECOVERED = ("respawned", "resumed", "adopted")
+_OF_HOSTS = ("unreachable", "back")
 
 
 class Interval(msgspec.Struct, frozen=True):
@@ -145,11 +147,14 @@ class RunRecorder:
     Args:
         plan: of the run.
         strategy: of the manager; empty without FTMs.
+        titles: of mechanisms and recoveries, see `SystemSpec.titles`.
     """
 
-    def __init__(self, plan: RunPlan, strategy: str = "") -> None:
+    def __init__(self, plan: RunPlan, strategy: str = "",
+                 titles: Mapping[str, str] = MappingProxyType({})) -> None:
         self._plan = plan
         self._strategy = strategy
+        self._titles = titles
         self._left_out = 0
         self._events: list[EventLine] = []
         self._intervals: list[Interval] = []
@@ -160,6 +165,7 @@ class RunRecorder:
         self._lives: dict[str, _Lives] = Remembered(KEPT)
         self._respawned: Remembered[tuple[str, int], None] = Remembered(KEPT)
         self._injections: dict[str, str] = Remembered(KEPT)
+        self._lasts_s: dict[str, float] = Remembered(KEPT)
         self._take: dict[str, Callable[[Any, Header], None]] = {
             ftm_topics.DETECTION.key: self._detection, ftm_topics.MANAGER_STATUS.key: self._manager,
             ftm_topics.DECISION.key: self._decision, ftm_topics.SHADOW.key: self._shadow,
@@ -179,7 +185,9 @@ class RunRecorder:
 
     def fields(self, duration_s: float) -> dict[str, Any]:
         """Return what it knows of the fields of a record."""
-        still = [Interval(lane, name, from_s, max(from_s, duration_s), reason)
+        still = [Interval(lane, name, from_s, max(from_s, min(
+                     duration_s, from_s + (self._lasts_s.get(name, math.inf)
+                                           if lane == "injection" else math.inf))), reason)
                  for (lane, name), (from_s, reason) in self._open.items()]
         events = sorted(self._events, key=lambda event: event.t_s)
         if count := self._left_out + self._decisions.forgotten:
@@ -212,8 +220,8 @@ class RunRecorder:
         r = record
         self._decisions[header.incarnation, r.decision] = DecisionLine(
             header.stamp, r.decision, r.strategy, r.active, r.rule, r.recoveries,
-            decision_in_words(r.active, r.rule, r.recoveries, r.strategy), r.path, r.rejected,
-            r.detected_s)
+            decision_in_words(r.active, r.rule, r.recoveries, r.strategy, self._titles), r.path,
+            r.rejected, r.detected_s)
 
     def _shadow(self, record: fm.ShadowRecord, header: Header) -> None:
         key = header.incarnation, record.decision
@@ -223,7 +231,7 @@ class RunRecorder:
                 shadow=f"{record.strategy}: {' and '.join(record.recoveries) or 'nothing'}")
 
     def _process_event(self, event: fm.ProcessEvent, header: Header) -> None:
-        if event.detail == "already":  # the answer to a request that came twice
+        if not event.news:
             return
         detail = f": {event.detail}" if event.detail else ""
         if event.event == "crashed":
@@ -237,6 +245,8 @@ class RunRecorder:
             self.turn("down", event.node, False, header.stamp)
             by = f" by {event.by}" if event.by else ""
             self._note(header.stamp, "clear", f"{event.node} {event.event}{by}")
+        elif event.event in _OF_HOSTS:
+            self._note(header.stamp, event.news, f"{event.node} {event.event}{detail}")
         if event.event == "given up":
             self._given_up[event.node] = None
         elif event.event in _RECOVERED:
@@ -267,6 +277,8 @@ class RunRecorder:
 
     def _injection(self, order: bm.Injection, _header: Header) -> None:
         self._injections[order.injection] = f"{order.mode} {order.topic}"
+        if order.duration_s > 0:  # 0 ends it
+            self._lasts_s[order.injection] = order.duration_s
 
     def _injection_report(self, report: bm.InjectionReport, header: Header) -> None:
         what = self._injections.get(report.injection, report.injection)

@@ -136,8 +136,9 @@ def clock(seconds: float | None) -> str:
     """Return simulated seconds as minutes:seconds."""
     if seconds is None or not math.isfinite(seconds):
         return "–"  # noqa: RUF001 - typography for people
-    minutes, rest = divmod(round(seconds, 1), 60)
-    return f"{int(minutes)}:{rest:04.1f}"
+    minutes, rest = divmod(abs(round(seconds, 1)), 60)
+    sign = MINUS if round(seconds, 1) < 0 else ""  # of what came before the start
+    return f"{sign}{int(minutes)}:{rest:04.1f}"
 
 
 def lanes_of(run: RunRecord) -> list[dict[str, Any]]:

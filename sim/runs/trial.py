@@ -94,7 +94,7 @@ class Trial:
         self.about = f"{run.system.title} ({run.system.name}); ctrl-C ends it"
         self.goals = 0
         self.console = self.tells(stream) if stream else None
-        self.recorder = RunRecorder(run.plan, self.strategy)
+        self.recorder = RunRecorder(run.plan, self.strategy, run.system.titles)
         self.injects: Injector | None = None
         self._brought_back = 0
         self._worlds = frozenset(n.name for n in run.system.nodes if n.kind is Kind.WORLD)

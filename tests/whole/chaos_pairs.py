@@ -170,7 +170,7 @@ class PairChaos:
 
     def release(self) -> None:
         """Do what an operator does when all is well again and the robot still stands: reset it."""
-        if not self.over() and self._decided == _LATCHED:
+        if not self.over() and f"({_LATCHED})" in self._decided and " for " not in self._decided:
             self.resets += self._run.tool("reset", _LATCHED).returncode == 0
 
     def _hit(self, pair: Pair, old: dict[str, int]) -> None:

@@ -88,7 +88,7 @@ def test_stopped_and_wedged_control_nodes_are_replaced_and_the_mission_goes_on(t
         before = run.story.count("goal")
         run.wait_for("goal 2/2", 60)
         assert run.story.count("goal") > before
-        assert "decision 1: RM3, block 1 for FTM4" in run.story
+        assert "(RM3), block 1 for Control node crash (FTM4)" in run.story
         assert run.story.count(": RM3, block 1 for FTM4") == 2
 
 

@@ -233,19 +233,25 @@ function safety(s) {
   $("detections").replaceChildren(...s.detections.map((d) => {
     const chip = element("li", d.active ? "active" : d.stale ? "stale" : "", d.active ? `▲ ${d.name}` : d.name);
     const nodes = d.nodes.length ? ` (${d.nodes.join(", ")})` : "";
-    chip.title = d.active ? `${d.reason}${nodes}` : d.stale ? "silent" : "idle";
-    chip.append(element("span", "unseen", `: ${chip.title}`));
+    const state = d.active ? `${d.reason}${nodes}` : d.stale ? "silent" : "idle";
+    chip.title = `${named(d.name)}: ${state}`;
+    chip.append(element("span", "unseen", `: ${state}`));
     return chip;
   }));
+}
+
+function named(name) {
+  const title = picture.system?.titles?.[name];
+  return title && title !== name ? `${title} (${name})` : name;
 }
 
 function manager(heard) {
   const m = heard && heard.value;
   const facts = [["Manager", !m ? "not heard" : heard.stale ? "silent" : "alive"]];
   if (m) {
-    facts.push(["Strategy", m.strategy], ["Active", m.active.join(", ") || "none"],
-      ["Activated", m.activated.join(", ") || "none"]);
-    if (m.silent.length) facts.push(["Silent modules", m.silent.join(", ")]);
+    facts.push(["Strategy", m.strategy], ["Active", m.active.map(named).join(", ") || "none"],
+      ["Activated", m.activated.map(named).join(", ") || "none"]);
+    if (m.silent.length) facts.push(["Silent modules", m.silent.map(named).join(", ")]);
   }
   $("manager").replaceChildren(...facts.flatMap(([k, v]) => [element("dt", "", k), element("dd", "", v)]));
   const latched = m ? m.latched : [];
@@ -253,14 +259,12 @@ function manager(heard) {
   $("alarm").hidden = !latched.length && !acting;
   $("alarm").classList.toggle("mild", !latched.length);
   say($("alarm-title"), latched.length
-    ? `${latched.join(", ")} latched: waits for your reset.` : acting
-      ? m.activated.length ? `Recovery under way: ${m.activated.join(", ")}.` : "A fault is detected." : "");
-  say($("alarm-text"), m && m.active.length ? `Active: ${m.active.join(", ")}.` : "");
+    ? `${latched.map(named).join(", ")}: latched, waits for your reset.` : acting
+      ? m.activated.length ? m.activated.map(named).join(", ") : "A fault is detected." : "");
+  say($("alarm-text"), m && m.active.length ? `${m.active.map(named).join(", ")}.` : "");
   document.title = `${latched.length ? "⚠ stopped · " : acting ? "▲ recovery · " : ""}Rampart`;
   memory.once("latched", latched, () => $("resets").replaceChildren(...latched.map((name) => {
-    const box = picture.system?.order?.boxes.find((shown) => shown.name === name);
-    const title = box && box.title !== name ? `${box.title.toLowerCase()} (${name})` : name;
-    const button = element("button", "", `Reset ${title}`);
+    const button = element("button", "", `Reset ${named(name)}`);
     button.onclick = () => send({ type: "reset", recovery: name });
     return button;
   })));

@@ -55,7 +55,7 @@ def test_a_detection_is_logged_when_it_begins_and_when_it_ends():
         view = fm.DetectionView("DM2", which, "stale" if which else "", ())
         state.manager(fm.ManagerStatus((), (), (), (), "safety-first", 0, (view,)), float(at_s))
     assert [(e["t"], e["kind"], e["text"]) for e in shown(state)["events"]] == [
-        (2.0, "fault", "DM2 detects: stale"), (4.0, "clear", "DM2 is idle again")]
+        (2.0, "fault", "DM2: stale"), (4.0, "clear", "DM2 is idle again")]
 
 
 def test_that_all_nodes_start_at_the_start_is_no_news_but_a_crash_is():
@@ -91,18 +91,32 @@ def test_a_decision_is_told_with_its_certificate():
 
 def test_decisions_are_put_in_words():
     assert decision_in_words(("FTM7",), 1, ("RM4",)) == (
-        "FTM7 is active: run RM4, because it is the only active mechanism (block 1).")
+        "RM4: FTM7, because it is the only active mechanism (block 1).")
     assert decision_in_words(("FTM3", "FTM4"), 3, ("RM2",)).startswith(
-        "FTM3 and FTM4 are active: run RM2")
+        "RM2: FTM3 and FTM4")
     assert decision_in_words((), 0, ()) == (
         "No mechanism is active: there is nothing to recover from.")
     assert decision_in_words((), 0, ("RM1",)) == (
         "No mechanism is active any more; RM1 stays in force until reset.")
     assert decision_in_words(("FTM3",), 2, ("RM2", "RM3"), "mission-first") == (
-        "FTM3 is active: run RM2 and RM3, because a deeper barrier did not end the error in time, "
+        "RM2 and RM3: FTM3, because a deeper barrier did not end the error in time, "
         "so the next one above takes over (mission-first, rule 2).")
     assert decision_in_words(("FTM3",), 2, ("RM2",), "of-yesterday") == (
-        "FTM3 is active: run RM2 (of-yesterday, rule 2).")
+        "RM2: FTM3 (of-yesterday, rule 2).")
+
+
+def test_a_decision_names_titles_first_and_codes_in_brackets():
+    titles = {"RM2": "Controlled stop", "FTM14": "No time left"}
+    assert decision_in_words(("FTM14", "X"), 1, ("RM2",), titles=titles).startswith(
+        "Controlled stop (RM2): No time left (FTM14) and X, ")
+
+
+def test_a_host_that_is_back_is_good_news_and_a_second_answer_is_none():
+    def news(event: str, detail: str = "") -> str:
+        return fm.ProcessEvent("ground", event, 1, 1, "supervisor", detail).news
+
+    assert [news("back"), news("respawned"), news("respawned", "already"), news("started"),
+            news("unreachable"), news("crashed")] == ["clear", "clear", "", "", "fault", "fault"]
 
 
 def test_the_drawing_holds_the_whole_airport_within_its_bounds():

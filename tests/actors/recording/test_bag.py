@@ -217,7 +217,7 @@ def test_the_log_tells_decisions_detections_and_processes_once_each():
     lines = [view for _ in range(2)
              for view in views.of(ftm_topics.DECISION, "d", header, decision, 0)]
     assert [line.message for _, line in lines] == [
-        "decision 3: FTM1 is active: run RM1, because it is the only active mechanism (block 1)."]
+        "decision 3: RM1: FTM1, because it is the only active mechanism (block 1)."]
     states = [fm.DetectionState.IDLE, fm.DetectionState.ACTIVE, fm.DetectionState.ACTIVE,
               fm.DetectionState.IDLE]
     told = [line.message for number, state in enumerate(states) for _, line in views.of(

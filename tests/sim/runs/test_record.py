@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable, ProcessEvent
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.sim.runs.record import Interval, RunRecorder
+from rampart.sim.runs.report import clock
 
 
 def recorder_with(*told: tuple[float, str]) -> RunRecorder:
@@ -48,3 +51,18 @@ def test_a_return_that_was_heard_is_told_once():
     record = recorder.record(9.0)
     assert record.intervals == (Interval("down", "pump", 5.0, 5.02, "crashed"),)
     assert len(record.events) == 2
+
+
+def test_the_bar_of_a_fault_whose_end_nothing_reported_is_as_long_as_the_fault():
+    recorder = RunRecorder(RunPlan())
+    order = bm.Injection("gps-bias", "summit_xl/gps", "drop", 5.0)
+    recorder.feed(bus_topics.INJECT, order, Header("tools", 1, 1, 10.0))
+    recorder.feed(bus_topics.INJECTION_REPORT, bm.InjectionReport("gps-bias", "base", 3, False, ""),
+                  Header("base", 1, 1, 10.1))
+    (bar,) = recorder.fields(100.0)["intervals"]
+    assert (bar.name, bar.from_s, round(bar.to_s, 3)) == ("gps-bias", 10.1, 15.1)
+
+
+def test_what_came_before_the_start_has_a_sign():
+    assert clock(-1.8) == "\N{MINUS SIGN}0:01.8"
+    assert clock(61.8) == "1:01.8"
