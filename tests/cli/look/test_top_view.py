@@ -85,7 +85,7 @@ def test_a_screen_of_80_by_24_tells_what_matters():
     manager = line_of(shown, "manager")
     assert "ACTIVE FTM4; recovery RM3; latched RM1" in manager
     assert "1 of 2: DM7 localization crashed" in line_of(shown, "detection")
-    assert "4: FTM4 is active: run RM3, because" in line_of(shown, "decisions")
+    assert "4: RM3: FTM4, because" in line_of(shown, "decisions")
     assert "localization       crashed     3     2  1h01m   2%    61" in line_of(
         shown, "localization")
 
@@ -183,7 +183,7 @@ def test_every_topic_is_either_read_or_counted():
 def test_the_same_can_be_had_as_data():
     data = msgspec.json.decode(msgspec.json.encode(picture_json(frame(busy()))))
     assert data["mission"]["step"] == 1
-    assert data["decisions"][0]["words"].startswith("FTM4 is active: run RM3")
+    assert data["decisions"][0]["words"].startswith("RM3: FTM4")
     assert data["processes"][0] == {
         "name": "localization", "kind": "control", "pid": 12, "state": "crashed",
         "incarnation": 3, "restarts": 2, "cpu": 2.0, "mb": 61.0, "age_s": 3700.0,
