@@ -27,7 +27,8 @@ _CHOICE = (
     whole("--runs", "N", "N random faults of all kinds"),
     several("--fault", "FAULT[@WHEN][+S]",
             "this fault; may be repeated, and be a pattern of names: 'kill:*'"),
-    whole("--together", "K", "with --runs or --search: K faults in each (default 1)", 1),
+    whole("--together", "K", "K faults in each run (default 1); with --fault: every combination of "
+          "K of those on different topics", 1),
     word("--kinds", "K,...", "with --runs or --search: only these kinds of faults, of those that "
          "--list shows"),
     whole("--search", "N", "N runs of an optimiser that looks for the smallest safety margin"),
@@ -121,6 +122,7 @@ def run(options: argparse.Namespace) -> int:
       rampart campaign --runs 200 --together 2       ... pairs of faults
       rampart campaign --fault 'kill:*' --seeds 5    every process killed, five seeds each
       rampart campaign --fault gps-bias@20+5 --obstacles 0,2 --ftm both
+      rampart campaign --fault 'gps-*@30+inf' --fault 'imu-*@30+inf' --together 2   every pair
       rampart campaign --list                        the faults that there are
       rampart campaign --replay 3f2a --out DIR       repeat one run of DIR and write its report
       rampart campaign --search 200                  look for the fault with the smallest margin

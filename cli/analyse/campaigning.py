@@ -10,7 +10,7 @@ import shlex
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 
 import msgspec
@@ -150,8 +150,25 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
             jobs, groups, options.runs, seed=options.seed, faults=faults_of(spec),
             together=options.together, moments=_moments(spec, jobs[0]),
             seeds=options.seeds or SEEDS)
-    faults = list(_planned(options.fault, spec, all_groups(spec)))
-    return "faults", cross(jobs, faults, range(options.seed, options.seed + (options.seeds or 1)))
+    planned = list(_planned(options.fault, spec, all_groups(spec)))
+    together = options.together
+    found = [(fault,) if fault else () for fault in planned] if together == 1 else [
+        each for each in combinations([fault for fault in planned if fault], together)
+        if _on_different_topics(each, spec)]
+    return f"faults-{together}" if together > 1 else "faults", cross(
+        jobs, found, range(options.seed, options.seed + (options.seeds or 1)))
+
+
+def _on_different_topics(faults: Sequence[PlannedFault], spec: SystemSpec) -> bool:
+    """Tell whether no two faults disturb the same topic, or hit the same process."""
+    hit: list[str] = []
+    of_robot, known = faults_of(spec), systems.topics_of(spec)
+    for fault in faults:
+        try:
+            hit += {each.topic for each in of_robot.find(fault.fault, 0, known).disturbances}
+        except UnknownFaultError:
+            hit.append(fault.fault.partition(":")[2])
+    return len(hit) == len(set(hit))
 
 
 def _moments(spec: SystemSpec, job: Job, *, searched: bool = False) -> tuple[float, float]:

@@ -53,16 +53,16 @@ def fault_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
     return groups
 
 
-def cross(jobs: Sequence[Job], faults: Iterable[PlannedFault | None], seeds: Iterable[int]
+def cross(jobs: Sequence[Job], faults: Iterable[tuple[PlannedFault, ...]], seeds: Iterable[int]
           ) -> list[Job]:
-    """Return every job with every fault and every seed; None is a run without a fault.
+    """Return every job with every set of faults and every seed.
 
     Args:
         jobs: What they have in common: options, strategy, with or without FTM.
-        faults: One per run.
+        faults: One set per run; an empty one is a run without a fault.
         seeds: Of the runs.
     """
-    return [_with(job, (fault,) if fault else (), seed)
+    return [_with(job, fault, seed)
             for job, fault, seed in product(jobs, list(faults), list(seeds))]
 
 

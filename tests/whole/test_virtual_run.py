@@ -202,7 +202,7 @@ def test_a_slow_process_is_slow():
 
 
 def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_afterwards(short):
-    record = run_virtually(job("slow:all:0.03@20+30", system="osmosis", options=short)).record
+    record = run_virtually(job("slow:all:0.025@20+30", system="osmosis", options=short)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
     assert [(d.active, d.recoveries) for d in record.decisions] == [
         (("FTM14",), ("RM2",)), ((), ())]
@@ -210,7 +210,7 @@ def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_after
 
 @pytest.mark.parametrize(("faults", "restarts"), [
     (("drop:detection/DM2@25+8",), {"DM2": 1}),
-    pytest.param(("slow:all:0.03@20+30", "drop:detection/DM2@25+8"), {}, marks=pytest.mark.slow)])
+    pytest.param(("slow:all:0.025@20+30", "drop:detection/DM2@25+8"), {}, marks=pytest.mark.slow)])
 def test_a_module_that_is_not_heard_is_restarted_but_not_for_being_late(short, faults, restarts):
     record = run_virtually(job(*faults, system="osmosis", options=short)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", restarts)

@@ -8,6 +8,11 @@ A sensor fails in one of these ways:
 * **dropout**: no reading at all.
 * **stuck**: the sensor goes on publishing, with fresh stamps, the value it had. A freshness check
   cannot see it; a frozen *driver*, which repeats old stamps too, is `freeze:TOPIC`.
+* **stuck-noise**: the same with the noise of a sound device on top, so that it does not repeat
+  itself.
+* **slow-drift**, **creep**: a third and a tenth of the drift: 5 and 1.5 cm/s of a position.
+
+A *frozen set* is several sensors that get stuck in the same moment, as behind a hung serial hub.
 
 The magnitudes are those of a device that has failed, ten times and more beyond the noise that
 `rampart.sim.osmosis.sensors` gives a healthy one, and within what the device could report. No
@@ -20,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 from msgspec.structs import replace
@@ -69,11 +75,14 @@ PAPER_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in (
 _SENSOR_GROUP = "sensor"
 _FOR_A_WHILE_S = 10.0
 _TO_GROW_S = 20.0
+_SLOW, _CREEP = 0.35, 0.106
 
 
 @dataclass(frozen=True, slots=True)
 class _Sensor:
     """A sensor with the size of its errors: field → amount, for `drift` per second.
+
+    `grain` is the noise of a sound device.
 
     It has the faults of which it says something, besides dropout and stuck.
     """
@@ -84,6 +93,7 @@ class _Sensor:
     bias: Mapping[str, float]
     noise: Mapping[str, float]
     drift: Mapping[str, float] = field(default_factory=dict)
+    grain: Mapping[str, float] = field(default_factory=dict)
     says: Mapping[str, str] = field(default_factory=dict)
     seen_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -93,6 +103,7 @@ SENSORS = (
             bias={"x_m": 1.5, "y_m": 1.5},
             noise={"x_m": 1.5, "y_m": 1.5, "velocity_x_mps": 0.3, "velocity_y_mps": 0.3},
             drift={"x_m": 0.1, "y_m": 0.1},
+            grain={"x_m": 0.01, "y_m": 0.01, "velocity_x_mps": 0.03, "velocity_y_mps": 0.03},
             says={"bias": "is 2.1 m off to the north-east, as by multipath at a hangar",
                   "drift": "drifts north-east by 0.14 m/s",
                   "noise": "has lost its RTK fix: 1.5 m noise, 0.3 m/s in velocity"},
@@ -102,6 +113,8 @@ SENSORS = (
             noise={"yaw_rad": 0.05, "yaw_rate_radps": 0.1, "accel_x_mps2": 1.0,
                    "accel_y_mps2": 1.0},
             drift={"yaw_rad": 0.02},
+            grain={"yaw_rad": 3e-4, "yaw_rate_radps": 0.003, "accel_x_mps2": 0.05,
+                   "accel_y_mps2": 0.05},
             says={"bias": "has a turn-on bias: 0.05 rad/s and 0.3 m/s2",
                   "drift": "has a heading that drifts by 0.02 rad/s",
                   "noise": "shakes on a loose mount: 0.1 rad/s, 1 m/s2, 0.05 rad of noise"}),
@@ -110,25 +123,35 @@ SENSORS = (
             noise={"pose.x_m": 0.1, "pose.y_m": 0.1, "pose.yaw_rad": 0.05,
                    "twist.linear_mps": 0.1, "twist.angular_radps": 0.1},
             drift={"pose.x_m": 0.1, "pose.yaw_rad": 0.02},
+            grain={"twist.linear_mps": 0.005, "twist.angular_radps": 0.005},
             says={"bias": "reports 0.1 m/s and 0.05 rad/s too much, as with worn tyres",
                   "drift": "counts slipping wheels: 0.1 m/s, 0.02 rad/s",
                   "noise": "has noise of 0.1 m, 0.05 rad, 0.1 m/s, 0.1 rad/s"}),
     _Sensor("laser", topics.SCAN, "the laser",
             bias={"ranges_f32": 0.5, "reference_m": 0.5},
             noise={"ranges_f32": 0.3, "reference_m": 0.3},
+            grain={"ranges_f32": 0.01, "reference_m": 0.01},
             says={"bias": "sees everything 0.5 m farther than it is, its reference too",
                   "noise": "has 0.3 m of noise on each ray, as in spray"}),
     _Sensor("light", topics.LIGHT, "the light sensor",
             bias={"illuminance_lux": 800.0}, noise={"illuminance_lux": 200.0},
+            grain={"illuminance_lux": 5.0},
             says={"bias": "sees 800 lux of stray light, half a healthy light of 200 cd",
                   "noise": "has 200 lux of noise"}),
     _Sensor("absolute-pose", topics.ABSOLUTE_POSE, "the absolute localization",
             bias={"x_m": 0.7, "y_m": 0.7}, noise={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1},
             drift={"x_m": 0.1, "y_m": 0.1, "yaw_rad": 0.01},
+            grain={"x_m": 0.01, "y_m": 0.01, "yaw_rad": 0.003},
             says={"bias": "is 1 m off to the north-east",
                   "drift": "drifts by 0.14 m/s and 0.01 rad/s",
                   "noise": "has noise of 0.3 m and 0.1 rad"},
-            seen_by={"bias": ("DM1",), "drift": ("DM1",), "dropout": ("DM6",)}))
+            seen_by={"bias": ("DM1",), "drift": ("DM1",), "dropout": ("DM6",)}),
+    _Sensor("encoders", topics.BASE_STATUS, "the base's status with its wheel speeds",
+            bias={"wheel_speeds_radps": 1.0}, noise={"wheel_speeds_radps": 1.0},
+            drift={"wheel_speeds_radps": 0.1}, grain={"wheel_speeds_radps": 0.05},
+            says={"bias": "has each wheel turn 1 rad/s, 12 cm/s, too fast",
+                  "drift": "has each wheel turn faster by 0.1 rad/s each second",
+                  "noise": "has noise of 1 rad/s on each wheel"}))
 """The sensors of the robot. Bias of the light sensor: 200 cd at 0.35 m give 1633 lux
 (`rampart.actors.osmosis.airport.photometry`), so 800 lux lift a dead light near the limit of half
 its intensity."""
@@ -145,20 +168,43 @@ def _faults_of(sensor: _Sensor) -> list[Fault]:
     ways = {
         "bias": replace(corrupt, add_fields=sensor.bias),
         "drift": replace(corrupt, ramp_fields=sensor.drift),
+        "slow-drift": replace(corrupt, ramp_fields=_share(sensor.drift, _SLOW)),
+        "creep": replace(corrupt, ramp_fields=_share(sensor.drift, _CREEP)),
         "noise": replace(corrupt, noise_fields=sensor.noise),
         "dropout": replace(corrupt, mode="drop"),
         "stuck": replace(corrupt, mode="stuck")}
     says = {"dropout": "gives no reading", "stuck": "repeats its last value with fresh stamps",
             **sensor.says}
-    return [Fault(f"{sensor.name}-{way}", f"{sensor.what} {says[way]}", (what,),
-                  sensor.seen_by.get(way, ()), _TO_GROW_S if way == "drift" else _FOR_A_WHILE_S,
-                  _SENSOR_GROUP)
-            for way, what in ways.items() if way in says]
+    if "drift" in says:
+        says |= {"slow-drift": f"drifts by {_SLOW:.0%} of {sensor.name}-drift",
+                 "creep": f"drifts by {_CREEP:.0%} of {sensor.name}-drift"}
+    found = [Fault(f"{sensor.name}-{way}", f"{sensor.what} {says[way]}", (what,),
+                   sensor.seen_by.get(way, ()), _TO_GROW_S if "drift" in way else _FOR_A_WHILE_S,
+                   _SENSOR_GROUP)
+             for way, what in ways.items() if way in says]
+    return [*found, Fault(
+        f"{sensor.name}-stuck-noise", f"{sensor.what} repeats its last value with a little noise",
+        (ways["stuck"], replace(corrupt, noise_fields=sensor.grain)), (), _FOR_A_WHILE_S,
+        _SENSOR_GROUP)]
+
+
+def _share(amounts: Mapping[str, float], share: float) -> dict[str, float]:
+    return {name: amount * share for name, amount in amounts.items()}
 
 
 SENSOR_FAULTS: Mapping[str, Fault] = {
     fault.name: fault for sensor in SENSORS for fault in _faults_of(sensor)}
 """The faults of the sensors."""
+
+_FROZEN_GROUP = "frozen"
+FROZEN_SETS: Mapping[str, Fault] = {fault.name: fault for fault in (
+    Fault("-".join(("frozen", *(sensor.name for sensor in sensors))),
+          f"{' and '.join(sensor.what for sensor in sensors)} get stuck in the same moment",
+          tuple(Disturbance(sensor.topic.key, "stuck") for sensor in sensors), (),
+          _FOR_A_WHILE_S, _FROZEN_GROUP)
+    for count in (2, 3) for sensors in combinations(
+        [sensor for sensor in SENSORS if sensor.topic is not topics.LIGHT], count))}
+"""Sets of two and three sensors that get stuck together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +228,7 @@ class OsmosisFaults(Faults):
     `brake-failure[:STRENGTH]` for the actuators, `obstacle-ahead[:METRES]` for the world.
     """  # noqa: D205 names that must not be broken
 
-    named = {**PAPER_FAULTS, **SENSOR_FAULTS}
+    named = {**PAPER_FAULTS, **SENSOR_FAULTS, **FROZEN_SETS}
     sizes = SIZES
     left_out = LEFT_OUT
     others = {
@@ -198,7 +244,7 @@ class OsmosisFaults(Faults):
            for wheel, name in _WHEELS.items()},
         "brake-failure": ("actuator", "the brakes do not brake")}
     kinds = {"none": "no fault", "paper": "paper's faults", "topic": "topics",
-             "reading": "nonsense readings", "sensor": "sensors",
+             "reading": "nonsense readings", "sensor": "sensors", "frozen": "frozen sets",
              "process": "processes", "actuator": "actuators", "world": "the world",
              "several": "several at once"}
     intruder = (OBSTACLE, 1.2, 6.0)

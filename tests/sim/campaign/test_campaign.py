@@ -87,7 +87,7 @@ def runs_of(*results: RunResult, **job) -> list[Run]:
 
 
 def test_the_cross_product_has_every_run_once():
-    faults = [None, PlannedFault("gps-bias"), PlannedFault("kill:DM1")]
+    faults = [(), (PlannedFault("gps-bias"),), (PlannedFault("kill:DM1"),)]
     jobs = cross(BASES, faults, range(1, 4))
     assert len(jobs) == len({job.key for job in jobs}) == 2 * 3 * 3
     assert Counter(job.row for job in jobs) == {"none": 6, "gps-bias": 6, "kill:DM1": 6}
@@ -191,7 +191,7 @@ def test_a_store_of_another_format_is_refused(tmp_path):
 
 def test_what_is_done_is_not_done_again(tmp_path):
     store = Store(tmp_path)
-    jobs = cross(BASES[:1], [SHORT], range(1, 4))
+    jobs = cross(BASES[:1], [(SHORT,)], range(1, 4))
     made = []
     assert execute(jobs[:2], store, workers=1, progress=lambda j, r: made.append(j.key)) == 2
     assert execute(jobs, store, workers=1, progress=lambda j, r: made.append(j.key)) == 1
@@ -201,7 +201,7 @@ def test_what_is_done_is_not_done_again(tmp_path):
 
 
 def test_results_do_not_depend_on_how_many_workers_there_are(tmp_path):
-    jobs = cross(BASES[:1], [SHORT], range(1, 5))
+    jobs = cross(BASES[:1], [(SHORT,)], range(1, 5))
     traces = []
     for workers in (1, 2):
         store = Store(tmp_path / str(workers))
@@ -213,7 +213,7 @@ def test_results_do_not_depend_on_how_many_workers_there_are(tmp_path):
 
 def test_a_job_that_makes_no_sense_is_named_and_what_was_finished_is_kept(tmp_path):
     store = Store(tmp_path)
-    good, bad = cross(BASES[:1], [SHORT, PlannedFault("gremlins")], [1])
+    good, bad = cross(BASES[:1], [(SHORT,), (PlannedFault("gremlins"),)], [1])
     with pytest.raises(JobError, match=f"run {bad.key} .gremlins@10.: UnknownFaultError"):
         execute([good, bad], store, workers=1)
     assert store.keys() <= {good.key}
@@ -343,7 +343,7 @@ def test_a_campaign_without_a_place_is_refused_in_one_line(tmp_path, capsys):
 @pytest.mark.slow
 def test_the_same_jobs_run_on_a_dask_cluster(tmp_path):
     distributed = pytest.importorskip("distributed")
-    jobs = cross(BASES[:1], [SHORT], range(1, 4))
+    jobs = cross(BASES[:1], [(SHORT,)], range(1, 4))
     store = Store(tmp_path)
     with distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
@@ -361,7 +361,7 @@ def test_a_cluster_that_is_not_there_is_refused_in_one_line(
     monkeypatch.setattr(execution, "CONNECT_TIMEOUT_S", 0.5)
     store = Store(tmp_path)
     with pytest.raises(BackendError, match=words) as caught:
-        execute(cross(BASES[:1], [SHORT], [1]), store, backend=backend, address=address)
+        execute(cross(BASES[:1], [(SHORT,)], [1]), store, backend=backend, address=address)
     assert "\n" not in str(caught.value)
     store.close()
 

@@ -263,37 +263,53 @@ def test_a_wrong_stamp_comes_from_its_seed_ahead_as_often_as_behind_small_as_oft
 
 
 def test_every_sensor_fails_in_every_way_but_those_left_out_for_a_reason():
-    everything = {f"{sensor.name}-{way}" for sensor in SENSORS
-                  for way in ("bias", "drift", "noise", "dropout", "stuck")}
-    assert set(SENSOR_FAULTS) | set(LEFT_OUT) == everything
+    ways = ("bias", "drift", "noise", "dropout", "stuck")
+    everything = {f"{sensor.name}-{way}" for sensor in SENSORS for way in ways}
+    drifts = {name for name in SENSOR_FAULTS if name.endswith("-drift")}
+    more = {f"{sensor.name}-stuck-noise" for sensor in SENSORS} | {
+        f"{name.removesuffix('drift')}{way}" for name in drifts & everything
+        for way in ("slow-drift", "creep")}
+    assert set(SENSOR_FAULTS) | set(LEFT_OUT) == everything | more
     assert not set(SENSOR_FAULTS) & set(LEFT_OUT)
-    assert len(everything) == 30
 
 
-def published(name: str, body: Any, count: int) -> list[Any]:
-    """Return what leaves a gate when the same reading is published each second of a fault."""
-    (disturbance,) = find_fault(name, seed=1).disturbances
+def published(name: str, *bodies: Any) -> list[Any]:
+    """Return what leaves a gate when a reading is published each second of a fault."""
+    disturbances = find_fault(name, seed=1).disturbances
     gate = FaultGate()
-    assert gate.order(disturbance.order("i", 10.0), 0.0, type(body)) == ""
-    return [gate.apply(f"{ROOT}/{disturbance.topic}", body, float(t), float(t))
-            for t in range(count)]
+    for number, disturbance in enumerate(disturbances):
+        assert gate.order(disturbance.order(f"i{number}", 10.0), 0.0, type(bodies[0])) == ""
+    return [gate.apply(f"{ROOT}/{disturbances[0].topic}", body, float(t), float(t))
+            for t, body in enumerate(bodies)]
 
 
 FIX = m.GpsFix(10.0, 20.0, 0.5, 0.0, 0.02)
 
 
+def test_a_receiver_that_is_stuck_with_noise_does_not_repeat_itself_and_stays_where_it_was():
+    moving = (msgspec.structs.replace(FIX, x_m=FIX.x_m + t) for t in range(9))
+    told = [out.body for out in published("gps-stuck-noise", *moving)]
+    assert len({body.x_m for body in told}) == 9
+    assert all(abs(body.x_m - FIX.x_m) < 0.1 for body in told)
+
+
+def test_a_receiver_that_creeps_drifts_by_a_centimetre_and_a_half_a_second():
+    body = published("gps-creep", *[FIX] * 9)[-1].body
+    assert math.hypot(body.x_m - FIX.x_m, body.y_m - FIX.y_m) == pytest.approx(8 * 0.015, rel=0.01)
+
+
 def test_a_biased_receiver_is_off_by_the_same_at_once_and_does_not_know_it():
-    assert {out.body for out in published("gps-bias", FIX, 9)} == {
+    assert {out.body for out in published("gps-bias", *[FIX] * 9)} == {
         m.GpsFix(11.5, 21.5, 0.5, 0.0, 0.02)}
 
 
 def test_a_drifting_receiver_is_right_at_first_and_worse_each_second():
-    drift = [out.body.x_m - FIX.x_m for out in published("gps-drift", FIX, 11)]
+    drift = [out.body.x_m - FIX.x_m for out in published("gps-drift", *[FIX] * 11)]
     assert drift == pytest.approx([0.1 * t for t in range(11)])
 
 
 def test_a_noisy_receiver_is_much_noisier_than_a_healthy_one_and_right_on_average():
-    errors = [out.body.y_m - FIX.y_m for out in published("gps-noise", FIX, 2000)]
+    errors = [out.body.y_m - FIX.y_m for out in published("gps-noise", *[FIX] * 2000)]
     assert np.std(errors) > 10 * Gps.POSITION_SIGMA_M
     assert np.mean(errors) == pytest.approx(0.0, abs=4 * 1.5 / math.sqrt(2000))
 
@@ -308,14 +324,14 @@ def test_a_stuck_sensor_has_fresh_stamps_and_a_frozen_one_has_not():
 
 def test_a_biased_laser_sees_obstacles_farther_away_and_still_no_echo_where_there_is_none():
     body = m.LaserScan(-1.0, 0.1, 8.0, np.array([0.4, 3.0, 8.0], dtype="<f4").tobytes())
-    (out,) = published("laser-bias", body, 1)
+    (out,) = published("laser-bias", *[body] * 1)
     ranges = np.frombuffer(out.body.ranges_f32, dtype="<f4")
     assert ranges == pytest.approx([0.9, 3.5, 8.5])
     assert ranges[2] >= body.range_max_m
 
 
 def test_a_noisy_heading_stays_an_angle():
-    outs = published("absolute-pose-noise", m.Pose(0.0, 0.0, math.pi), 200)
+    outs = published("absolute-pose-noise", *[m.Pose(0.0, 0.0, math.pi)] * 200)
     assert all(-math.pi < out.body.yaw_rad <= math.pi for out in outs)
     assert min(out.body.yaw_rad for out in outs) < 0 < max(out.body.yaw_rad for out in outs)
 
@@ -335,7 +351,7 @@ def test_a_fault_is_found_by_its_name_and_makes_sense(name):
     assert fault.name == name
     assert "\n" not in fault.title
     assert fault.title
-    assert fault.group in ("paper", "sensor", "topic", "reading")
+    assert fault.group in OsmosisFaults.kinds
     for order in fault.orders("i"):
         assert order.duration_s > 0
         assert flaw(order, resolve(order.topic, topics.ALL)[0].type) == ""

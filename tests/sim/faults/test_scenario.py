@@ -65,7 +65,7 @@ def test_text_and_plan_say_the_same(fault, at_s, goal, duration_s):
 def test_every_fault_of_the_catalogue_becomes_an_action():
     groups = fault_groups(SYSTEM)
     kinds = {"paper": tuple, "sensor": tuple, "topic": tuple, "reading": tuple,
-             "process": OnProcess, "actuator": tuple, "world": SuddenObstacle}
+             "frozen": tuple, "process": OnProcess, "actuator": tuple, "world": SuddenObstacle}
     assert set(groups) == set(kinds)
     for group, names in groups.items():
         assert len(names) == len(set(names)) > 0

@@ -1,22 +1,44 @@
 """Localization by fusion: odometry, IMU, GPS and the absolute pose, any one of which may fail.
 
 In the place of `rampart.actors.osmosis.control.localization.localization`, the paper's, if a
-system's spec says so. It keeps nothing that a restart would lose: a new process starts from the
-first absolute pose and fix.
+system's spec says so. A new process starts from the first absolute pose and fix. It keeps one
+thing: how far the positions still have to move as the wheels do, after these contradicted them. A
+successor that forgot this would believe what its predecessor was silent for.
 """
 
 from __future__ import annotations
 
 import math
 
+import msgspec
+
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits
-from rampart.actors.osmosis.messages import GpsFix, Imu, Odometry, Pose
+from rampart.actors.osmosis.messages import BaseStatus, GpsFix, Imu, Odometry, Pose
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.spec.tables import NonNegative
 
 _PERIOD_S = 0.05
+_KEEP_EACH_M = 1.0
+
+
+class LocalizationKept(msgspec.Struct, frozen=True):
+    """State of the localization.
+
+    Attributes:
+        owed_m: see `PoseFilter`.
+    """
+
+    owed_m: float = 0.0
+
+
+def _objection(kept: LocalizationKept) -> str:
+    return "" if 0.0 <= kept.owed_m < math.inf else f"owed_m = {kept.owed_m}: must be 0 or more"
+
+
+LOCALIZATION_STATE = StateFormat(LocalizationKept, version=1, objection=_objection)
 
 
 class FusedLocalization(Actor):
@@ -34,6 +56,7 @@ class FusedLocalization(Actor):
 
         bridge_m: NonNegative = FilterLimits().bridge_m
 
+    most_spare = "warm"
     parameters: Parameters
     outputs = (topics.POSE, topics.LOCALIZATION_STATUS)
 
@@ -41,6 +64,17 @@ class FusedLocalization(Actor):
         super().__init__(context)
         self._filter = PoseFilter(FilterLimits(self.parameters.bridge_m))
         self._told_s = -math.inf
+        self._kept_m = 0.0
+
+    def on_start(self) -> None:
+        """Go on from what the predecessor found out about the positions."""
+        if (kept := self.kept(LOCALIZATION_STATE)) is not None:
+            self._kept_m = self._filter.owed_m = kept.owed_m
+
+    @on(topics.BASE_STATUS)
+    def status(self, message: BaseStatus, header: Header) -> None:
+        """Take the base's own wheel speeds."""
+        self._filter.encoders(header.stamp, message, self.clock.now())
 
     @on(topics.IMU)
     def imu(self, message: Imu, header: Header) -> None:
@@ -67,6 +101,10 @@ class FusedLocalization(Actor):
     @every(_PERIOD_S)
     def tell(self) -> None:
         """Publish the pose, if there is a newer one."""
+        owed_m = self._filter.owed_m
+        if owed_m > self._kept_m or self._kept_m - owed_m >= (_KEEP_EACH_M if owed_m else 1e-9):
+            self._kept_m = owed_m
+            self.keep(LOCALIZATION_STATE, LocalizationKept(owed_m))
         estimate = self._filter.estimate()
         if estimate is not None and estimate.stamp_s > self._told_s:
             self._told_s = estimate.stamp_s

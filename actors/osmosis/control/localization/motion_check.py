@@ -58,6 +58,10 @@ IMU_PARITY = ParityLimits(step=0.02, sum=0.02, forget_s=2.0, fastest=3.6)
 """Measured without a fault: below 1e-15 rad a step, 0.4 mrad where a message was lost at 4 rad/s2.
 Two hundredths of a radian per second reach the sum's limit in 1.4 s."""
 
+_SLOW_S, _SLOW_RAD, _SLOW_MOST_RAD = 60.0, 0.03, 0.035
+"""The same over a minute, for a heading that drifts by milliradians a second. The sum goes no
+further than its most, so that a device that has recovered is believed again soon."""
+
 
 @dataclass(slots=True)
 class Source:
@@ -163,7 +167,7 @@ class ImuCheck(Source):
         self.yaw_rad = 0.0
         self.rate_radps = 0.0
         self._acceleration = (0.0, 0.0)
-        self._sum = 0.0
+        self._sum = self._slow_sum = 0.0
         self._flat = 0
 
     def take(self, stamp_s: float, reading: Imu, now_s: float) -> None:
@@ -185,10 +189,12 @@ class ImuCheck(Source):
         limits = IMU_PARITY
         off = wrap_angle(yaw_rad - then_yaw - rate_radps * dt_s)
         self._sum = self._sum * max(0.0, 1.0 - dt_s / limits.forget_s) + off
+        slow_sum = self._slow_sum * (1.0 - dt_s / _SLOW_S) + off
+        self._slow_sum = max(-_SLOW_MOST_RAD, min(_SLOW_MOST_RAD, slow_sum))
         if abs(rate_radps) > limits.fastest or not -limits.step < off < limits.step:
             self._sum = 0.0
             self.flaw("heading and turning rate contradict each other", stamp_s)
-        elif abs(self._sum) > limits.sum:
+        elif abs(self._sum) > limits.sum or abs(self._slow_sum) > _SLOW_RAD:
             self.flaw("heading and turning rate drift apart", stamp_s)
         elif self._flat >= _FLAT_READINGS:
             self.flaw("repeats the same reading", stamp_s)

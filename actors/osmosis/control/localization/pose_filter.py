@@ -4,8 +4,12 @@ A Kalman filter alone does not isolate faults. It trusts a precise source that l
 it, and then rejects the honest one. So three witnesses of the position are held against each other,
 absolute pose, GPS and dead reckoning (wheels and gyro), and two that agree outvote the third:
 
-* *Both positions agree*: they are right, whatever dead reckoning says. If neither fits the filter,
-  the prediction was wrong: the filter starts anew from them, and wheels or gyro are excluded.
+* *Both positions agree*: they are right, unless odometry, encoders and gyro agree with each other
+  and not with them. If neither fits the filter, the prediction was wrong: the filter starts anew
+  from them, and wheels or gyro are excluded.
+* *Both positions agree, and odometry, encoders and gyro contradict them*: two against two. There
+  is no estimate until both have moved as the wheels do for `proof_m`. The proof is still due after
+  a restart.
 * *They contradict each other*: the one that has moved otherwise than the wheels in the last seconds
   is excluded. If neither has done so clearly, both are excluded once they are far apart.
 * *One fails the gate alone* (normalised innovation squared): it is not taken in, and if it goes on
@@ -32,7 +36,15 @@ from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, O
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
 from rampart.actors.osmosis.control.polyline import wrap_angle
-from rampart.actors.osmosis.messages import GpsFix, LocalizationStatus, Odometry, Pose
+from rampart.actors.osmosis.messages import (
+    BaseStatus,
+    GpsFix,
+    Imu,
+    LocalizationStatus,
+    Odometry,
+    Pose,
+)
+from rampart.actors.osmosis.motion_parity import MotionParity
 from rampart.actors.osmosis.readings import is_fix, is_pose
 
 _MAX_AGE_S = 0.3
@@ -51,17 +63,20 @@ class PoseFilter:
 
     Args:
         limits: noise, gates and bounds.
+        owed_m: see the attribute; of an earlier incarnation.
 
     Attributes:
-        imu: takes an IMU reading: stamp s, the reading, and what time it is.
+        owed_m: way over which the positions still have to move as the wheels do before there is an
+            estimate; 0 if they were not contradicted.
     """
 
-    def __init__(self, limits: FilterLimits | None = None) -> None:
+    def __init__(self, limits: FilterLimits | None = None, owed_m: float = 0.0) -> None:
         self.limits = limits or FilterLimits()
+        self.owed_m = owed_m
+        self._parity = MotionParity()
         self._ekf: PlanarEkf | None = None
         self._wheels = OdometryCheck()
         self._gyro = ImuCheck()
-        self.imu = self._gyro.take  # at 50 Hz a call of its own would show
         self._pose = PositionSource("absolute pose", fresh_s=0.2, patience=4)
         self._gps = PositionSource("GPS", fresh_s=0.35, patience=3)
         self._time_s = -math.inf
@@ -97,16 +112,28 @@ class PoseFilter:
     def _lost(self, ekf: PlanarEkf) -> bool:
         blind = not self._wheels.usable(self._time_s) and not (
             self._pose.usable(self._time_s) or self._gps.usable(self._time_s))
-        return (blind or self._bridged_m > self.limits.bridge_m
+        return (blind or self.owed_m > 0 or self._bridged_m > self.limits.bridge_m
                 or ekf.position_sd_m > self.limits.largest_sd_m)
 
     # -- wheels and gyro ------------------------------------------------------------------------
+
+    def imu(self, stamp_s: float, reading: Imu, now_s: float) -> None:
+        """Take an IMU reading."""
+        self._gyro.take(stamp_s, reading, now_s)
+        self._parity.imu(reading, stamp_s, now_s)
+
+    def encoders(self, stamp_s: float, reading: BaseStatus, now_s: float) -> None:
+        """Take the base's own wheel speeds."""
+        self._parity.encoders(reading, stamp_s, now_s)
+        if not self._parity.encoders_agree(stamp_s):
+            self._wheels.flaw("the encoders contradict it, or each other", stamp_s)
 
     def odometry(self, stamp_s: float, reading: Odometry, now_s: float) -> None:
         """Take an odometry reading."""
         if not _timely(stamp_s, now_s):
             return
         wheels = self._wheels
+        self._parity.odometry(reading, stamp_s, now_s)
         step = wheels.take(stamp_s, reading)
         if step is None or self._ekf is None:
             return
@@ -125,6 +152,9 @@ class PoseFilter:
         # After a while without wheels the filter may be part of the way along this step.
         share = rest_s / dt_s if rest_s < dt_s else 1.0
         self._move(self._ekf, stamp_s, forward_m * share, turn_rad * share)
+        if self.owed_m and self._confirmed(stamp_s) and not any(
+                source.strays or not source.usable(stamp_s) for source in (self._pose, self._gps)):
+            self.owed_m = max(0.0, self.owed_m - abs(forward_m))
 
     def _move(self, ekf: PlanarEkf, stamp_s: float, forward_m: float, turn_rad: float | None
               ) -> None:
@@ -155,6 +185,10 @@ class PoseFilter:
             self._bridged_m = 0.0
         else:
             self._bridged_m += max(abs(forward_m), _CREEP_MPS * dt_s)
+            pair = self._pose, self._gps
+            if self._bridged_m > limits.bridge_m and all(
+                    source.distrust and source.fresh(stamp_s) for source in pair):
+                self.owed_m = limits.proof_m
 
     # -- positions ------------------------------------------------------------------------------
 
@@ -174,6 +208,10 @@ class PoseFilter:
             stamp_s) else 0.0
         self._weigh_gyro(ekf, stamp_s)
         variance, heading_variance = limits.absolute_sd_m**2, limits.absolute_sd_rad**2
+        if not self._parity.gyro_agrees and self._gyro.usable(stamp_s) \
+                and ekf.heading_nis(yaw_rad, heading_variance) > limits.gate:
+            self._gyro.flaw("turns otherwise than wheels and absolute pose", stamp_s)
+            ekf.doubt(0.0, _GYRO_ASTRAY_RAD)
         fits = (ekf.position_nis(x_m, y_m, variance) <= limits.gate
                 and ekf.heading_nis(yaw_rad, heading_variance) <= limits.gate)
         if self._judge(ekf, source, self._gps, fits):
@@ -238,8 +276,8 @@ class PoseFilter:
         # While it is not clear who is wrong, and later of who is, nothing is taken for usual.
         sure = self._pose.distrust or self._gps.distrust
         doubted = source.distrust if sure else (math.hypot(*self._apart) > self.limits.apart_m)
-        source.see((x_m - self._track[0], y_m - self._track[1]), dt_s,
-                   math.inf if doubted else self.limits.witness_s)
+        source.see((x_m - self._track[0], y_m - self._track[1]), dt_s, self.limits,
+                   doubted=bool(doubted))
         return x_m, y_m
 
     # -- who is wrong ---------------------------------------------------------------------------
@@ -260,9 +298,14 @@ class PoseFilter:
         by_pose, by_gps = pose.deviation_m, gps.deviation_m
         excluded = pose.distrust or gps.distrust
         if apart_m <= limits.apart_m:
-            if min(by_pose, by_gps) > _WHEELS_ASTRAY_M and not (
-                    excluded or self._wheels.distrust):
-                self._wheels.flaw("drifts against both positions", stamp_s)
+            if excluded:
+                return
+            stray = pose.strays and gps.strays
+            if stray and self._confirmed(stamp_s):
+                self._contradict(stamp_s)
+            elif stray or self._wheels.distrust:
+                if not self._wheels.distrust:
+                    self._wheels.flaw("drifts against both positions", stamp_s)
                 pose.start_over()
                 gps.start_over()
             return
@@ -277,6 +320,18 @@ class PoseFilter:
             for source, other in ((pose, gps), (gps, pose)):
                 source.flaw(f"contradicts {other.name} by {apart_m:.1f} m", stamp_s)
 
+    def _confirmed(self, stamp_s: float) -> bool:
+        """Whether odometry, encoders and gyro are all there, and agree."""
+        parity = self._parity
+        return (parity.confirmed(stamp_s) and parity.gyro_agrees
+                and self._wheels.usable(stamp_s) and self._gyro.usable(stamp_s))
+
+    def _contradict(self, stamp_s: float) -> None:
+        """Exclude both positions, which agree: odometry, encoders and gyro agree otherwise."""
+        self.owed_m = self.limits.proof_m
+        for source in (self._pose, self._gps):
+            source.flaw("moves otherwise than odometry, encoders and gyro", stamp_s)
+
     def _exclude(self, ekf: PlanarEkf, source: PositionSource, apart_m: float, stamp_s: float
                  ) -> None:
         source.flaw(f"moves otherwise than the others, {apart_m:.1f} m", stamp_s)
@@ -289,7 +344,7 @@ class PoseFilter:
         """Note whether a reading fits; return whether to take it in."""
         stamp_s = source.stamp_s
         apart_m = math.hypot(*self._apart)
-        if source.deviation_m > _WHEELS_ASTRAY_M and not source.distrust \
+        if source.strays and not source.distrust \
                 and not other.usable(stamp_s) \
                 and self._wheels.usable(stamp_s) and self._gyro.usable(stamp_s):
             # One against one. Who is wrong is not known; dead reckoning is wrong more slowly.
@@ -297,8 +352,9 @@ class PoseFilter:
         if fits:
             source.fails = 0
             if source.distrust:
-                if apart_m > self.limits.apart_m if other.fresh(stamp_s) else (
-                        source.deviation_m > _WHEELS_ASTRAY_M):
+                if (source.strays and (self.owed_m or (
+                        other.strays and self._confirmed(stamp_s)))) or (
+                        apart_m > self.limits.apart_m if other.fresh(stamp_s) else source.strays):
                     source.flaw(source.distrust, stamp_s)
                 else:
                     source.clean(stamp_s)
@@ -309,7 +365,10 @@ class PoseFilter:
         if source.distrust:
             source.flaw(source.distrust, stamp_s)
         if other.fails and other.fresh(stamp_s) and self._together >= _MORE_THAN_CHANCE:
-            self._believe_both(ekf, stamp_s)
+            if not self._confirmed(stamp_s):
+                self._believe_both(ekf, stamp_s)
+            elif not source.distrust:
+                self._contradict(stamp_s)
         elif source.fails >= source.patience and not source.distrust:
             source.flaw("does not fit the motion", stamp_s)
         return False
@@ -368,7 +427,7 @@ _UNKNOWN_TURN_RADPS, _UNKNOWN_SPEED_MPS = 1.0, 0.3
 _CREEP_MPS, _TOP_SPEED_MPS = 0.05, 1.0
 _GPS_REPEATS, _STRAIGHT_RADPS = 2, 0.1
 _APART_GAIN, _CLEARLY, _MORE_THAN_CHANCE = 0.3, 2.0, 3
-_WHEELS_ASTRAY_M, _GYRO_ASTRAY_RAD = 0.25, 0.1
+_GYRO_ASTRAY_RAD = 0.1
 
 
 def _timely(stamp_s: float, now_s: float) -> bool:

@@ -21,6 +21,9 @@ GPS_VELOCITY_SD_MPS, SIDESLIP_RAD = 0.03, 0.03
 COURSE_FROM_MPS = 0.4
 """Slower than this, the velocity over ground does not say where the robot is heading."""
 
+ASTRAY_M, STRAY_M = 0.25, 0.4
+"""By which a position may leave its average of some seconds, and of a minute."""
+
 _APART_M = 0.3
 _ALONE_S = 0.15
 _IMU_SD_RAD = 0.05
@@ -43,6 +46,8 @@ class FilterLimits(msgspec.Struct, frozen=True):
         way_m2_per_m: variance of dead reckoning per metre driven.
         way_m2_per_rad: the same per radian turned, when skid steering slips sideways.
         witness_s: over how long a position is held against dead reckoning.
+        stray_s: the same for slow drifts, which leave no trace in that time.
+        proof_m: way over which positions that were contradicted have to move as the wheels do.
     """
 
     bridge_m: float = 10.0
@@ -56,6 +61,8 @@ class FilterLimits(msgspec.Struct, frozen=True):
     way_m2_per_m: float = 1e-4
     way_m2_per_rad: float = 2.5e-3
     witness_s: float = 5.0
+    stray_s: float = 60.0
+    proof_m: float = 20.0
 
 
 @dataclass(slots=True)
@@ -68,6 +75,7 @@ class PositionSource(Source):
         velocity: over ground in `map`, m/s, of a source that measures it.
         offset: from the dead-reckoned track to the newest reading, m.
         usual: the same, averaged over the last seconds; None before the first reading.
+        of_old: the same, averaged over a minute.
         fails: readings in a row that failed the gate.
         repeats: readings in a row that were the same to the last bit.
     """
@@ -77,28 +85,40 @@ class PositionSource(Source):
     velocity: tuple[float, float] = (0.0, 0.0)
     offset: tuple[float, float] = (0.0, 0.0)
     usual: tuple[float, float] | None = None
+    of_old: tuple[float, float] = (0.0, 0.0)
     fails: int = 0
     repeats: int = 0
 
-    def see(self, offset: tuple[float, float], dt_s: float, average_s: float) -> None:
+    def see(self, offset: tuple[float, float], dt_s: float, limits: FilterLimits, *,
+            doubted: bool) -> None:
         """Take note of an offset from the track, `dt_s` after the last one."""
         self.offset = offset
         usual = self.usual
         if usual is None or dt_s > _TOO_LONG_S:
-            self.usual = offset
-        elif average_s < math.inf:
-            gain = dt_s / average_s
-            self.usual = (usual[0] + gain * (offset[0] - usual[0]),
-                          usual[1] + gain * (offset[1] - usual[1]))
+            self.start_over()
+        elif not doubted:
+            self.usual = _towards(usual, offset, dt_s / limits.witness_s)
+            self.of_old = _towards(self.of_old, offset, dt_s / limits.stray_s)
 
     def start_over(self) -> None:
         """Take the present offset for usual."""
-        self.usual = self.offset
+        self.usual = self.of_old = self.offset
 
     @property
     def deviation_m(self) -> float:
         """How far it has lately moved otherwise than the wheels."""
         return 0.0 if self.usual is None else math.dist(self.offset, self.usual)
+
+    @property
+    def strays(self) -> bool:
+        """Whether it has moved otherwise than the wheels by more than their errors explain."""
+        return self.usual is not None and (
+            self.deviation_m > ASTRAY_M or math.dist(self.offset, self.of_old) > STRAY_M)
+
+
+def _towards(here: tuple[float, float], there: tuple[float, float], share: float
+             ) -> tuple[float, float]:
+    return (here[0] + share * (there[0] - here[0]), here[1] + share * (there[1] - here[1]))
 
 
 class FirstPose(msgspec.Struct, frozen=True):

@@ -92,6 +92,11 @@ class EstimationError(DetectionModule):
         """Hear the way that the wheels made."""
         self.monitor.vote.track.odometry(message, header.stamp, self.clock.now())
 
+    @on(topics.BASE_STATUS)
+    def status(self, message: m.BaseStatus, header: Header) -> None:
+        """Take the base's own wheel speeds."""
+        self.monitor.vote.see_encoders(message, header.stamp, self.clock.now())
+
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
         """Hear a fix, and compare."""

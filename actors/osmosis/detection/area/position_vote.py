@@ -6,9 +6,11 @@ code than localization's: whoever checks must not share the error of what it che
 Wheels and IMU give a *track*: where the robot would be if it had started at (0, 0). Each position
 source has an offset from it. What the sources say at different times is compared by the offsets,
 so motion between the readings does not matter, and the offset of an honest source stays while
-that of a wrong one moves. Its recent movement, with forgetting, is its *deviation*.
+that of a wrong one moves. Its recent movement, with forgetting, is its *deviation*,
+over some seconds and over a minute: a slow drift leaves no trace in five seconds.
 
-    both positions agree            they are right, whatever the wheels say
+    both positions agree            they are right, unless both have moved otherwise than
+                                    odometry, encoders and gyro, which agree: two against two
     they differ                     the one with by far the greater deviation is wrong
     one is missing                  the other counts while its deviation is small
     neither, or nothing is clear    nobody is believed
@@ -23,6 +25,7 @@ import math
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.motion_parity import MotionParity
 from rampart.actors.osmosis.readings import is_fix, is_imu, is_odometry
 
 GPS = "GPS"
@@ -42,6 +45,9 @@ CLEARLY = 2.0
 
 FORGET_S = 5.0
 """Time constant of the deviation."""
+
+STRAY_M, STRAY_S = 0.4, 60.0
+"""The same over a minute: a drift of 1.5 cm/s has then moved a position by half a metre."""
 
 POSITION_FRESH_S = 0.25
 """Greatest age of the other position."""
@@ -66,6 +72,7 @@ class Track:
         place: where the robot would be if it had started at (0, 0).
         stamp_s: of the newest odometry.
         speed_mps: of the newest odometry.
+        parity: whether odometry, encoders and gyro agree.
     """
 
     def __init__(self, fresh_s: float) -> None:
@@ -76,20 +83,28 @@ class Track:
         self._imu: tuple[float, float, float] = (-math.inf, 0.0, 0.0)
         self._align_rad = 0.0
         self._wheels_rad = 0.0
-        self._fallback_rad = 0.0  # from the wheels' heading to that in `map`, for want of an IMU
+        self.parity = MotionParity()
+        self._by_gyro = True
+        # From the wheels' heading to that in `map`, for want of a gyro; None before the first.
+        self._fallback_rad: float | None = None
 
     def imu(self, imu: m.Imu, stamp_s: float, now_s: float) -> None:
         """Take the IMU's heading."""
         if stamp_s > self._imu[0] and is_possible(stamp_s, now_s) and is_imu(imu):
             self._imu = (stamp_s, imu.yaw_rad, imu.yaw_rate_radps)
+            self.parity.imu(imu, stamp_s, now_s)
+
+    @property
+    def by_gyro(self) -> bool:
+        """Whether the heading is the gyro's: it is present, and turns as the wheels do."""
+        return self._by_gyro and self.stamp_s - self._imu[0] <= self._fresh_s
 
     @property
     def heading_rad(self) -> float:
         """Heading in `map`."""
-        stamp_s, yaw_rad, _ = self._imu
-        if self.stamp_s - stamp_s <= self._fresh_s:
-            return yaw_rad + self._align_rad
-        return self._fallback_rad + self._wheels_rad
+        if self.by_gyro:
+            return self._imu[1] + self._align_rad
+        return (self._fallback_rad or 0.0) + self._wheels_rad
 
     def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> float:
         """Take odometry; return the way made since the last, m."""
@@ -97,15 +112,22 @@ class Track:
         if not stamp_s > self.stamp_s or not is_possible(stamp_s, now_s) \
                 or not is_odometry(odometry):
             return 0.0
+        self.parity.odometry(odometry, stamp_s, now_s)
         dt_s = stamp_s - self.stamp_s
         self.stamp_s = stamp_s
         self._wheels_rad = yaw_rad
+        if self.parity.gyro_agrees is not self._by_gyro:
+            if self.parity.gyro_agrees:
+                self._align_rad = self.heading_rad - self._imu[1]
+            self._by_gyro = self.parity.gyro_agrees
         if dt_s > self._fresh_s:
             self.speed_mps = linear_mps
             return 0.0
         heading = self.heading_rad
-        if stamp_s - self._imu[0] <= self._fresh_s:
-            self._fallback_rad = heading - yaw_rad
+        if self.by_gyro:  # slowly: what a failing gyro adds is not taken over before it is noticed
+            off = heading - yaw_rad
+            self._fallback_rad = off if self._fallback_rad is None else self._fallback_rad + (
+                dt_s / _FALLBACK_S * math.remainder(off - self._fallback_rad, math.tau))
         made_m = (self.speed_mps + linear_mps) / 2 * dt_s
         self.speed_mps = linear_mps
         self.place = (self.place[0] + made_m * math.cos(heading),
@@ -115,12 +137,19 @@ class Track:
     def align(self, course_rad: float) -> None:
         """Take the course over ground of a robot that drives straight forward."""
         off = math.remainder(course_rad - self.heading_rad, math.tau)
-        if abs(off) >= _WILD_COURSE_RAD:
-            return
-        if self.stamp_s - self._imu[0] <= self._fresh_s:
-            self._align_rad += _ALIGN_GAIN * off
+        if abs(off) < _WILD_COURSE_RAD:
+            self._turn(_ALIGN_GAIN * off)
+
+    def align_slowly(self, yaw_rad: float) -> None:
+        """Take the heading of a position source, no faster than a sound gyro drifts."""
+        off = math.remainder(yaw_rad - self.heading_rad, math.tau)
+        self._turn(_SLOW_GAIN * max(-_SLOW_RAD, min(_SLOW_RAD, off)))
+
+    def _turn(self, by_rad: float) -> None:
+        if self.by_gyro:
+            self._align_rad += by_rad
         else:
-            self._fallback_rad += _ALIGN_GAIN * off
+            self._fallback_rad = (self._fallback_rad or 0.0) + by_rad
 
     @property
     def straight(self) -> bool:
@@ -134,7 +163,9 @@ class Track:
         return (self.place[0] + on_m * math.cos(heading), self.place[1] + on_m * math.sin(heading))
 
 
-_ALIGN_GAIN, _WILD_COURSE_RAD = 0.02, 0.3
+_ALIGN_GAIN, _WILD_COURSE_RAD, _FALLBACK_S = 0.02, 0.3, 2.0
+_SLOW_GAIN, _SLOW_RAD = 0.005, 0.01
+"""20 times a second 1 mrad/s at most: four times the drift of the simulated gyro."""
 _COURSE_FROM_MPS, _STRAIGHT_RADPS = 0.4, 0.1
 
 
@@ -152,6 +183,7 @@ class Witness:
         self.offset: Place = (0.0, 0.0)
         self._fresh_s = fresh_s
         self._usual: Place | None = None
+        self._of_old: Place = (0.0, 0.0)
 
     def fresh(self, now_s: float) -> bool:
         """Whether its newest reading is new enough."""
@@ -164,20 +196,29 @@ class Witness:
         dt_s, self.stamp_s = stamp_s - self.stamp_s, stamp_s
         usual = self._usual
         if usual is None or (dt_s > 1.0 and forget_s < math.inf):
-            self._usual = offset
+            self.restart()
         elif forget_s < math.inf:
-            gain = dt_s / forget_s
-            self._usual = (usual[0] + gain * (offset[0] - usual[0]),
-                           usual[1] + gain * (offset[1] - usual[1]))
+            self._usual = _towards(usual, offset, dt_s / forget_s)
+            self._of_old = _towards(self._of_old, offset, dt_s / STRAY_S)
 
     def restart(self) -> None:
         """Take the present offset for usual."""
-        self._usual = self.offset
+        self._usual = self._of_old = self.offset
 
     @property
     def deviation_m(self) -> float:
         """By how much it has lately moved otherwise than the track."""
         return 0.0 if self._usual is None else math.dist(self.offset, self._usual)
+
+    @property
+    def strays(self) -> bool:
+        """Whether it has moved otherwise than the track by more than the track's errors explain."""
+        return self._usual is not None and (
+            self.deviation_m > DEVIATION_M or math.dist(self.offset, self._of_old) > STRAY_M)
+
+
+def _towards(here: Place, there: Place, share: float) -> Place:
+    return (here[0] + share * (there[0] - here[0]), here[1] + share * (there[1] - here[1]))
 
 
 class PositionVote:
@@ -189,6 +230,8 @@ class PositionVote:
     Attributes:
         outlier: name of the position that is outvoted; "" if none is.
         compared: whether both positions were ever held against each other.
+        contradicted: whether both positions have moved otherwise than wheels and gyro, although
+            odometry, encoders and gyro agree. Two against two: no witness is believed.
     """
 
     def __init__(self, name: str) -> None:
@@ -196,18 +239,33 @@ class PositionVote:
         self.position = Witness(name, POSITION_FRESH_S)
         self.gps = Witness(GPS, GPS_FRESH_S)
         self.outlier = ""
-        self.compared = False
+        self.compared = self.contradicted = False
         self.apart_m = 0.0
         self._differing = self._agreeing = 0
 
     # -- what is heard --------------------------------------------------------------------------
 
-    def see_position(self, stamp_s: float, place: Place, now_s: float) -> bool:
-        """Take a reading of the position that is not GPS; return whether it could be used."""
+    def see_position(self, stamp_s: float, place: Place, now_s: float,
+                     yaw_rad: float | None = None) -> bool:
+        """Take a reading of the position that is not GPS; return whether it could be used.
+
+        Args:
+            stamp_s: when it was true.
+            place: in `map`.
+            now_s: now.
+            yaw_rad: its heading, if that may keep the gyro's aligned while GPS is out.
+        """
         if not self._usable(self.position, stamp_s, place, now_s):
             return False
+        without_gps = self.outlier == GPS or not (self.outlier or self.gps.fresh(now_s))
+        if yaw_rad is not None and without_gps:
+            self.track.align_slowly(yaw_rad)
         self.position.see(stamp_s, place, self.track, self._forget_s(self.position))
         return True
+
+    def see_encoders(self, status: m.BaseStatus, stamp_s: float, now_s: float) -> None:
+        """Take the base's own wheel speeds."""
+        self.track.parity.encoders(status, stamp_s, now_s)
 
     def see_gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> bool:
         """Take a fix and compare; return whether it could be used."""
@@ -215,7 +273,7 @@ class PositionVote:
             return False
         track = self.track
         self.gps.see(stamp_s, (fix.x_m, fix.y_m), track, self._forget_s(self.gps))
-        if track.straight and self.outlier != GPS:
+        if track.straight and self.outlier != GPS and not self.contradicted:
             track.align(math.atan2(fix.velocity_y_mps, fix.velocity_x_mps))
         if self.position.fresh(now_s):
             self._compare(now_s)
@@ -234,8 +292,8 @@ class PositionVote:
         """
         if self.outlier == witness.name or (self._differing > 0 and not self.outlier):
             return math.inf
-        alone = not self._agreeing and witness.deviation_m > DEVIATION_M
-        return math.inf if alone else FORGET_S
+        alone = not self._agreeing and witness.strays
+        return math.inf if alone or self.contradicted else FORGET_S
 
     # -- judgement ------------------------------------------------------------------------------
 
@@ -246,20 +304,36 @@ class PositionVote:
         if self.apart_m <= APART_M:
             self._differing = 0
             self._agreeing += 1
-            if self.outlier and self._agreeing >= AGREEING:
+            self._hold_against_motion(now_s)
+            if self.outlier and self._agreeing >= AGREEING and not self.contradicted:
                 self.outlier = ""
                 position.restart()
                 gps.restart()
             return
         self._agreeing = 0
         self._differing += 1
-        if self.outlier or self._differing < DIFFERING or not self.wheels_fresh(now_s):
+        if self.outlier or self._differing < DIFFERING or not self.wheels_agree(now_s):
             return
         for wrong, other in ((position, gps), (gps, position)):
             if wrong.deviation_m > CLEARLY * other.deviation_m \
                     and other.deviation_m <= DEVIATION_M:
                 self.outlier = wrong.name
                 other.restart()
+
+    def _hold_against_motion(self, now_s: float) -> None:
+        """Compare two positions that agree with a dead reckoning that is confirmed."""
+        parity, pair = self.track.parity, (self.position, self.gps)
+        stray = all(witness.strays for witness in pair)
+        if self.track.by_gyro and parity.confirmed(now_s):
+            self.contradicted = stray
+        elif not self.contradicted and not self.outlier and (
+                stray or not (parity.whole(now_s) and parity.sure(now_s))):
+            for witness in pair:
+                witness.restart()
+
+    def wheels_agree(self, now_s: float) -> bool:
+        """Whether odometry is received and nothing contradicts it."""
+        return self.wheels_fresh(now_s) and self.track.parity.sure(now_s)
 
     def wheels_fresh(self, now_s: float) -> bool:
         """Whether odometry is heard."""
@@ -268,13 +342,15 @@ class PositionVote:
     def agreeing(self, now_s: float) -> tuple[str, ...]:
         """Return the names of two witnesses that agree now; none if there are no two."""
         position, gps = self.position, self.gps
+        if self.contradicted:
+            return ()
         sure = not self.outlier and not self._differing
         if sure and position.fresh(now_s) and gps.fresh(now_s):
             return (position.name, GPS)
-        if not self.wheels_fresh(now_s):
+        if not self.wheels_agree(now_s):
             return ()
         for witness, other in ((gps, position), (position, gps)):
             alone = self.outlier == other.name or (sure and not other.fresh(now_s))
-            if alone and witness.fresh(now_s) and witness.deviation_m <= DEVIATION_M:
+            if alone and witness.fresh(now_s) and not witness.strays:
                 return (witness.name, WHEELS)
         return ()

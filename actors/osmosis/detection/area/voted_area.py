@@ -64,7 +64,7 @@ class VotedPosition:
             self._trusted_s = witness.stamp_s
             if self.by_gps and self._fix is not None:
                 return self._fix, witness.stamp_s
-        if self._anchor is None or not vote.wheels_fresh(now_s) \
+        if self._anchor is None or vote.contradicted or not vote.wheels_agree(now_s) \
                 or now_s - self._trusted_s > self._blind_s or self._since_m > self._blind_m:
             return None
         track = vote.track
@@ -115,8 +115,13 @@ class VotedArea(DetectionModule):
     def absolute_pose(self, message: m.Pose, header: Header) -> None:
         """Hear the absolute pose."""
         if is_pose(message):
-            self._where.vote.see_position(
-                header.stamp, (message.x_m, message.y_m), self.clock.now())
+            self._where.vote.see_position(header.stamp, (message.x_m, message.y_m),
+                                          self.clock.now(), message.yaw_rad)
+
+    @on(topics.BASE_STATUS)
+    def status(self, message: m.BaseStatus, header: Header) -> None:
+        """Take the base's own wheel speeds."""
+        self._where.vote.see_encoders(message, header.stamp, self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:

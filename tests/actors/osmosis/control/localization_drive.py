@@ -27,7 +27,7 @@ from rampart.sim.osmosis.world import World
 
 START_RAD = 0.7
 SOURCES = {"gps": topics.GPS, "imu": topics.IMU, "odom": topics.ODOMETRY,
-           "absolute-pose": topics.ABSOLUTE_POSE}
+           "absolute-pose": topics.ABSOLUTE_POSE, "encoders": topics.BASE_STATUS}
 
 # Seconds, m/s, rad/s: standing, straight, a bend, on the spot, backwards, a fast bend, standing.
 LEGS = ((1.5, 0.0, 0.0), (4.0, 1.0, 0.0), (3.0, 0.8, 0.4), (3.0, 1.0, 0.0), (2.5, 0.0, 1.2),
@@ -100,6 +100,8 @@ def _read(world: World, key: str) -> bm.Message:
         return world.imu()
     if key == topics.ODOMETRY.key:
         return world.odometry()
+    if key == topics.BASE_STATUS.key:
+        return world.base_status()
     return m.Pose(*world.pose)
 
 

@@ -31,8 +31,8 @@ from tests.osmosis_system import System, shipped_system
 
 END_S = sum(leg[0] for leg in LEGS)
 FROM_S = 4.0
-KEYS = [topic.key for topic in (topics.GPS, topics.IMU, topics.ODOMETRY)]
-NAMES = [name for name in SENSOR_FAULTS if name.startswith(("gps", "imu", "odom"))]
+KEYS = [topic.key for topic in (topics.GPS, topics.IMU, topics.ODOMETRY, topics.BASE_STATUS)]
+NAMES = [name for name in SENSOR_FAULTS if name.startswith(("gps", "imu", "odom", "encoders"))]
 NAMES += [f"{mode}:{key}" for mode in ("drop", "freeze", "delay", "corrupt") for key in KEYS]
 
 
@@ -70,6 +70,8 @@ def feed(monitor: EstimationMonitor, item: Reading, now_s: float) -> None:
         track.imu(body, item.stamp_s, now_s)
     elif item.topic is topics.ODOMETRY:
         track.odometry(body, item.stamp_s, now_s)
+    elif item.topic is topics.BASE_STATUS:
+        monitor.vote.see_encoders(body, item.stamp_s, now_s)
     elif item.topic is topics.GPS:
         monitor.gps(body, item.stamp_s, now_s)
 
@@ -207,4 +209,4 @@ def test_the_actor_names_the_life_that_lied():
 
 def test_the_actor_does_not_hear_the_absolute_pose_that_localization_lives_on():
     assert set(heard(Member("DM8", EstimationError, EstimationError.Parameters()))) == {
-        "summit_xl/gps", "summit_xl/imu", "summit_xl/odom", "localization/pose"}
+        "summit_xl/gps", "summit_xl/imu", "summit_xl/odom", "summit_xl/status", "localization/pose"}

@@ -31,8 +31,9 @@ from tests.osmosis_system import System, shipped_system
 
 END_S = sum(leg[0] for leg in LEGS)
 FROM_S = 4.0
-SENSORS = ("gps", "imu", "odom", "absolute-pose")
-KEYS = [t.key for t in (topics.GPS, topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE)]
+SENSORS = ("gps", "imu", "odom", "absolute-pose", "encoders")
+KEYS = [t.key for t in (topics.GPS, topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE,
+                        topics.BASE_STATUS)]
 NAMES = [name for name in SENSOR_FAULTS if name.startswith(SENSORS)]
 NAMES += [f"{mode}:{key}" for mode in ("drop", "freeze", "delay", "corrupt") for key in KEYS]
 
@@ -73,8 +74,10 @@ def feed(where: VotedPosition, item: Reading, now_s: float) -> None:
         where.odometry(body, stamp_s, now_s)
     elif item.topic is topics.GPS:
         where.gps(body, stamp_s, now_s)
+    elif item.topic is topics.BASE_STATUS:
+        where.vote.see_encoders(body, stamp_s, now_s)
     else:
-        where.vote.see_position(stamp_s, (body.x_m, body.y_m), now_s)
+        where.vote.see_position(stamp_s, (body.x_m, body.y_m), now_s, body.yaw_rad)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -148,6 +151,14 @@ def test_after_two_faults_it_knows_nothing_beyond_the_bound_rather_than_somethin
     assert unknown_s > 3.0
 
 
+@pytest.mark.parametrize("way", ["stuck", "stuck-noise", "drift", "slow-drift"])
+def test_two_positions_that_are_wrong_alike_are_not_believed(way):
+    worst_m, unknown_s = follow((fault(f"gps-{way}"), FROM_S, math.inf),
+                                (fault(f"absolute-pose-{way}"), FROM_S, math.inf))
+    assert worst_m < 0.6
+    assert unknown_s > 10.0
+
+
 def test_how_long_and_how_far_it_goes_on_blind_is_bounded():
     both = [(fault(name), FROM_S, math.inf) for name in ("gps-dropout", "absolute-pose-dropout")]
     by_way = follow(*both, blind_s=1000.0, blind_m=2.0)[1]
@@ -158,13 +169,20 @@ def test_how_long_and_how_far_it_goes_on_blind_is_bounded():
     assert never < 0.3
 
 
-def vote(a, gps, wheels_mps, seconds=3.0, start=0.0):
-    """A robot that drives along x with 1 m/s; a, gps: functions of time to an error along y."""
+def vote(a, gps, wheels_mps, seconds=3.0, start=0.0, *, encoders_mps=None):
+    """A robot that drives along x with 1 m/s; a, gps: functions of time to an error along y.
+
+    `encoders_mps` is what the base's status says of its wheels; None for no status.
+    """
     it = PositionVote("a")
     for i in range(round(seconds * 50)):
         t = start + 0.02 * i
-        it.track.imu(m.Imu(0.0, 0.0, 0.0, 0.0), t, t)
-        it.track.odometry(m.Odometry(m.Pose(0.0, 0.0, 0.0), m.Twist(wheels_mps, 0.0)), t, t)
+        it.track.imu(m.Imu(0.0, 0.0, 0.001 * i, 0.0), t, t)
+        it.track.odometry(
+            m.Odometry(m.Pose(wheels_mps * t, 0.0, 0.0), m.Twist(wheels_mps, 0.0)), t, t)
+        if i % 5 == 0 and encoders_mps is not None:
+            wheels = (encoders_mps / 0.1175,) * 4
+            it.see_encoders(m.BaseStatus(False, False, 0.0, wheels), t, t)
         if i % 5 == 0 and a is not None:
             it.see_position(t, (t, a(t)), t)
         if i % 5 == 0 and gps is not None:
@@ -200,6 +218,20 @@ def drift(t):
 def test_two_out_of_three(a, gps, wheels_mps, agreeing, outlier):
     it, now_s = vote(a, gps, wheels_mps)
     assert (it.agreeing(now_s), it.outlier) == (agreeing, outlier)
+
+
+@pytest.mark.parametrize(("a", "gps", "wheels_mps", "encoders_mps", "agreeing"), [
+    pytest.param(none, none, 1.0, 1.0, ("a", GPS), id="all agree"),
+    pytest.param(none, none, 0.5, 1.0, ("a", GPS), id="odometry is wrong"),
+    pytest.param(none, none, 1.0, 0.5, ("a", GPS), id="the encoders are wrong"),
+    pytest.param(none, none, 0.5, 0.5, (), id="two against two"),
+    pytest.param(none, none, 0.5, None, ("a", GPS), id="no encoders: two against one"),
+    pytest.param(jump, none, 1.0, 0.5, (), id="a is wrong, and nobody knows how it moves"),
+    pytest.param(None, none, 1.0, 0.5, (), id="GPS alone, and nobody knows how it moves"),
+])
+def test_encoders_decide_whether_wheels_count(a, gps, wheels_mps, encoders_mps, agreeing):
+    it, now_s = vote(a, gps, wheels_mps, encoders_mps=encoders_mps)
+    assert it.agreeing(now_s) == agreeing
 
 
 def test_who_was_wrong_is_believed_again_when_it_agrees():
@@ -320,7 +352,8 @@ def test_a_receiver_that_is_stuck_does_not_blind_it():
 
 def test_it_does_not_hear_the_localization_that_it_guards():
     assert set(heard(Member("DM1", VotedArea, VotedArea.Parameters()))) == {
-        "summit_xl/gps", "summit_xl/imu", "summit_xl/odom", "summit_xl/absolute_pose"}
+        "summit_xl/gps", "summit_xl/imu", "summit_xl/odom", "summit_xl/absolute_pose",
+        "summit_xl/status"}
 
 
 def test_the_drive_leaves_no_doubt_that_the_faults_matter():

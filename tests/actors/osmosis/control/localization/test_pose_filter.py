@@ -32,8 +32,9 @@ from tests.actors.osmosis.control.localization_drive import (
 
 END_S = sum(leg[0] for leg in LEGS)
 FOR_EVER = math.inf
-KEYS = [topic.key for topic in (topics.GPS, topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE)]
-SENSORS = ("gps", "imu", "odom", "absolute-pose")
+KEYS = [topic.key for topic in (topics.GPS, topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE,
+                                topics.BASE_STATUS)]
+SENSORS = ("gps", "imu", "odom", "absolute-pose", "encoders")
 NAMES = [name for name in SENSOR_FAULTS if name.startswith(SENSORS)]
 NAMES += [f"{mode}:{key}" for mode in ("drop", "freeze", "delay", "corrupt") for key in KEYS]
 
@@ -48,23 +49,25 @@ class Outcome:
     lost_s: float = 0.0
     bridged_m: float = 0.0
     told: int = 0
+    owed_m: float = 0.0
     excluded: set[str] = field(default_factory=set)
 
 
 def feed(pose_filter: PoseFilter, reading: Reading, now_s: float) -> None:
     take = {topics.IMU: pose_filter.imu, topics.ODOMETRY: pose_filter.odometry,
-            topics.GPS: pose_filter.gps, topics.ABSOLUTE_POSE: pose_filter.absolute_pose}
+            topics.GPS: pose_filter.gps, topics.ABSOLUTE_POSE: pose_filter.absolute_pose,
+            topics.BASE_STATUS: pose_filter.encoders}
     take[reading.topic](reading.stamp_s, reading.body, now_s)
 
 
-def run(*faults, start_s=0.0, seed=1, limits=None, judge_to_s=FOR_EVER):
+def run(*faults, start_s=0.0, seed=1, limits=None, judge_to_s=FOR_EVER, owed_m=0.0):
     """Drive with faults, (name or fault, from s, to s); compare with the truth at 20 Hz."""
     found = [(fault(f) if isinstance(f, str) else f, a, b) for f, a, b in faults]
-    return run_all(disturbed(found, seed), start_s, limits, judge_to_s)
+    return run_all(disturbed(found, seed), start_s, limits, judge_to_s, owed_m)
 
 
-def run_all(items, start_s=0.0, limits=None, judge_to_s=FOR_EVER):
-    pose_filter, outcome = PoseFilter(limits), Outcome()
+def run_all(items, start_s=0.0, limits=None, judge_to_s=FOR_EVER, owed_m=0.0):
+    pose_filter, outcome = PoseFilter(limits, owed_m), Outcome()
     for now_s, item in items:
         if now_s < start_s:
             continue
@@ -74,6 +77,7 @@ def run_all(items, start_s=0.0, limits=None, judge_to_s=FOR_EVER):
         if now_s < start_s + 0.4 or now_s > judge_to_s:
             continue
         compare(pose_filter, item, now_s, outcome)
+    outcome.owed_m = pose_filter.owed_m
     return outcome
 
 
@@ -227,7 +231,8 @@ def test_one_reading_beyond_all_measure_neither_ends_it_nor_stays_in_it(topic):
     ("gps-bias", "GPS"), ("gps-drift", "GPS"), ("gps-noise", "GPS"), ("gps-stuck", "GPS"),
     ("imu-bias", "IMU"), ("imu-drift", "IMU"), ("imu-noise", "IMU"), ("imu-stuck", "IMU"),
     ("odom-bias", "odometry"), ("odom-drift", "odometry"), ("odom-noise", "odometry"),
-    ("odom-stuck", "odometry"), ("absolute-pose-bias", "absolute pose"),
+    ("odom-stuck", "odometry"), ("encoders-bias", "odometry"),
+    ("absolute-pose-bias", "absolute pose"),
     ("absolute-pose-drift", "absolute pose"), ("absolute-pose-noise", "absolute pose"),
     ("absolute-pose-stuck", "absolute pose"), ("freeze:summit_xl/gps", "GPS"),
     ("delay:summit_xl/absolute_pose", "absolute pose"),
@@ -270,6 +275,35 @@ def test_without_both_positions_it_dead_reckons_with_growing_uncertainty_and_the
 def test_after_two_faults_it_is_roughly_right_or_says_nothing(names):
     outcome = run(*((name, 5.0 + 4 * i, FOR_EVER) for i, name in enumerate(names)))
     assert outcome.worst_m < 1.0
+
+
+ALIKE = ["stuck", "stuck-noise", "drift", "slow-drift"]
+
+
+@pytest.mark.parametrize("way", ALIKE)
+def test_two_positions_that_are_wrong_alike_leave_it_silent_and_its_successor_too(way):
+    alike = ((f"gps-{way}", 4.0, FOR_EVER), (f"absolute-pose-{way}", 4.0, FOR_EVER))
+    first = run(*alike)
+    assert first.worst_m < 0.6
+    assert first.lost_s > 5.0
+    assert first.owed_m > 0.0
+    second = run(*alike, start_s=5.0, owed_m=first.owed_m)
+    assert (second.told, second.owed_m) == (0, FilterLimits().proof_m)
+
+
+def test_a_successor_believes_positions_that_have_moved_as_the_wheels_do():
+    limits = FilterLimits(proof_m=8.0)
+    outcome = run(limits=limits, owed_m=limits.proof_m)
+    assert outcome.owed_m == 0.0
+    assert outcome.told > 200
+    assert 8.0 < outcome.lost_s < 13.0
+
+
+@pytest.mark.parametrize("name", ["odom-stuck", "odom-drift", "imu-stuck", "imu-slow-drift",
+                                  "encoders-stuck", "encoders-drift", "encoders-dropout"])
+def test_one_wrong_measurement_of_motion_does_not_silence_two_good_positions(name):
+    outcome = run((name, 4.0, FOR_EVER))
+    assert (outcome.owed_m, outcome.lost_s) == (0.0, 0.0)
 
 
 def test_it_comes_back_when_the_positions_do():
