@@ -98,7 +98,7 @@ class Trial:
         self.injects: Injector | None = None
         self._brought_back = 0
         self._worlds = frozenset(n.name for n in run.system.nodes if n.kind is Kind.WORLD)
-        self._unstable = ""
+        self._unjudged = ""
         self._keeping_up = None if run.plan.virtual else KeepingUp(
             run.system.timing, sorted(self._worlds), run.plan.rate)
 
@@ -110,8 +110,8 @@ class Trial:
 
     def _look_at_world(self, topic: Topic[Any], message: Any, header: Header) -> None:
         if topic is bus_topics.DIAGNOSTIC and message.context == UNSTABLE \
-                and header.source in self._worlds and not self._unstable:
-            self._unstable = f"{UNSTABLE}: {message.reason}"
+                and header.source in self._worlds and not self._unjudged:
+            self._unjudged = f"{UNSTABLE}: {message.reason}"
 
     def outside(self, context: Callable[[str], Context], heard: Callable[[NodeTable], None],
                 scenario: Sequence[PlannedFault], control: ProcessControl, nodes: Sequence[str],
@@ -171,18 +171,18 @@ class Trial:
 
     def ended(self, now_s: float) -> str | None:
         """Return why the run is over, or None: also because its world has blown up."""
-        return self._unstable or self.over(now_s)
+        return self._unjudged or self.over(now_s)
 
     def settled(self, verdict: Verdict) -> Verdict:
-        """Return a verdict on the run; what came after the world had blown up counts for nothing.
+        """Return a verdict on the run, of which the end was not watched if the world was lost.
 
         An unsafe run stays unsafe; any other cannot be judged.
         """
-        if not self._unstable:
+        if not self._unjudged:
             return verdict
         return msgspec.structs.replace(
             verdict, success=False, safe=None if verdict.safe else verdict.safe,
-            reasons=(self._unstable, *verdict.reasons))
+            reasons=(self._unjudged, *verdict.reasons))
 
     def over(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""

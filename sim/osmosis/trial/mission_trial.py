@@ -136,7 +136,8 @@ class MissionTrial(Trial):
 
     def over(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
-        return self._end.ended(now_s)
+        self._unjudged = self._unjudged or self._end.world_gone(now_s)
+        return self._unjudged or self._end.ended(now_s)
 
     def conclude(self, now_s: float, why: str) -> RunRecord:
         """Return the record of the run with the judge's verdict, and what became of faults."""

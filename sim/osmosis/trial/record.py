@@ -162,7 +162,7 @@ class MissionRecorder(RunRecorder):
         self._mode = status.goals[status.step].mode.value if running else ""
         newly = len(status.step_times_s) - len(self._reached)  # negative: it forgot, we do not
         self._reached += (header.stamp,) * newly
-        self._skipped |= frozenset(status.skipped)
+        self._skipped |= frozenset(status.skipped).intersection(range(len(self._mission.goals)))
 
     def _light(self, light: m.LightMeasurement, _header: Header) -> None:
         if light.light in self._known_lights:

@@ -114,10 +114,16 @@ class RunEnd:
         self._truth_at_s += stall_s
         self._lost_at_s += stall_s
 
+    def world_gone(self, now_s: float) -> str:
+        """Return that ground truth is missing, so that no judge watches, or ""."""
+        late_s = WORLD_SILENT_S if self._is_gone else WORLD_LATE_S
+        return ("the world is gone: no ground truth from the simulator"
+                if now_s - self._truth_at_s > late_s else "")
+
     def ended(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
-        if now_s - self._truth_at_s > (WORLD_SILENT_S if self._is_gone else WORLD_LATE_S):
-            return "the world is gone: no ground truth from the simulator"
+        if gone := self.world_gone(now_s):
+            return gone
         why, since_s = self._outcome(now_s)
         if not why or (self._moves and now_s - since_s < WATCH_S):
             return None

@@ -1,4 +1,4 @@
-"""A world that blows up ends its run, which nobody can judge."""
+"""A world that blows up, or dies, ends its run, which no judge has watched to its end."""
 
 from __future__ import annotations
 
@@ -37,3 +37,16 @@ def test_a_run_whose_world_blows_up_ends_at_once_and_is_neither_safe_nor_a_succe
 def test_a_run_that_was_unsafe_before_stays_unsafe(monkeypatch):
     monkeypatch.setattr(Judge, "verdict", lambda _judge: Verdict(success=False, safe=False))
     assert virtual_run("paper", options={"mission": "A"}).record.safety == "unsafe"
+
+
+def test_a_run_whose_world_dies_is_neither_safe_nor_a_success(monkeypatch):
+    tick = World._tick
+
+    def die(self):
+        if self.time_s >= BLOWS_UP_S:
+            raise RuntimeError("died")
+        tick(self)
+
+    monkeypatch.setattr(World, "_tick", die)
+    done = virtual_run("paper", options={"mission": "A"})
+    assert (done.record.mission, done.record.safety) == ("fail", "not known")
