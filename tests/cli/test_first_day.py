@@ -52,9 +52,9 @@ def test_the_environment_names_the_run(capsys, monkeypatch):
 
 
 def test_a_name_among_many_is_answered_by_the_nearest_three(capsys):
-    assert refused(capsys, "topic", "info", "control/comand", "--system", "osmosis") == (
-        "rampart: unknown topic 'control/comand'; the nearest of 52: control/command, "
-        "control/standby_command, control/status\n")
+    told = refused(capsys, "topic", "info", "control/comand", "--system", "osmosis")
+    assert told.startswith("rampart: unknown topic 'control/comand'; the nearest of ")
+    assert told.endswith(": control/command, control/standby_command, control/status\n")
     assert str(output.unknown("topic", "?", map(str, range(20)))) == (
         "unknown topic '?'; none of 20 is like it")
     assert str(output.unknown("order", "x", ["a", "b"])) == "unknown order 'x'; known: a, b"

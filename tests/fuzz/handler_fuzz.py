@@ -335,7 +335,7 @@ def fuzz_tools(seed: int) -> Finding | None:
 class _Run:
     """What an exposition needs of a run."""
 
-    run_id, title, base_port, rate = "fuzz", "fuzz", 7450, 1.0
+    run_id, title, base_port, rate, recording, keys = "fuzz", "fuzz", 7450, 1.0, "", ""
 
     def exposition(self, now_s: float, picture: RunPicture) -> Any:
         from rampart.cli.look.metrics_families import Exposition

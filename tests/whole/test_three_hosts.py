@@ -43,9 +43,9 @@ def has(run: RealRun, nodes: tuple[str, ...], *, run_here: bool, within_s: float
 
 def comes_back(home: RealRun, robot: RealRun) -> None:
     """Kill the camera; the desk's module detects it, the robot's restarts it, the desk's knows."""
-    before = robot.story.count("D_VISION_CRASH: clear")
+    before = robot.story.count("(D_VISION_CRASH): clear")
     home.kill("camera")
-    robot.wait_until(lambda: robot.story.count("D_VISION_CRASH: clear") > before, 10, "not back")
+    robot.wait_until(lambda: robot.story.count("(D_VISION_CRASH): clear") > before, 10, "not back")
 
 
 def test_each_may_lose_each(net, tmp_path: Path):

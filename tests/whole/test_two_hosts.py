@@ -146,7 +146,7 @@ def test_the_manager_survives_its_machine_and_never_are_two_obeyed(net, tmp_path
         assert ground.pid("cell_manager") is not None  # it goes on, and nobody here hears it
         before = len(robot.story)
         trigger(robot, "D_CURTAIN")  # heard, too, after the links were closed: 2 s after the cut
-        robot.wait_until(lambda: "rule 1 for M_CURTAIN" in robot.story[before:], 10, "no manager")
+        robot.wait_until(lambda: "(M_CURTAIN)" in robot.story[before:], 10, "no manager")
         net.line = Line()
         ground.wait_for("cell_manager handed over")
         ground.wait_for("cell_manager respawned", 20)

@@ -278,7 +278,7 @@ export class Stick {
     const status = this.status;
     const other = status && status.holder !== null && status.holder !== this.page;
     if (this.page === null || !status) pill(this.state, "warn", "not connected");
-    else if (this.visitor.barred("stick")) pill(this.state, "", "not available");
+    else if (this.visitor.barred("stick")) pill(this.state, "", "not for you");
     else if (other) pill(this.state, "warn", `page ${status.holder} drives`);
     else if (!status.works) pill(this.state, "warn", "no effect now");
     else if (driving && status.note) pill(this.state, "warn", "not followed");

@@ -188,7 +188,7 @@ def test_all_that_is_offered_survives_the_plan_and_is_sound():
     assert msgspec.json.decode(msgspec.json.encode(OFFERED), type=tuple[fm.NamedFault, ...]) == (
         OFFERED)
     faults = injections()
-    assert {f.group for f in OFFERED} == {"paper", "sensor", "actuator"}
+    assert {f.group for f in OFFERED} == {"paper", "sensor", "frozen", "actuator"}
     for offered in OFFERED:
         ordered = faults.order(offered.name, 0.0, None, 0.0)
         for order in ordered.orders:

@@ -130,7 +130,7 @@ async def test_what_a_role_lacks_is_out_of_use_and_says_why(tmp_path, role):
         if not drives:
             assert not any(s.dead_man for s in world.others.stick)
             assert await tab.value("document.querySelector('.stick-state').textContent") == (
-                "not for your role")
+                "not for you")
         assert tab.errors == []
 
 

@@ -453,10 +453,17 @@ actor = "rampart.actors.ros2.ros_nodes:RosNodes"
 within_s = 0.5
 parameters = { gateway = "gateway", nodes = ["/robot/base"], alone = true, suspects = ["base"] }
 
+[[recovery]]
+name = "R_BASE"
+title = "Restart the base"
+actor = "rampart.actors.recovery.respawn:Respawn"
+kind = "masking"
+parameters = { nodes = ["base"] }
+
 [[mechanism]]
 name = "M_ROS"
 detect = "D_ROS"
-recover = "R_RESTART"
+recover = "R_BASE"
 event = "missing"
 against = { within_s = 5.0, hazard = "the robot stands" }
 """

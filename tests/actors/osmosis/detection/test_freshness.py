@@ -13,6 +13,7 @@ from rampart.actors.detection.stub import StubDetection
 from rampart.actors.ftm import messages as fm
 from rampart.actors.layout.layout import Layout
 from rampart.actors.layout.wiring import heard
+from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_plan import RunPlan
@@ -191,7 +192,7 @@ def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_judges():
             await asyncio.sleep(0.2)
             assert ear.states == ["idle"]
             loop.jump(2.0)  # the mail is read, but there was none
-            await asyncio.sleep(EXCUSE_S + 0.02)
+            await asyncio.sleep(GRACE_S + 0.02)
             assert ear.states == ["idle", "active"]
 
     run(scenario)
