@@ -120,7 +120,7 @@ def test_top_shows_a_crash_in_words_and_the_new_life(run):
         it.wait_for("teleoperation")
         life = run.pid("hmi")
         run.kill("hmi")
-        it.wait_for(": run RM4")  # in the words of the decision
+        it.wait_for(": RM4: FTM5, because")  # in the words of the decision
         run.wait_until(lambda: run.pid("hmi") not in {None, life}, 20, "hmi did not come back")
         it.wait_for(lambda: re.search(r"hmi +running +[2-9] +[1-9]", it.text) is not None)
         it.press("q")

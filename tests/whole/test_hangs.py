@@ -125,7 +125,7 @@ def test_a_loop_that_hangs_is_found_by_its_missing_signs_of_life(tmp_path: Path,
     (tmp_path / "loops_nodes.py").write_text(NODES)
     (tmp_path / "loops.toml").write_text(SYSTEM.format(how=how))
     with RealRun(tmp_path, tmp_path / "loops.toml", "--duration", "6") as run:
-        run.wait_for(f"D: loop: its loop hangs, {found}")
+        run.wait_for(f"(D): loop: its loop hangs, {found}")
         run.wait_for("loop respawned, incarnation 2")
         assert run.process.wait(30) == 0, run.story
     result = json.loads((tmp_path / "stdout.txt").read_text().splitlines()[-1])

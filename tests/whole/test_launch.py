@@ -161,7 +161,7 @@ def test_an_emergency_stop_stays_until_it_is_reset_and_then_the_mission_goes_on(
         assert run.tool("inject", "prohibited-area", "--duration", "20", "--at-once"
                         ).returncode == 0
         run.wait_for("RM1")
-        run.wait_for("DM1: clear")
+        run.wait_for("(DM1): clear")
         time.sleep(1)
         status = json.loads(run.tool("status", "--json").stdout)
         assert "RM1" in json.dumps(status)

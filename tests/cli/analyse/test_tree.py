@@ -382,7 +382,7 @@ def test_active_mechanisms_are_lit_and_the_decision_is_marked(capsys, active, de
     assert [b["name"] for b in tree["boxes"] if b["decided"]] == decided
     main(["tree", "--what", "ftm-tree", "--active", *active])
     lines = told(capsys).splitlines()
-    assert f"{active[0]} and" in lines[1] or f"{active[0]}, " in lines[1]
+    assert all(f"({name})" in lines[1] for name in active)
     assert sum("● active" in line for line in lines) == len(active)
     assert sum("◀ decided" in line for line in lines) == 1
 

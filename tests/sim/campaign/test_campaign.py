@@ -743,10 +743,10 @@ def test_a_log_gets_a_line_a_minute_with_the_time_left_and_one_at_the_end():
     log = ProgressLog(total=30, done=10)
     lines = [log.made_one(now_s, unsafe=0) for now_s in range(100, 300, 10)]
     assert lines[:6] == [""] * 6
-    assert lines[6] == "17 of 30 runs, 0 unsafe with FTM, 2 min left"  # 13 left, 10 s each
+    assert lines[6] == "17 of 30 runs, 0 unsafe, 2 min left"  # 13 left, 10 s each
     assert [i for i, line in enumerate(lines) if line] == [6, 12, 18, 19]
-    assert lines[-1] == "30 of 30 runs, 0 unsafe with FTM"
-    assert ProgressLog(total=1, done=0).made_one(5.0, unsafe=1) == "1 of 1 runs, 1 unsafe with FTM"
+    assert lines[-1] == "30 of 30 runs, 0 unsafe"
+    assert ProgressLog(total=1, done=0).made_one(5.0, unsafe=1) == "1 of 1 runs, 1 unsafe"
 
 
 def test_a_store_of_version_0_6_is_read_and_its_runs_are_repeated(tmp_path, capsys):
