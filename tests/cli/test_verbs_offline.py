@@ -324,9 +324,10 @@ def test_topics_of_a_robot_s_own_actors_are_listed_and_described(capsys, tmp_pat
     info = json.loads(told(capsys))
     assert (info["publishers"], info["readers"]) == (["platform"], ["display"])
     assert main(["inject", "--list", *own]) == 0
-    lines = {line.split()[0]: line for line in told(capsys).splitlines() if line}
-    assert "nan" in lines["porter/load"]
-    assert "corrupt" not in lines["porter/axle/{name}"].removesuffix("all but corrupt")
+    rows = [line.split(maxsplit=1) for line in told(capsys).splitlines() if len(line.split()) > 1]
+    assert [modes for topic, modes in rows if topic == "porter/load"] == [
+        "all", "zero, negative, huge, infinite, nan"]
+    assert [modes for topic, modes in rows if topic == "porter/axle/{name}"] == ["all but corrupt"]
 
 
 def test_an_actor_that_cannot_be_loaded_is_one_line_and_needed_for_its_own_topics_only(
