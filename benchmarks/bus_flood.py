@@ -31,12 +31,12 @@ from typing import Any
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.run_info import find_runs
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.run.run_info import find_runs
 from rampart.cli.session import Session, connect
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,7 +49,7 @@ _GRASS = (_POINT.x, _POINT.y)
 JOIN = """
 import sys, time, zenoh
 from rampart.actors.bus.zenoh_session import open_client
-from rampart.actors.run.run_info import find_runs
+from rampart.actors.bus.run_info import find_runs
 from rampart.cli.session import tools_credentials
 def join():
     run = next(run for run in find_runs() if run.base_port == int(sys.argv[-1]))

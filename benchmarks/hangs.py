@@ -29,9 +29,9 @@ from benchmarks.hanging_loop import HANG, HOW, SYSTEM, Hang
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionReport, DetectionState, NodeTable
 from rampart.actors.recovery.respawn import accused
-from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_plan import OBSERVER, RunPlan
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.process_title import find_processes
 from rampart.files import working_folder

@@ -33,8 +33,8 @@ from pathlib import Path
 import httpx
 import websockets
 
+from rampart.actors.bus.run_info import find_runs
 from rampart.actors.machine.process_usage import read_count
-from rampart.actors.run.run_info import find_runs
 from rampart.actors.supervision.process_title import find_processes
 
 ROOT = Path(__file__).resolve().parents[1]

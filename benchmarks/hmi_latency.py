@@ -35,9 +35,9 @@ from typing import Any
 import msgspec
 import websockets
 
+from rampart.actors.bus.run_info import RunInfo, find_runs
 from rampart.actors.machine.process_usage import read_count
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_info import RunInfo, find_runs
 from rampart.actors.supervision.process_title import find_processes
 from rampart.cli.session import Session, connect
 from tests.actors.operator.browser import CHROMIUM, Browser, browser

@@ -20,9 +20,9 @@ from typing import Any
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeTable, RespawnRequest
-from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.process_title import find_processes
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from rampart.actors.run.application import Application
+from rampart.actors.runtime.application import Application
 from rampart.cli.output import UsageError
 
 

@@ -8,10 +8,10 @@ import signal
 from collections.abc import AsyncGenerator, Iterator
 from typing import Any
 
+from rampart.actors.bus.run_info import RunInfo, find_runs
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.operator.processes import ProcessObserver
-from rampart.actors.run.run_info import RunInfo, find_runs
 from rampart.actors.supervision.process_title import process_state
 from rampart.cli import systems
 from rampart.cli.output import NoEffectError, UsageError, warn

@@ -20,9 +20,9 @@ from rampart.actors.ftm.messages import ProcessEvent
 from rampart.actors.hosts.host_observer import HostObserver
 from rampart.actors.hosts.launchers import OtherHost, OtherLauncher
 from rampart.actors.hosts.meeting import MeetingError
-from rampart.actors.run.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import clock_of
+from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.supervision.unseen import watch
 from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.run_options import ERROR_LOG, refuse

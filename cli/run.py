@@ -20,15 +20,15 @@ from typing import Any, TextIO
 
 import msgspec
 
-from rampart.actors.layout.layout import Layout, load_application
-from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.other_hosts import others_of
 from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.virtual import VirtualRecording
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import RunPlan, load_document
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import RunPlan, load_document
 from rampart.actors.supervision.launcher import LaunchError
+from rampart.actors.system.layout import Layout, load_application
+from rampart.actors.system.topics import system_topics
 from rampart.cli.host import HostRun
 from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.run_options import ERROR_LOG, MAX_RATE, parse, plan_of, refuse

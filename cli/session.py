@@ -24,10 +24,10 @@ from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode, encode
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import ROUTERS
+from rampart.actors.bus.run_info import NoRunError, RunInfo, find_run
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, key_file
-from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.actors.runtime.clock import Clock
 from rampart.cli.output import NoEffectError, UsageError, refusing
 

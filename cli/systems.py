@@ -6,11 +6,11 @@ import argparse
 import contextlib
 
 from rampart import systems
-from rampart.actors.layout.layout import Layout, application_class, load_application
-from rampart.actors.layout.system_topics import declared_topics, own_topics, system_topics
-from rampart.actors.layout.wiring import REPORTS_ON, import_class, load_member
-from rampart.actors.run.run_info import NoRunError, find_run
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.bus.run_info import NoRunError, find_run
+from rampart.actors.runtime.run_plan import RunPlan
+from rampart.actors.system.layout import Layout, application_class, load_application
+from rampart.actors.system.members import REPORTS_ON, import_class, load_member
+from rampart.actors.system.topics import declared_topics, own_topics, system_topics
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.robot_lines import RobotLines
 from rampart.cli.verbs import Option, either, option, port_of_environment

@@ -23,12 +23,12 @@ from rampart.actors.bus.bounds import DOCUMENT_CHARS, clip
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.layout.layout import Layout
-from rampart.actors.layout.wiring import heard, published
 from rampart.actors.machine.absence import ABSENT_S, Absence
-from rampart.actors.run.run_plan import tailor
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
+from rampart.actors.runtime.run_plan import tailor
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import heard, published
 from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_memory import (
     Memory,

@@ -8,10 +8,10 @@ from typing import Any, TypeVar
 from rampart import systems
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.run.application import Application
-from rampart.actors.run.run_context import NO_SYSTEM, RunContext
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor
+from rampart.actors.runtime.application import Application
+from rampart.actors.runtime.run_context import NO_SYSTEM, RunContext
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.manager.spec.specification import SystemSpec, parse_specification
 from rampart.testing import VirtualSystem
 

@@ -12,8 +12,8 @@ import msgspec
 
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.launcher import Launcher
 from rampart.testing import free_base_port
 from tests import ROOT

@@ -12,11 +12,11 @@ from typing import Any, Final
 
 from rampart.actors.bus.topic import ROOT, Members, Qos, Topic
 from rampart.actors.bus.topics import INJECT
-from rampart.actors.layout.layout import Layout, router
-from rampart.actors.layout.system_topics import declared_topics
-from rampart.actors.layout.wiring import Member, heard, published, shows_panels
-from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
+from rampart.actors.runtime.run_plan import OBSERVER
+from rampart.actors.system.layout import Layout, router
+from rampart.actors.system.members import Member, heard, published, shows_panels
+from rampart.actors.system.topics import declared_topics
 
 OPERATOR: Final = "operator"
 VIEWER: Final = "viewer"

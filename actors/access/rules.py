@@ -35,7 +35,7 @@ from rampart.actors.access.rights import (
     together,
 )
 from rampart.actors.bus.run_folder import ROUTERS
-from rampart.actors.layout.layout import Layout
+from rampart.actors.system.layout import Layout
 
 INGRESS, EGRESS = "ingress", "egress"
 PUT, SUBSCRIBER, QUERY, QUERYABLE, REPLY = (

@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.manager.spec.nodes import NodeSpec
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import SpecificationError

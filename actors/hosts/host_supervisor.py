@@ -31,9 +31,9 @@ from rampart.actors.hosts.copies import Copies
 from rampart.actors.hosts.parts import Wait
 from rampart.actors.hosts.placement import FIRST, Changes, Home, Placement
 from rampart.actors.hosts.state_files import StateFiles
-from rampart.actors.run.run_plan import SUPERVISOR, on_host
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.checkpoint import Record
+from rampart.actors.runtime.run_plan import SUPERVISOR, on_host
 from rampart.actors.supervision.held_process import HeldProcess
 from rampart.actors.supervision.kill_node import (
     SIGNALS,

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import msgspec
 
 from rampart.actors.bus import run_folder
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.hosts.clock_sync import ClockSync
 from rampart.actors.hosts.meeting import (
     DOOR,
@@ -20,13 +21,12 @@ from rampart.actors.hosts.meeting import (
     contents_of,
     joined,
 )
-from rampart.actors.layout.hosts import Hosts
-from rampart.actors.layout.layout import load_application
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_info import RunInfo
-from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_system, on_host
 from rampart.actors.runtime.clock import keep_origin, origin_file
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_system, on_host
 from rampart.actors.supervision.launcher import Launcher, LaunchError
+from rampart.actors.system.hosts import Hosts
+from rampart.actors.system.layout import load_application
 from rampart.manager.spec.schema import SystemSpec
 
 _RETRY_S = 0.2

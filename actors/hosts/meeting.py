@@ -24,8 +24,8 @@ from rampart.actors.access.register import Kind, read_register
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.zenoh_session import Credentials
-from rampart.actors.run.application import Application
-from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_document, on_host
+from rampart.actors.runtime.application import Application
+from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_document, on_host
 from rampart.files.reading import plain_line
 
 PERIOD_S = 0.25

@@ -34,9 +34,9 @@ from rampart.actors.operator.requests import REQUESTS, RefusedError, Request, Re
 from rampart.actors.operator.server import Handlers, PageServer, PortError
 from rampart.actors.operator.state import STALE_S, HmiState
 from rampart.actors.operator.system import draw_system
-from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import Panels, TopicsPublished
+from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.web.access import Access, AccessError, is_loopback
 from rampart.actors.web.audit import AuditLog
 from rampart.actors.web.gate import Gate

@@ -19,10 +19,10 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NamedFault
-from rampart.actors.layout.system_topics import declared_topics, find_topic, published_keys
 from rampart.actors.operator.requests import RefusedError
 from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S, FaultWatch, Order
 from rampart.actors.runtime.injection import UNTOUCHED, flaw
+from rampart.actors.system.topics import declared_topics, find_topic, published_keys
 from rampart.manager.spec.schema import SystemSpec
 
 TAKE_HOLD_S = 3.0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 
 from rampart.actors.osmosis import topics
-from rampart.actors.run.application import Application
+from rampart.actors.runtime.application import Application
 from rampart.manager.spec.schema import SystemSpec
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE, Envelope, Header, decode, pack
 from rampart.actors.bus.topic import ROOT, ROS_SIDE, Topic
-from rampart.actors.layout.system_topics import find_topic
+from rampart.actors.system.topics import find_topic
 
 B = TypeVar("B")
 

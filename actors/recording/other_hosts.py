@@ -24,8 +24,8 @@ from rampart.actors.access.checking import includes
 from rampart.actors.access.rights import EVERYTHING, said_elsewhere
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.zenoh_session import Credentials, answering, open_client
-from rampart.actors.layout.layout import Layout
 from rampart.actors.recording.message_form import header_of
+from rampart.actors.system.layout import Layout
 
 MOST_SILENCES = 100
 """Of a host, that are told one by one; with more the last one covers what follows."""

@@ -18,12 +18,12 @@ from pathlib import Path
 import msgspec
 import setproctitle
 
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.other_hosts import OtherHosts
 from rampart.actors.recording.recorder import RUN_ENDED, Recorder
-from rampart.actors.run.run_info import RunInfo
-from rampart.actors.run.run_plan import OBSERVER
+from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.files import streams, working_folder
 
 _READY = "ready"

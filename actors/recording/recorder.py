@@ -26,12 +26,12 @@ from operator import itemgetter
 from pathlib import Path
 
 from rampart.actors.bus import recorder_connection
+from rampart.actors.bus.run_info import RunInfo, ask
 from rampart.actors.bus.zenoh_session import Credentials
 from rampart.actors.machine.unix_peer import is_same_user
 from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
 from rampart.actors.recording.other_hosts import EachOnce, Ear, Frame, OtherHosts, Silences
 from rampart.actors.recording.run_documents import collect
-from rampart.actors.run.run_info import RunInfo, ask
 
 PERIOD_S = 0.05
 """Real seconds between two looks into the sockets."""

@@ -13,12 +13,12 @@ import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
-from rampart.actors.layout.layout import application_class, load_application
-from rampart.actors.layout.wiring import import_class
 from rampart.actors.recording.views import Views
-from rampart.actors.run.application import Application
-from rampart.actors.run.run_context import NO_SYSTEM
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.application import Application
+from rampart.actors.runtime.run_context import NO_SYSTEM
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import application_class, load_application
+from rampart.actors.system.members import import_class
 from rampart.files.reading import FileError, read_bytes
 from rampart.manager.spec.specification import SystemSpec
 

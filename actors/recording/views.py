@@ -21,8 +21,8 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.recording import foxglove as fg
-from rampart.actors.run.application import Application
-from rampart.actors.run.run_context import NO_SYSTEM
+from rampart.actors.runtime.application import Application
+from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import decision_in_words
 

@@ -16,9 +16,9 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.machine.patience import Usage
 from rampart.actors.machine.patience import usage as read_usage
 from rampart.actors.machine.process_usage import ProcessCount, read_count
-from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_context import RunContext
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """What the class of an actor declares: the topics it hears and publishes, its timers, its peers.
 
-`rampart.actors.layout.wiring` computes from it who talks with whom, before any actor is made.
+`rampart.actors.system.members` computes from it who talks with whom, before any actor is made.
 """
 
 from __future__ import annotations

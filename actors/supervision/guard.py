@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 
 from rampart.actors.bus.run_folder import issued
 from rampart.actors.machine.patience import Patience, usage
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import RunProcess, find_process, find_processes, kill
 from rampart.actors.supervision.processes import OsHandle
 from rampart.actors.supervision.spawner import NAMES

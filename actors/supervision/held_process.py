@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 from rampart.actors.bus.run_folder import restarts_of
 from rampart.actors.ftm.messages import NodeInfo
-from rampart.actors.layout.wiring import Spare
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.processes import Processes, ProcessHandle
 from rampart.actors.supervision.supervised_process import SupervisedProcess
+from rampart.actors.system.members import Spare
 
 
 @dataclass

@@ -25,13 +25,12 @@ from typing import BinaryIO
 
 import msgspec
 
-from rampart.actors.bus import run_folder
+from rampart.actors.bus import run_folder, run_info
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.ftm.messages import NodeTable
-from rampart.actors.run import run_info
-from rampart.actors.run.run_plan import OBSERVER, RunPlan, on_host
+from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.supervision.guard import Guard
 from rampart.actors.supervision.process_title import (
     TITLE_BYTES,

@@ -43,15 +43,15 @@ from rampart.actors.bus.run_folder import ROUTERS, is_here, process_of, register
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.foreign.child import CommandError
-from rampart.actors.layout.layout import Layout, router
-from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 from rampart.actors.runtime.clock import clock_of
+from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.supervision.process_title import WAITING, end_run, kill, set_title
 from rampart.actors.supervision.rehearsal import Stage, run_for_a_moment
 from rampart.actors.supervision.unseen import tell_of_callbacks
+from rampart.actors.system.layout import Layout, router
 from rampart.files.streams import complain
 from rampart.manager.spec.schema import Kind
 

@@ -25,12 +25,12 @@ import msgspec
 from rampart.actors.bus.bus import SharedBus
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints, StateFormat
 from rampart.actors.runtime.checkpoint_file import SUFFIXES, beside
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints, newest
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_plan import RunPlan
 
 _PATIENCE_S = 0.05
 """Seconds after which it is over, whatever has not come."""

@@ -32,7 +32,7 @@ from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.machine.patience import Patience, usage
 from rampart.actors.machine.unix_peer import process_state
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.rehearsal import rehearse
 

@@ -38,15 +38,15 @@ from rampart.actors.bus.run_folder import (
 )
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.layout.layout import Layout, adapted_system, load_run
-from rampart.actors.layout.system_topics import published_keys
 from rampart.actors.machine import turns
 from rampart.actors.machine.unix_peer import is_same_user, process_id
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.node_process import Role, Told, Waits, live, node_main, wedge
 from rampart.actors.supervision.process_title import end_run, set_title
 from rampart.actors.supervision.spare import Spares, wait
+from rampart.actors.system.layout import Layout, adapted_system, load_run
+from rampart.actors.system.topics import published_keys
 from rampart.files import streams, working_folder
 from rampart.manager.spec.tables import Supervision
 

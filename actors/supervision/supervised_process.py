@@ -23,8 +23,8 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from rampart.actors.ftm.messages import NodeState
-from rampart.actors.layout.layout import Unit
 from rampart.actors.machine.patience import Patience, Standstill, Usage
+from rampart.actors.system.layout import Unit
 from rampart.manager.spec.budget import PERIODS_TO_MISS
 from rampart.manager.spec.tables import Supervision
 

@@ -30,11 +30,10 @@ from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.lateness import Lateness
-from rampart.actors.layout.layout import Layout, Unit, adapted_system
 from rampart.actors.machine.absence import Absence
 from rampart.actors.machine.patience import Patience
-from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.held_process import HeldProcess
 from rampart.actors.supervision.processes import OsProcesses, Processes, ProcessHandle, RunProcess
 from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
@@ -46,6 +45,7 @@ from rampart.actors.supervision.supervised_process import (
     RestartPolicy,
     State,
 )
+from rampart.actors.system.layout import Layout, Unit, adapted_system
 from rampart.manager.spec.adaptation import changed_actors
 from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.tables import FAILOVER_S

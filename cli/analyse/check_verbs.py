@@ -8,8 +8,8 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.layout.layout import Layout, Unit
-from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR
+from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR
+from rampart.actors.system.layout import Layout, Unit
 from rampart.cli import systems
 from rampart.cli.look import topic_catalogue as catalogue
 from rampart.cli.output import UsageError, print_json, print_table, say

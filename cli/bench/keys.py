@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rampart.actors.access import key_folder
-from rampart.actors.layout.layout import Layout
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout
 from rampart.cli.bench.figures import Floor, Kill, ratio, spread
 from rampart.cli.bench.floors import trips_of_actors
 from rampart.cli.bench.killing import Show

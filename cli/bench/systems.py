@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
-from rampart.actors.run import run_info
+from rampart.actors.bus import run_info
 from rampart.cli.bench.programs import BenchError, Line, Program, of_ours
 
 START_S = 60.0

@@ -18,12 +18,12 @@ import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.json_schema import plain_schema
 from rampart.actors.recording.run_documents import known_of
 from rampart.actors.recording.views import encode
-from rampart.actors.run.run_info import RunInfo
 from rampart.cli.following import LOOK_S, is_over, sessions, stopped_by_signals
 from rampart.cli.output import UsageError, between, say, warn
 from rampart.cli.session import Session, pause

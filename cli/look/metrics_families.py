@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.machine.process_usage import ProcessCount
-from rampart.actors.run.run_info import RunInfo
 from rampart.cli.run_picture import RunPicture
 from rampart.cli.session import days_left
 

@@ -18,9 +18,9 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
+from rampart.actors.bus.run_info import ask
 from rampart.actors.ftm import topics
 from rampart.actors.machine.process_usage import read_count
-from rampart.actors.run.run_info import ask
 from rampart.actors.web.server import WebServer
 from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
 from rampart.cli.look.metrics_families import Exposition, families

@@ -15,7 +15,6 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.layout.wiring import load_member
 from rampart.actors.ros2.gateway import Gateway, types_of
 from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.node import RosNode
@@ -24,6 +23,7 @@ from rampart.actors.ros2.side import NoSide, ZenohSide
 from rampart.actors.ros2.translation.fields import plain
 from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
 from rampart.actors.ros2.wire import ADMIN, Attachment, Endpoint, EndpointKind, Qos, ros_name
+from rampart.actors.system.members import load_member
 from rampart.cli import systems
 from rampart.cli.look.topic_lines import in_line, print_rate, rate_of
 from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say, warn

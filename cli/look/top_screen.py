@@ -12,7 +12,7 @@ import sys
 from rich.console import Console, Group
 from rich.live import Live
 
-from rampart.actors.run import run_info
+from rampart.actors.bus import run_info
 from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
 from rampart.cli.look import top_view
 from rampart.cli.output import print_json, say

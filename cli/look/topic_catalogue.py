@@ -10,14 +10,14 @@ from typing import Any, NamedTuple, cast
 import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES
+from rampart.actors.bus.run_info import NoRunError, find_run
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.ftm import topics
-from rampart.actors.layout.layout import Layout
-from rampart.actors.layout.system_topics import find_topic
-from rampart.actors.layout.wiring import heard, published
-from rampart.actors.run.run_info import NoRunError, find_run
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
+from rampart.actors.runtime.run_plan import RunPlan
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import heard, published
+from rampart.actors.system.topics import find_topic
 from rampart.cli import systems
 from rampart.cli.output import UsageError, refusing, rendered, unknown
 from rampart.manager.spec.specification import SystemSpec

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import InjectionReport
-from rampart.actors.run.run_info import NoRunError, find_run
+from rampart.actors.bus.run_info import NoRunError, find_run
 from rampart.actors.runtime.fault_watch import FaultWatch, Order
 from rampart.actors.supervision.kill_node import SignalError
 from rampart.cli.look.topic_catalogue import check_member

@@ -31,8 +31,8 @@ import msgspec
 from rampart import systems as shipped
 from rampart.actors.access.register import IdentityName, KeysError, Kind, read_register
 from rampart.actors.bus.run_folder import ROUTERS
-from rampart.actors.layout.layout import Layout
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout
 from rampart.cli import systems
 from rampart.cli.output import (
     UsageError,

@@ -8,9 +8,9 @@ import uuid
 from collections.abc import Mapping
 
 from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.run_info import RunInfo, find_runs
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
-from rampart.actors.run.run_info import RunInfo, find_runs
 from rampart.actors.supervision import kill_node
 from rampart.actors.supervision.kill_node import (
     Elsewhere,

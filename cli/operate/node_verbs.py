@@ -20,12 +20,12 @@ from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 
+from rampart.actors.bus.run_info import NoRunError, RunInfo, find_run
 from rampart.actors.bus.topic import Topic
 from rampart.actors.foreign.program import LOGS
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ros2.messages import GRAPH, RosGraphReport
-from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.cli import systems
 from rampart.cli.following import is_over
 from rampart.cli.operate.operator_verbs import Holdings

@@ -20,15 +20,15 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from rampart.actors.bus.run_info import NoRunError, RunInfo, find_run
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.layout.layout import Layout
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.other_hosts import OtherHosts, others_of
 from rampart.actors.recording.process import stop_pipe, told
 from rampart.actors.recording.recorder import Recorder
-from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
 from rampart.cli.output import (

@@ -22,7 +22,7 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from rampart.actors.bus import run_folder, topics
+from rampart.actors.bus import run_folder, run_info, topics
 from rampart.actors.bus.bus import BusError, SharedBus
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.messages import Message
@@ -30,18 +30,17 @@ from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint
-from rampart.actors.layout.layout import application_class
-from rampart.actors.layout.wiring import load_class
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import Forms, header_of, renumbered
 from rampart.actors.recording.run_documents import NOT_CHOSEN, SYSTEM, Known, restore
-from rampart.actors.run import run_info
-from rampart.actors.run.run_context import NO_SYSTEM, RunContext
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_context import NO_SYSTEM, RunContext
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.system.layout import application_class
+from rampart.actors.system.members import load_class
 from rampart.cli import systems
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.session import pause

@@ -7,7 +7,7 @@ import socket
 from collections.abc import Iterator
 from itertools import cycle, islice
 
-from rampart.actors.run import run_info
+from rampart.actors.bus import run_info
 
 
 def bases() -> Iterator[int]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from rampart.actors.run.run_info import RunInfo, find_runs
+from rampart.actors.bus.run_info import RunInfo, find_runs
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing.ports import free_base_port
 from rampart.testing.waiting import wait_until

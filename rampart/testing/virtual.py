@@ -18,13 +18,13 @@ from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.topics import INJECT
-from rampart.actors.layout.layout import Layout, load_run
 from rampart.actors.machine.patience import AT_LEISURE
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, NoCheckpoints, Shelf
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout, load_run
 from rampart.files import working_folder
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.runs.trial import trial_class

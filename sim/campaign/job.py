@@ -16,10 +16,10 @@ from typing import Any, TypeVar
 import msgspec
 
 from rampart import systems
-from rampart.actors.layout.layout import application_class, load_application
-from rampart.actors.run.application import Application
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import RunPlan, load_system, tailor
+from rampart.actors.runtime.application import Application
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import RunPlan, load_system, tailor
+from rampart.actors.system.layout import application_class, load_application
 from rampart.files import toml, working_folder
 from rampart.files.reading import read_text
 from rampart.manager.spec.adaptation import Action, Change, adapt

@@ -10,7 +10,7 @@ from itertools import product
 import msgspec
 
 from rampart.actors.bus.topic import ROOT
-from rampart.actors.layout.system_topics import published_keys, system_topics
+from rampart.actors.system.topics import published_keys, system_topics
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.campaign.defaults import SEEDS
 from rampart.sim.campaign.job import Job

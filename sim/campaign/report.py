@@ -16,7 +16,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from rampart.actors.layout.wiring import import_class
+from rampart.actors.system.members import import_class
 from rampart.sim.campaign.charts import distributions
 from rampart.sim.campaign.job import trial_of_system
 from rampart.sim.campaign.named import Section

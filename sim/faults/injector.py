@@ -22,9 +22,9 @@ from rampart.actors.bus.messages import InjectionReport
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import ProcessEvent, SignalOrder
-from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.fault_watch import FaultWatch
+from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.faults.faults import Faults

@@ -29,9 +29,9 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.runtime.corruption import InjectionError, check_fields, is_array
 from rampart.actors.runtime.injection import MODES, UNTOUCHED
+from rampart.actors.system.topics import find_topic
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.wrong_numbers import Sizes, numbers, plausible_offsets
 

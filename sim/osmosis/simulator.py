@@ -24,8 +24,8 @@ from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import Positive
 from rampart.sim.osmosis.actuator_faults import FaultNews

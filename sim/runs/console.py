@@ -13,8 +13,8 @@ from rampart.actors.bus.limits import RateLimit, Remembered
 from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
-from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import Header
+from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan
 from rampart.files.plain_text import LINE_CHARS, printable
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import named

@@ -14,10 +14,10 @@ from typing import Any
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.layout.layout import application_class
-from rampart.actors.layout.wiring import import_class
 from rampart.actors.runtime.actor import BASE_INPUTS, Actor, Context, Header, on
 from rampart.actors.runtime.parameters import TopicsHeard
+from rampart.actors.system.layout import application_class
+from rampart.actors.system.members import import_class
 from rampart.manager.spec.schema import SystemSpec
 
 Sink = Callable[[Topic[Any], Any, Header], None]

@@ -11,9 +11,9 @@ from rampart.actors.access.register import KeysError
 from rampart.actors.bus.bus import SharedBus
 from rampart.actors.bus.run_folder import register_of
 from rampart.actors.hosts.launchers import FirstLauncher
-from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.actors.supervision.kill_node import SignalError, signal_node
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.unseen import watch

@@ -15,8 +15,8 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.web.audit import AuditLine
 from rampart.manager.strategies.registry import decision_in_words
 from rampart.sim.faults.scenario import FaultOutcome

@@ -20,14 +20,14 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeTable, ProcessEvent
-from rampart.actors.layout.layout import application_class, judge_class, judged_topics
-from rampart.actors.layout.system_topics import system_topics
-from rampart.actors.layout.wiring import import_class
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import OBSERVER
+from rampart.actors.system.layout import application_class, judge_class, judged_topics
+from rampart.actors.system.members import import_class
+from rampart.actors.system.topics import system_topics
 from rampart.actors.web.audit import read_audit
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.faults.faults import faults_of

@@ -18,9 +18,9 @@ from dataclasses import replace
 
 import msgspec
 
-from rampart.actors.layout.layout import Layout
-from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Context
+from rampart.actors.runtime.run_plan import OBSERVER
+from rampart.actors.system.layout import Layout
 from rampart.sim.faults.injector import INJECTOR, Branch, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.judge import Verdict

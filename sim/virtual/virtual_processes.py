@@ -20,13 +20,12 @@ from typing import Any
 import msgspec
 
 from rampart.actors.ftm.messages import AdaptedSystem, NodeTable
-from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.machine.patience import Usage
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime import checkpoint
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.guard import PERIOD_S, SUPERVISOR_PATIENCE_S
 from rampart.actors.supervision.processes import (
     ProcessHandle,
@@ -35,6 +34,7 @@ from rampart.actors.supervision.processes import (
 )
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.supervisor import Supervisor
+from rampart.actors.system.layout import Layout, adapted_system
 from rampart.manager.spec.nodes import Kind
 from rampart.sim.virtual.network import drawer, measured
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus

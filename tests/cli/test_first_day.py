@@ -12,7 +12,7 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import ProcessEvent
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.cli import output
 from rampart.cli.main import main
 from rampart.sim.runs.record import RunRecorder

@@ -10,7 +10,7 @@ import signal
 import msgspec
 import pytest
 
-from rampart.actors.run.run_info import RunInfo
+from rampart.actors.bus.run_info import RunInfo
 from rampart.cli import following
 from rampart.cli.output import UsageError
 

@@ -12,13 +12,13 @@ import pytest
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_info import RunInfo
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.clock import Clock
 from rampart.cli import systems
@@ -133,7 +133,7 @@ async def run(monkeypatch, bus_folder):
     info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), bus_folder, names,
                    "r1", 0, "test run", plan={"mission": "AB"})
     monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: info)
-    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)  # those of others
+    monkeypatch.setattr("rampart.actors.bus.run_info.find_runs", list)  # those of others
     async with AsyncExitStack() as stack:
         nodes = []
         for name, cls in (("simulator", Everything), ("DM1", Bystander)):

@@ -12,10 +12,10 @@ import pytest
 
 from rampart import systems as shipped
 from rampart.actors.bus import messages as bm
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_info import RunInfo
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve
 from rampart.cli.look.topic_verbs import in_line, rate_of
@@ -108,7 +108,7 @@ def test_only_the_sets_in_which_strategies_differ_can_be_shown(capsys):
 
 @pytest.fixture(autouse=True)
 def _no_runs_of_others(monkeypatch):
-    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
+    monkeypatch.setattr("rampart.actors.bus.run_info.find_runs", list)
 
 
 @pytest.mark.parametrize("verb", [
@@ -192,7 +192,7 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
 def test_nonsense_is_refused_in_one_line_that_names_it(capsys, monkeypatch, arguments, words):
     monkeypatch.setattr("rampart.cli.session.find_run",
                         lambda _port: pytest.fail("looked for a run"))
-    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
+    monkeypatch.setattr("rampart.actors.bus.run_info.find_runs", list)
     assert main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -207,7 +207,7 @@ def test_nonsense_is_refused_in_one_line_that_names_it(capsys, monkeypatch, argu
     ["obstacle", "add", "crate", "1", "2"], ["obstacle", "remove", "crate"],
 ])
 def test_without_a_run_each_verb_says_so_and_exits_2(capsys, monkeypatch, arguments):
-    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
+    monkeypatch.setattr("rampart.actors.bus.run_info.find_runs", list)
     assert main(arguments) == 2
     assert capsys.readouterr().err == (
         "rampart: no run found; start one with `python launch.py`\n")
@@ -336,7 +336,7 @@ def test_an_actor_that_cannot_be_loaded_is_one_line_and_needed_for_its_own_topic
     file.write_text(file.read_text().replace("tests.porter_actors:", "no_actors:"))
     run = RunInfo(1, 7450, 1.0, 0.0, str(file), "", (), "r1", 0, "test run")
     monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: run)
-    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
+    monkeypatch.setattr("rampart.actors.bus.run_info.find_runs", list)
     for arguments in (["topic", "list", "--system", str(file)],
                       ["inject", "drop:porter/load"],
                       ["campaign", "--list", "--system", str(file)],

@@ -11,7 +11,7 @@ import pytest
 
 import rampart
 import rampart.testing
-from rampart.actors.layout.wiring import load_class
+from rampart.actors.system.members import load_class
 from tests import ROOT
 
 DOCUMENT = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from rampart.actors.ftm import topics
-from rampart.actors.layout.wiring import load_class
+from rampart.actors.system.members import load_class
 from rampart.testing import VirtualSystem, run
 from tests import ROOT
 

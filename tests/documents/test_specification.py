@@ -13,8 +13,8 @@ import msgspec
 import pytest
 
 from rampart.actors.ftm.messages import DetectionState
-from rampart.actors.layout.system_topics import system_topics
-from rampart.actors.layout.wiring import load_class
+from rampart.actors.system.members import load_class
+from rampart.actors.system.topics import system_topics
 from rampart.manager.model.gates import GateError, detection_gate
 from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.ros2 import Ros2Link

@@ -7,9 +7,9 @@ import dataclasses
 import pytest
 
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.layout.system_topics import own_topics, published_keys, system_topics
-from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import topics
+from rampart.actors.system.members import load_class
+from rampart.actors.system.topics import own_topics, published_keys, system_topics
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import markdown, uses
 from tests import ROOT, porter_actors, system_file
@@ -43,7 +43,7 @@ def test_whole_systems_have_the_common_topics_and_no_other(name):
 
 def test_who_asks_only_for_a_robot_s_own_topics_loads_no_actor_that_ships(tmp_path, monkeypatch):
     loaded = []
-    monkeypatch.setattr("rampart.actors.layout.system_topics.load_class",
+    monkeypatch.setattr("rampart.actors.system.topics.load_class",
                         lambda path: loaded.append(path) or load_class(path))
     assert [own_topics(systems.load(str(system_file(name))))
             for name in ("paper", "osmosis", "cell")] == [()] * 3

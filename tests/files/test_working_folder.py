@@ -11,10 +11,10 @@ import pytest
 from rampart.files import working_folder
 from tests import ROOT
 
-LOOK = ("from rampart.actors.layout import wiring\n"
+LOOK = ("from rampart.actors.system import members\n"
         "from rampart.files import working_folder\n"
         "working_folder.admit()\n"
-        "wiring.load_class('intruder:Node')\n")
+        "members.load_class('intruder:Node')\n")
 
 
 @pytest.mark.parametrize(("mode", "words"), [

@@ -31,16 +31,16 @@ from msgspec import inspect
 
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.layout.layout import Layout, load_run
-from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.machine.patience import AT_LEISURE, Usage
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.recording.views import OsmosisViews
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
 from rampart.actors.runtime.parameters import topics_named
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR, RunPlan
+from rampart.actors.system.layout import Layout, load_run
+from rampart.actors.system.topics import find_topic
 from rampart.cli import systems
 from rampart.cli.look import top_view
 from rampart.cli.look.metrics_families import families

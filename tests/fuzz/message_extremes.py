@@ -18,8 +18,8 @@ from msgspec import inspect
 
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.topic import Topic
-from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.osmosis import topics
+from rampart.actors.system.topics import system_topics
 from rampart.cli import systems
 from tests import system_file
 

@@ -25,10 +25,10 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.recording.views import OsmosisViews
-from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, on
 from rampart.actors.runtime.injection import MAX_DELAYED, MAX_IN_FORCE
 from rampart.actors.runtime.mailbox import Dispatcher
+from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor

@@ -8,10 +8,10 @@ import pytest
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.layout.layout import adapted_system
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, on
+from rampart.actors.runtime.run_plan import SUPERVISOR
+from rampart.actors.system.layout import adapted_system
 from rampart.testing import VirtualSystem, run
 from tests.fuzz import handler_fuzz
 from tests.fuzz.handler_fuzz import SYSTEMS, cases, fuzz_actor, fuzz_tools, system

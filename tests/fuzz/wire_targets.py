@@ -8,6 +8,7 @@ import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE, ArrivalGuard, Header, encode
 from rampart.actors.bus.recorder_connection import frame, parse_frame
+from rampart.actors.bus.run_info import RunInfo, read_info
 from rampart.actors.machine.process_usage import parse_stat
 from rampart.actors.operator.requests import RequestError, RequestReader
 from rampart.actors.osmosis import topics
@@ -22,7 +23,6 @@ from rampart.actors.osmosis.control.teleoperation.joystick_device import (
 )
 from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS
 from rampart.actors.recording.message_form import Forms
-from rampart.actors.run.run_info import RunInfo, read_info
 from rampart.actors.runtime.checkpoint import StateError
 from rampart.actors.supervision.process_title import parse_title
 from rampart.actors.supervision.spawner import ForkRequest, Ping, Reply, Request, SetOrigin

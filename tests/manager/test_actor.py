@@ -19,7 +19,6 @@ from rampart.actors.detection.module import DetectionModule
 from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.layout.wiring import Member, heard, published
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
@@ -31,6 +30,7 @@ from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
 from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.system.members import Member, heard, published
 from rampart.manager.actor import DECISIONS_PER_INCARNATION, FtmManager
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from rampart.testing import run

@@ -28,9 +28,9 @@ from typing import Any
 from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
-from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import WAITING, find_processes, process_state
 from rampart.actors.supervision.spawner import NAMES

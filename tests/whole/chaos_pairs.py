@@ -26,8 +26,8 @@ from typing import Any
 
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeState, NodeTable
-from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import HEARTBEAT
+from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.cli.output import UsageError

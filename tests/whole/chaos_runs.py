@@ -16,7 +16,7 @@ from pathlib import Path
 
 from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.run.run_plan import SUPERVISOR
+from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.manager.spec.specification import SystemSpec, check_document, read_document
 from rampart.testing import RealRun, free_base_port
 from tests import ROOT

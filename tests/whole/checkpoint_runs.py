@@ -11,10 +11,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rampart.actors.bus import messages as bm
-from rampart.actors.layout.layout import load_run
 from rampart.actors.osmosis import messages as m
-from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.checkpoint import Shelf
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import load_run
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun

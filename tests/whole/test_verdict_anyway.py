@@ -19,7 +19,7 @@ from msgspec.structs import replace
 import rampart.sim.osmosis.trial.mission_trial
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recording.virtual import VirtualRecording
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.cli import run as launch
 from rampart.sim.osmosis.trial.record import MissionRecorder
 from rampart.sim.osmosis.trial.report import render

@@ -17,8 +17,8 @@ from rampart.actors.osmosis.readings import ray_distances
 from rampart.actors.osmosis.recording import scene
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.views import View, Views, line
-from rampart.actors.run.application import Application
-from rampart.actors.run.run_context import NO_SYSTEM
+from rampart.actors.runtime.application import Application
+from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.manager.spec.schema import SystemSpec
 
 

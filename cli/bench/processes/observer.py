@@ -21,10 +21,10 @@ import msgspec
 import zenoh
 
 from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.run_info import find_run
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.bus.zenoh_bus import PATIENCE_S
 from rampart.actors.bus.zenoh_session import Credentials, session_config
-from rampart.actors.run.run_info import find_run
 from rampart.cli.bench.actors import INPUT_HZ, OUTPUT, is_mean, scan
 from rampart.cli.session import tools_credentials
 

@@ -12,9 +12,9 @@ import sys
 
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeState, NodeTable
-from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_plan import OBSERVER, RunPlan
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.files import working_folder
 

@@ -12,9 +12,9 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_context import RunContext
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.injector import OsmosisInjector

@@ -14,8 +14,8 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
 from rampart.actors.osmosis.airport.model import Airport, Light, Mission, MissionGoal
 from rampart.actors.osmosis.messages import GroundTruth
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.record import KEPT, RunRecord, RunRecorder, Safety
 

@@ -21,10 +21,10 @@ from rampart.actors.access import key_folder
 from rampart.actors.access.certificates import new_authority, new_certificate
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, endpoint, session_config
-from rampart.actors.layout.layout import Layout, router
-from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
+from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.launcher import kept_ports
+from rampart.actors.system.layout import Layout, router
 from tests import ROOT
 
 PATIENCE_S = 20.0

@@ -14,8 +14,8 @@ from rampart.actors.access.register import Register
 from rampart.actors.access.rights import rights_of_all
 from rampart.actors.access.rules import Host, rules_as_declared, rules_of
 from rampart.actors.bus.zenoh_session import session_config
-from rampart.actors.layout.layout import Layout
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_bus import VirtualBus
 from rampart.testing import virtual_run
 from tests import two_hosts as systems

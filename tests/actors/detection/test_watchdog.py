@@ -9,9 +9,9 @@ import pytest
 
 from rampart.actors.detection.watchdog import Watchdog, WatchdogCore
 from rampart.actors.ftm import messages as m
-from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.system.members import Member, heard
 from rampart.testing import Ear, play, run, table
 from tests.osmosis_system import System
 

@@ -18,15 +18,15 @@ from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import Checkpoints, StateCopy
 from rampart.actors.hosts.copies import checksum
-from rampart.actors.layout.layout import Layout
 from rampart.actors.machine.unix_peer import process_id
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.node_process import make_actor
 from rampart.actors.supervision.spawner_client import SpawnerBusyError
+from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run
 from tests.actors.supervision.test_supervisor import Machine

@@ -27,9 +27,9 @@ from rampart.actors.hosts.meeting import (
     context,
     joined,
 )
-from rampart.actors.layout.hosts import Hosts
-from rampart.actors.layout.layout import load_application
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.hosts import Hosts
+from rampart.actors.system.layout import load_application
 from rampart.systems import DEFAULT
 from rampart.testing import eventually
 from rampart.testing.ports import free_port

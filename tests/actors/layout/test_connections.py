@@ -8,8 +8,8 @@ import textwrap
 
 import pytest
 
-from rampart.actors.layout.layout import Layout
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout
 from tests import system_file
 
 HEAD = """

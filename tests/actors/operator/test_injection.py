@@ -24,9 +24,9 @@ from rampart.actors.operator.injection import (
 from rampart.actors.operator.requests import RefusedError
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S, Order
 from rampart.actors.runtime.injection import MODES, flaw
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.cli import systems
 from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import Faults

@@ -11,13 +11,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from rampart.actors.layout.layout import Layout
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.server import page_files
 from rampart.actors.operator.state import STALE_S, TRACE_POINTS, HmiState
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor
+from rampart.actors.runtime.run_plan import RunPlan
+from rampart.actors.system.layout import Layout
 from rampart.manager.spec.panels import MAX_KEPT, MAX_PANELS, Panel
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import eventually, free_port

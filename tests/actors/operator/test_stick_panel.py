@@ -14,12 +14,12 @@ import pytest
 from rampart.actors.bus.fields import Steered
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
-from rampart.actors.layout.layout import Layout
-from rampart.actors.layout.wiring import published
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.limits import BURST
 from rampart.actors.operator.stick import TICKET_S
 from rampart.actors.runtime.actor import Actor, Header, on
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import published
 from rampart.cli.analyse.check_verbs import explain
 from rampart.manager.spec.panels import Panel
 from rampart.testing import eventually

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 
+from rampart.actors.bus import run_info
 from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -16,7 +17,6 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_writer import BagWriter
 from rampart.actors.recording.run_documents import Documents, collect
-from rampart.actors.run import run_info
 from tests import ROOT
 
 PLAN = {"system_file": str(ROOT / "systems" / "paper.toml"), "airport": "vallombre",

@@ -18,7 +18,6 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topics import HEARTBEAT
 from rampart.actors.bus.zenoh_session import endpoint, session_config
-from rampart.actors.layout.layout import Layout
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of, repair
 from rampart.actors.recording.bag_writer import UNHEARD, BagWriter, SequenceGaps
 from rampart.actors.recording.other_hosts import (
@@ -30,7 +29,8 @@ from rampart.actors.recording.other_hosts import (
     others_of,
 )
 from rampart.actors.recording.recorder import RUN_ENDED, Recorder
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout
 from rampart.testing import free_base_port, wait_until
 from tests.actors.recording.samples import AnsweringLauncher, documents, pose
 from tests.two_hosts import two_hosts

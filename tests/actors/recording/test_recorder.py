@@ -24,13 +24,13 @@ from mcap.stream_reader import StreamReader
 
 from rampart.actors.bus import recorder_connection as wire
 from rampart.actors.bus.recorder_connection import RecorderConnection, frame, parse_frame
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of
 from rampart.actors.recording.process import Order, RecorderProcess, told
 from rampart.actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
-from rampart.actors.run.run_info import RunInfo
 from rampart.cli.main import main
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port, wait_until
 from tests import ROOT

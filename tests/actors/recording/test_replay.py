@@ -20,6 +20,7 @@ import pytest
 from websockets.asyncio.client import connect as open_socket
 
 from rampart.actors.bus import messages as bm
+from rampart.actors.bus import run_info
 from rampart.actors.bus.envelope import ArrivalGuard, Header, encode
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.bus.zenoh_bus import ZenohBus
@@ -36,7 +37,6 @@ from rampart.actors.recording.bag_writer import BagWriter
 from rampart.actors.recording.message_form import Forms, MessageForm
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.recording.run_documents import collect
-from rampart.actors.run import run_info
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.cli.main import main
 from rampart.cli.output import UsageError

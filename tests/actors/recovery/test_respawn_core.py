@@ -11,7 +11,7 @@ from rampart.actors.bus.topics import HEARTBEAT
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import RecoveryCommand
 from rampart.actors.recovery.respawn import Ask, Respawn, RespawnCore
-from rampart.actors.run.run_context import RunContext
+from rampart.actors.runtime.run_context import RunContext
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import VirtualSystem
 from rampart.testing import run as virtually

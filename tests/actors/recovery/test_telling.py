@@ -9,11 +9,11 @@ import pytest
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.layout.layout import Layout
 from rampart.actors.recovery.telling import Call, CallEach, Hold, SwitchMode
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor, Header, on
 from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.run_plan import RunPlan
+from rampart.actors.system.layout import Layout
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import VirtualSystem, run
 from tests.tank import LEVEL, ORDER, TOPICS, VALVE, Level, Valve

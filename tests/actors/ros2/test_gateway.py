@@ -9,10 +9,10 @@ import msgspec
 import pytest
 
 from rampart.actors.bus.topics import DIAGNOSTIC
-from rampart.actors.layout.layout import Layout
 from rampart.actors.ros2.messages import GRAPH
 from rampart.actors.ros2.wire import Qos
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout
 from rampart.systems import SHIPPED
 from rampart.testing import Ear, VirtualSystem, run
 

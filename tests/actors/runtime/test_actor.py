@@ -23,18 +23,18 @@ from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.layout.layout import SUPERVISOR_CLASS, Layout
-from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.recovery.module import RecoveryModule
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.declaration import Declared
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.node_process import make_actor
+from rampart.actors.system.layout import SUPERVISOR_CLASS, Layout
+from rampart.actors.system.members import load_class
 from rampart.cli import systems
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.systems import SHIPPED

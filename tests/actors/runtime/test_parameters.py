@@ -12,14 +12,14 @@ import pytest
 
 from rampart import systems
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.layout.layout import Layout
-from rampart.actors.layout.wiring import REPORTS_ON, load_class, load_member
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recovery.stub import StubRecovery
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.parameters import NodeNames, read_parameters
+from rampart.actors.runtime.run_plan import RunPlan
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import REPORTS_ON, load_class, load_member
 from rampart.cli import systems as cli_systems
 from rampart.cli.output import UsageError
 from rampart.manager.spec.schema import SystemSpec

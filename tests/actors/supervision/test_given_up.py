@@ -12,7 +12,7 @@ import pytest
 
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem, RespawnRequest
-from rampart.actors.run.run_plan import load_document
+from rampart.actors.runtime.run_plan import load_document
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.manager.spec.adaptation import Action, Change, adapt
 from rampart.sim.campaign.job import Job, run_virtually

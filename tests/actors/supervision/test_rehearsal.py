@@ -11,11 +11,11 @@ import pytest
 
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints, newest
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision import rehearsal
 from rampart.actors.supervision.rehearsal import Stage, run_for_a_moment
 

@@ -20,13 +20,13 @@ import pytest
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem, RespawnRequest
-from rampart.actors.layout.layout import Layout
 from rampart.actors.machine.patience import usage
 from rampart.actors.osmosis import topics as robot
-from rampart.actors.run.run_plan import load_document, load_system
 from rampart.actors.runtime.actor import Actor, on
+from rampart.actors.runtime.run_plan import load_document, load_system
 from rampart.actors.supervision import spare
 from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually
 from tests.actors.supervision import test_supervision as base

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from rampart.actors.ftm.messages import NodeState
-from rampart.actors.layout.layout import Unit
 from rampart.actors.machine.patience import AT_LEISURE, Patience, Usage
 from rampart.actors.supervision.supervised_process import (
     START_TIMEOUT_S,
@@ -16,6 +15,7 @@ from rampart.actors.supervision.supervised_process import (
     State,
     SupervisedProcess,
 )
+from rampart.actors.system.layout import Unit
 from rampart.manager.spec.schema import Kind, NodeSpec
 from rampart.manager.spec.tables import Supervision
 

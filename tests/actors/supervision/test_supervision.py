@@ -22,23 +22,22 @@ import pytest
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.run_folder import ROUTERS
+from rampart.actors.bus.run_info import find_runs
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeTable, ProcessEvent, RespawnRequest
-from rampart.actors.layout.layout import Layout
-from rampart.actors.run import run_info
-from rampart.actors.run.run_info import find_runs
-from rampart.actors.run.run_plan import load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_plan import load_system
 from rampart.actors.supervision import guard as guard_module
 from rampart.actors.supervision import launcher as launcher_module
-from rampart.actors.supervision import node_process
+from rampart.actors.supervision import node_process, run_info
 from rampart.actors.supervision.kill_node import main as kill_node
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.supervision.process_title import TITLE_BYTES, find_processes
 from rampart.actors.supervision.spawner import address
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import RestartPolicy
+from rampart.actors.system.layout import Layout
 from rampart.manager.spec.tables import Supervision
 from rampart.testing import eventually
 from tests import ROOT

@@ -19,15 +19,15 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem, ManagerStatus, NodeState, RespawnRequest
-from rampart.actors.layout.layout import Layout
 from rampart.actors.machine.patience import Usage
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import SUPERVISOR, RunPlan, load_document, load_system
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan, load_document, load_system
 from rampart.actors.supervision.processes import RunProcess, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import MOST_EXCUSED_S
 from rampart.actors.supervision.supervisor import Supervisor
+from rampart.actors.system.layout import Layout
 from rampart.manager.spec.tables import Supervision
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run, turns

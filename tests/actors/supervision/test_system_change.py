@@ -10,9 +10,9 @@ import msgspec
 import pytest
 
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.layout.layout import Layout, adapted_system
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout, adapted_system
 from tests import ROOT
 from tests.two_hosts import two_hosts
 

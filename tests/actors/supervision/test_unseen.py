@@ -10,13 +10,13 @@ import sys
 
 import pytest
 
-from rampart.actors.layout.layout import load_run
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import load_system
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import load_system
 from rampart.actors.supervision.launcher import needed_descriptors
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
+from rampart.actors.system.layout import load_run
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.process_run import ProcessRun
 from rampart.sim.runs.trial import Trial

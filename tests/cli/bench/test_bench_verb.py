@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from rampart.actors.foreign.keeper import descendants
-from rampart.actors.layout.layout import Layout
 from rampart.actors.machine.unix_peer import process_state
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout
 from rampart.cli.bench.measuring import bench  # noqa: F401 imported once, before a test is timed
 from rampart.cli.bench.peers import HOT, OURS
 from rampart.cli.bench.processes.observer import Heard

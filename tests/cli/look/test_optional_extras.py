@@ -15,10 +15,10 @@ import pytest
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.machine.process_usage import ProcessCount
-from rampart.actors.run.run_info import RunInfo
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.web.guests import ROOM
 from rampart.actors.web.server import WebServer

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 
 from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_info import RunInfo
 from rampart.actors.runtime.clock import Clock
 from rampart.cli import following
 from rampart.cli.following import draw

@@ -9,6 +9,7 @@ import json
 import msgspec
 import pytest
 
+from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.ftm import messages as fm
@@ -21,10 +22,9 @@ from rampart.actors.osmosis.control.mission import mission_state
 from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
 from rampart.actors.osmosis.control.mission.mission_state import MissionState, obey, status
 from rampart.actors.osmosis.messages import MissionAction, MissionPhase
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_info import RunInfo
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_context import RunContext
 from rampart.cli import systems
 from rampart.cli.main import main
 from tests.cli.test_verbs_live import RATE, Run

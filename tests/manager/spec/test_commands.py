@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rampart.actors.foreign.program import check_programs
-from rampart.actors.layout.layout import Layout
-from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.system.layout import Layout
 from rampart.manager.spec.specification import (
     SpecificationError,
     check_change,

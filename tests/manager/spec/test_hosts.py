@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rampart.actors.layout.hosts import Hosts
+from rampart.actors.system.hosts import Hosts
 from rampart.manager.spec.budget import check
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import SpecificationError

@@ -15,11 +15,11 @@ from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.envelope import Header, decode, encode
 from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.layout.system_topics import published_keys
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.corruption import corrupt
 from rampart.actors.runtime.injection import MODES, FaultGate, flaw
+from rampart.actors.system.topics import published_keys
 from rampart.cli.look.topic_catalogue import resolve, uses
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import DELAY_S, NONSENSE, modes_of, systematic_faults

@@ -9,8 +9,8 @@ import pytest
 
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
-from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.run_context import RunContext
 from rampart.manager.spec.specification import parse_specification
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.injector import Injector

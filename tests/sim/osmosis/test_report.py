@@ -16,8 +16,8 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
 from rampart.sim.osmosis.trial.report import clearance, render
 from rampart.sim.runs.report import clock, try_report

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.web.audit import AuditLine, AuditLog
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import render, try_report

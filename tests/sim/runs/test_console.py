@@ -9,8 +9,8 @@ import pytest
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.manager.spec.specification import parse_specification
 from rampart.sim.osmosis.trial.mission_trial import MissionConsole
 from rampart.sim.runs.console import Console

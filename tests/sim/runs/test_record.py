@@ -8,8 +8,8 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable, ProcessEvent
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.sim.runs.record import Interval, RunRecorder
 from rampart.sim.runs.report import clock
 

@@ -7,7 +7,6 @@ import math
 
 import pytest
 
-from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.estimation_error import (
@@ -15,6 +14,7 @@ from rampart.actors.osmosis.detection.area.estimation_error import (
     EstimationMonitor,
 )
 from rampart.actors.runtime.actor import Actor
+from rampart.actors.system.members import Member, heard
 from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from rampart.testing import Ear, run
 from tests.actors.osmosis.control.localization_drive import (

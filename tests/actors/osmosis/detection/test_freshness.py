@@ -11,13 +11,13 @@ from rampart.actors.detection.freshness import Freshness, FreshnessMonitor
 from rampart.actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
 from rampart.actors.detection.stub import StubDetection
 from rampart.actors.ftm import messages as fm
-from rampart.actors.layout.layout import Layout
-from rampart.actors.layout.wiring import heard
 from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header, on
+from rampart.actors.runtime.run_plan import RunPlan
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import heard
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from rampart.testing import Ear, play, run, table
 from tests.actors.osmosis.detection.sources import Source

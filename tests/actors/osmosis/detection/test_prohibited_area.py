@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from shapely.geometry import box
 
 from rampart.actors.detection.freshness import FreshnessMonitor
-from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
@@ -26,6 +25,7 @@ from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.messages import GpsFix
 from rampart.actors.osmosis.readings import is_fix
 from rampart.actors.runtime.actor import Actor
+from rampart.actors.system.members import Member, heard
 from rampart.testing import Ear, play, run, table
 from tests.actors.osmosis.detection.sources import Source
 from tests.osmosis_system import System, shipped_system

@@ -8,13 +8,13 @@ import math
 import pytest
 from shapely.geometry import box
 
-from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.detection.area.position_vote import GPS, WHEELS, PositionVote
 from rampart.actors.osmosis.detection.area.voted_area import VotedArea, VotedPosition
 from rampart.actors.runtime.actor import Actor
+from rampart.actors.system.members import Member, heard
 from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from rampart.testing import Ear, run
 from tests.actors.osmosis.control.localization_drive import (

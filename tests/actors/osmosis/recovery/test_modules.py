@@ -7,7 +7,6 @@ import asyncio
 import pytest
 
 from rampart.actors.ftm import messages as fm
-from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import PilotMode
@@ -17,6 +16,7 @@ from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleopera
 from rampart.actors.recovery.module import TRANSITIONS, IllegalTransitionError, RecoveryModule
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.system.members import Member, heard
 from rampart.testing import run
 from tests.actors.osmosis.recovery.world import Base, Boss, Node, Pilot, Supervisor, hang
 from tests.osmosis_system import System

@@ -9,12 +9,12 @@ import pytest
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.localization.fused_localization import FusedLocalization
 from rampart.actors.osmosis.control.localization.localization import Localization
 from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.system.members import Member, heard
 from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import run

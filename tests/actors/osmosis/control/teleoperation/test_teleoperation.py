@@ -25,10 +25,10 @@ from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     INITIAL,
 )
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.cli import run as launch
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 
 from rampart.actors.bus.run_folder import ROUTERS
-from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, on_host
+from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR, on_host
 from rampart.manager.spec.hosts import HostSpec
 from rampart.manager.spec.schema import SystemSpec
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.run.application import Application
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.application import Application
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.manager.spec.schema import SystemSpec
 
 NO_SYSTEM = SystemSpec("none", "an actor without a system")

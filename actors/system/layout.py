@@ -12,15 +12,20 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.layout.chosen_topics import choose_topics, with_pages
-from rampart.actors.layout.connections import (
+from rampart.actors.runtime.application import Application
+from rampart.actors.runtime.declaration import Handlers
+from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.run_context import RunContext
+from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_document, on_host, tailor
+from rampart.actors.system.checks import (
     check_connections,
     check_heard,
     check_repairs,
     publishers_of,
 )
-from rampart.actors.layout.hosts import Hosts
-from rampart.actors.layout.wiring import (
+from rampart.actors.system.chosen_topics import choose_topics, with_pages
+from rampart.actors.system.hosts import Hosts
+from rampart.actors.system.members import (
     SPARES,
     Member,
     Spare,
@@ -29,11 +34,6 @@ from rampart.actors.layout.wiring import (
     load_member,
     topics_of,
 )
-from rampart.actors.run.application import Application
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import OBSERVER, RunPlan, load_document, on_host, tailor
-from rampart.actors.runtime.declaration import Handlers
-from rampart.actors.runtime.parameters import read_parameters
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 from rampart.manager.spec.specification import check_change, check_document
 from rampart.manager.spec.tables import Layers

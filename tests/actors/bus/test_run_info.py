@@ -13,7 +13,7 @@ from itertools import islice
 import msgspec
 import pytest
 
-from rampart.actors.run import run_info
+from rampart.actors.bus import run_info
 from rampart.testing import free_base_port
 from rampart.testing.ports import bases
 

@@ -15,9 +15,9 @@ import msgspec
 from msgspec import inspect
 
 from rampart.actors.bus.topic import Members, Qos, Topic
-from rampart.actors.layout.wiring import Member, heard, panels_of, published
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import BASE_OUTPUTS
+from rampart.actors.system.members import Member, heard, panels_of, published
 from rampart.manager.spec.schema import Kind, SystemSpec
 
 Published = Mapping[str, list[tuple[Member, Members]]]

@@ -15,9 +15,9 @@ import msgspec
 from rampart.actors.bus.fields import Field, Steered
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
-from rampart.actors.layout.wiring import Member, panels_of, published, shows_panels
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import Named, messages_said, topics_named
+from rampart.actors.system.members import Member, panels_of, published, shows_panels
 from rampart.manager.spec.panels import NUMBER, Panel
 from rampart.manager.spec.schema import SystemSpec
 

@@ -7,10 +7,10 @@ from typing import Any
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
-from rampart.actors.layout.connections import flaw
-from rampart.actors.layout.layout import Layout, application_class
-from rampart.actors.layout.wiring import heard, load_class, load_member, published, topics_of
-from rampart.actors.run.run_plan import OBSERVER, RunPlan
+from rampart.actors.runtime.run_plan import OBSERVER, RunPlan
+from rampart.actors.system.checks import flaw
+from rampart.actors.system.layout import Layout, application_class
+from rampart.actors.system.members import heard, load_class, load_member, published, topics_of
 from rampart.manager.spec.ros2 import GATEWAY
 from rampart.manager.spec.specification import SystemSpec
 
