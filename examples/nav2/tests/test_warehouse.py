@@ -18,6 +18,7 @@ SYSTEM = Path(__file__).resolve().parents[1] / "warehouse.toml"
     ("drop:nav/command@10+5", "M_SILENT", "R_RESTART"),
     ("stuck:guard/velocity@10+inf", "M_GUARD_STUCK", "R_RESTART"),
     ("drop:guard/velocity@10+inf", "M_GUARD_SILENT", "R_RESTART"),
+    ("corrupt:guard/velocity@10+inf", "M_DAMAGED", "R_RESTART"),
     ("kill:controller_server@10", "M_CRASH", "R_RESTART"),
     pytest.param("kill:amcl@10", "M_CRASH", "R_RESTART", marks=pytest.mark.slow),
     pytest.param("wedge:planner_server@10", "M_CRASH", "R_RESTART", marks=pytest.mark.slow)])

@@ -43,6 +43,7 @@ class Guard(Actor):
         self._nearest_m, self._seen_s = math.nan, -math.inf
         self._told_s = -math.inf
         self._stop, self._why = False, "nothing was commanded"
+        self._linear_mps = 0.0
         self.hear_topic(said.command, self._commanded)
         self.hear_topic(said.scan, self._scanned)
 
@@ -71,6 +72,7 @@ class Guard(Actor):
             linear, angular = 0.0, angular if self._why.endswith("obstacle") else 0.0
         linear = max(-said.top_mps, min(said.top_mps, linear))
         angular = max(-said.top_radps, min(said.top_radps, angular))
+        self._linear_mps = linear
         self.publish(topics.CHECKED, Velocity(linear, angular, header.stamp),
                      stamp=header.stamp)
 
@@ -80,5 +82,6 @@ class Guard(Actor):
         now_s = self.clock.now()
         if now_s - self._told_s > self.parameters.stale_s:
             self._why = "the navigation is silent"
+            self._linear_mps = 0.0
             self.publish(topics.CHECKED, Velocity(0.0, 0.0, now_s))
-        self.publish(topics.STATE, GuardState(bool(self._why), self._why))
+        self.publish(topics.STATE, GuardState(bool(self._why), self._why, self._linear_mps))

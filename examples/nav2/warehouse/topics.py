@@ -23,10 +23,11 @@ class Order(Message, frozen=True):
 
 
 class GuardState(Message, frozen=True):
-    """What the guard does, and why it does not pass a command on, "" if it does."""
+    """Whether and why the guard stops the robot, and the speed that it decided on, m/s."""
 
     stopped: bool
     reason: str
+    linear_mps: float
 
 
 class Truth(Message, frozen=True):
