@@ -20,7 +20,9 @@ test-slow: setup
 	$(BIN)/python -m pytest -m slow
 
 # More cases of what the suite samples: 5,000 bytes of a recording damaged one by one, for example.
+# Cut sets are compared with those of SCRAM, a program of its own.
 test-nightly: setup
+	@command -v scram >/dev/null || { echo "make test-nightly: scram is missing; install Debian's package scram" >&2; exit 2; }
 	$(BIN)/python -m pytest -m nightly
 
 lint: setup

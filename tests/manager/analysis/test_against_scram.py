@@ -1,0 +1,109 @@
+"""Minimal cut sets beside SCRAM, an independent program: its own inputs, random trees, exports.
+
+Needs Debian's package `scram` (GPL-3, neither linked nor shipped): `make test-nightly` asks for it.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from rampart.manager.analysis.cut_sets import CutSets
+from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
+from rampart.manager.spec.specification import parse_specification
+from tests import system_file
+from tests.manager.analysis.test_cut_sets import trees
+
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(1800)]
+
+INPUTS = Path("/usr/share/scram/input")
+ALL = 1000
+"""Sets of at most so many events; SCRAM's own default leaves out those of more than 20."""
+
+ORDERS = {"CEA9601": 4}
+"""Of inputs of which SCRAM does not count all sets within a minute."""
+
+WITHOUT_COUNT = {
+    "high-prob", "mcs_prob", "mixed_mcs_prob",  # probabilities only
+    "attack", "bcd", "mef_example", "event_tree", "gas_leak",  # event trees
+    "common_cause", "substitutions", "nondeclarative_substitutions",  # refused: other sets
+    "attack_alignment", "two_train_alignment",  # phases of a mission, each with counts of its own
+    "config"}
+
+
+def count(folder: Path, *files: Path, order: int = ALL) -> dict[str, int]:
+    """Return SCRAM's number of minimal cut sets of each top."""
+    output = folder / "scram.xml"
+    done = subprocess.run(
+        ["scram", *map(str, files), "--limit-order", str(order), "-o", str(output)],
+        check=False, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return {top: int(products) for top, products in re.findall(
+        r'<sum-of-products name="([^"]*)"[^>]* products="(\d+)"', output.read_text())}
+
+
+def inputs() -> list[Path]:
+    """Return the fault trees among SCRAM's inputs."""
+    return sorted(path for path in INPUTS.rglob("*.xml") if path.stem not in WITHOUT_COUNT
+                  and not path.stem.endswith("-basic-events"))
+
+
+def test_the_inputs_of_scram_have_as_many_cut_sets_as_scram_finds(tmp_path):
+    compared = 0
+    for path in inputs():
+        order = ORDERS.get(path.stem, ALL)
+        events = path.with_name(f"{path.stem}-basic-events.xml")
+        found = count(tmp_path, path, *([events] if events.exists() else []), order=order)
+        for top, expected in found.items():
+            tree = read_open_psa(path.read_text(encoding="utf-8"), path.name, top)
+            assert CutSets(tree, max_order=order).count == expected, (path, top)
+            compared += 1
+    assert compared >= 13
+
+
+def test_a_count_for_which_scram_uses_more_than_gates_is_refused():
+    for stem in ("common_cause", "substitutions", "nondeclarative_substitutions",
+                 "two_train_alignment"):
+        path = next(INPUTS.rglob(f"{stem}.xml"))
+        with pytest.raises(OpenPsaError, match=rf"{stem}\.xml:\d+: "):
+            read_open_psa(path.read_text(encoding="utf-8"), path.name)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+@given(tree=trees(coherent=True))
+def test_random_trees_have_as_many_cut_sets_as_scram_finds(tmp_path, tree):
+    gates = "".join(
+        f'<define-gate name="{name}">{written(gate.low, gate.inputs, tree)}</define-gate>'
+        for name, gate in tree.gates.items())
+    path = tmp_path / "tree.xml"
+    events = "".join(f'<define-basic-event name="e{i}"/>' for i in range(6))
+    events += "".join(f'<define-house-event name="{name}"><constant value="{str(state).lower()}"/>'
+                      f"</define-house-event>" for name, state in tree.house.items())
+    path.write_text(f'<opsa-mef><define-fault-tree name="t">{gates}</define-fault-tree>'
+                    f"<model-data>{events}</model-data></opsa-mef>")
+    assert count(tmp_path, path)[tree.top] == CutSets(tree).count
+
+
+def written(least, names, tree) -> str:
+    """Return the formula "at least so many of these" in Open-PSA; SCRAM wants 2 inputs or more."""
+    kinds = {**dict.fromkeys(tree.gates, "gate"), **dict.fromkeys(tree.house, "house-event")}
+    parts = [f'<{kinds.get(name, "basic-event")} name="{name}"/>' for name in names]
+    if len(parts) == 1:
+        return parts[0]
+    if least in {1, len(parts)}:
+        return f"<or>{''.join(parts)}</or>" if least == 1 else f"<and>{''.join(parts)}</and>"
+    return f'<atleast min="{least}">{"".join(parts)}</atleast>'
+
+
+@pytest.mark.parametrize("system", ["paper", "osmosis", "cell"])
+def test_an_exported_system_has_as_many_cut_sets_in_scram(tmp_path, system):
+    file = system_file(system)
+    spec = parse_specification(file.read_text(encoding="utf-8"), file.name)
+    path = tmp_path / "export.xml"
+    path.write_text(write_open_psa(spec), encoding="utf-8")
+    ours = CutSets(read_open_psa(path.read_text(encoding="utf-8"), path.name))
+    assert list(count(tmp_path, path).values()) == [ours.count]
