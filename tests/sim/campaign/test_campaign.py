@@ -676,13 +676,14 @@ def made_up(monkeypatch):
     return bad
 
 
-def test_named_faults_together_are_every_pair_that_can_be_injected_at_once(tmp_path, made_up, capsys):
+def test_named_faults_together_are_every_pair_that_can_be_injected_at_once(tmp_path, made_up):
     assert rampart(["campaign", "--fault", "gps-b*@30+inf", "--fault", "imu-[bd]*@30+inf",
                     "--fault", "stuck:summit_xl/gps@30+inf", "--together", "2",
                     "--obstacles", "0,2", "--out", str(tmp_path)]) == 0
     made = Counter(frozenset(fault.fault for fault in job.faults) for job in jobs_in(tmp_path))
-    assert set(made) == {frozenset((one, f"imu-{kind}")) for one in ("gps-bias", "stuck:summit_xl/gps")
-                         for kind in ("bias", "drift", "dropout")}
+    assert set(made) == {
+        frozenset((one, f"imu-{kind}")) for one in ("gps-bias", "stuck:summit_xl/gps")
+        for kind in ("bias", "drift", "dropout")}
     assert set(made.values()) == {2}
 
 
