@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -66,34 +67,23 @@ class Host:
     people: bool = True
 
 
-class _Meeting:
-    """Which key expressions of a system meet others."""
-
-    def __init__(self) -> None:
-        self._parsed: dict[str, zenoh.KeyExpr] = {}
-
-    def of(self, those: Iterable[str], these: Iterable[str]) -> frozenset[str]:
-        """Return those of the first that have a key in common with one of the second."""
-        wanted = [self._parse(key) for key in these]
-        return frozenset(key for key in those
-                         if any(self._parse(key).intersects(one) for one in wanted))
-
-    def _parse(self, key: str) -> zenoh.KeyExpr:
-        found = self._parsed.get(key)
-        if found is None:
-            found = self._parsed[key] = zenoh.KeyExpr(key)
-        return found
+_parsed = cache(zenoh.KeyExpr)
 
 
-def grants(own: Rights, everybody: Rights, meeting: _Meeting | None = None) -> list[Grant]:
+def _meet(those: Iterable[str], these: Iterable[str]) -> frozenset[str]:
+    """Return those of the first that have a key in common with one of the second."""
+    wanted = [_parsed(key) for key in these]
+    return frozenset(key for key in those
+                     if any(_parsed(key).intersects(one) for one in wanted))
+
+
+def grants(own: Rights, everybody: Rights) -> list[Grant]:
     """Return what a router lets through on a link to somebody.
 
     Args:
         own: what that one may.
         everybody: what all of the system may.
-        meeting: keeps what it has parsed.
     """
-    meet = (meeting or _Meeting()).of
     found: list[Grant] = [
         (INGRESS, (PUT,), own.says),
         (INGRESS, (SUBSCRIBER,), own.hears),
@@ -102,12 +92,12 @@ def grants(own: Rights, everybody: Rights, meeting: _Meeting | None = None) -> l
         (INGRESS, (TOKEN,), own.is_there),
         (INGRESS, (TOKENS, TOKEN_QUERY), own.watches),
         (EGRESS, (PUT,), own.hears),
-        (EGRESS, (SUBSCRIBER,), meet(everybody.hears, own.says)),
-        (EGRESS, (QUERY,), meet(everybody.asks, own.answers)),
-        (EGRESS, (QUERYABLE,), meet(everybody.answers, own.asks)),
+        (EGRESS, (SUBSCRIBER,), _meet(everybody.hears, own.says)),
+        (EGRESS, (QUERY,), _meet(everybody.asks, own.answers)),
+        (EGRESS, (QUERYABLE,), _meet(everybody.answers, own.asks)),
         (EGRESS, (REPLY,), own.asks),
         (EGRESS, (TOKEN,), own.watches),
-        (EGRESS, (TOKENS, TOKEN_QUERY), meet(everybody.watches, own.is_there))]
+        (EGRESS, (TOKENS, TOKEN_QUERY), _meet(everybody.watches, own.is_there))]
     return [grant for grant in found if grant[2]]
 
 
@@ -149,7 +139,7 @@ def rules_of(host: Host, hosts: Sequence[Host], rights: Mapping[str, Rights],
         rights: of all, see `rights_of_all`.
         register: who has which certificate; nobody else may anything.
     """
-    everybody, meeting = together(rights.values()), _Meeting()
+    everybody = together(rights.values())
     routers, nodes = register.of_kind("router"), register.of_kind("node")
     found: dict[str, list[Grant]] = {}
     for name in host.routers:
@@ -157,16 +147,16 @@ def rules_of(host: Host, hosts: Sequence[Host], rights: Mapping[str, Rights],
             found[routers[name]] = _BETWEEN_ROUTERS
     for name in host.nodes:
         if name in nodes:
-            found[nodes[name]] = grants(rights[name], everybody, meeting)
+            found[nodes[name]] = grants(rights[name], everybody)
     for kind in (OPERATOR, VIEWER) if host.people else ():
         people = register.of_kind(kind)
-        granted = grants(rights[kind], everybody, meeting) if people else []
+        granted = grants(rights[kind], everybody) if people else []
         found.update((common_name, granted) for common_name in people.values())
     for other in hosts:
         if other.name != host.name:
             there = [rights[name] for name in (*other.nodes, *other.routers)]
             there += [rights[kind] for kind in (OPERATOR, VIEWER) if other.people]
-            between = grants(together(there), everybody, meeting)
+            between = grants(together(there), everybody)
             found.update((routers[name], between) for name in other.routers if name in routers)
     return Rules(found)
 

@@ -20,7 +20,6 @@ import msgspec
 import zenoh
 from zenoh.handlers import Callback
 
-from rampart.actors.access.checking import includes
 from rampart.actors.access.rights import EVERYTHING, said_elsewhere
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.zenoh_session import Credentials, answering, open_client
@@ -70,10 +69,10 @@ def distinct(expressions: Collection[str]) -> tuple[str, ...]:
     """Return the key expressions that no other one includes; everything, if they are too many."""
     if sum(map(len, expressions)) > _MOST_BYTES:
         return (EVERYTHING,)
-    wide = [one for one in expressions if "*" in one]
+    wide = [zenoh.KeyExpr(one) for one in expressions if "*" in one]
     return tuple(sorted(
         one for one in expressions
-        if not any(other != one and includes(other, one) for other in wide)))
+        if not any(str(other) != one and other.includes(one) for other in wide)))
 
 
 class EachOnce:

@@ -6,10 +6,6 @@ import argparse
 import time
 from typing import Any
 
-import msgspec
-
-from rampart.actors.access.checking import AccessReport, check_each_host
-from rampart.actors.access.rules import rules_as_declared
 from rampart.cli import systems
 from rampart.cli.output import UsageError, print_json, print_table, progress, refusing, say
 from rampart.cli.verbs import JSON, add_verb, flag, several, whole
@@ -34,8 +30,7 @@ def run(options: argparse.Namespace) -> int:
     what each strategy decides for every set of active mechanisms, and every state
     of the arbiter that carries it out, from when it has heard every module. A property holds, or
     the shortest counterexamples are shown. docs/verification.md explains the
-    properties, and what is not looked at. Then the access rules of a run with keys
-    are compared with what the classes declare, for each identity on each key.
+    properties, and what is not looked at.
 
     Examples:
       rampart verify
@@ -44,35 +39,21 @@ def run(options: argparse.Namespace) -> int:
       rampart verify --strict && python launch.py     only if all holds
 
     exit code: 0 verified, whatever was found; with --strict 1 if a property of the
-    system's strategy (or of one given by --strategy) or the access rules fail; 2 bad
-    usage or bad spec
+    system's strategy (or of one given by --strategy) fails; 2 bad usage or bad spec
     """
-    layout = systems.check(options.system)
-    spec = layout.spec
+    spec = systems.check(options.system).spec
     if options.together < 1:
         raise UsageError(f"--together {options.together}: a number from 1 up is right")
     start = time.monotonic()
     with progress() as show, refusing(TooLargeError, UnknownStrategyError):
         report = verify(spec, options.strategy, options.together, show)
-    access = check_each_host(layout, rules_as_declared)
     if options.json:
-        print_json({**msgspec.to_builtins(report), "access": msgspec.to_builtins(access)})
+        print_json(report)
     else:
         _show(spec, report, time.monotonic() - start)
-        _show_access(access)
     wanted = set(options.strategy or [spec.strategy]) | {""}
     failed = any(not p.holds and p.strategy in wanted for p in report.properties)
-    return 1 if options.strict and (failed or not access.holds) else 0
-
-
-def _show_access(access: AccessReport) -> None:
-    say()
-    say(f"access rules of a run with keys: {access.identities} identities on {access.keys} keys, "
-        f"{access.pairs} pairs: " + (
-            f"{access.let_through} may publish, as declared; nobody may publish, hear or answer "
-            "what they do not declare" if access.holds else f"WRONG in {access.wrong}"))
-    for line in access.examples:
-        say(f"  {line}")
+    return 1 if options.strict and failed else 0
 
 
 def _show(spec: SystemSpec, report: Report, seconds: float) -> None:

@@ -1,18 +1,16 @@
-"""Do the access rules say what the classes declare? Checked pair by pair, for `rampart verify`.
+"""Access rules, pair by pair, beside what the classes declare.
 
-The rules are read as a router reads them: from Zenoh's configuration, by the name in a certificate,
-a key let through if a rule's expression includes it. What is declared is asked of each class, key
-by key. So neither the way from classes to rules nor Zenoh's library is used, and a mistake there
-shows as a pair of an identity and a key on which the two disagree.
+The rules are read as a router reads them: from Zenoh's configuration, by the name in a certificate.
+What is declared is asked of each class, key by key, and not taken from where the rules come from.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import msgspec
+import zenoh
 
 from rampart.actors.bus.topic import ROOT, Members, Qos, Topic
 from rampart.actors.bus.topics import INJECT
@@ -23,135 +21,52 @@ from rampart.actors.system.members import Member, shows_panels
 from rampart.actors.system.topics import declared_topics
 
 PEOPLE = ("operator", "viewer")
-MOST_SHOWN = 20
 
 _INCARNATION = "1"
 _FOREIGN = ("nothing/declared", "**", "*/*", "heartbeat/*", "alive/*/*", "gone/*")
 """What nobody declares; as keys, expressions with wildcards included."""
 
-Claim = tuple[str, str, str]
-"""Flow, message, and whether that is to say, to hear, to answer, to ask, or to be there."""
-
-_CLAIMS: tuple[Claim, ...] = (
+_CLAIMS = (
     ("ingress", "put", "says"), ("ingress", "declare_subscriber", "hears"),
     ("egress", "put", "hears"), ("ingress", "declare_queryable", "answers"),
     ("ingress", "reply", "answers"), ("ingress", "query", "asks"), ("egress", "reply", "asks"),
     ("ingress", "liveliness_token", "is there"), ("ingress", "delete", "never"),
     ("egress", "delete", "never"))
-_WHAT = tuple(dict.fromkeys(what for _, _, what in _CLAIMS))
+"""Flow, message, and whether that is to say, to hear, to answer, to ask, or to be there."""
 
 
-class AccessReport(msgspec.Struct, frozen=True):
-    """What came of the check.
+def disagreements(layout: Layout, config: Mapping[str, Any]) -> tuple[list[str], dict[str, set]]:
+    """Compare what the routers of a layout's host let through with what is declared.
 
-    Attributes:
-        identities: that were looked at: all but the host's own routers, which hand everything on.
-        keys: on which.
-        pairs: of an identity and a key, each looked at for all that Zenoh can refuse.
-        let_through: pairs in which the identity may publish.
-        wrong: how many things are let through that nobody declares, or declared and refused.
-        examples: the first of them, in words.
-        speakers: by key, who may publish on it.
-    """
-
-    identities: int
-    keys: int
-    pairs: int
-    let_through: int
-    wrong: int
-    examples: tuple[str, ...]
-    speakers: dict[str, tuple[str, ...]]
-
-    @property
-    def holds(self) -> bool:
-        """Whether the rules say what is declared."""
-        return self.wrong == 0
-
-
-def check_access(layout: Layout, config: Mapping[str, Any]) -> AccessReport:
-    """Compare what a router lets through with what is declared.
-
-    Args:
-        layout: of the system, as the host of the router has it.
-        config: Zenoh's `access_control`; the names in certificates are those of the identities,
-            `operator` and `viewer` those of people.
+    Returns what is let through and not declared, or the other way round; and who may publish on
+    each key.
     """
     declared = _Declared(layout)
-    keys = list(declared.keys())
+    keys = {key: zenoh.KeyExpr(f"{ROOT}/{key}") for key in dict.fromkeys(declared.keys())}
     wrong: list[str] = []
-    speakers: dict[str, list[str]] = {}
-    identities = declared.identities
-    for name in identities:
-        claims = [(claim, _let_through(config, name, *claim[:2])) for claim in _CLAIMS]
-        for key in keys:
-            said = {what: declared.may(name, what, key) for what in _WHAT}
-            for (flow, message, what), lets in claims:
-                may, should = lets(f"/{ROOT}/{key}"), said[what]
-                if may and message == "put" and flow == "ingress":
-                    speakers.setdefault(key, []).append(name)
-                if may != should:
+    speakers: dict[str, set[str]] = {}
+    for name in declared.identities:
+        for flow, message, what in _CLAIMS:
+            lets = _let_through(config, name, flow, message)
+            for key, expression in keys.items():
+                may = lets(expression)
+                if may and (flow, message) == ("ingress", "put"):
+                    speakers.setdefault(key, set()).add(name)
+                if may != declared.may(name, what, key):
                     wrong.append(f"{name}: {message} of {key!r} ({flow}) is " + (
                         "let through, and not declared" if may else "declared, and refused"))
-    return AccessReport(
-        len(identities), len(keys), len(identities) * len(keys),
-        sum(map(len, speakers.values())), len(wrong), tuple(wrong[:MOST_SHOWN]),
-        {key: tuple(those) for key, those in sorted(speakers.items())})
+    return wrong, speakers
 
 
-def check_each_host(layout: Layout, rules: Callable[[Layout], Mapping[str, Any]]) -> AccessReport:
-    """Compare what the routers of each host let through with what is declared; all in one report.
-
-    Args:
-        layout: of the system.
-        rules: returns the rules of the routers of the host that a layout is of.
-    """
-    found: dict[str, AccessReport] = {}
+def on_each_host(layout: Layout) -> Iterator[Layout]:
+    """Yield a layout as each of its hosts has it."""
     for host in layout.hosts.supervisors:
-        there = Layout(msgspec.structs.replace(layout.plan, host=host), layout.spec)
-        found[host] = check_access(there, rules(there))
-    reports = list(found.values())
-    if len(reports) == 1:
-        return reports[0]
-    speakers: dict[str, dict[str, None]] = {}
-    for report in reports:
-        for key, those in report.speakers.items():
-            speakers.setdefault(key, {}).update(dict.fromkeys(those))
-    return AccessReport(
-        reports[0].identities, reports[0].keys, sum(one.pairs for one in reports),
-        sum(one.let_through for one in reports), sum(one.wrong for one in reports),
-        tuple(f"host {host or 'the first'}: {line}" for host, report in found.items()
-              for line in report.examples)[:MOST_SHOWN],
-        {key: tuple(those) for key, those in sorted(speakers.items())})
-
-
-def includes(expression: str, key: str) -> bool:
-    """Whether a key expression includes another, as Zenoh has it; without `$*`."""
-    return _pattern([expression]).fullmatch(f"/{key}") is not None
-
-
-def _pattern(expressions: Iterable[str]) -> re.Pattern[str]:
-    """Return what matches the keys that one of some expressions includes, with a slash before each.
-
-    `*` stands for one chunk, also for another `*`, and `**` for any number of chunks, none too.
-    """
-    patterns = []
-    for expression in expressions:
-        text = ""
-        for chunk in expression.split("/"):
-            if chunk == "**":
-                text += "(?:/[^/]+)*"
-            else:
-                text += r"/(?!\*\*(?:/|\Z))[^/]+" if chunk == "*" else "/" + re.escape(chunk)
-        patterns.append(text)
-    return re.compile("|".join(f"(?:{one})" for one in patterns) or r"(?!)")
+        yield Layout(msgspec.structs.replace(layout.plan, host=host), layout.spec)
 
 
 def _let_through(config: Mapping[str, Any], common_name: str, flow: str,
-                 message: str) -> Callable[[str], bool]:
-    """Return whether a router lets a message through on a key, by the name in a certificate.
-
-    What is returned takes the key with a slash before it.
-    """
+                 message: str) -> Callable[[zenoh.KeyExpr], bool]:
+    """Return whether a router lets a message through on a key, by the name in a certificate."""
     if not config["enabled"]:
         return lambda _key: True
     subjects = {subject["id"] for subject in config["subjects"]
@@ -162,10 +77,15 @@ def _let_through(config: Mapping[str, Any], common_name: str, flow: str,
     for rule in config["rules"]:
         if rule["id"] in chosen and flow in rule["flows"] and message in rule["messages"]:
             found[rule["permission"]] += rule["key_exprs"]
-    allowed, denied = _pattern(found["allow"]), _pattern(found["deny"])
     by_default = config["default_permission"] == "allow"
-    return lambda key: denied.fullmatch(key) is None and (
-        by_default or allowed.fullmatch(key) is not None)
+    denies, allows = _includer(found["deny"]), _includer(found["allow"])
+    return lambda key: not denies(key) and (by_default or allows(key))
+
+
+def _includer(expressions: list[str]) -> Callable[[zenoh.KeyExpr], bool]:
+    literal = {one for one in expressions if "*" not in one}
+    wide = [zenoh.KeyExpr(one) for one in expressions if "*" in one]
+    return lambda key: str(key) in literal or any(one.includes(key) for one in wide)
 
 
 class _Declared:
