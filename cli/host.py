@@ -33,6 +33,8 @@ _LEFT_TO_THE_FIRST = ("wait", "strategy", "shadow", "no_ftm", "rate", "seed", "p
 
 EXIT_OVER, EXIT_FAILED = 0, 1
 
+_ENDING = (signal.SIGINT, signal.SIGTERM)
+
 
 class HostRun:
     """One host's part in a run.
@@ -66,17 +68,23 @@ class HostRun:
             LaunchError: its processes cannot be started.
         """
         host = OtherHost(self._plan, _say)
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, host.interrupted.set)
+        loop, task, why = asyncio.get_running_loop(), asyncio.current_task(), ""
+        assert task is not None  # noqa: S101 for the type checker
+
+        def interrupt() -> None:
+            for number in _ENDING:
+                loop.add_signal_handler(number, lambda: None)
+            task.cancel()
+
+        for number in _ENDING:
+            loop.add_signal_handler(number, interrupt)
         try:
-            await host.join()
-            launcher = host.launcher
-            if launcher is None or host.interrupted.is_set():
-                return EXIT_FAILED
+            launcher = await host.join()
             launcher.begin()
             await host.start()
-            why = await self._stay(host, launcher) if not host.interrupted.is_set() else ""
+            why = await self._stay(host, launcher)
+        except asyncio.CancelledError:
+            task.uncancel()
         except MeetingError as error:
             raise UsageError(f"--host {self._plan.host}: {error}") from None
         finally:

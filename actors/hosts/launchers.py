@@ -17,6 +17,7 @@ from rampart.actors.hosts.meeting import (
     Attendance,
     Meeting,
     MeetingError,
+    RunOverError,
     Told,
     contents_of,
     joined,
@@ -88,12 +89,10 @@ class OtherHost:
 
     Attributes:
         launcher: of this host's processes, from `join` on.
-        interrupted: set to end before the run does.
     """
 
     def __init__(self, own: RunPlan, say: Callable[[str], None]) -> None:
         self.launcher: OtherLauncher | None = None
-        self.interrupted = asyncio.Event()
         self._own = own
         self._say = say
         self._spec = load_system(own)
@@ -104,22 +103,23 @@ class OtherHost:
             own.host, self._where, contents_of(own),
             own.credentials(on_host(OBSERVER, own.host)))
         self._clocks = ClockSync(self._link.clock_s)
-        self._said = ""
+        self._said = self._unreachable = ""
         self._is_trusted = True
 
-    async def join(self) -> RunPlan:
-        """Wait for the first host, and return the plan of the run as it is for this one.
+    async def join(self) -> OtherLauncher:
+        """Wait for the first host, and return the launcher of this one's part in the run.
 
         Raises:
             MeetingError: this host may not take part.
         """
-        told = await self._answer()
+        while (told := await self._asked()) is None:
+            pass
         plan = joined(told.plan, self._own)
         application = load_application(plan, self._spec)
         self._attendance.ready(contents_of(plan, application))
         plan = msgspec.structs.replace(plan, incarnations=(told.starts - 1) * run_folder.EPOCH)
         self.launcher = OtherLauncher(plan, self._spec, told.incarnations)
-        return plan
+        return self.launcher
 
     async def start(self) -> None:
         """Start this host's processes when the first host says so.
@@ -131,16 +131,12 @@ class OtherHost:
         launcher = self.launcher
         assert launcher is not None  # noqa: S101 for the type checker
         await launcher.load()
-        while not self.interrupted.is_set():
-            told = await self._answer()
-            if told.over:
-                raise MeetingError(f"the run is over: {told.over}")
-            if told.origin_s is not None:
-                launcher.begins_s = told.origin_s - self._clocks.offset_s
-                await launcher.start()
-                return
-            self._tell(f"waiting for {', '.join(told.waits_for) or 'the first host'}")
+        while (told := await self._asked()) is None or told.origin_s is None:
+            if told is not None:
+                self._tell(f"waiting for {', '.join(told.waits_for) or 'the first host'}")
             await asyncio.sleep(PERIOD_S)
+        launcher.begins_s = told.origin_s - self._clocks.offset_s
+        await launcher.start()
 
     async def stay(self) -> str:
         """Follow the first host's clock until the run is over; return why it is.
@@ -152,13 +148,14 @@ class OtherHost:
         """
         launcher = self.launcher
         assert launcher is not None  # noqa: S101 for the type checker
-        while not (launcher.failure or self.interrupted.is_set()):
-            told = await self._answer()
-            if told.over:
-                return told.over
-            if told.origin_s is not None:
+        while not launcher.failure:
+            try:
+                told = await self._asked()
+            except RunOverError as over:
+                return str(over)
+            if told is not None and told.origin_s is not None:
                 launcher.follow(told.origin_s - self._clocks.offset_s)
-            self._judge_clock()
+                self._judge_clock()
             await asyncio.sleep(PERIOD_S)
         return ""
 
@@ -166,31 +163,28 @@ class OtherHost:
         """Ask no more."""
         await self._attendance.close()
 
-    async def _answer(self) -> Told:
-        """Ask until there is an answer; what the clocks show of it is noted.
+    async def _asked(self) -> Told | None:
+        """Ask once, and note what the answer shows of the clocks; None if there is no answer now.
 
         Raises:
             MeetingError: this host may not take part, or the first one has begun another run.
         """
-        while True:
-            try:
-                told, asked_s, heard_s = await self._attendance.ask()
-            except OSError as error:
-                why = error.strerror or str(error) or "no answer"
-                self._tell(f"the first host cannot be reached at {self._where[0]} port "
-                           f"{self._where[1]} ({why}); trying on")
-                await asyncio.sleep(_RETRY_S)
-                if self.interrupted.is_set() or (self.launcher and self.launcher.failure):
-                    return Told(self._own, over="it was interrupted")
-                continue
-            if self._said.startswith("the first host cannot"):
-                self._tell("the first host answers")
-            if self.launcher and told.plan.run_id != self.launcher.plan.run_id:
-                raise MeetingError(f"the first host has begun another run ({told.plan.run_id}); "
-                                   "start this host again")
-            if told.now_s:
-                self._clocks.exchanged(asked_s, told.now_s, heard_s)
-            return told
+        try:
+            told, asked_s, heard_s = await self._attendance.ask()
+        except OSError as error:
+            why = error.strerror or str(error) or "no answer"
+            self._unreachable = (f"the first host cannot be reached at {self._where[0]} port "
+                                 f"{self._where[1]} ({why}); trying on")
+            self._tell(self._unreachable)
+            await asyncio.sleep(_RETRY_S)
+            return None
+        if self._said and self._said == self._unreachable:
+            self._tell("the first host answers")
+        if self.launcher and told.plan.run_id != self.launcher.plan.run_id:
+            raise MeetingError(f"the first host has begun another run ({told.plan.run_id}); "
+                               "start this host again")
+        self._clocks.exchanged(asked_s, told.now_s, heard_s)
+        return told
 
     def _judge_clock(self) -> None:
         bound_s = self._clocks.bound_at(time.monotonic())

@@ -1,9 +1,9 @@
 """How the launchers of a run come together: the others ask the first host's.
 
-A connection for each host, over which lines of JSON go, a question and its answer. By them a
-launcher learns of the plan of the run, whether its own files are the same, when simulated time
-begins, what time it is, and when the run is over. A connection that breaks is made again; the run
-does not depend on it.
+Each of them has a WebSocket to the first host's and sends a question now and then. From the answers
+a launcher learns the plan of the run, whether its own files are the same, when simulated time
+begins, and what time it is on the first host. At its end the first host closes all connections with
+a code that means so. A connection that breaks is made again; the run does not depend on it.
 """
 
 from __future__ import annotations
@@ -11,13 +11,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import logging
 import ssl
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed, WebSocketException
 
 import rampart
 from rampart.actors.access.register import Kind, read_register
@@ -35,15 +40,19 @@ DOOR = ROUTERS[0]
 """By whose certificate the first host's launcher is known: routers have those of servers."""
 
 _PATIENCE_S = 3.0
-"""For an answer, or for the next question: then the connection is made again."""
+"""To connect, for an answer, and for the sign that the other end is there."""
 
-_FAREWELL_S = 2.0
-"""How long others are waited for at the end: over a bad line the word is sent again and again."""
+_FAREWELL_S, _GOODBYE_S = 2.0, 0.5
+"""How long first and other hosts wait for the other end as they close: a bad line delivers late."""
 
-_GOODBYE_S = 0.5
-"""How long a connection that is closed waits for the other end's word that it has heard so."""
+_OVER = 4000
+"""Close code: the first host has ended the run, for the reason that is given with it."""
 
-_MAX_LINE = 1 << 20
+_QUIET = logging.getLogger("rampart.hosts.meeting")
+_QUIET.disabled = True  # strangers who connect are not the user's concern
+
+_SETTINGS: dict[str, Any] = {
+    "compression": None, "max_size": 1 << 20, "logger": _QUIET, "open_timeout": _PATIENCE_S}
 
 
 class Ask(msgspec.Struct, frozen=True, tag="ask"):
@@ -61,9 +70,9 @@ class Ask(msgspec.Struct, frozen=True, tag="ask"):
 class Told(msgspec.Struct, frozen=True, tag="told"):
     """The answer.
 
-    `refused` says why the host may not take part, `over` why the run has ended; both end it.
-    `now_s` and `origin_s` are readings of the first host's monotonic clock, `origin_s` at simulated
-    time 0, None before that is known. `waits_for` names the hosts that are missing.
+    `refused` says why the host may not take part. `now_s` and `origin_s` are readings of the first
+    host's monotonic clock, `origin_s` at simulated time 0, None before that is known. `waits_for`
+    names the hosts that are missing.
     """
 
     plan: RunPlan
@@ -73,11 +82,29 @@ class Told(msgspec.Struct, frozen=True, tag="told"):
     waits_for: tuple[str, ...] = ()
     incarnations: dict[str, int] = {}
     refused: str = ""
-    over: str = ""
 
 
 class MeetingError(Exception):
     """A host cannot take part; the text is one line for the user."""
+
+
+class RunOverError(MeetingError):
+    """The first host has ended the run; the text says why."""
+
+
+@dataclass(slots=True)
+class _Guest:
+    """Another host, as the first one knows it.
+
+    Attributes:
+        serials: of its starts, the present one last.
+        connection: by which it asks; None if there is none.
+        is_ready: whether it waits for the start of the run.
+    """
+
+    serials: list[str] = field(default_factory=list)
+    connection: ServerConnection | None = None
+    is_ready: bool = False
 
 
 class Meeting:
@@ -95,15 +122,11 @@ class Meeting:
         self._plan = shared(plan)
         self._contents = dict(contents)
         self._issued = issued
-        self._serials: dict[str, list[str]] = {host: [] for host in hosts}
-        self._ready: dict[str, bool] = dict.fromkeys(hosts, False)
+        self._guests = {host: _Guest() for host in hosts}
         self._changed = asyncio.Event()
         self._origin_s: float | None = None
-        self._over = ""
-        self._server: asyncio.Server | None = None
+        self._server: Server | None = None
         self._shown: Credentials | None = None
-        self._told: dict[str, asyncio.Event] = {}
-        self._writers: set[asyncio.StreamWriter] = set()
 
     async def open(self, address: str, port: int, shown: Credentials | None = None) -> None:
         """Listen.
@@ -117,11 +140,14 @@ class Meeting:
             MeetingError: the address is not one of this machine's, or in use.
         """
         self._shown = shown
+        tls: dict[str, Any] = {
+            "ssl": context(shown, ssl.Purpose.CLIENT_AUTH),
+            "ssl_handshake_timeout": _PATIENCE_S} if shown else {}
         try:
-            self._server = await asyncio.start_server(
-                self._serve, address, port, limit=_MAX_LINE, reuse_address=True,
-                ssl=context(shown, ssl.Purpose.CLIENT_AUTH) if shown else None,
-                ssl_shutdown_timeout=_GOODBYE_S if shown else None)
+            self._server = await serve(
+                self._serve, address, port, origins=[None],  # no page that a browser shows
+                close_timeout=_FAREWELL_S, ping_interval=_PATIENCE_S / 2,
+                ping_timeout=_PATIENCE_S / 2, **tls, **_SETTINGS)
         except OSError as error:
             raise MeetingError(f"cannot listen at {address} port {port} for the other hosts: "
                                f"{error.strerror or error}") from None
@@ -143,66 +169,53 @@ class Meeting:
 
     async def close(self) -> None:
         """Tell the others that the run is over, as far as they can be reached soon."""
-        self._over = "the first host has ended it"
-        waiting = [one.wait() for one in self._told.values()]
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(asyncio.gather(*waiting), _FAREWELL_S)
         if self._server is not None:
-            self._server.close()
-        for writer in list(self._writers):
-            await _closed(writer)
+            self._server.close(code=_OVER, reason="the first host has ended it")
+            with contextlib.suppress(TimeoutError):  # somebody is still connecting
+                await asyncio.wait_for(self._server.wait_closed(), 2 * _FAREWELL_S)
 
     def _missing(self) -> tuple[str, ...]:
-        return tuple(host for host, ready in self._ready.items() if not ready)
+        return tuple(host for host, guest in self._guests.items() if not guest.is_ready)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        told_of_end, host = asyncio.Event(), ""
-        self._writers.add(writer)
+    async def _serve(self, connection: ServerConnection) -> None:
         try:
-            while True:
-                line = await asyncio.wait_for(reader.readuntil(), _PATIENCE_S)
-                ask = msgspec.json.decode(line, type=Ask)
-                host = ask.host
-                if self._shown and not _is(writer, self._shown, "node", on_host(OBSERVER, host)):
-                    raise ValueError(f"somebody else asks for host {host}")
-                self._told[host] = told_of_end
-                answer = self._answer(ask)
-                writer.write(msgspec.json.encode(answer) + b"\n")
-                await writer.drain()
-                if answer.over or answer.refused:
+            async for question in connection:
+                ask = msgspec.json.decode(question, type=Ask)
+                if self._shown and not _is(
+                        connection, self._shown, "node", on_host(OBSERVER, ask.host)):
                     return
-        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError,
-                *UNREADABLE):
-            return  # it is gone, or nobody of ours
+                answer = self._answer(ask, connection)
+                await connection.send(msgspec.json.encode(answer))
+                if answer.refused:
+                    return
+        except (ConnectionClosed, *UNREADABLE):
+            return  # it is gone, or a stranger
         finally:
-            told_of_end.set()
-            if self._told.get(host) is told_of_end:
-                del self._told[host]
-                if host in self._ready and self._origin_s is None:
-                    self._ready[host] = False
+            for guest in self._guests.values():
+                if guest.connection is connection:
+                    guest.connection = None
+                    guest.is_ready = guest.is_ready and self._origin_s is not None
                     self._changed.set()
-            self._writers.discard(writer)
-            await _closed(writer)
 
-    def _answer(self, ask: Ask) -> Told:
-        if ask.host not in self._ready:
+    def _answer(self, ask: Ask, connection: ServerConnection) -> Told:
+        guest = self._guests.get(ask.host)
+        if guest is None:
             return Told(self._plan, refused=f"no host {ask.host!r} waits to take part; known: "
-                        f"{', '.join(self._ready)}")
+                        f"{', '.join(self._guests)}")
         if differs := _difference(self._contents, ask):
             return Told(self._plan, refused=differs)
-        serials = self._serials[ask.host]
-        if ask.serial not in serials:
-            if ask.host in self._told and serials and self._ready[ask.host] and (
-                    self._origin_s is None):
+        if ask.serial not in guest.serials:
+            if guest.is_ready and self._origin_s is None:
                 return Told(self._plan, refused=f"host {ask.host} takes part already")
-            serials.append(ask.serial)
-        elif ask.serial != serials[-1]:
+            guest.serials.append(ask.serial)
+        elif ask.serial != guest.serials[-1]:
             return Told(self._plan, refused=f"host {ask.host} was started anew")
-        if ask.is_ready and not self._ready[ask.host]:
-            self._ready[ask.host] = True
+        guest.connection = connection
+        if ask.is_ready and not guest.is_ready:
+            guest.is_ready = True
             self._changed.set()
-        return Told(self._plan, len(serials), time.monotonic(), self._origin_s, self._missing(),
-                    self._issued() if not ask.is_ready else {}, over=self._over)
+        return Told(self._plan, len(guest.serials), time.monotonic(), self._origin_s,
+                    self._missing(), self._issued() if not ask.is_ready else {})
 
 
 class Attendance:
@@ -221,7 +234,7 @@ class Attendance:
         self._where = where
         self._shown = shown
         self._context = context(shown, ssl.Purpose.SERVER_AUTH) if shown else None
-        self._ends: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+        self._connection: ClientConnection | None = None
 
     def ready(self, contents: Mapping[str, str]) -> None:
         """Be ready to start from the next question on, with these files."""
@@ -232,38 +245,44 @@ class Attendance:
 
         Raises:
             OSError: it cannot be reached, or does not answer; the next question may.
+            RunOverError: it has ended the run.
             MeetingError: this host may not take part.
         """
         try:
             async with asyncio.timeout(_PATIENCE_S):
-                if self._ends is None:
-                    self._ends = await asyncio.open_connection(
-                        *self._where, limit=_MAX_LINE, ssl=self._context,
-                        ssl_shutdown_timeout=_GOODBYE_S if self._context else None)
-                    if self._shown and not _is(self._ends[1], self._shown, "router", DOOR):
-                        raise MeetingError("somebody else answers in the first host's place")
-                reader, writer = self._ends
+                connection = self._connection = self._connection or await self._connected()
                 asked_s = time.monotonic()
-                writer.write(msgspec.json.encode(self._ask) + b"\n")
-                line = await reader.readuntil()
+                await connection.send(msgspec.json.encode(self._ask))
+                told = msgspec.json.decode(await connection.recv(), type=Told)
                 heard_s = time.monotonic()
-                told = msgspec.json.decode(line, type=Told)
-        except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, *UNREADABLE) as error:
+        except (OSError, WebSocketException, *UNREADABLE) as error:
             await self.close()
+            if (isinstance(error, ConnectionClosed) and error.rcvd is not None
+                    and error.rcvd.code == _OVER):
+                raise RunOverError(plain_line(error.rcvd.reason)) from None
+            if isinstance(error, OSError):
+                raise
             raise OSError(f"no answer ({error})") from None
-        except (OSError, TimeoutError):
-            await self.close()
-            raise
         if told.refused:
             await self.close()
             raise MeetingError(plain_line(told.refused))
         return told, asked_s, heard_s
 
+    async def _connected(self) -> ClientConnection:
+        scheme = "wss" if self._context else "ws"
+        connection = await connect(
+            f"{scheme}://rampart/", host=self._where[0], port=self._where[1], ssl=self._context,
+            proxy=None, close_timeout=_GOODBYE_S, ping_interval=None, **_SETTINGS)
+        if self._shown and not _is(connection, self._shown, "router", DOOR):
+            await connection.close()
+            raise MeetingError("somebody else answers in the first host's place")
+        return connection
+
     async def close(self) -> None:
         """Close the connection; the next question makes another one."""
-        ends, self._ends = self._ends, None
-        if ends is not None:
-            await _closed(ends[1])
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            await connection.close()
 
 
 _OWN = (*(name for name in RunPlan.__struct_fields__ if name.startswith("hmi_")),
@@ -294,7 +313,8 @@ def contents_of(plan: RunPlan, application: Application | None = None) -> dict[s
         OSError: it cannot be read.
     """
     document = load_document(msgspec.structs.replace(plan, strategy="", shadow=""))
-    hashes = {"rampart": _program(), "specification": _hash(msgspec.json.encode(_sorted(document)))}
+    specification = msgspec.json.encode(document, order="sorted")
+    hashes = {"rampart": _program(), "specification": _hash(specification)}
     for name, path in application.documents() if application else ():
         hashes[name] = _hash(path.read_bytes())
     return hashes
@@ -322,19 +342,14 @@ def context(shown: Credentials, purpose: ssl.Purpose) -> ssl.SSLContext:
     return made
 
 
-def _is(writer: asyncio.StreamWriter, shown: Credentials, kind: Kind, identity: str) -> bool:
+def _is(connection: ClientConnection | ServerConnection, shown: Credentials, kind: Kind,
+        identity: str) -> bool:
     """Whether the certificate at the other end is that of an identity, and not revoked."""
-    certificate = writer.get_extra_info("peercert") or {}
+    certificate = connection.transport.get_extra_info("peercert") or {}
     names = [value for part in certificate.get("subject", ()) for name, value in part
              if name == "commonName"]
     register = read_register(Path(shown.authority).parent)
     return names == [register.of_kind(kind).get(identity)]
-
-
-async def _closed(writer: asyncio.StreamWriter) -> None:
-    writer.close()
-    with contextlib.suppress(OSError):
-        await writer.wait_closed()
 
 
 def _program() -> str:
@@ -349,10 +364,3 @@ def _program() -> str:
 def _hash(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
-
-def _sorted(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _sorted(value[key]) for key in sorted(value)}
-    if isinstance(value, list | tuple):
-        return [_sorted(one) for one in value]
-    return value

@@ -13,16 +13,19 @@ from contextlib import asynccontextmanager, contextmanager
 
 import msgspec
 import pytest
+from websockets.asyncio.client import connect
+from websockets.asyncio.server import serve
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rampart.actors.access import key_folder
 from rampart.actors.bus.zenoh_session import credentials_in
 from rampart.actors.hosts.launchers import OtherHost
 from rampart.actors.hosts.meeting import (
     DOOR,
-    Ask,
     Attendance,
     Meeting,
     MeetingError,
+    RunOverError,
     contents_of,
     context,
     joined,
@@ -148,9 +151,9 @@ async def test_the_end_is_told(later_s):
         await ground.ask()
         closing = asyncio.create_task(made.close())
         await asyncio.sleep(later_s)
-        assert (await ground.ask())[0].over == "the first host has ended it"
+        with pytest.raises(RunOverError, match="the first host has ended it"):
+            await ground.ask()
         await closing
-        await ground.close()
 
 
 async def test_nobody_there_is_an_error_that_may_pass():
@@ -159,32 +162,50 @@ async def test_nobody_there_is_an_error_that_may_pass():
         await ground.ask()
 
 
-@pytest.mark.parametrize("said", [b"", b"\n", b"garbage\n", b'{"type":"ask"}\n', b"x" * 2_000_000,
-                                  b'{"type":"ask","host":"ground","serial":"1","contents":5}\n'])
-async def test_a_stranger_is_let_go_and_disturbs_nobody(said):
+async def is_undisturbed(where) -> bool:
+    ground = Attendance("ground", where, FIRST)
+    told, _, _ = await ground.ask()
+    await ground.close()
+    return told.plan.run_id == "r1"
+
+
+@pytest.mark.parametrize("sent", [b"", b"\n", b"GET / HTTP/1.1\r\n\r\n", b"x" * 2_000_000])
+async def test_a_stranger_is_let_go_and_disturbs_nobody(sent):
     async with meeting() as (_, where):
         reader, writer = await asyncio.open_connection(*where)
-        writer.write(said)
-        writer.write_eof()
-        with contextlib.suppress(ConnectionResetError):  # there was more that nobody wanted to read
-            assert await asyncio.wait_for(reader.read(), 10) == b""
+        with contextlib.suppress(ConnectionError):  # there was more than is read
+            writer.write(sent)
+            writer.write_eof()
+            assert b"r1" not in await asyncio.wait_for(reader.read(), 10)
         writer.close()
-        with contextlib.suppress(ConnectionResetError):
+        with contextlib.suppress(ConnectionError):
             await writer.wait_closed()
-        ground = Attendance("ground", where, FIRST)
-        assert (await ground.ask())[0].plan.run_id == "r1"
-        await ground.close()
+        assert await is_undisturbed(where)
+
+
+@pytest.mark.parametrize("sent", [b"", "garbage", b'{"type":"ask"}', b"x" * 2_000_000,
+                                  b'{"type":"ask","host":"ground","serial":"1","contents":5}'])
+async def test_questions_that_make_no_sense_end_their_connection_only(sent):
+    async with meeting() as (_, where):
+        async with connect("ws://first/", host=where[0], port=where[1]) as stranger:
+            await stranger.send(sent)
+            with pytest.raises(ConnectionClosed):
+                await asyncio.wait_for(stranger.recv(), 10)
+        assert await is_undisturbed(where)
+
+
+async def test_a_page_in_a_browser_cannot_ask():
+    async with meeting() as (_, where):
+        with pytest.raises(InvalidStatus, match="403"):
+            await connect("ws://first/", host=where[0], port=where[1], origin="http://evil.example")
 
 
 async def test_an_answer_that_makes_no_sense_is_an_error_that_may_pass():
-    async def serve(reader, writer):
-        await reader.readuntil()
-        writer.write(b"nonsense\n")
-        await writer.drain()
-        writer.close()
+    async def answer(connection):
+        async for _ in connection:
+            await connection.send("nonsense")
 
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    async with server:
+    async with serve(answer, "127.0.0.1", 0) as server:
         ground = Attendance("ground", server.sockets[0].getsockname(), FIRST)
         with pytest.raises(OSError, match="no answer"):
             await ground.ask()
@@ -270,6 +291,10 @@ async def test_who_answers_in_the_first_host_s_place_with_a_node_s_key_is_not_be
 # ---- one that is silent -------------------------------------------------------------------------
 
 
+UPGRADE = (b"GET / HTTP/1.1\r\nHost: first\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+           b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n")
+
+
 @contextmanager
 def in_a_thread(talk):
     """Have somebody talk as far as he does, and then neither read nor close until the end."""
@@ -293,8 +318,8 @@ async def test_with_keys_the_end_waits_for_nobody_who_is_silent(keys):
     def talk(silent):
         secure = context(shown, ssl.Purpose.SERVER_AUTH)
         with secure.wrap_socket(socket.create_connection(where)) as ground:
-            ground.sendall(msgspec.json.encode(Ask("ground", "7", FIRST)) + b"\n")
-            ground.recv(100_000)
+            ground.sendall(UPGRADE)
+            assert ground.recv(100_000).startswith(b"HTTP/1.1 101 ")
             heard.set()
             silent()
 
@@ -357,19 +382,16 @@ async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path):
     first = Meeting(plan, ("ground",), contents, dict)
     await first.open("127.0.7.1", port)
     ground = OtherHost(own, said.append)
-    ground.launcher = Started(await ground.join())
+    ground.launcher = Started((await ground.join()).plan)
     starting = asyncio.create_task(ground.start())
     await first.all_ready(said.append)
     first.begin(100.0)
     await starting
-    staying = asyncio.create_task(ground.stay())
-    await asyncio.sleep(0.3)
-    first._server.close()
-    for writer in list(first._writers):
-        writer.transport.abort()
+    await ground.close()
+    await first.close()  # it cannot be told
     again = Meeting(msgspec.structs.replace(plan, run_id="r2"), ("ground",), contents, dict)
     await again.open("127.0.7.1", port)
     with pytest.raises(MeetingError, match=r"the first host has begun another run \(r2\)"):
-        await asyncio.wait_for(staying, 15)
+        await asyncio.wait_for(ground.stay(), 15)
     await ground.close()
     await again.close()
