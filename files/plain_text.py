@@ -9,8 +9,8 @@ how JSON writes it.
 
 from __future__ import annotations
 
-LINE_CHARS = 400
-"""Longest line of a console."""
+LINE_CHARS = 600
+"""Longest line, unless told otherwise."""
 
 
 def printable(text: str, keep: str = "") -> str:
@@ -26,9 +26,22 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def one_line(text: str, chars: int = LINE_CHARS) -> str:
-    """Return a text as one printable line of at most so many characters; white space is joined."""
+    """Return a text as one printable line of at most so many characters.
+
+    White space is joined. A longer one lacks its middle: an error ends with what was expected.
+    """
     line = printable(" ".join(text.split()))
-    return line if len(line) <= chars else f"{line[:chars - 3]}..."
+    end = chars // 4
+    return line if len(line) <= chars else f"{line[:chars - end - 5]} ... {line[-end:]}"
+
+
+def shown(value: object, chars: int = 60) -> str:
+    """Return a value for a message, as Python writes it, cut to a length."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits; nesting
+        return "a value too large to show"
+    return text if len(text) <= chars else f"{text[:chars - 3]}..."
 
 
 def _escaped(character: str) -> str:

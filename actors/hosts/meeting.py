@@ -31,7 +31,7 @@ from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.zenoh_session import Credentials
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_document, on_host
-from rampart.files.reading import plain_line
+from rampart.files.plain_text import one_line
 
 PERIOD_S = 0.25
 """Real seconds between two questions."""
@@ -259,13 +259,13 @@ class Attendance:
             await self.close()
             if (isinstance(error, ConnectionClosed) and error.rcvd is not None
                     and error.rcvd.code == _OVER):
-                raise RunOverError(plain_line(error.rcvd.reason)) from None
+                raise RunOverError(one_line(error.rcvd.reason)) from None
             if isinstance(error, OSError):
                 raise
             raise OSError(f"no answer ({error})") from None
         if told.refused:
             await self.close()
-            raise MeetingError(plain_line(told.refused))
+            raise MeetingError(one_line(told.refused))
         return told, asked_s, heard_s
 
     async def _connected(self) -> ClientConnection:

@@ -5,24 +5,23 @@ drawn. Texts are clipped, lists end, and how many entries were left out is count
 list has its own room, so that a long one takes nothing from what stands beside it: the recoveries
 that wait for a reset, for instance.
 
-What is no printable character is replaced: a line break could look like a line of the log, and a
-mark that turns the direction of writing like another name.
+A text is shown as one printable line: a line break could look like a line of the log, and a mark
+that turns the direction of writing like another name.
 """
 
 from __future__ import annotations
 
-import re
 from itertools import islice
 from typing import Any
 
 import msgspec
 
+from rampart.files.plain_text import one_line
+
 MAX_NAME = 100
 """Characters of a name."""
 
 _NUMBER_BYTES = 20
-_UNPRINTABLE = re.compile(r"[^\S ]|[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
-                          r"\ud800-\udfff]")
 
 
 class Bounds(msgspec.Struct, frozen=True):
@@ -49,12 +48,6 @@ LINE = Bounds(items=40, room=2_000)
 """A line of a log."""
 
 
-def clip(text: str, characters: int = SHOWN.text) -> str:
-    """Return a text that is shown on one line."""
-    kept = text if len(text) <= characters else f"{text[:characters - 1]}…"
-    return kept if kept.isprintable() else _UNPRINTABLE.sub("�", kept)
-
-
 class _Room(msgspec.Struct):
     left: int
 
@@ -68,7 +61,7 @@ class _Fitting:
 
     def value(self, value: Any, room: _Room | None) -> Any:
         if isinstance(value, str):
-            text = clip(value, self._bounds.text)
+            text = one_line(value, self._bounds.text)
             _take(room, len(text.encode(errors="replace")) + 3)
             return text
         if isinstance(value, dict):

@@ -25,7 +25,7 @@ from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator.bounds import Bounds, clip
+from rampart.actors.operator.bounds import Bounds
 from rampart.actors.operator.camera_eye import CameraEye
 from rampart.actors.operator.feed import Feed
 from rampart.actors.operator.operating import Operating
@@ -42,6 +42,7 @@ from rampart.actors.web.audit import AuditLog
 from rampart.actors.web.gate import Gate
 from rampart.actors.web.tls import Tls, TlsError
 from rampart.actors.web.visitors import Register, Role, Visitor, digest
+from rampart.files.plain_text import one_line
 from rampart.manager.spec.panels import MAX_PANELS, Panel
 from rampart.manager.spec.specification import SystemSpec, check_document
 
@@ -129,7 +130,7 @@ class Hmi(Actor):
         """Return what a page needs to know to begin; what it is not told of, it does not show."""
         return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
                 "badge": self.badge,
-                "system": clip(self.context.run.system.name),
+                "system": one_line(self.context.run.system.name),
                 "camera": self._camera is not None, "tables": self._state.picture.tables,
                 "panels": _PANELS.fit(self._panels)[0], "past": self._state.past()}
 
@@ -218,7 +219,7 @@ class Hmi(Actor):
             tls=tls, camera=self._camera, files=self.files, tell=complain)
 
     def _complain(self, why: str) -> None:
-        self.report_diagnostic("operator's page", clip(why), f"port {self._port}")
+        self.report_diagnostic("operator's page", one_line(why), f"port {self._port}")
 
     def on_stop(self) -> None:
         """Close the page."""
@@ -247,7 +248,7 @@ class Hmi(Actor):
             document = msgspec.json.decode(message.document, type=dict[str, Any])
             system = check_document(document, "changed system")
         except UNREADABLE as error:
-            self.report_diagnostic("changed system", clip(f"not shown: {error}"), self.name)
+            self.report_diagnostic("changed system", one_line(f"not shown: {error}"), self.name)
             return
         self._show_system(system, message.version)
 

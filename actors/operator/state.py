@@ -15,8 +15,9 @@ import msgspec
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.ftm import messages as fm
-from rampart.actors.operator.bounds import SHOWN, Bounds, clip
+from rampart.actors.operator.bounds import SHOWN, Bounds
 from rampart.actors.operator.picture import Picture
+from rampart.files.plain_text import one_line
 from rampart.manager.strategies.registry import decision_in_words, named
 
 STALE_S = 1.5
@@ -185,7 +186,7 @@ class HmiState:
 
     def log(self, now_s: float, kind: str, text: str) -> None:
         """Add a line to the event log; `kind` is fault, clear or note."""
-        self.picture.add("events", {"t": round(now_s, 2), "kind": kind, "text": clip(text)})
+        self.picture.add("events", {"t": round(now_s, 2), "kind": kind, "text": one_line(text)})
 
     # -- showing --------------------------------------------------------------------------------
 

@@ -51,7 +51,7 @@ from rampart.actors.recording.bag_writer import (
     open_target,
 )
 from rampart.actors.recording.run_documents import MAX_FILE_BYTES
-from rampart.files.reading import shown
+from rampart.files.plain_text import shown
 
 MAX_RECORD_BYTES = (64 << 20) + (64 << 10)
 """Of a record: an attached file of 64 MB and what stands around it."""

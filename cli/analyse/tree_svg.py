@@ -16,7 +16,8 @@ from typing import Any
 import msgspec
 
 from rampart.cli.output import rendered
-from rampart.manager.drawing.diagram import Box, Diagram, clean
+from rampart.files.plain_text import one_line
+from rampart.manager.drawing.diagram import Box, Diagram
 from rampart.manager.drawing.placing import place
 
 MARGIN = 24.0
@@ -141,7 +142,7 @@ def _cut(text: str) -> str:
 
 def _wrap(text: str, width: int, most: int) -> list[str]:
     """Break a text into at most so many lines; a word too long for one is broken as well."""
-    lines = textwrap.wrap(clean(text), width, break_on_hyphens=False)
+    lines = textwrap.wrap(one_line(text), width, break_on_hyphens=False)
     if len(lines) > most:
         lines = [*lines[:most - 1], f"{lines[most - 1][:width - 1]}…"]
     return lines

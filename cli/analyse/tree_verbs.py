@@ -15,7 +15,8 @@ from rampart.cli.analyse.tree_svg import to_svg
 from rampart.cli.analyse.tree_text import to_dot, to_text
 from rampart.cli.output import UsageError, refusing, say, unknown, using
 from rampart.cli.verbs import JSON_FORMAT, add_verb, option, word
-from rampart.manager.drawing.diagram import WHATS, Diagram, Situation, clean, draw
+from rampart.files.plain_text import one_line
+from rampart.manager.drawing.diagram import WHATS, Diagram, Situation, draw
 from rampart.manager.model.order import CycleError, UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import UnknownStrategyError, decide
@@ -84,7 +85,7 @@ def _draw(spec: SystemSpec, whats: Sequence[str], options: argparse.Namespace
     criteria = tuple(options.order or spec.criteria)
     for name in criteria:
         if name not in spec.orders:
-            raise unknown("order", name, map(clean, spec.orders))
+            raise unknown("order", name, map(one_line, spec.orders))
     strategy = options.strategy or spec.strategy
     try:
         order = spec.build_order(*criteria)

@@ -55,7 +55,7 @@ from rampart.cli.verbs import (
     whole,
 )
 from rampart.files import working_folder
-from rampart.files.reading import plain_line
+from rampart.files.plain_text import one_line
 
 _PORTS = (1024, 65535)
 _WIDTH = 11
@@ -269,7 +269,7 @@ def bag_info(options: argparse.Namespace) -> int:
         _say(f"attached   {', '.join(name for name, _, _ in summary.files)}")
     say()
     print_table(("channel", "schema", "messages", "rate"), [
-        (plain_line(row["channel"]), plain_line(row["schema"]), row["messages"],
+        (one_line(row["channel"]), one_line(row["schema"]), row["messages"],
          f"{row['rate_hz']:.2f} Hz" if row["rate_hz"] is not None else "")
         for row in summary.table()])
     return code
@@ -290,7 +290,7 @@ def bag_repair(options: argparse.Namespace) -> int:
         copied = repair(reader, Path(options.out), overwrite=options.overwrite)
     lines = left_behind(reader, time_zero_s(reader))
     say(f"{options.out}: {copied} messages; left behind: "
-        f"{plain_line(', '.join(lines)) or 'nothing'}")
+        f"{one_line(', '.join(lines)) or 'nothing'}")
     return 1 if lines else 0
 
 
@@ -314,7 +314,7 @@ def bag_ros2(options: argparse.Namespace) -> int:
     bag, reader = write(
         Path(options.file), Path(options.out), options.system, options.distribution)
     code = 1 if reader.gaps else 0
-    left = {plain_line(what): {"times": times, "why": plain_line(why)}
+    left = {one_line(what): {"times": times, "why": one_line(why)}
             for what, (times, why) in bag.left_out.items()}
     if options.json:
         print_json({"folder": options.out, "messages": dict(bag.counts), "left_out": left,
@@ -324,13 +324,13 @@ def bag_ros2(options: argparse.Namespace) -> int:
     for what, one in left.items():
         say(f"left out: {what}: {one['why']} ({one['times']} times)")
     for line in left_behind(reader, time_zero_s(reader)):
-        say(f"gone: {plain_line(line)}")
+        say(f"gone: {one_line(line)}")
     return code
 
 
 def _say(line: str) -> None:
     """Print a line in which words of the file are; they steer no terminal."""
-    say(line[:_WIDTH] + plain_line(line[_WIDTH:]))
+    say(line[:_WIDTH] + one_line(line[_WIDTH:]))
 
 
 def described(summary: Summary) -> dict[str, Any]:

@@ -22,7 +22,8 @@ import msgspec
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import DefusedXMLParser
 
-from rampart.files.reading import FileError, check_size, plain_line, shown
+from rampart.files.plain_text import one_line, shown
+from rampart.files.reading import FileError, check_size
 from rampart.manager.analysis.formula import (
     GENERATED,
     Connective,
@@ -97,7 +98,7 @@ class OpenPsaError(ValueError):
 
     def __init__(self, file: str, path: str, problem: str, line: int = 0) -> None:
         where = f"{file}:{line}" if line else file
-        super().__init__(plain_line(f"{where}: {path}: {problem}"))
+        super().__init__(one_line(f"{where}: {path}: {problem}"))
 
 
 class _Element(ET.Element):

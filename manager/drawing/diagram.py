@@ -6,11 +6,11 @@ The boxes carry what is active and what was decided, so that a picture shows a s
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Sequence
 
 import msgspec
 
+from rampart.files.plain_text import one_line
 from rampart.manager.model.gates import detection_gate, recovery_gate
 from rampart.manager.model.order import PartialOrder
 from rampart.manager.spec.schema import MechanismSpec, SystemSpec
@@ -18,8 +18,6 @@ from rampart.manager.strategies.registry import decision_in_words
 
 WHATS = ("fault-tree", "ftm-tree", "order")
 """What can be drawn."""
-
-_DIRECTION = {*"\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"}
 
 
 class Box(msgspec.Struct, frozen=True):
@@ -123,21 +121,9 @@ def draw(spec: SystemSpec, what: str, order: PartialOrder, criteria: Sequence[st
     elif what == "ftm-tree":
         subject, parts = "Tree of mechanisms", _ftm_tree(spec, situation)
     else:
-        subject = f"Order of recoveries ({', then '.join(map(clean, criteria))})"
+        subject = f"Order of recoveries ({', then '.join(map(one_line, criteria))})"
         parts = _order(spec, order, situation)
-    return Diagram(what, f"{subject}: {clean(spec.title)}", situation.note(spec), *parts)
-
-
-def clean(text: str) -> str:
-    """Return text fit to be shown: one line, and nothing in it that a terminal or XML obeys.
-
-    White space becomes one space; control characters, changes of writing direction and
-    what is no character become U+FFFD.
-    """
-    return " ".join("".join(
-        " " if c.isspace() else
-        "\ufffd" if unicodedata.category(c) in {"Cc", "Cs", "Cn"} or c in _DIRECTION else c
-        for c in text).split())
+    return Diagram(what, f"{subject}: {one_line(spec.title)}", situation.note(spec), *parts)
 
 
 def covers(order: PartialOrder) -> tuple[tuple[str, str], ...]:
@@ -159,15 +145,16 @@ def _fault_tree(spec: SystemSpec, situation: Situation) -> _Parts:
     boxes = {}
     for event in spec.events:
         gate = event.gate if isinstance(event.gate, str) else "at-least" if event.of else ""
-        boxes[event.name] = Box(event.name, clean(event.title), gate, event.required, len(event.of))
+        boxes[event.name] = Box(
+            event.name, one_line(event.title), gate, event.required, len(event.of))
     for mechanism in spec.mechanisms:
         boxes[mechanism.event] = _bar(boxes[mechanism.event], mechanism, spec, situation)
     return tuple(boxes.values()), tuple((e.name, lower) for e in spec.events for lower in e.of)
 
 
 def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:
-    titles = {d.name: clean(d.title) for d in spec.detections}
-    titles |= {r.name: clean(r.title) for r in spec.recoveries}
+    titles = {d.name: one_line(d.title) for d in spec.detections}
+    titles |= {r.name: one_line(r.title) for r in spec.recoveries}
     boxes = []
     for mechanism in spec.mechanisms:
         detects, recovers = (gate.said_with(titles) for gate in (
@@ -180,7 +167,7 @@ def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:
 
 def _order(spec: SystemSpec, order: PartialOrder, situation: Situation) -> _Parts:
     asked = {r for m in spec.mechanisms if m.name in situation.active for r in m.recoveries}
-    boxes = tuple(Box(r.name, clean(r.title), active=r.name in asked,
+    boxes = tuple(Box(r.name, one_line(r.title), active=r.name in asked,
                       decided=r.name in situation.recoveries) for r in spec.recoveries)
     return boxes, covers(order)
 
@@ -194,6 +181,6 @@ def _bar(box: Box, mechanism: MechanismSpec, spec: SystemSpec, situation: Situat
                if not set(m.recoveries).isdisjoint(situation.recoveries)]
     active = mechanism.name in situation.active
     return msgspec.structs.replace(
-        box, mechanism=mechanism.name, detect=clean(mechanism.detect),
-        recover=clean(mechanism.recover), active=active, decided=mechanism.name in decided and (
+        box, mechanism=mechanism.name, detect=one_line(mechanism.detect),
+        recover=one_line(mechanism.recover), active=active, decided=mechanism.name in decided and (
             active or situation.active.isdisjoint(decided)))

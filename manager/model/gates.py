@@ -25,7 +25,7 @@ from operator import and_, or_
 
 import msgspec
 
-from rampart.files.reading import plain_line
+from rampart.files.plain_text import one_line
 
 MAX_NAMES = 16
 """A gate over more modules than these is a fault tree; it belongs there."""
@@ -49,7 +49,7 @@ class GateError(ValueError):
     """A gate that cannot be read, or that makes no sense. The message is one line."""
 
     def __init__(self, problem: str) -> None:
-        super().__init__(plain_line(problem))
+        super().__init__(one_line(problem))
 
 
 class Gate(msgspec.Struct, frozen=True):

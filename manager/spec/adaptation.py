@@ -14,7 +14,8 @@ from typing import Any
 import msgspec
 
 from rampart.files import toml
-from rampart.files.reading import FileError, shown
+from rampart.files.plain_text import shown
+from rampart.files.reading import FileError
 from rampart.manager.spec.schema import TABLES, SystemSpec
 from rampart.manager.spec.specification import check_document
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 
-from rampart.files.reading import plain_line, shown
+from rampart.files.plain_text import one_line, shown
 
 OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]{0,63})?\Z")]
 Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
@@ -46,7 +46,7 @@ class SpecificationError(ValueError):
         self.path = path
         self.problem = problem
         said = f" = {shown(value[0], _LONGEST_SHOWN)}" if value else ""
-        super().__init__(plain_line(f"{file}: {path}{said}: {problem}"))
+        super().__init__(one_line(f"{file}: {path}{said}: {problem}"))
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from rampart.files.reading import shown
+from rampart.files.plain_text import shown
 from rampart.sim.campaign.job import Job, RunResult, job_of, trial_of_system
 
 FILE_NAME = "runs.sqlite"

@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
-from rampart.actors.bus.bounds import MANY, clip
+from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.limits import RateLimit, Remembered
 from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan
-from rampart.files.plain_text import LINE_CHARS, printable
+from rampart.files.plain_text import one_line, printable
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import named
 from rampart.sim.runs.record import RunRecord
@@ -25,6 +25,9 @@ REPORTS_PER_S = 10
 
 LINES_PER_S = 50
 """Other lines shown in a real second."""
+
+LINE_CHARS = 400
+"""Longest line that is shown."""
 
 
 class Console:
@@ -113,7 +116,7 @@ class Console:
     def line(self, at_s: float, text: str, limit: RateLimit | None = None) -> None:
         """Write one line with its simulated time, unless there are too many of its kind."""
         if not self._is_limited or (limit or self._others).allows(self._clock()):
-            self.say(f"[{at_s:7.2f} s] {clip(text, LINE_CHARS)}")
+            self.say(f"[{at_s:7.2f} s] {one_line(text, LINE_CHARS)}")
 
     def conclusion(self, record: RunRecord, report: Path | None) -> None:
         """Say how it ended, and where the report is, if there is one."""

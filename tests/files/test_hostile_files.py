@@ -29,7 +29,8 @@ from rampart.actors.supervision.process_title import parse_title
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
 from rampart.files import toml
-from rampart.files.reading import FileError, plain_line, read_bytes
+from rampart.files.plain_text import one_line
+from rampart.files.reading import FileError, read_bytes
 from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa
 from rampart.manager.model.gates import GateError, detection_gate, recovery_gate
 from rampart.manager.spec.adaptation import ChangeError, parse_value
@@ -41,7 +42,7 @@ SPEC = (ROOT / "systems" / "paper.toml").read_text("utf-8")
 DOTTED = "a" + ".a" * 50_000 + " = 1"
 
 
-def one_line(capsys: pytest.CaptureFixture[str], program: Callable[[list[str]], int],
+def refusal(capsys: pytest.CaptureFixture[str], program: Callable[[list[str]], int],
              *arguments: str) -> str:
     """Run a program that has to refuse, and return what it says."""
     assert program(list(arguments)) == 2
@@ -115,14 +116,14 @@ AIRPORTS = {
 def test_an_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, text, words):
     path = tmp_path / "field.toml"
     path.write_text(text)
-    assert words in one_line(capsys, launch.main, "--virtual", "--airport", str(path))
+    assert words in refusal(capsys, launch.main, "--virtual", "--airport", str(path))
 
 
 @pytest.mark.parametrize("text", [AIRPORTS["nested 100,000 deep"][0], DOTTED])
 def test_a_mission_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, text):
     path = tmp_path / "mission.toml"
     path.write_text(text)
-    one_line(capsys, launch.main, "--virtual", "--mission", str(path))
+    refusal(capsys, launch.main, "--virtual", "--mission", str(path))
 
 
 SPECS = {
@@ -148,8 +149,8 @@ def test_a_system_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, text,
     assert text != SPEC
     path = tmp_path / "system.toml"
     path.write_text(text)
-    assert words in one_line(capsys, launch.main, "--virtual", "--system", str(path))
-    assert words in one_line(capsys, rampart, "table", "--system", str(path))
+    assert words in refusal(capsys, launch.main, "--virtual", "--system", str(path))
+    assert words in refusal(capsys, rampart, "table", "--system", str(path))
 
 
 @pytest.mark.parametrize("read", [launch.main, rampart])
@@ -157,13 +158,13 @@ def test_a_device_without_end_is_read_no_further_than_a_spec_is_long(tmp_path, c
     path = tmp_path / "zero.toml"
     path.symlink_to("/dev/zero")
     arguments = ["--virtual", "--system"] if read is launch.main else ["verify", "--system"]
-    one_line(capsys, read, *arguments, str(path))
+    refusal(capsys, read, *arguments, str(path))
 
 
 def test_a_table_to_be_replaced_is_read_within_the_same_bounds(tmp_path, capsys):
     path = tmp_path / "table.toml"
     path.write_text(DOTTED)
-    assert "6 dotted parts" in one_line(capsys, rampart, "adapt", "replace", "FTM7", str(path))
+    assert "6 dotted parts" in refusal(capsys, rampart, "adapt", "replace", "FTM7", str(path))
     with pytest.raises(ChangeError, match="expected a TOML value"):
         parse_value("{" + DOTTED + "}")
 
@@ -244,7 +245,7 @@ FOREIGN = {
 @pytest.mark.parametrize(("parts", "words"), FOREIGN.values(), ids=FOREIGN)
 def test_a_foreign_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, parts, words):
     path = foreign(tmp_path, **parts)
-    assert words in one_line(capsys, launch.main, "--virtual", "--airport", path, "--mission", "A")
+    assert words in refusal(capsys, launch.main, "--virtual", "--airport", path, "--mission", "A")
 
 
 def test_a_damaged_mask_is_read_or_refused_and_nothing_else_happens(tmp_path):
@@ -291,7 +292,7 @@ def test_a_chunk_that_is_too_large_unpacked_is_refused(tmp_path, capsys, kind):
     assert path.stat().st_size < 500_000
     for verb in (("bag", "info", str(path)), ("bag", "repair", str(path), str(tmp_path / "out")),
                  ("replay", str(path))):
-        assert "bytes, unpacked; at most 67108864" in one_line(capsys, rampart, *verb)
+        assert "bytes, unpacked; at most 67108864" in refusal(capsys, rampart, *verb)
     assert not (tmp_path / "out").exists()
 
 
@@ -346,7 +347,7 @@ def test_an_open_psa_file_is_bounded_in_bytes_elements_and_components(tmp_path, 
             (tree.format(f'<define-gate name="{"n" * 2000}"/>'), "at most 1000 characters")):
         path = tmp_path / "tree.xml"
         path.write_text(text)
-        assert words in one_line(capsys, rampart, "cut-sets", str(path))
+        assert words in refusal(capsys, rampart, "cut-sets", str(path))
     with pytest.raises(OpenPsaError):
         read_open_psa('<!DOCTYPE x [<!ENTITY a "b">]><opsa-mef>&a;</opsa-mef>', "f.xml")
 
@@ -374,10 +375,10 @@ def test_a_damaged_store_of_results_is_refused_in_one_line(tmp_path, capsys, dam
             database.execute("update runs set result = ''")
     database.close()
     if damage == "drop table runs":
-        assert "no run" in one_line(capsys, rampart, "campaign", "--replay", "abc", "--out",
+        assert "no run" in refusal(capsys, rampart, "campaign", "--replay", "abc", "--out",
                                     str(tmp_path))
         return
-    one_line(capsys, rampart, "campaign", "--replay", "abc", "--out", str(tmp_path))
+    refusal(capsys, rampart, "campaign", "--replay", "abc", "--out", str(tmp_path))
 
 
 def test_a_store_with_a_damaged_row_says_so_when_it_is_read(tmp_path):
@@ -416,9 +417,9 @@ def test_a_document_at_the_limits_is_read_and_strings_and_comments_hold_anything
 
 
 def test_what_is_said_of_a_file_is_one_printable_line_of_bounded_length():
-    assert plain_line("a\n\tb\x1b[31m\ud800") == "a b\\x1b[31m\\ud800"
-    assert len(plain_line("x" * 10_000_000)) < 1000
-    assert plain_line("Flughafen Zürich: 滑走路") == "Flughafen Zürich: 滑走路"
+    assert one_line("a\n\tb\x1b[31m\ud800") == "a b\\u001b[31m\\ud800"
+    assert len(one_line("x" * 10_000_000)) < 1000
+    assert one_line("Flughafen Zürich: 滑走路") == "Flughafen Zürich: 滑走路"
 
 
 def test_a_file_is_read_no_further_than_it_may_be_long():

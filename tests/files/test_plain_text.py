@@ -55,7 +55,7 @@ def test_what_is_not_printable_is_written_as_its_number(text, shown):
 
 def test_one_line_is_one_line_and_not_too_long():
     assert one_line(" a \n\t b\x1b ") == "a b\\u001b"
-    assert one_line("x" * 1000, 10) == "xxxxxxx..."
+    assert one_line("x" * 1000, 10) == "xxx ... xx"
     assert printable("a\nb\x1b", keep="\n") == "a\nb\\u001b"
 
 

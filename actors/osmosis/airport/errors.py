@@ -8,14 +8,15 @@ from pathlib import Path
 
 import msgspec
 
-from rampart.files.reading import FileError, plain_line
+from rampart.files.plain_text import one_line
+from rampart.files.reading import FileError
 
 
 class AirportError(ValueError):
     """An airport or mission file is wrong: one line naming file, field, value and the remedy."""
 
     def __init__(self, line: str) -> None:
-        super().__init__(plain_line(line))
+        super().__init__(one_line(line))
 
 
 class Problem(msgspec.Struct, frozen=True):
@@ -35,7 +36,7 @@ class Problem(msgspec.Struct, frozen=True):
 
     def line(self, file: str) -> str:
         """Return the one-line message for `file`."""
-        return plain_line(f"{file}: {self.field}: {self.value}: {self.remedy}")
+        return one_line(f"{file}: {self.field}: {self.value}: {self.remedy}")
 
 
 @contextlib.contextmanager

@@ -25,7 +25,8 @@ from rampart.actors.osmosis.airport.errors import AirportError, readable
 from rampart.actors.osmosis.airport.limits import check_count
 from rampart.actors.osmosis.airport.mask import MaskScale, allowed_area
 from rampart.actors.osmosis.airport.model import Airport, Mission, Point
-from rampart.files.reading import read_text, shown
+from rampart.files.plain_text import shown
+from rampart.files.reading import read_text
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 MAX_TEXT_BYTES = 1 << 20

@@ -19,7 +19,8 @@ from rampart.actors.osmosis.airport.limits import check_count, check_nearness
 from rampart.actors.osmosis.airport.model import Name, Point, Record
 from rampart.actors.osmosis.airport.world import WorldTruth
 from rampart.files import toml
-from rampart.files.reading import read_text, shown
+from rampart.files.plain_text import shown
+from rampart.files.reading import read_text
 
 SurfaceKind = Literal["runway", "taxiway", "apron", "area"]
 _CHOICES = {"mode": model.GOAL_MODES, "kind": get_args(SurfaceKind),

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.operator.bounds import MAX_NAME, clip
+from rampart.actors.operator.bounds import MAX_NAME
 from rampart.actors.operator.camera_eye import CameraEye, renderer
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.requests import RefusedError, Request
@@ -28,6 +28,7 @@ from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS, OrderRequest,
 from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.actors.osmosis.page.submission import Submission, first_request, system_is_up
 from rampart.actors.runtime.actor import Context, Header, on
+from rampart.files.plain_text import one_line
 from rampart.manager.spec.panels import Panel
 
 
@@ -101,7 +102,7 @@ class OsmosisHmi(Hmi):
             "map": self._map.encoded if self._map else None,
             "left_out": self._map.left_out if self._map else {},
             "footprint_m": (robot.length_m, robot.width_m) if robot else None,
-            "missions": [name for name in self._missions if name == clip(name, MAX_NAME)][:200],
+            "missions": [name for name in self._missions if name == one_line(name, MAX_NAME)][:200],
             "track": list(self._state.track)}
 
     @cached_property

@@ -10,9 +10,10 @@ from itertools import islice
 
 import msgspec
 
-from rampart.actors.operator.bounds import MAX_NAME, clip
+from rampart.actors.operator.bounds import MAX_NAME
 from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
 from rampart.actors.osmosis.airport.model import Airport, Light
+from rampart.files.plain_text import one_line
 
 MAX_PATHS_BYTES = 150_000
 """Of the prohibited area, the pavement and the buildings together."""
@@ -45,11 +46,11 @@ def page_map(airport: Airport) -> PageMap:
     while _paths_bytes(drawn := draw(airport, tolerance_m)) > MAX_PATHS_BYTES:
         tolerance_m *= _COARSER
     shown = msgspec.structs.replace(
-        drawn, name=clip(drawn.name, MAX_NAME),
+        drawn, name=one_line(drawn.name, MAX_NAME),
         surfaces=tuple(filter(_is_seen, drawn.surfaces)),
-        buildings=tuple((clip(name, MAX_NAME), path)
+        buildings=tuple((one_line(name, MAX_NAME), path)
                         for name, path in filter(_is_seen, drawn.buildings)),
-        nodes={clip(name, MAX_NAME): at for name, at in islice(drawn.nodes.items(), MAX_GRAPH)},
+        nodes={one_line(name, MAX_NAME): at for name, at in islice(drawn.nodes.items(), MAX_GRAPH)},
         edges=drawn.edges[:MAX_GRAPH],
         lights=tuple(islice(filter(_is_plain, drawn.lights), MAX_LIGHTS)))
     missing = {"pieces of pavement": len(drawn.surfaces) - len(shown.surfaces),
@@ -73,7 +74,7 @@ def lights_shown(airport: Airport) -> frozenset[str]:
 
 def _is_plain(light: Light) -> bool:
     """Tell whether the page can show a light's name as it is: by that the light is known."""
-    return light.name == clip(light.name, MAX_NAME) and light.row == clip(light.row, MAX_NAME)
+    return all(name == one_line(name, MAX_NAME) for name in (light.name, light.row))
 
 
 def _paths_bytes(drawn: AirportDrawing) -> int:

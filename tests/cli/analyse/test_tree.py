@@ -21,7 +21,8 @@ from rampart.cli import systems
 from rampart.cli.analyse.tree_svg import to_svg
 from rampart.cli.analyse.tree_text import quote, to_dot, to_text
 from rampart.cli.main import main
-from rampart.manager.drawing.diagram import Box, Diagram, Situation, clean, covers, draw
+from rampart.files.plain_text import one_line
+from rampart.manager.drawing.diagram import Box, Diagram, Situation, covers, draw
 from rampart.manager.drawing.placing import place
 from rampart.manager.model.order import PartialOrder
 from rampart.systems import SHIPPED
@@ -97,7 +98,7 @@ def fault_trees(draw_from):
         required = draw_from(st.integers(1, inputs)) if inputs else 0
         gate = "" if not inputs else draw_from(st.sampled_from(["or", "and", "at-least"]))
         mechanism = f"F{i}" if draw_from(st.booleans()) else ""
-        title = clean(draw_from(st.text(max_size=40)))
+        title = one_line(draw_from(st.text(max_size=40)))
         boxes.append(Box(name, title, gate, required, inputs, mechanism, f"D{i}", f"R{i}",
                          draw_from(st.booleans()), draw_from(st.booleans())))
     return Diagram("fault-tree", "T", "", tuple(boxes), tuple(edges))
@@ -313,14 +314,14 @@ def test_hostile_titles_are_shown_and_obeyed_by_nobody(capsys, tmp_path, form):
         assert len(json.loads(out)) == 3
     else:
         assert out.splitlines()[1:13] == [
-            line.replace("erroneous_graph", f"erroneous_graph  {clean(HOSTILE)}")
+            line.replace("erroneous_graph", f"erroneous_graph  {one_line(HOSTILE)}")
             for line in OSMOSIS.splitlines()[1:13]]
 
 
 @settings(deadline=None)
 @given(st.text())
 def test_a_cleaned_text_is_one_line_that_xml_can_hold(text):
-    cleaned = clean(text)
+    cleaned = one_line(text)
     assert len(cleaned.splitlines()) <= 1
     svg = to_svg([graph([], a=Box("a", cleaned))])
     assert ET.fromstring(svg) is not None
