@@ -167,6 +167,11 @@ EPOCH = 1_000_000
 than the restarts of one process in any run, 50 in a minute being a thousand hours' worth."""
 
 
+def next_epoch(incarnation: int) -> int:
+    """Return what the incarnations of a node have to exceed that is started in another place."""
+    return (incarnation // EPOCH + 1) * EPOCH
+
+
 def restarts_of(incarnation: int) -> int:
     """Return how often a node was restarted at least, by its incarnation."""
     return max(0, sum(divmod(incarnation, EPOCH)) - 1)

@@ -82,18 +82,16 @@ class HostSupervisor(Supervisor):
                  files: Callable[..., StateFiles] = StateFiles) -> None:
         super().__init__(context, processes)
         hosts, units = self._layout.hosts, self._layout.units
-        own, others = self.parameters.host, self.parameters.others
-        self._supervisors = {hosts.supervisors[host]: host for host in others}
-        self._guard_of = {name: host for host in others for name in hosts.guards_of(host)}
-        self._issued = dict(context.run.known_incarnations)
+        own = self.parameters.host
+        self._supervisors = {hosts.supervisors[host]: host for host in self.parameters.others}
+        self._guards = {name: host for host in hosts.supervisors for name in hosts.guards_of(host)}
         self._signalled: deque[fm.ProcessEvent] = deque(maxlen=_ORDERS_KEPT)
         self._placement = Placement(
-            own, others,
+            own,
             {name: Home(hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes),
                         any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
              for name, unit in units.items()},
-            hosts.link, self._loop.time(), rate=self._plan.rate,
-            guards={name: host for host in hosts.supervisors for name in hosts.guards_of(host)})
+            self._guards, hosts.link, self._known, now_s=self._loop.time(), rate=self._plan.rate)
         self._looked_s = self._loop.time()
         self._ending: list[HeldProcess] = []
         self._waits: dict[str, Wait] = {}
@@ -129,17 +127,17 @@ class HostSupervisor(Supervisor):
     def on_start(self) -> None:
         """Adopt what is run here in another host's place as well.
 
-        What the first host ran last is not begun here before that has given it back.
+        What ran on another host last is not begun here before the first has given it back.
         """
         living = {self._layout.unit_of.get(process.names[0], "")
                   for process in self._machine.living()}
         for unit in living - self._processes.keys() - {""}:
             self._placement.adopted(unit)
             self._processes[unit] = self._held(self._layout.units[unit])
-        is_new = self._plan.incarnations and self._incarnation == self._plan.incarnations + 1
-        for unit in self._placement.waits(lambda unit: bool(is_new) or (
-                unit not in living and any(is_elsewhere(self._plan.folder, node)
-                                           for node in self._processes[unit].names))):
+        for unit in self._placement.waits(
+                lambda unit: unit not in living and any(
+                    is_elsewhere(self._plan.folder, node)
+                    for node in self._processes[unit].names)):
             del self._processes[unit]
         super().on_start()
         if self._copies.nodes:
@@ -159,8 +157,9 @@ class HostSupervisor(Supervisor):
     @on(bus_topics.HEARTBEAT)
     def guard_heard(self, _message: Heartbeat, header: Header) -> None:
         """Note that another host is there."""
-        host = self._guard_of.get(header.source)
-        if host is not None and self._placement.heard(host, self._loop.time()):
+        own = self.parameters.host
+        host = self._guards.get(header.source, own)
+        if host != own and self._placement.heard(host, self._loop.time()):
             self._publish_table()  # each soon knows what the other runs
             self.tell_states()
 
@@ -172,9 +171,10 @@ class HostSupervisor(Supervisor):
             return
         now_s = self._loop.time()
         was_missed = self._placement.heard(host, now_s)
-        news, drop = self._placement.told(host, table.nodes, self._mine(), now_s)
+        news, drop = self._placement.told(host, table.nodes, now_s)
+        news = [row for row in news if row.name != header.source]  # of itself it is believed
         for row in news:
-            self._issue(row)
+            self._issue(row.name, row.incarnation)
         for unit in drop:
             self._drop(unit)
         if news or drop or was_missed:
@@ -217,21 +217,25 @@ class HostSupervisor(Supervisor):
         self._signalled.append(answer)
         return answer
 
-    def _issue(self, row: fm.NodeInfo) -> None:
-        if row.name in self._supervisors:  # of itself it is believed: who else could say it?
-            return
-        try:
-            if self.context.register(row.name) != row.incarnation:
-                issue(self._plan.folder, [row.name], row.incarnation)
-        except OSError as error:
-            self.report_diagnostic("incarnation", f"not noted: {error}", row.name)
+    def _known(self, node: str) -> int:
+        """Return the highest incarnation of a node that was issued anywhere, as known here."""
+        process = self._process_of(node)
+        return max(self.context.register(node) or 0, process.highest if process else 0)
+
+    def _issue(self, node: str, incarnation: int) -> None:
+        """Have all readers of this host know the incarnation of a node that does not run here."""
+        if incarnation > (self.context.register(node) or 0):
+            try:
+                issue(self._plan.folder, [node], incarnation)
+            except OSError as error:
+                self.report_diagnostic("incarnation", f"not noted: {error}", node)
 
     def _look_at_hosts(self) -> None:
         # Who stood still has mail to read before others can be said to be silent.
         stall_s, self._looked_s = self._loop.time() - self._looked_s, self._loop.time()
         if stall_s > 4 * _LOOK_S:
             self._placement.excuse(stall_s)
-        changes = self._placement.look(self._loop.time(), self._mine(), self._has_states)
+        changes = self._placement.look(self._loop.time(), self._has_states)
         if changes != Changes():
             for host in changes.lost:
                 self._copies.lost(host)
@@ -244,11 +248,6 @@ class HostSupervisor(Supervisor):
                 self._take(unit, above)
             self._publish_table()
         self.call_later(_LOOK_S * self.clock.rate, self._look_at_hosts)
-
-    def _mine(self) -> dict[str, int]:
-        """Return the incarnations that were issued here."""
-        return {**self._issued, **{name: process.highest for process in self._processes.values()
-                                   for name in process.names}}
 
     # -- what follows ---------------------------------------------------------------------------
 
@@ -264,8 +263,8 @@ class HostSupervisor(Supervisor):
             process.forget_step()
             process.kill()
             self._tell(process, "handed over", self.name)
-            # One that was asked for may have begun.
-            self._issued.update(dict.fromkeys(process.names, process.highest + process.waits))
+            for node in process.names:  # one that was asked for may have begun
+                self._issue(node, process.highest + process.waits)
             self._copies.unsettle(process.names)
             if not self._ending:
                 self.call_later(_ENDING_S * self.clock.rate, self._settle)
@@ -357,7 +356,7 @@ class HostSupervisor(Supervisor):
 
     def _publish_table(self) -> None:
         given_back = (fm.NodeInfo(node, "", 0, fm.NodeState.UNREACHABLE, highest, 0, host=home)
-                      for node, home, highest in self._placement.given_back(self._mine()))
+                      for node, home, highest in self._placement.given_back())
         self.publish(topics.HOST_NODES, fm.NodeTable((*self._own_rows(), *given_back)))
 
 

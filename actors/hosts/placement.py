@@ -6,8 +6,8 @@ while, the first host lets go of that, and the home starts it anew. No agreement
 for two rules hold at any time:
 
 * **The highest incarnation counts.** What the first host starts in another one's place has an
-  incarnation that its home cannot have reached meanwhile (`EPOCH`). Every reader refuses the lower
-  one as soon as its host knows, and whoever learns of a higher one lets go of its own.
+  incarnation that its home cannot have reached meanwhile (`next_epoch`). A supervisor that receives
+  a higher one than its own lets go of the process, and all readers on its host refuse lower ones.
 * **Only the first host takes over.** A home that hears nothing of the first goes on with what it
   has, which then only those can hear who are cut off with it.
 
@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from rampart.actors.bus.run_folder import EPOCH
+from rampart.actors.bus.run_folder import next_epoch
 from rampart.actors.ftm.messages import NodeInfo
 from rampart.manager.spec.hosts import Link
 
@@ -115,22 +115,23 @@ class Placement:
 
     Args:
         own: Name of its host.
-        others: Of the other hosts.
         homes: Where each unit belongs.
-        link: When a host is lost, and when it is back.
-        now_s: Now.
         guards: Name of each supervisor and router with that of its host.
+        link: When a host is lost, and when it is back.
+        known: Returns the highest incarnation of a node that is known on this host, 0 if none is.
+        now_s: Now.
         rate: Simulated seconds in a real one: at less than 1 others speak more rarely.
 
     Attributes:
         held: Units that it runs.
     """
 
-    def __init__(self, own: str, others: Iterable[str], homes: Mapping[str, Home],
-                 link: Link, now_s: float, *, guards: Mapping[str, str], rate: float = 1.0) -> None:
+    def __init__(self, own: str, homes: Mapping[str, Home], guards: Mapping[str, str], link: Link,
+                 known: Callable[[str], int], *, now_s: float, rate: float = 1.0) -> None:
         self.held = {unit for unit, home in homes.items() if home.host == own}
         self._own = own
         self._homes = homes
+        self._known = known
         self._unit_of = {node: unit for unit, home in homes.items() for node in home.nodes}
         self._guards = guards
         slow = max(1.0, 1.0 / rate)
@@ -138,8 +139,7 @@ class Placement:
         self._return_after_s, self._settles_s = link.return_after_s, slow * _SETTLES_S
         self._others = {
             name: _Other(now_s + _GRACE_S - self._lost_after_s, now_s, self._return_after_s)
-            for name in others}
-        self._highest: dict[str, int] = {}
+            for name in guards.values() if name != own}
 
     def is_lost(self, host: str) -> bool:
         """Whether a host is lost."""
@@ -184,43 +184,34 @@ class Placement:
         other.heard_s = now_s
         return was_missed
 
-    def told(self, host: str, rows: Iterable[NodeInfo], mine: Mapping[str, int], now_s: float
+    def told(self, host: str, rows: Iterable[NodeInfo], now_s: float
              ) -> tuple[list[NodeInfo], list[str]]:
         """Take what the supervisor of another host runs.
 
         Args:
             host: Its name.
-            rows: What it says; of nodes that are not its own to run, nothing is believed. A row
-                with another host's name says what was issued, see `given_back`.
-            mine: Incarnation of each node that is run here.
+            rows: What it publishes; of nodes that are not its own to run, nothing is believed. A
+                row with another host's name says what was issued, see `given_back`.
             now_s: Now.
 
         Returns:
-            What is news of which incarnation was issued there, and the units to be let go.
+            The rows with an incarnation higher than known here, and the units to be let go.
         """
         other = self._others[host]
         other.told_s = now_s
-        believed = {row.name: row for row in rows if self._may_run(host, row.name)}
-        other.runs = {name: row for name, row in believed.items() if row.host == host}
-        news, drop = [], dict[str, None]()
-        for name, row in believed.items():
-            if row.incarnation > self._highest.get(name, 0):
-                self._highest[name] = row.incarnation
-                if row.incarnation > mine.get(name, 0):
-                    news.append(row)
-            unit = self._unit_of.get(name, "")
-            if unit in self.held and row.incarnation > mine.get(name, 0):
-                drop[unit] = None
+        believed = [row for row in rows if self._may_run(host, row.name)]
+        other.runs = {row.name: row for row in believed if row.host == host}
+        news = [row for row in believed if row.incarnation > self._known(row.name)]
+        superseded = {self._unit_of.get(row.name, "") for row in news}
+        drop = [unit for unit in self._homes if unit in superseded & self.held]
         self.held.difference_update(drop)
-        return news, list(drop)
+        return news, drop
 
-    def look(self, now_s: float, mine: Mapping[str, int],
-             is_ready: Callable[[str], bool] = lambda _unit: True) -> Changes:
+    def look(self, now_s: float, is_ready: Callable[[str], bool] = lambda _unit: True) -> Changes:
         """Return what is to be done.
 
         Args:
             now_s: Now.
-            mine: Incarnation of each node that was ever issued on this host.
             is_ready: Asked of a unit that was given back: whether it can be started.
         """
         lost, back, drop = list[str](), list[str](), list[str]()
@@ -241,10 +232,11 @@ class Placement:
             if not other.is_lost:
                 drop += self._wanted_back(host, other)
             elif is_silent:
-                take += [(unit, self._next_epoch(unit, mine)) for unit in self._homed(host)
+                take += [(unit, next_epoch(self._highest(unit))) for unit in self._homed(host)
                          if unit not in self.held and not self._homes[unit].is_fixed]
         if self._own != FIRST:
-            take += [one for one in self._given_back(now_s, mine) if is_ready(one[0])]
+            take += [(unit, self._highest(unit)) for unit in self._returned(now_s)
+                     if is_ready(unit)]
         self.held.update(unit for unit, _ in take)
         self.held.difference_update(drop)
         return Changes(tuple(lost), tuple(back), tuple(take), tuple(drop))
@@ -254,24 +246,23 @@ class Placement:
         return [row for other in self._others.values() for row in other.runs.values()
                 if self._unit_of.get(row.name, "") not in self.held]
 
-    def given_back(self, mine: Mapping[str, int]) -> list[tuple[str, str, int]]:
-        """Return what was run here in another host's place, as long as its home runs a lower one.
+    def given_back(self) -> list[tuple[str, str, int]]:
+        """Return what the first host does not run, as long as its home runs a lower one than known.
 
-        Until a home has heard of that number, all that its own says is refused.
-
-        Args:
-            mine: Incarnation of each node that was ever issued on this host.
+        Until a home has received that number, all that its own node publishes is refused.
 
         Returns:
-            Node, its home, and the highest incarnation that was issued here.
+            Node, its home, and the highest incarnation that is known.
         """
-        return [(node, home.host, mine[node]) for unit, home in self._homes.items()
+        if self._own != FIRST:
+            return []
+        return [(node, home.host, self._known(node)) for unit, home in self._homes.items()
                 if home.host != self._own and unit not in self.held for node in home.nodes
-                if mine.get(node, 0) > self._runs_at(home.host, node)]
+                if self._known(node) > self._runs_at(home.host, node)]
 
     def told_of(self, unit: str) -> dict[str, int]:
-        """Return the highest incarnation of each node of a unit that another host has told of."""
-        return {node: self._highest.get(node, 0) for node in self._homes[unit].nodes}
+        """Return the highest incarnation of each node of a unit that is known here."""
+        return {node: self._known(node) for node in self._homes[unit].nodes}
 
     def _runs_at(self, host: str, node: str) -> int:
         row = self._others[host].runs.get(node)
@@ -301,18 +292,13 @@ class Placement:
     def _homed(self, host: str) -> list[str]:
         return [unit for unit, home in self._homes.items() if home.host == host]
 
-    def _known(self, unit: str, mine: Mapping[str, int]) -> int:
-        return max(max(self._highest.get(name, 0), mine.get(name, 0))
-                   for name in self._homes[unit].nodes)
+    def _highest(self, unit: str) -> int:
+        return max(map(self._known, self._homes[unit].nodes))
 
-    def _next_epoch(self, unit: str, mine: Mapping[str, int]) -> int:
-        return (self._known(unit, mine) // EPOCH + 1) * EPOCH
-
-    def _given_back(self, now_s: float, mine: Mapping[str, int]) -> list[tuple[str, int]]:
+    def _returned(self, now_s: float) -> list[str]:
         """Return what has its home here and is not run: the first host does not list it (more)."""
         first = self._others[FIRST]
         if now_s - first.told_s > self._table_s:
             return []
-        return [(unit, self._known(unit, mine)) for unit in self._homed(self._own)
-                if unit not in self.held
+        return [unit for unit in self._homed(self._own) if unit not in self.held
                 and first.runs.keys().isdisjoint(self._homes[unit].nodes)]

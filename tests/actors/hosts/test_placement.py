@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 
 import pytest
 from hypothesis import given, settings
@@ -32,57 +33,79 @@ LINES = {"cut": set(), "join": {"", "ground"}, "only the robot hears": {""},
 """Who hears the other, by what happens to the line."""
 
 
-def placement(host: str) -> Placement:
-    others = [other for other in ("", "ground") if other != host]
-    return Placement(host, others, HOMES, LINK, 0.0, guards=GUARDS)
+class Side(Placement):
+    """What one supervisor decides, and the numbers that are issued as its host knows them."""
+
+    def __init__(self, host: str, issued: Mapping[str, int] = MappingProxyType({}),
+                 rate: float = 1.0) -> None:
+        self.issued = dict(issued)
+        super().__init__(host, HOMES, GUARDS, LINK, lambda node: self.issued.get(node, 0),
+                         now_s=0.0, rate=rate)
+
+    def told(self, host: str, rows: Iterable[NodeInfo], now_s: float
+             ) -> tuple[list[NodeInfo], list[str]]:
+        news, drop = super().told(host, rows, now_s)
+        self.issued.update({one.name: one.incarnation for one in news})
+        return news, drop
+
+    def look(self, now_s: float, is_ready: Callable[[str], bool] = lambda _unit: True) -> Changes:
+        changes = super().look(now_s, is_ready)
+        for unit, above in changes.take:
+            self.issued.update(dict.fromkeys(HOMES[unit].nodes, above + 1))
+        return changes
+
+    def restart(self, unit: str) -> None:
+        """Issue the next numbers of a unit, if it runs here."""
+        for node in HOMES[unit].nodes if unit in self.held else ():
+            self.issued[node] += 1
 
 
-def robot() -> Placement:
-    made = placement("")
+def robot(issued: Mapping[str, int] = MappingProxyType({})) -> Side:
+    made = Side("", issued)
     made.heard("ground", 0.0)
     return made
 
 
 def test_each_begins_with_what_has_its_home_there():
     assert robot().held == {"pilot"}
-    assert placement("ground").held == {"page", "modules", "world"}
+    assert Side("ground").held == {"page", "modules", "world"}
 
 
 def test_a_host_that_starts_is_waited_for():
-    made = placement("")
-    assert made.look(9.9, {}) == Changes()
-    assert made.look(10.1, {}).lost == ("ground",)
+    made = Side("")
+    assert made.look(9.9) == Changes()
+    assert made.look(10.1).lost == ("ground",)
 
 
 def test_what_a_lost_host_ran_is_taken_over_with_incarnations_that_it_cannot_have_reached():
     made = robot()
-    made.told("ground", [row("hmi", 3), row("DM1", 1), row("DM2", 1)], {}, 0.1)
-    assert made.look(LINK.lost_after_s, {}) == Changes()
-    assert made.look(LOST_S, {}) == Changes(
+    made.told("ground", [row("hmi", 3), row("DM1", 1), row("DM2", 1)], 0.1)
+    assert made.look(LINK.lost_after_s) == Changes()
+    assert made.look(LOST_S) == Changes(
         lost=("ground",), take=(("page", EPOCH), ("modules", EPOCH)))
     assert made.held == {"pilot", "page", "modules"}
-    assert made.look(LOST_S + 1, {}) == Changes()
+    assert made.look(LOST_S + 1) == Changes()
 
 
 def test_a_second_time_they_are_higher_again():
     made = robot()
-    made.told("ground", [row("hmi", EPOCH + 4)], {}, 0.1)
-    assert dict(made.look(LOST_S, {}).take)["page"] == 2 * EPOCH
-    again = robot()
-    assert dict(again.look(LOST_S, {"hmi": 5 * EPOCH + 1}).take)["page"] == 6 * EPOCH
+    made.told("ground", [row("hmi", EPOCH + 4)], 0.1)
+    assert dict(made.look(LOST_S).take)["page"] == 2 * EPOCH
+    again = robot({"hmi": 5 * EPOCH + 1})
+    assert dict(again.look(LOST_S).take)["page"] == 6 * EPOCH
 
 
 def test_it_is_given_back_when_the_host_was_heard_for_a_while_without_a_break():
     made = robot()
-    made.look(LOST_S, {})
+    made.look(LOST_S)
     for tenth in range(10, 13):
         hear_table(made, tenth / 10)
-        assert made.look(tenth / 10, {}) == Changes()
+        assert made.look(tenth / 10) == Changes()
     for tenth in range(50, 53):  # after a break: it begins anew
         hear_table(made, tenth / 10)
-        assert made.look(tenth / 10, {}) == Changes()
+        assert made.look(tenth / 10) == Changes()
     made.heard("ground", 5.4)
-    assert made.look(5.4, {}) == Changes(back=("ground",), drop=("page", "modules"))
+    assert made.look(5.4) == Changes(back=("ground",), drop=("page", "modules"))
     assert made.held == {"pilot"}
 
 
@@ -94,7 +117,7 @@ def over_a_line(made: Placement, is_cut: Callable[[float], bool], until_s: float
         now_s = tick / 20
         if not is_cut(now_s):
             hear_table(made, now_s)
-        changes = made.look(now_s, {"hmi": EPOCH + 1})
+        changes = made.look(now_s)
         taken += [now_s for unit, _ in changes.take if unit == "page"]
         back += [now_s for unit in changes.drop if unit == "page"]
     return taken, back
@@ -120,139 +143,137 @@ def test_what_was_taken_over_is_not_moved_again_before_it_can_have_found_out_wha
 
 def hear_table(made: Placement, now_s: float, *rows: NodeInfo) -> None:
     made.heard("ground", now_s)
-    made.told("ground", rows, {"hmi": EPOCH + 1, "DM1": EPOCH + 1, "DM2": EPOCH + 1}, now_s)
+    made.told("ground", rows, now_s)
 
 
 def test_what_the_host_says_it_still_runs_is_not_given_back_until_it_has_heard_of_the_higher_one():
     made = robot()
     hear_table(made, 0.1, row("hmi", 1))
-    made.look(LOST_S + 0.1, {})
+    made.look(LOST_S + 0.1)
     made.heard("ground", 6.0)
     made.heard("ground", 6.5)
-    assert made.look(6.5, {}) == Changes(back=("ground",))  # it has said nothing since
+    assert made.look(6.5) == Changes(back=("ground",))  # it has said nothing since
     hear_table(made, 6.7, row("hmi", 1))
-    assert made.look(6.7, {}) == Changes(drop=("modules",))
+    assert made.look(6.7) == Changes(drop=("modules",))
     hear_table(made, 6.9)
-    assert made.look(6.9, {}) == Changes(drop=("page",))
+    assert made.look(6.9) == Changes(drop=("page",))
     assert made.held == {"pilot"}
 
 
 def test_who_hears_of_a_higher_incarnation_lets_go_of_its_own_and_starts_it_when_it_is_given_back():
-    ground = placement("ground")
-    news, drop = ground.told("", [row("hmi", EPOCH + 1, "")], {"hmi": 2}, 1.0)
+    ground = Side("ground", {"hmi": 2})
+    news, drop = ground.told("", [row("hmi", EPOCH + 1, "")], 1.0)
     assert [(one.name, one.incarnation) for one in news] == [("hmi", EPOCH + 1)]
     assert drop == ["page"]
-    assert ground.look(1.1, {}).take == ()
-    ground.told("", [row("pilot", 1, "")], {}, 1.2)
-    assert ground.look(1.3, {}).take == (("page", EPOCH + 1),)
+    assert ground.look(1.1).take == ()
+    ground.told("", [row("pilot", 1, "")], 1.2)
+    assert ground.look(1.3).take == (("page", EPOCH + 1),)
     assert ground.held == {"page", "modules", "world"}
 
 
 def test_what_another_runs_already_is_not_taken_back_while_that_host_is_heard():
     made = robot()
-    made.look(LOST_S, {})
+    made.look(LOST_S)
     made.heard("ground", 2.0)
-    made.told("ground", [row("hmi", 2 * EPOCH)], {"hmi": EPOCH + 1}, 2.0)
+    made.told("ground", [row("hmi", 2 * EPOCH)], 2.0)
     assert made.held == {"pilot", "modules"}
-    assert made.look(2.1, {}) == Changes()
+    assert made.look(2.1) == Changes()
 
 
 def test_a_host_that_was_started_anew_waits_until_it_is_given_what_is_its_own():
-    ground = placement("ground")
+    ground = Side("ground")
     assert ground.waits(lambda _: True) == ["page", "modules"]
     assert ground.held == {"world"}
-    ground.told("", [row("hmi", EPOCH + 1, ""), row("DM1", EPOCH + 1, ""), row("DM2", 1, "")], {},
+    ground.told("", [row("hmi", EPOCH + 1, ""), row("DM1", EPOCH + 1, ""), row("DM2", 1, "")],
                 1.0)
-    assert ground.look(1.1, {}).take == ()
-    ground.told("", [row("DM1", EPOCH + 1, ""), row("DM2", 1, "")], {}, 1.2)
-    assert ground.look(1.3, {"hmi": EPOCH + 1}).take == (("page", EPOCH + 1),)
+    assert ground.look(1.1).take == ()
+    ground.told("", [row("DM1", EPOCH + 1, ""), row("DM2", 1, "")], 1.2)
+    assert ground.look(1.3).take == (("page", EPOCH + 1),)
 
 
 def test_of_an_old_table_nothing_follows():
-    ground = placement("ground")
-    ground.told("", [row("hmi", EPOCH + 1, "")], {}, 1.0)
-    ground.told("", [], {}, 1.2)
-    assert ground.look(3.0, {}).take == ()
+    ground = Side("ground")
+    ground.told("", [row("hmi", EPOCH + 1, "")], 1.0)
+    ground.told("", [], 1.2)
+    assert ground.look(3.0).take == ()
 
 
 def test_another_host_than_the_first_takes_nothing_over():
-    ground = placement("ground")
+    ground = Side("ground")
     ground.heard("", 0.0)
-    changes = ground.look(100.0, {})
+    changes = ground.look(100.0)
     assert changes.lost == ("",)
     assert changes.take == ()
 
 
 def test_a_supervisor_is_believed_about_its_own_host_only():
     made = robot()
-    news, drop = made.told("ground", [row("pilot", 99)], {"pilot": 1}, 0.1)
+    news, drop = made.told("ground", [row("pilot", 99)], 0.1)
     assert (news, drop) == ([], [])
     assert made.rows() == []
 
 
 def test_a_unit_that_was_found_running_here_says_that_its_host_is_lost():
-    made = placement("")
+    made = Side("")
     made.adopted("page")
     assert made.is_lost("ground")
-    assert [unit for unit, _ in made.look(0.1, {}).take] == ["modules"]
+    assert [unit for unit, _ in made.look(0.1).take] == ["modules"]
 
 
 def test_a_number_that_was_given_back_is_said_until_the_home_runs_a_higher_one():
-    made = robot()
-    made.look(LOST_S, {})
-    mine = {"pilot": 1, "hmi": EPOCH + 1}
-    assert made.given_back(mine) == []  # it still runs here
+    made = robot({"pilot": 1})
+    made.look(LOST_S)
+    assert made.given_back() == []  # it still runs here
     made.held.discard("page")
-    assert made.given_back(mine) == [("hmi", "ground", EPOCH + 1)]
-    made.told("ground", [row("hmi", 3)], mine, 1.0)
-    assert made.given_back(mine) == [("hmi", "ground", EPOCH + 1)]
-    made.told("ground", [row("hmi", EPOCH + 2)], mine, 1.1)
-    assert made.given_back(mine) == []
+    assert made.given_back() == [("hmi", "ground", EPOCH + 1)]
+    made.told("ground", [row("hmi", 3)], 1.0)
+    assert made.given_back() == [("hmi", "ground", EPOCH + 1)]
+    made.told("ground", [row("hmi", EPOCH + 2)], 1.1)
+    assert made.given_back() == []
 
 
 def test_who_hears_of_such_a_number_starts_its_own_above_it():
-    ground = placement("ground")
-    _, drop = ground.told("", [row("hmi", EPOCH + 1, "ground")], {"hmi": 2}, 1.0)
+    ground = Side("ground", {"hmi": 2})
+    _, drop = ground.told("", [row("hmi", EPOCH + 1, "ground")], 1.0)
     assert drop == ["page"]
-    assert ground.look(1.1, {"hmi": 2}).take == (("page", EPOCH + 1),)
+    assert ground.look(1.1).take == (("page", EPOCH + 1),)
 
 
 def test_a_host_may_be_lost_more_often_than_anybody_counts():
-    made, mine = robot(), {"hmi": 1, "DM1": 1, "DM2": 1}
+    made = robot({"hmi": 1, "DM1": 1, "DM2": 1})
     for time in range(5000):
         made.heard("ground", 100.0 * time)
-        made.look(100.0 * time + LINK.return_after_s + 0.1, mine)
+        made.look(100.0 * time + LINK.return_after_s + 0.1)
         made.heard("ground", 100.0 * time + 70.0)
-        made.told("ground", (), mine, 100.0 * time + 70.0)
-        made.look(100.0 * time + 70.0, mine)
-        for unit, above in made.look(100.0 * time + 70.0 + LOST_S, mine).take:
-            mine.update(dict.fromkeys(HOMES[unit].nodes, above + 1))
-    assert mine["hmi"] > 4000 * EPOCH
-    table = NodeTable((row("hmi", mine["hmi"]),))
-    payload = encode(Header("supervisor", mine["hmi"], 1, 0.0), table)
+        made.told("ground", (), 100.0 * time + 70.0)
+        made.look(100.0 * time + 70.0)
+        made.look(100.0 * time + 70.0 + LOST_S)
+    assert made.issued["hmi"] > 4000 * EPOCH
+    table = NodeTable((row("hmi", made.issued["hmi"]),))
+    payload = encode(Header("supervisor", made.issued["hmi"], 1, 0.0), table)
     assert decode(HOST_NODES, payload)[1] == table
 
 
 def test_who_stood_still_does_not_take_the_others_for_silent():
     made = robot()
     made.excuse(5.0)
-    assert made.look(5.0 + LINK.lost_after_s, {}) == Changes()
-    assert made.look(5.0 + LOST_S, {}).lost == ("ground",)
+    assert made.look(5.0 + LINK.lost_after_s) == Changes()
+    assert made.look(5.0 + LOST_S).lost == ("ground",)
 
 
 @pytest.mark.parametrize(("rate", "times"), [(0.1, 10), (0.5, 2), (1, 1), (4, 1)])
 def test_in_slow_motion_others_are_waited_for_longer(rate, times):
-    made = Placement("", ["ground"], HOMES, LINK, 0.0, guards=GUARDS, rate=rate)
+    made = Side("", rate=rate)
     made.heard("ground", 0.0)
-    assert not made.look(times * LINK.lost_after_s, {}).lost
-    assert made.look(times * LINK.lost_after_s + 0.01, {}).lost
+    assert not made.look(times * LINK.lost_after_s).lost
+    assert made.look(times * LINK.lost_after_s + 0.01).lost
 
 
 @pytest.mark.parametrize("name", ["router_a", "supervisor", "observer", "stranger", "../x", "a\0b"])
 def test_a_host_is_not_believed_about_what_is_no_node_and_no_guard_of_its_own(name):
     made = robot()
     own = row("router_a_ground", 7)
-    assert made.told("ground", [row(name, 999), own], {}, 1.0) == ([own], [])
+    assert made.told("ground", [row(name, 999), own], 1.0) == ([own], [])
     assert made.rows() == [own]
 
 
@@ -262,10 +283,8 @@ def test_a_host_is_not_believed_about_what_is_no_node_and_no_guard_of_its_own(na
 def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(steps):
     """Two supervisors that exchange tables while they are joined; the issued numbers decide."""
     now_s, hears = 0.0, {"", "ground"}
-    sides = {"": placement(""),
-             "ground": placement("ground")}
-    issued = {"": {"pilot": 1}, "ground": {"hmi": 1, "DM1": 1, "DM2": 1, "world": 1}}
-    mine = {own: dict(numbers) for own, numbers in issued.items()}
+    sides = {"": Side("", {"pilot": 1}),
+             "ground": Side("ground", {"hmi": 1, "DM1": 1, "DM2": 1, "world": 1})}
 
     def pass_time(seconds: float) -> None:
         nonlocal now_s
@@ -276,35 +295,30 @@ def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(st
                 other = "ground" if own == "" else ""
                 if other in hears:
                     sides[other].heard(own, now_s)
-                    rows = [row(node, issued[own][node], own) for unit in side.held
+                    rows = [row(node, side.issued[node], own) for unit in side.held
                             for node in HOMES[unit].nodes]
-                    rows += [row(node, highest, home)
-                             for node, home, highest in side.given_back(mine[own])]
-                    news, _ = sides[other].told(own, rows, issued[other], now_s)
-                    issued[other].update({one.name: max(
-                        one.incarnation, issued[other].get(one.name, 0)) for one in news})
-                for unit, above in side.look(now_s, issued[own]).take:
-                    issued[own].update(dict.fromkeys(HOMES[unit].nodes, above + 1))
-                    mine[own].update(dict.fromkeys(HOMES[unit].nodes, above + 1))
+                    rows += [row(node, highest, home) for node, home, highest in side.given_back()]
+                    sides[other].told(own, rows, now_s)
+                side.look(now_s)
 
     for step in (*steps, "join", "wait"):
         hears = LINES.get(step, hears)
-        for side, unit in (("", "pilot"), ("ground", "page")):
-            if step.startswith(side or "robot") and unit in sides[side].held:
-                more = {node: issued[side][node] + 1 for node in HOMES[unit].nodes}
-                issued[side].update(more)
-                mine[side].update(more)
+        if step == "robot restarts a unit":
+            sides[""].restart("page")
+            sides[""].restart("pilot")
+        if step == "ground restarts a unit":
+            sides["ground"].restart("page")
         pass_time(75.0 if step == "wait" else 0.5)
     assert sides[""].held == {"pilot"}
     assert sides["ground"].held == {"page", "modules", "world"}
     for node in ("hmi", "DM1", "DM2"):
-        assert issued["ground"][node] >= issued[""].get(node, 0)
+        assert sides["ground"].issued[node] >= sides[""].issued.get(node, 0)
 
 
 @pytest.mark.parametrize("host", ["", "ground"])
 def test_what_is_lost_is_known_by_name(host):
-    made = placement(host)
-    assert made.look(20.0, {}).lost == tuple(o for o in ("", "ground") if o != host)
+    made = Side(host)
+    assert made.look(20.0).lost == tuple(o for o in ("", "ground") if o != host)
 
 
 @pytest.mark.parametrize(("incarnation", "restarts"), [
