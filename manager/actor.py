@@ -203,13 +203,14 @@ class FtmManager(Actor):
 
     def _step(self, event: Input) -> None:
         now_s = self.clock.now()
+        self._absence.note(now_s)
         # Before simulated time 0 the system is starting: silence means nothing yet.
-        missed_s = self._absence.note(now_s) or (
-            now_s - self._ran_s - (ABSENT_S if now_s > 0 else 0.0))
+        is_excused = now_s <= 0 or self._absence.excuses(now_s)
+        missed_s = now_s - self._ran_s - (0.0 if is_excused else ABSENT_S)
         self._ran_s = now_s
         state = self.arbiter_state
         if missed_s > 0:
-            state = forgive_absence(state, missed_s)
+            state = forgive_absence(state, missed_s, now_s)
         self.arbiter_state, outputs = self._arbiter.step(state, event, now_s)
         for output in outputs:
             match output:
@@ -291,14 +292,17 @@ def _is_calm(status: m.ManagerStatus) -> bool:
     return not (status.active or status.silent or status.activated or status.latched)
 
 
-def forgive_absence(state: State, missed_s: float) -> State:
-    """Return the state of an arbiter for which `missed_s` of its time did not pass.
+def forgive_absence(state: State, missed_s: float, now_s: float) -> State:
+    """Return the state of an arbiter for which the last `missed_s` of its time did not pass.
 
     A manager that was stopped and goes on has heard no module meanwhile, and that is not their
     fault: their reports wait unread. Taken for silence, it would be an emergency stop.
     """
+    def later(at_s: float) -> float:
+        return min(at_s + missed_s, now_s)
+
     return replace(
-        state, started_s=state.started_s + missed_s,
-        since=tuple((name, since_s + missed_s) for name, since_s in state.since),
-        detections=tuple(replace(t, heard_s=t.heard_s + missed_s) for t in state.detections),
-        recoveries=tuple(replace(t, ordered_s=t.ordered_s + missed_s) for t in state.recoveries))
+        state, started_s=later(state.started_s),
+        since=tuple((name, later(since_s)) for name, since_s in state.since),
+        detections=tuple(replace(t, heard_s=later(t.heard_s)) for t in state.detections),
+        recoveries=tuple(replace(t, ordered_s=later(t.ordered_s)) for t in state.recoveries))

@@ -18,8 +18,12 @@ from rampart.actors.machine.unix_peer import peer, process_state
 AUTHORITY = "ca.crt"
 """In a folder of keys: the certificate of the authority."""
 
-LEASE_MS = 2000
-"""A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
+NEAR_LEASE_MS, FAR_LEASE_MS = 86_400_000, 2000
+"""A link that is silent for so long is closed. Within a host the kernel closes the links of a
+process that ends, and the supervisor finds a stopped one. A shorter lease would only close all
+links in a pause of everybody, and the run would be deaf until they are open again. A session that
+is linked to another host has the far lease: a cut cable closes no link.
+"""
 
 HANDSHAKE_MS = 300
 """A handshake that takes longer is given up on either side: what connects and says nothing holds
@@ -157,7 +161,7 @@ def session_config(listen: Sequence[str], dial: Sequence[str],
         "transport/shared_memory/enabled": False,  # a SIGKILL would leave its segment behind
         "transport/unicast/open_timeout": handshake_ms,
         "transport/unicast/accept_timeout": handshake_ms,
-        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/lease": FAR_LEASE_MS if is_far else NEAR_LEASE_MS,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": FULL_US,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _ROOM_US,
         **{f"transport/link/tx/queue/size/{kind}": room for kind, room in _ROOM.items()},

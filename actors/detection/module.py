@@ -169,7 +169,7 @@ class DetectionModule(Actor):
         """Say it again, for nodes that have joined since."""
         self.note_absence()
         self._note_move()
-        if (self._told or self.first_life) and not self._is_withheld():
+        if self._told or self.first_life:
             self.publish(topics.DETECTION, self._report)
 
     def accused(self, suspects: tuple[str, ...], header: Header) -> tuple[str, ...]:

@@ -13,10 +13,11 @@ import math
 ABSENT_S = 0.3
 """An observer that does something at least each 0.2 s and has not for so long was stopped."""
 
-GRACE_S = 0.5
-"""Within which the others go on as well, are linked to a router again, and are heard."""
+GRACE_S = 1.0
+"""Within which the others go on as well, and are heard. Links within a host outlast a pause (see
+`rampart.actors.bus.zenoh_session`), so this is the time in which all processes are continued."""
 
-AGAIN_S = 1.0
+AGAIN_S = 2.0
 """Not sooner does the next absence count: one that is always late is not always excused."""
 
 
@@ -30,15 +31,15 @@ class Absence:
 
     def __init__(self, now_s: float, rate: float = 1.0) -> None:
         self._ran_s = now_s
-        self._grace_s = GRACE_S * max(1.0, rate)
+        self._rate = max(1.0, rate)
         self._until_s = -math.inf
 
     def note(self, now_s: float) -> float:
         """Note that the observer runs; return for how long it was absent, 0 if it was not."""
         gap_s, self._ran_s = now_s - self._ran_s, now_s
-        if gap_s <= ABSENT_S or now_s <= self._until_s + AGAIN_S:
+        if gap_s <= ABSENT_S or now_s <= self._until_s + AGAIN_S * self._rate:
             return 0.0
-        self._until_s = now_s + self._grace_s
+        self._until_s = now_s + GRACE_S * self._rate
         return gap_s
 
     def excuses(self, now_s: float) -> bool:

@@ -223,6 +223,8 @@ class Supervisor(Actor):
         now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
         stall_s, self._checked_s = now - self._checked_s - period_s, now
         self._absence.note(now)
+        if self._absence.excuses(now):
+            stall_s = math.inf
         missed_s = max(FAILOVER_S if self._bus.moved() else 0.0,
                        stall_s if stall_s > _LATE_S else 0.0)
         for process in self._processes.values() if missed_s else ():

@@ -19,6 +19,7 @@ from rampart.actors.detection.module import DetectionModule
 from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
@@ -506,6 +507,25 @@ def test_a_manager_that_was_stopped_takes_nobodys_unread_mail_for_silence():
         assert not system.base.engaged
         assert all("DM" not in name for s in system.recorder.statuses for name in s.silent)
         assert system.recorder.decisions == []
+
+    in_whole_system(scenario)
+
+
+def test_a_manager_that_was_stopped_waits_for_modules_that_go_on_after_it():
+    async def scenario(system: Whole) -> None:
+        for actor in system.actors.values():
+            actor.hold(True)
+        await asyncio.sleep(5.0)
+        system.actors["ftm_manager"].hold(False)
+        await asyncio.sleep(0.8 * GRACE_S)
+        for actor in system.actors.values():
+            actor.hold(False)
+        await asyncio.sleep(2.0)
+        assert system.recorder.decisions == []
+        assert set(system.incarnations.values()) == {1}
+        system.actors["DM6"].hold(True)
+        await asyncio.sleep(2.0)
+        assert "DM6" in system.status.silent
 
     in_whole_system(scenario)
 

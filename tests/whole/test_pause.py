@@ -12,60 +12,79 @@ import pytest
 
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
-from tests.whole.checkpoint_runs import write_short_mission
+from tests.whole.checkpoint_runs import write_near_mission
 
-pytestmark = [pytest.mark.processes, pytest.mark.alone, pytest.mark.slow]
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 SHUFFLED_STEP_S = 0.002
 
 
-def order_of(name: str, pids: list[int], supervisor: int) -> list[int]:
+def order_of(name: str, pids: list[int], run: RealRun) -> list[int]:
     """Return in which order the processes go on."""
     if name == "reversed":
         return pids[::-1]
     if name == "random":
         return random.Random(7).sample(pids, len(pids))
-    if name == "supervisor first":
-        return sorted(pids, key=lambda pid: pid != supervisor)
-    if name == "supervisor last":
-        return sorted(pids, key=lambda pid: pid == supervisor)
-    return pids
+    last = {"supervisor last": ["supervisor"], "routers last": ["router_a", "router_b"]}
+    of_last = {run.pid(node) for node in last.get(name, [])}
+    return sorted(pids, key=lambda pid: pid in of_last)
 
 
-def pause_everybody(run: RealRun, seconds: float, order: str) -> None:
-    """Stop all processes of a run, its launcher first, and have them go on in some order."""
-    supervisor = run.pid("supervisor")
-    assert supervisor is not None
+def restarted_by(run: RealRun, seconds: float, order: str, killed: str = "", left: str = ""
+                 ) -> set[tuple[str, ...]]:
+    """Return the nodes of which a process was replaced because everybody was stopped for a while.
+
+    All processes of the run are stopped, its launcher first. One is killed meanwhile, one is left
+    stopped, the others go on in some order.
+    """
+    before = {(p.names, p.incarnation) for p in find_processes(run.port)}
     pids = [run.process.pid, *(p.pid for p in find_processes(run.port)
                                if p.pid != run.process.pid)]
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     time.sleep(seconds)
-    for pid in order_of(order, pids, supervisor):
+    going_on = [pid for pid in order_of(order, pids, run) if pid != run.pid(left)]
+    if killed:
+        run.kill(killed)
+    for pid in going_on:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGCONT)
         time.sleep(SHUFFLED_STEP_S)
-
-
-def restarted_by(run: RealRun, seconds: float, order: str) -> set[tuple[str, ...]]:
-    """Return the nodes of which a process was replaced because of a pause."""
-    before = {(p.names, p.incarnation) for p in find_processes(run.port)}
-    pause_everybody(run, seconds, order)
     time.sleep(4.0)
     after = {(p.names, p.incarnation) for p in find_processes(run.port)}
-    return {names for names, incarnation in after - before if incarnation > 1}
+    return {names for names, incarnation in after - before
+            if incarnation > 1 and not names[0].startswith("spare.")}
+
+
+SHORT = {(0.5, "reversed"), (3.0, "supervisor last")}
+"""In every run of the suite; the others are slow tests."""
+
+CASES = [(seconds, order) for seconds in (0.5, 3.0, 10.0)
+         for order in ("as started", "reversed", "supervisor last", "routers last", "random")]
 
 
 @pytest.mark.parametrize(("seconds", "order"), [
-    (3.0, "supervisor first"), (1.0, "random"), (3.0, "as started"), (3.0, "reversed"),
-    (3.0, "supervisor last"), (12.0, "random"), (30.0, "reversed")])
+    pytest.param(*case, marks=[] if case in SHORT else [pytest.mark.slow]) for case in CASES])
 def test_after_a_pause_of_everybody_nothing_is_restarted_and_the_mission_goes_on(
         tmp_path, seconds, order):
-    mission = write_short_mission(tmp_path)
+    mission = write_near_mission(tmp_path)
     with RealRun(tmp_path, "osmosis", "--mission", str(mission), "--rate", "2") as run:
-        run.sleep_until(8.0)
+        run.sleep_until(4.0)
         restarted = restarted_by(run, seconds, order)
         assert restarted == set(), run.story
         _, result = run.result()
         assert (result["mission"], result["safety"]) == ("success", "safe"), run.story
         assert "latched" not in run.story
+
+
+def test_what_died_or_hangs_after_a_pause_is_found(tmp_path):
+    mission = write_near_mission(tmp_path)
+    with RealRun(tmp_path, "osmosis", "--mission", str(mission), "--rate", "2") as run:
+        run.sleep_until(4.0)
+        died, hangs = "graph_planner", "DM5"
+        pids = [run.pid(died), run.pid(hangs)]
+        restarted = restarted_by(run, 3.0, "random", killed=died, left=hangs)
+        assert restarted == {(died,), (hangs,)}, run.story
+        assert run.pid(died) not in pids and run.pid(hangs) not in pids
+        _, result = run.result()
+        assert (result["mission"], result["safety"]) == ("success", "safe"), run.story

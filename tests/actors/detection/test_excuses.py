@@ -7,6 +7,7 @@ import asyncio
 import pytest
 
 from rampart.actors.detection.freshness import Freshness
+from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor
@@ -75,6 +76,25 @@ def test_one_that_was_stopped_does_not_blame_those_that_go_on_a_little_later():
             assert not [report for _, report in ear.heard if report.reason]
             await asyncio.sleep(1.0)
             assert [report for _, report in ear.heard if report.reason], "then it is stale"
+
+    run(scenario)
+
+
+def test_one_that_concludes_nothing_yet_is_not_silent():
+    async def scenario() -> None:
+        async with System() as system:
+            ear, source = system.start("ear", Ear), system.start("localization", Source)
+            module = system.start("DM6", Freshness, **POSE, timeout_s=TIMEOUT_S)
+            source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+            await asyncio.sleep(0.1)
+            module.hold(True)
+            await asyncio.sleep(5.0)
+            ear.heard.clear()
+            module.hold(False)
+            source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0), stamp=system.clock.now() - 4.0)
+            await asyncio.sleep(0.9 * GRACE_S)
+            assert len(ear.heard) >= 4
+            assert not [report for _, report in ear.heard if report.reason]
 
     run(scenario)
 

@@ -305,7 +305,7 @@ def test_a_latch_does_not_become_younger_when_somebody_is_started_again(again, b
         bench.report("RM1", IDLE)
         bench.report("RM1", DONE)
     else:
-        bench.state = forgive_absence(bench.state, 29.0)
+        bench.state = forgive_absence(bench.state, 29.0, bench.now)
     bench.wait(between_s)
     assert bench.state.latched == ("RM1",)
     bench.active("DM5")
