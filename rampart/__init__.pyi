@@ -12,6 +12,7 @@ from rampart.actors.detection.watchdog import Watchdog as Watchdog
 from rampart.actors.ftm.messages import DetectionState as DetectionState
 from rampart.actors.ftm.messages import RecoveryCommand as RecoveryCommand
 from rampart.actors.operator.hmi import Hmi as Hmi
+from rampart.actors.operator.panels import Panel as Panel
 from rampart.actors.recovery.holding import HeldOrder as HeldOrder
 from rampart.actors.recovery.module import RecoveryModule as RecoveryModule
 from rampart.actors.recovery.respawn import Respawn as Respawn
@@ -35,7 +36,6 @@ from rampart.manager.arbitration.arbiter_state import RecoveryHeard as RecoveryH
 from rampart.manager.arbitration.arbiter_state import ResetAsked as ResetAsked
 from rampart.manager.arbitration.arbiter_state import Tick as Tick
 from rampart.manager.arbitration.recovery_track import Command as Command
-from rampart.manager.spec.panels import Panel as Panel
 from rampart.manager.spec.schema import SystemSpec as SystemSpec
 from rampart.manager.spec.specification import parse_specification as parse_specification
 from rampart.manager.spec.tables import NonNegative as NonNegative

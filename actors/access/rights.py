@@ -15,7 +15,7 @@ from rampart.actors.bus.topics import INJECT
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.actors.system.layout import Layout, router
-from rampart.actors.system.members import Member, heard, published, shows_panels
+from rampart.actors.system.members import Member, heard, published
 from rampart.actors.system.topics import declared_topics
 
 OPERATOR: Final = "operator"
@@ -128,7 +128,7 @@ def _kept(keys: Mapping[str, Members], topics: Mapping[str, Topic[Any]]) -> dict
 def _operated(layout: Layout, topics: Mapping[str, Topic[Any]]) -> Iterator[str]:
     """Yield what operators say: what their page does, and commands that come from outside."""
     own = {topic.key for topic in BASE_OUTPUTS}
-    pages = [member for member in layout.members.values() if shows_panels(member.actor)]
+    pages = [member for member in layout.members.values() if member.actor.is_page]
     by_page = {key: names for page in pages for key, names in published(page).items()
                if key not in own}
     outside = {topic.key: None for topic in topics.values()

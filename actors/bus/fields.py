@@ -15,12 +15,16 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
+NUMBER, TEXT, TRUTH = "number", "text", "truth"
+ANYTHING = (NUMBER, TEXT, TRUTH)
+"""Kinds of fields."""
+
 _STEP = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+|min|max|len)\]")
 _FOLDS: dict[str, Callable[[Any], Any]] = {"min": min, "max": max, "len": len}
 _LISTS = (inspect.VarTupleType, inspect.ListType, inspect.TupleType)
 _SIMPLE: dict[type[inspect.Type], str] = {
-    inspect.FloatType: "number", inspect.IntType: "number", inspect.BoolType: "truth",
-    inspect.StrType: "text", inspect.EnumType: "text", inspect.LiteralType: "text"}
+    inspect.FloatType: NUMBER, inspect.IntType: NUMBER, inspect.BoolType: TRUTH,
+    inspect.StrType: TEXT, inspect.EnumType: TEXT, inspect.LiteralType: TEXT}
 
 
 class Field:

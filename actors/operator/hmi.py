@@ -13,6 +13,7 @@ import os
 import pwd
 import secrets
 import socket
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -29,13 +30,21 @@ from rampart.actors.operator.bounds import Bounds
 from rampart.actors.operator.camera_eye import CameraEye
 from rampart.actors.operator.feed import Feed
 from rampart.actors.operator.operating import Operating
+from rampart.actors.operator.panels import (
+    MAX_PANELS,
+    Panel,
+    plots_of,
+    problem_of,
+    read_panels,
+    steered,
+)
 from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.operator.requests import REQUESTS, RefusedError, Request, ResetRequest
 from rampart.actors.operator.server import Handlers, PageServer, PortError
 from rampart.actors.operator.state import STALE_S, HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.runtime.parameters import Panels, TopicsPublished
+from rampart.actors.runtime.parameters import Named, TopicsPublished, named
 from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.web.access import Access, AccessError, is_loopback
 from rampart.actors.web.audit import AuditLog
@@ -43,7 +52,6 @@ from rampart.actors.web.gate import Gate
 from rampart.actors.web.tls import Tls, TlsError
 from rampart.actors.web.visitors import Register, Role, Visitor, digest
 from rampart.files.plain_text import one_line
-from rampart.manager.spec.panels import MAX_PANELS, Panel
 from rampart.manager.spec.specification import SystemSpec, check_document
 
 REPEAT_S = 0.5
@@ -75,7 +83,7 @@ class Hmi(Actor):
             fault_orders: topics on which the page orders faults of the robot.
         """
 
-        panels: Panels = ()
+        panels: tuple[Panel, ...] = ()
         fault_orders: TopicsPublished = ()
 
     parameters: Parameters
@@ -84,6 +92,8 @@ class Hmi(Actor):
     badge: ClassVar[str] = "live"
     refuses: ClassVar[str] = ""
     most_spare = "none"
+    tables = ("panel",)
+    is_page = True
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECT, ftm_topics.SIGNAL)
     requests: ClassVar[tuple[type[Request], ...]] = REQUESTS
@@ -97,6 +107,52 @@ class Hmi(Actor):
             if panel.script and not (cls.files and (cls.files / panel.script).is_file()):
                 raise ValueError(f"panel {panel.title!r}: script = {panel.script!r}: no such file "
                                  f"in {cls.__name__}.files = {str(cls.files)!r}")
+
+    @classmethod
+    def given(cls, name: str, spec: SystemSpec, file: str) -> dict[str, Any]:
+        """Return the panels of class and specification; raises as that of its base."""
+        panels = (*cls.panels, *read_panels(spec, file))
+        if problem := problem_of(panels):
+            raise ValueError(f"{file}: {name}: {problem}")
+        return {"panels": panels}
+
+    @classmethod
+    def completed(cls, parameters: Parameters, topics: Iterable[Topic[Any]],
+                  ordered: Iterable[str]) -> Parameters:
+        """Return what it shows, plots if nothing is declared, and what it orders."""
+        return msgspec.structs.replace(
+            parameters, panels=parameters.panels or plots_of(topics), fault_orders=tuple(ordered))
+
+    @classmethod
+    def named(cls, parameters: Parameters) -> dict[str, list[Named]]:
+        """Return what its panels show and say, besides what its parameters name."""
+        found = super().named(parameters)
+        for panel in parameters.panels:
+            for shown in panel.fields():
+                found["published" if shown.is_said else "heard"].append(named(
+                    shown.key, shown.field, kinds=shown.kinds, row=f"panel {panel.title!r}: "))
+        return found
+
+    @classmethod
+    def alone_on(cls, parameters: Parameters) -> dict[str, str]:
+        """Return the keys of its sticks."""
+        return {panel.topic: f"panel {panel.title!r}: stick"
+                for panel in parameters.panels if panel.stick}
+
+    @classmethod
+    def check_topics(cls, parameters: Parameters, topics: Mapping[str, Topic[Any]]) -> None:
+        """Refuse sticks of which no message can be made.
+
+        Raises:
+            ValueError: there is one.
+        """
+        for panel in parameters.panels:
+            if panel.stick:
+                try:
+                    steered(panel, topics[panel.topic])
+                except ValueError as error:
+                    raise ValueError(f"panel {panel.title!r}: stick: topic {panel.topic}: {error}"
+                                     ) from None
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

@@ -19,6 +19,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator import requests
 from rampart.actors.operator.adaptation import StrategyChoice
 from rampart.actors.operator.injection import Injections, places_of
+from rampart.actors.operator.panels import Panel
 from rampart.actors.operator.requests import RefusedError, Request
 from rampart.actors.operator.stick import Stick
 from rampart.actors.supervision.kill_node import (
@@ -27,7 +28,6 @@ from rampart.actors.supervision.kill_node import (
     UnknownNodeError,
     signal_node,
 )
-from rampart.manager.spec.panels import Panel
 from rampart.manager.strategies.registry import STRATEGIES
 
 if TYPE_CHECKING:

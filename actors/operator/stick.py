@@ -24,10 +24,9 @@ from enum import StrEnum
 from typing import Any
 
 from rampart.actors.bus.limits import Remembered
+from rampart.actors.operator.panels import Panel, steered
 from rampart.actors.operator.requests import StickRequest
 from rampart.actors.runtime.actor import Actor
-from rampart.actors.system.chosen_topics import steered
-from rampart.manager.spec.panels import Panel
 
 SILENCE_S = 0.3
 """A page that was not heard for so long has let go (real seconds)."""

@@ -15,8 +15,8 @@ from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ros2.links import Host
 from rampart.actors.ros2.translation.mapping import Inward, Outward
 from rampart.actors.ros2.translation.mirror import message_of
+from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
-from rampart.manager.spec.ros2 import Ros2Link
 
 CANCEL = "action_msgs/srv/CancelGoal"
 _REQUEST, _RESPONSE = "_Request", "_Response"

@@ -41,11 +41,12 @@ from rampart.actors.ros2.ros_clock import NS, RosClock
 from rampart.actors.ros2.side import Mode, NoSide, Side
 from rampart.actors.ros2.stand_in import side_of, wall_ns
 from rampart.actors.ros2.translation.mirror import topic_of
+from rampart.actors.ros2.translation.tables import ROUTER, Ros2Link, read_links
 from rampart.actors.ros2.translation.types import Distribution, Types
 from rampart.actors.ros2.wire import ADMIN, EndpointKind, Qos
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.runtime.parameters import RosLinks
-from rampart.manager.spec.ros2 import ROUTER, Ros2Link
+from rampart.actors.runtime.parameters import Named, named
+from rampart.manager.spec.schema import SystemSpec
 
 _CLOCK, _CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
 _SETTLE_S = 0.05
@@ -93,10 +94,11 @@ class Gateway(Actor):
         interfaces: tuple[str, ...] = ()
         clock: Literal["wall", "ros"] = "wall"
         diagnostics: bool = True
-        ros2: RosLinks = ()
+        ros2: tuple[Ros2Link, ...] = ()
 
     parameters: Parameters
     most_spare = "none"
+    tables = ("ros2",)
     outputs = (GRAPH,)
 
     def __init__(self, context: Context) -> None:
@@ -117,6 +119,24 @@ class Gateway(Actor):
                 self.hear_topic(link.from_, self._passed_on(link))
 
     # -- what its class says before a run ---------------------------------------------------------
+
+    @classmethod
+    def given(cls, name: str, spec: SystemSpec, file: str) -> dict[str, Any]:
+        """Return the links that it passes on; raises as that of its base."""
+        own = next(node.actor for node in spec.nodes if node.name == name)
+        gateways = [node.name for node in spec.nodes if node.actor == own]
+        return {"ros2": tuple(link for link in read_links(spec, gateways, file)
+                              if (link.gateway or gateways[0]) == name)}
+
+    @classmethod
+    def named(cls, parameters: Parameters) -> dict[str, list[Named]]:
+        """Return what its links take and make, besides what its parameters name."""
+        found = super().named(parameters)
+        for link in parameters.ros2:
+            for way, key, name in (("heard", link.from_, "from"), ("published", link.to, "to")):
+                if key:
+                    found[way].append(named(name, key, row=f"ros2 {link.name}: "))
+        return found
 
     @classmethod
     def own_topics(cls, parameters: Parameters) -> tuple[Topic[Any], ...]:

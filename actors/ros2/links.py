@@ -16,8 +16,8 @@ from rampart.actors.ros2.graph import RosGraph
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import RosClock
 from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward
+from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.wire import Attachment, Qos
-from rampart.manager.spec.ros2 import Ros2Link
 
 HEARD_LATELY_S = 1.0
 """A publisher that is silent for so long, simulated seconds, gives way to another."""

@@ -16,9 +16,9 @@ from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ros2.messages import GRAPH, RosGraphReport
+from rampart.actors.ros2.translation.tables import RosName
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import NodeName, Suspects
-from rampart.manager.spec.ros2 import RosName
 from rampart.manager.spec.tables import NonNegative
 
 _GRACE_S = 5.0

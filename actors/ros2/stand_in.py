@@ -20,10 +20,10 @@ from rampart.actors.ros2.bus_side import BusSide
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import EPOCH_NS, NS
 from rampart.actors.ros2.side import Mode, Record, Side, ZenohSide
+from rampart.actors.ros2.translation.tables import ROUTER
 from rampart.actors.ros2.translation.types import Distribution, Types
 from rampart.actors.ros2.wire import Attachment, Qos
 from rampart.actors.runtime.actor import Actor, Context
-from rampart.manager.spec.ros2 import ROUTER
 
 
 def side_of(actor: Actor, bus: Bus, connect: Sequence[str], mode: Mode,

@@ -42,7 +42,7 @@ from rampart.actors.runtime.context import Context
 from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
 from rampart.actors.runtime.injection import InjectedFaults
 from rampart.actors.runtime.mailbox import IDLE, Dispatcher
-from rampart.actors.runtime.parameters import read_parameters, topics_named
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.timer import Timer, Timers
 
 __all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
@@ -100,7 +100,7 @@ class Actor(Declared):
         self._outlets: dict[str | tuple[str, str], str] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
         self._may_publish.update(
-            self.chosen_topic(name.key).key for name in topics_named(self.parameters)["published"])
+            self.chosen_topic(name.key).key for name in self.named(self.parameters)["published"])
         self._chosen: dict[str, list[Callable[[Any, Header], None]]] = {}
 
     # -- what a subclass may override, besides what `Declared` has ---------------------------------
@@ -417,6 +417,6 @@ class Actor(Declared):
             return
         topic = self.published(order.topic, self.name, self.parameters) or (
             next((self.context.topics[named.key] for named in
-                  topics_named(self.parameters)["published"] if named.key == order.topic), None))
+                  self.named(self.parameters)["published"] if named.key == order.topic), None))
         if topic is not None:
             self._injections.order(order, topic)

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Protocol, Self
 
 import msgspec
 
+from rampart.actors import ROLES
 from rampart.actors.bus.topic import Topic
 from rampart.manager.spec.schema import SystemSpec
 
@@ -59,10 +60,10 @@ class Application:
         """
 
     topics: ClassVar[tuple[Topic[Any], ...]] = ()
-    views: ClassVar[str] = "rampart.actors.recording.views:Views"
-    lines: ClassVar[str] = "rampart.cli.robot_lines:RobotLines"
+    views: ClassVar[str] = ROLES["views"]
+    lines: ClassVar[str] = ROLES["lines"]
     faults: ClassVar[str] = ""
-    observer: ClassVar[str] = "rampart.sim.runs.observer:Observer"
+    observer: ClassVar[str] = ROLES["observer"]
     trial: ClassVar[str] = ""
     examples: ClassVar[tuple[tuple[str, str], ...]] = ()
 

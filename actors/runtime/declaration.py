@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, INJECT, INJECTION_REPORT
+from rampart.actors.runtime.parameters import Named, topics_named
+from rampart.manager.spec.schema import SystemSpec
 
 F = TypeVar("F", bound=Callable[..., None])
 
@@ -145,6 +147,8 @@ class Declared(Handlers):
             checkpoints. "none": neither, for `on_start` takes a port, or starts a program. Of all
             others a spare of the node's own runs one for a moment beside the node, in rehearsal:
             what it publishes and keeps then goes nowhere.
+        tables: those of a specification whose rows it is given.
+        is_page: whether an operator works with it.
         Parameters: what the system spec may say of it, by field: type, range and default. A class
             that takes more derives its own from that of its base class.
     """
@@ -156,6 +160,8 @@ class Declared(Handlers):
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
     node_kind: ClassVar[str] = ""
     most_spare: ClassVar[str] = "hot"
+    tables: ClassVar[tuple[str, ...]] = ()
+    is_page: ClassVar[bool] = False
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
@@ -191,6 +197,43 @@ class Declared(Handlers):
             ValueError: they make no sense.
         """
         return ()
+
+    @classmethod
+    def given(cls, name: str, spec: SystemSpec, file: str) -> Mapping[str, Any]:  # noqa: ARG003
+        """Parameters of the node `name` that are made of rows of the specification.
+
+        Args:
+            name: of the node.
+            spec: the system.
+            file: name of the specification, for messages.
+
+        Raises:
+            ValueError: a row makes no sense; one line with file and path.
+        """
+        return {}
+
+    @classmethod
+    def completed(cls, parameters: Any, topics: Iterable[Topic[Any]],
+                  ordered: Iterable[str]) -> Any:
+        """Return its parameters as they are in the whole system.
+
+        Args:
+            parameters: of the node.
+            topics: what the nodes of the system publish that are no pages.
+            ordered: keys of topics on which faults of the run are ordered.
+        """
+        del topics, ordered
+        return parameters
+
+    @classmethod
+    def named(cls, parameters: Any) -> dict[str, list[Named]]:
+        """Topics that its parameters have it hear and publish, by "heard", "published"."""
+        return topics_named(parameters)
+
+    @classmethod
+    def alone_on(cls, parameters: Any) -> Mapping[str, str]:  # noqa: ARG003
+        """Keys on which no other node may publish, each with what says so, for messages."""
+        return {}
 
     @classmethod
     def check_topics(cls, parameters: Any, topics: Mapping[str, Topic[Any]]) -> None:

@@ -14,9 +14,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import msgspec
 from msgspec import inspect
 
+from rampart.actors.bus.fields import ANYTHING
 from rampart.manager.spec.budget import find_false_alarm
-from rampart.manager.spec.panels import ANYTHING, Panel
-from rampart.manager.spec.ros2 import Ros2Link
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Name, SpecificationError
 
@@ -46,10 +45,6 @@ OptionalFieldName = Annotated[str, msgspec.Meta(
     pattern=r"^([^:]+:[^:]+)?\Z", extra={"names": "field", "way": "heard"})]
 FieldNames = Annotated[tuple[FieldName, ...], msgspec.Meta(min_length=1, extra={
     "names": "field", "way": "heard"})]
-Panels = Annotated[tuple[Panel, ...], msgspec.Meta(extra={"panels": True, "way": "heard"})]
-"""Panels of the operator's page; the node hears what they show, and publishes what they say."""
-RosLinks = Annotated[tuple[Ros2Link, ...], msgspec.Meta(extra={"ros2": True})]
-"""What is passed on between ROS 2 and the system, both ways."""
 
 MessageOf = Annotated[dict[str, Any], msgspec.Meta(extra={"message_of": "topic"})]
 """Fields of a message on the topic that the parameter `topic` names."""
@@ -101,11 +96,11 @@ class Named(NamedTuple):
     """A topic that a parameter names.
 
     Attributes:
-        name: of the parameter; of a panel its key.
+        name: of the parameter, or of what in a row of a table names it.
         key: of the topic.
         field: of its messages, or "".
         kinds: of which the field may be.
-        shown_by: "panel TITLE: " if a panel shows or says it.
+        row: which row that is, for messages; "" of a parameter.
         signs_of: nodes of which it is a sign of life, if it is.
     """
 
@@ -113,7 +108,7 @@ class Named(NamedTuple):
     key: str
     field: str
     kinds: tuple[str, ...] = ANYTHING
-    shown_by: str = ""
+    row: str = ""
     signs_of: tuple[str, ...] = ()
 
 
@@ -122,27 +117,17 @@ def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
     found: dict[str, list[Named]] = {"heard": [], "published": []}
     for name, marks in _marks(type(parameters)).items():
         said = getattr(parameters, name)
-        if marks.get("panels"):
-            for panel in said:
-                for shown in panel.fields():
-                    found["published" if shown.is_said else "heard"].append(Named(
-                        shown.key, *_parts(shown.field), shown.kinds, f"panel {panel.title!r}: "))
-        elif marks.get("ros2"):
-            for link in said:
-                found["heard"] += [Named("from", link.from_, "", shown_by=f"ros2 {link.name}: ")
-                                   ] * bool(link.from_)
-                found["published"] += [Named("to", link.to, "", shown_by=f"ros2 {link.name}: ")
-                                       ] * bool(link.to)
-        elif "way" in marks and said:
+        if "way" in marks and said:
             nodes = getattr(parameters, marks["signs_of"]) if "signs_of" in marks else ()
-            found[marks["way"]] += [Named(name, *_parts(text), signs_of=nodes)
+            found[marks["way"]] += [named(name, text, signs_of=nodes)
                                     for text in ([said] if isinstance(said, str) else said)]
     return found
 
 
-def _parts(text: str) -> tuple[str, str]:
+def named(name: str, text: str, **more: Any) -> Named:
+    """Return what is named by "topic" or "topic:field"."""
     key, _, field = text.partition(":")
-    return key, field
+    return Named(name, key, field, **more)
 
 
 class Said(NamedTuple):

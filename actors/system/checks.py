@@ -1,4 +1,6 @@
-"""Whether what the actors of a system hear can come, and what they publish is theirs to say.
+"""What is checked of all actors of a system together.
+
+Whether what they hear can come, what they publish is theirs to say, and what they name is there.
 
 A node that waits for a topic under a mistyped key, or for messages of another type, works as well
 as any: it is only silent. So it is refused before a run, in one line.
@@ -7,6 +9,7 @@ as any: it is only silent. So it is refused before a run, in one line.
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from typing import Any
@@ -14,11 +17,19 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
+from rampart.actors.bus.fields import Field
 from rampart.actors.bus.topic import Members, Qos, Topic
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import BASE_OUTPUTS
-from rampart.actors.system.members import Member, heard, panels_of, published
+from rampart.actors.runtime.parameters import Named, messages_said
+from rampart.actors.system.members import Member, heard, published
 from rampart.manager.spec.schema import Kind, SystemSpec
+
+LEAST_SIGN_HZ = 10.0
+"""What is published less often is no better a sign of life than heartbeats."""
+
+_LATEST_SIGN = 1.5
+"""Periods of such a topic within which a loop that turns has had a timer to handle."""
 
 Published = Mapping[str, list[tuple[Member, Members]]]
 """Topic key → who publishes it, and which members of a family."""
@@ -93,7 +104,7 @@ def check_connections(members: Collection[Member], said: Published, known: Itera
             if key not in optional and key not in silent:
                 check_heard(f"{file}: {member.where}:", declared.find(key), names, said)
     for member in members:
-        _check_sticks(member, said, declared, file)
+        check_alone(member, said, declared, file)
     for key, publishers in said.items():
         topic = declared.find(key)
         if topic.several or topic.qos is Qos.COMMAND or topic in BASE_OUTPUTS:
@@ -164,21 +175,76 @@ def check_heard(who: str, topic: Topic[Any], names: Members, said: Published) ->
                      "without is named in optional_inputs of its class")
 
 
-def _check_sticks(page: Member, said: Published, declared: Declared, file: str) -> None:
-    """Check that nobody else publishes what an operator says with a stick.
+def check_alone(node: Member, said: Published, declared: Declared, file: str) -> None:
+    """Check that no other node publishes where one is to be alone, as an operator is with a stick.
 
     Also of a command: the robot is told to stand still once, when he lets go.
+
+    Raises:
+        ValueError: one does.
     """
-    for panel in panels_of(page.parameters):
-        for key, publishers in said.items() if panel.stick else ():
+    for alone_on, what in node.actor.alone_on(node.parameters).items():
+        for key, publishers in said.items():
             topic = declared.find(key)
-            name = topic.member(panel.topic)
+            name = topic.member(alone_on)
             for other, names in publishers if name is not None and not topic.several else ():
-                if other.name != page.name and (names is None or name in names):
+                if other.name != node.name and (names is None or name in names):
                     raise ValueError(
-                        f"{file}: {page.name}: panel {panel.title!r}: stick: {other.where} "
-                        f"publishes {panel.topic!r} as well, and may move what an operator let go "
+                        f"{file}: {node.name}: {what}: {other.where} "
+                        f"publishes {alone_on!r} as well, and may move what an operator let go "
                         "of; a topic of the stick's own is right (or several = True in the Topic)")
+
+
+def check_named(topic: Topic[Any], named: Named, members: Iterable[Member], where: str) -> None:
+    """Check what a parameter names of a topic: a field, or a sign of life.
+
+    Raises:
+        ValueError: there is no such field, it is of another kind, or the topic is no sign of life
+            of a watched node, or too rare to be a better one than heartbeats.
+    """
+    if named.field:
+        try:
+            kind = Field(topic.type, named.field).kind
+        except ValueError as error:
+            raise ValueError(f"{where}: topic {topic.key}: {error}") from None
+        if kind not in named.kinds:
+            raise ValueError(f"{where}: topic {topic.key}: {named.field} is a {kind}; a "
+                             f"{' or a '.join(named.kinds)} is right")
+    if named.signs_of:
+        _check_sign(topic, named, members, f"{where} = {named.key!r}")
+
+
+def _check_sign(topic: Topic[Any], named: Named, members: Iterable[Member], where: str) -> None:
+    if topic.rate_hz < LEAST_SIGN_HZ:
+        comes = f"comes {topic.rate_hz:g} times a second" if topic.rate_hz else "comes on event"
+        raise ValueError(f"{where}: {comes}, heartbeats show as much; a topic with a rate of "
+                         f"{LEAST_SIGN_HZ:g} Hz or more is right")
+    publishers = [m for m in members if topic.key in published(m)]
+    watched = [m for m in publishers if m.name in named.signs_of]
+    if not watched:
+        names = ", ".join(m.name for m in publishers) or "none"
+        raise ValueError(f"{where}: published by {names}, a topic of "
+                         f"{' or '.join(named.signs_of)} is right")
+    longest_s = _LATEST_SIGN / topic.rate_hz
+    for member in watched:
+        if min(member.actor.periods_s(), default=math.inf) > longest_s:
+            raise ValueError(f"{where}: {member.name} has no timer of {1 / topic.rate_hz:g} s, so "
+                             "it is silent when others are; what is published by a timer (@every) "
+                             "is right")
+
+
+def check_said(parameters: msgspec.Struct, topics: Mapping[str, Topic[Any]]) -> None:
+    """Check that messages which parameters hold are of their topics, which are given by key.
+
+    Raises:
+        ValueError: one is not.
+    """
+    for name, said in messages_said(parameters).items():
+        topic = topics[said.topic]
+        try:
+            msgspec.convert(said.fields, topic.type)
+        except ValueError as error:
+            raise ValueError(f"parameters.{name}: topic {topic.key}: {error}") from None
 
 
 def _spelt(said: Published) -> list[str]:

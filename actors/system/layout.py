@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import msgspec
 
+from rampart.actors import ROLES, TAKES
 from rampart.actors.bus.topic import Topic
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
+from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.declaration import Handlers
 from rampart.actors.runtime.parameters import read_parameters
@@ -23,7 +25,7 @@ from rampart.actors.system.checks import (
     check_repairs,
     publishers_of,
 )
-from rampart.actors.system.chosen_topics import choose_topics, with_pages
+from rampart.actors.system.chosen_topics import choose_topics
 from rampart.actors.system.hosts import Hosts
 from rampart.actors.system.members import (
     SPARES,
@@ -37,12 +39,6 @@ from rampart.actors.system.members import (
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 from rampart.manager.spec.specification import check_change, check_document
 from rampart.manager.spec.tables import Layers
-
-SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"
-FIRST_SUPERVISOR_CLASS = "rampart.actors.hosts.host_supervisor:FirstSupervisor"
-HOST_SUPERVISOR_CLASS = "rampart.actors.hosts.host_supervisor:HostSupervisor"
-HOST_OBSERVER_CLASS = "rampart.actors.hosts.host_observer:HostObserver"
-ROUTER_CLASS = "rampart.actors.supervision.router:Router"
 
 
 class Unit(msgspec.Struct, frozen=True):
@@ -85,7 +81,7 @@ class Layout:
         self.unit_of: dict[str, str] = {
             node.name: unit.name for unit in self.units.values() for node in unit.nodes}
         self.routers: dict[str, Unit] = {
-            name: Unit(name, (NodeSpec(name, Kind.SUPERVISION, ROUTER_CLASS),))
+            name: Unit(name, (NodeSpec(name, Kind.SUPERVISION, ROLES["router"]),))
             for name in plan.routers}
         self.hosts = Hosts(spec, plan.host)
         self.here = {name: unit for name, unit in self.units.items()
@@ -98,35 +94,59 @@ class Layout:
             judged = judged_topics(spec, observer)
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
-        own = [*self._supervisors(),
-               Member(OBSERVER, observer, msgspec.convert(
-                   {"judged": [topic.key for topic in judged]}, observer.Parameters))]
-        own += [Member(on_host(OBSERVER, host), watcher, msgspec.convert(
-                    {"supervisor": name}, watcher.Parameters))
-                for host, name in self.hosts.supervisors.items() if host
-                for watcher in [load_class(HOST_OBSERVER_CLASS)]]
         world = {"seed": plan.seed, **(application or Application()).world_parameters(),
                  "dead_man": spec.layers.dead_man,
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
-        own += [load_member(n, spec, file, world if n.kind is Kind.WORLD else {})
-                for n in spec.actors()]
+        # Without fault tolerance its actors are not started: what they publish is not missed, and
+        # what they hear is checked.
+        whole = msgspec.structs.replace(spec, layers=Layers()).actors()
+        everyone = self._complete((
+            *self._guards(observer, judged),
+            *(load_member(n, spec, file, world if n.kind is Kind.WORLD else {}) for n in whole)),
+            file)
+        started = {*self.unit_of, *(m.name for m in everyone if m.kind is Kind.SUPERVISION)}
         known = (*kind.topics, *stand_in_topics(spec))
-        ordered = dict.fromkeys(o.topic for fault in plan.faults for o in fault.orders)
-        self.members, self.topics = choose_topics(
-            with_pages(own, spec, ordered, file), (*known, *judged), file)
-        made = {topic.key for member in own for topic in member.actor.own_topics(member.parameters)}
-        self._check(judge, (*ftm_topics.ALL, *known, *(
-            topic for key, topic in self.topics.items() if key in made)), file)
+        chosen, topics = choose_topics(everyone, (*known, *judged), file)
+        self.members = {name: member for name, member in chosen.items() if name in started}
+        self.topics = topics
+        made = {topic.key for member in everyone
+                for topic in member.actor.own_topics(member.parameters)}
+        self._check(judge, chosen.values(), (*ftm_topics.ALL, *known, *(
+            topic for key, topic in topics.items() if key in made)), file)
 
-    def _supervisors(self) -> Iterator[Member]:
+    def _guards(self, observer: type[Actor], judged: Collection[Topic[Any]]) -> Iterator[Member]:
+        """Yield supervisors and observers of all hosts, the observer of the run among them."""
+        several = self.hosts.several
         for host, name in self.hosts.supervisors.items():
-            kind = load_class(SUPERVISOR_CLASS if len(self.hosts.supervisors) == 1 else
-                              HOST_SUPERVISOR_CLASS if host else FIRST_SUPERVISOR_CLASS)
-            yield Member(name, kind, msgspec.convert(
-                {"nodes": self.hosts.heard_by(host, self.unit_of), "host": host,
-                 "others": tuple(one for one in self.hosts.supervisors if one != host)}
-                if self.hosts.several else {"nodes": self.hosts.heard_by(host, self.unit_of)},
-                kind.Parameters))
+            role = ("host supervisor" if host else "first supervisor") if several else "supervisor"
+            others = tuple(one for one in self.hosts.supervisors if one != host)
+            yield _guard(name, load_class(ROLES[role]), {
+                "nodes": self.hosts.heard_by(host, self.unit_of),
+                **({"host": host, "others": others} if several else {})})
+        yield _guard(OBSERVER, observer, {"judged": [topic.key for topic in judged]})
+        for host, name in self.hosts.supervisors.items():
+            if host:
+                yield _guard(on_host(OBSERVER, host), load_class(ROLES["host observer"]),
+                             {"supervisor": name})
+
+    def _complete(self, members: Iterable[Member], file: str) -> list[Member]:
+        """Return members with the parameters that they have in the whole system.
+
+        Raises:
+            ValueError: the spec has rows of a table that no actor takes.
+        """
+        everyone = list(members)
+        for table, rows in (("panel", self.spec.panels), ("ros2", self.spec.ros2)):
+            if rows and not any(table in member.actor.tables for member in everyone):
+                raise ValueError(f"{file}: $.{table}: no node takes it; one of actor "
+                                 f"{TAKES[table]} does")
+        nodes = {node.name for node in self.spec.nodes}
+        topics = {topic.key: topic for member in everyone
+                  if member.name in nodes and not member.actor.is_page
+                  for topic in member.actor.outputs}
+        ordered = dict.fromkeys(o.topic for fault in self.plan.faults for o in fault.orders)
+        return [replace(member, parameters=member.actor.completed(
+            member.parameters, topics.values(), ordered)) for member in everyone]
 
     def spare_of(self, names: Collection[str]) -> Spare:
         """Return which spare the process of these actors is to have; the least that one allows."""
@@ -138,19 +158,12 @@ class Layout:
         return all(name in self.members and self.members[name].actor.most_spare != "none"
                    for name in names)
 
-    def _check(self, judge: Any, known: Collection[Topic[Any]], file: str) -> None:
+    def _check(self, judge: Any, everyone: Iterable[Member], known: Collection[Topic[Any]],
+               file: str) -> None:
         """Check who hears and publishes what; raises as the constructor."""
-        members = list(self.members.values())
-        others: list[Member] = []
-        silent: list[str] = []
-        if not self.spec.layers.ftm:  # its modules are not started, and what they say is not missed
-            every_node = msgspec.structs.replace(self.spec, layers=Layers()).actors()
-            others = [load_member(node, self.spec, file) for node in every_node
-                      if node.name not in self.members]
-            silent = [topic.key for topic in ftm_topics.ALL]
-        everyone = choose_topics((*members, *others), (*known, *self.topics.values()), file)[0]
-        said = publishers_of(everyone.values())
-        declared = check_connections(members, said, known, silent, file)
+        silent = [] if self.spec.layers.ftm else [topic.key for topic in ftm_topics.ALL]
+        said = publishers_of(everyone)
+        declared = check_connections(list(self.members.values()), said, known, silent, file)
         check_repairs(self.members, self.spec, file)
         if judge is None:
             return
@@ -166,10 +179,13 @@ class Layout:
                 check_heard(f"{file}: {who}", topic, None, said)
 
 
+def _guard(name: str, kind: type[Actor], given: Mapping[str, Any]) -> Member:
+    return Member(name, kind, msgspec.convert(given, kind.Parameters))
+
+
 def router(name: str) -> Member:
     """Return a router of the bus, which real runs have."""
-    kind = load_class(ROUTER_CLASS)
-    return Member(name, kind, kind.Parameters())
+    return _guard(name, load_class(ROLES["router"]), {})
 
 
 def adapted_system(layout: Layout, run: RunContext,

@@ -19,7 +19,6 @@ from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
-from rampart.manager.spec.panels import Panel, problem_of
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
@@ -32,9 +31,6 @@ REPORTS_ON: Mapping[Kind, Topic[Any]] = {
 _PLACE = {Kind.DETECTION: "it belongs into [[detection]]",
           Kind.RECOVERY: "it belongs into [[recovery]]",
           Kind.MANAGER: "kind = 'manager' is right"}
-
-_ROOMS_OF_0_6 = ("actors", "manager", "sim")
-
 
 Spare = Literal["none", "warm", "own", "hot"]
 SPARES: tuple[Spare, ...] = ("none", "warm", "own", "hot")
@@ -134,15 +130,8 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
             load_member(node.in_virtual_time(), spec, file, derived)
         return Member(node.name, actor, read_parameters(
             actor.Parameters, node.command_parameters, file, path, spec), "", node.kind)
-    given = {name: derived[name] for name in takes & derived.keys()} | node.parameters
-    if shows_panels(actor):
-        given["panels"] = panels = (*getattr(actor, "panels", ()), *spec.panels)
-        if problem := problem_of(panels):
-            raise ValueError(f"{file}: {node.name}: {problem}")
-    if "ros2" in takes:
-        first = next(one.name for one in spec.nodes if one.actor == node.actor)
-        given["ros2"] = tuple(
-            link for link in spec.ros2 if (link.gateway or first) == node.name)
+    given = {name: derived[name] for name in takes & derived.keys()}
+    given |= {**node.parameters, **actor.given(node.name, spec, file)}
     return Member(node.name, actor, read_parameters(
         actor.Parameters, given, file, f"{path}: parameters", spec), kind=node.kind,
         spare=_spare(node, actor, f"{file}: {path}"))
@@ -161,16 +150,6 @@ def _spare(node: NodeSpec, actor: type[Actor], path: str) -> Spare:
         raise ValueError(
             f"{path}: spare = {node.spare!r}: {actor.__name__} allows {most!r} at most")
     return node.spare
-
-
-def shows_panels(actor: type[Actor]) -> bool:
-    """Whether an actor is a page, which shows panels."""
-    return any(field.name == "panels" for field in msgspec.structs.fields(actor.Parameters))
-
-
-def panels_of(parameters: Actor.Parameters) -> tuple[Panel, ...]:
-    """Return the panels of an actor that is a page."""
-    return getattr(parameters, "panels", ())
 
 
 def load_class(path: str, kind: Kind | None = None, field: str = "actor") -> type[Actor]:
@@ -211,8 +190,7 @@ def import_class(path: str, base: type[T], field: str, what: str = "") -> type[T
         imported = importlib.import_module(module)
     except ImportError as error:
         hidden = "; ".join(dict.fromkeys(working_folder.refused.values()))
-        hint = _moved(module, name) or (
-            f"; nothing is imported from there: {hidden}" if hidden else "")
+        hint = f"; nothing is imported from there: {hidden}" if hidden else ""
         raise ValueError(f"{field} = {path!r}: {error}{hint}") from None
     except Exception as error:  # a module of the user's own may raise anything
         frames = traceback.extract_tb(error.__traceback__)
@@ -229,14 +207,3 @@ def import_class(path: str, base: type[T], field: str, what: str = "") -> type[T
                          "known: "
                          f"{', '.join(known) or 'none'}")
     return found
-
-
-def _moved(module: str, name: str) -> str:
-    """Return where a class of Rampart 0.6 is now, for a message; "" if it is none."""
-    if module.partition(".")[0] not in _ROOMS_OF_0_6:
-        return ""
-    root = Path(rampart.__file__).parent
-    now = [file.relative_to(root).with_suffix("")
-           for room in ("actors", "manager", "sim") for file in (root / room).rglob("*.py")
-           if f"class {name}(" in file.read_text(encoding="utf-8")]
-    return f"; since 0.7 it is rampart.{'.'.join(now[0].parts)}:{name}" if len(now) == 1 else ""

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from rampart.actors import TAKES
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan
 from rampart.actors.system.checks import flaw
 from rampart.actors.system.layout import Layout, application_class
 from rampart.actors.system.members import heard, load_class, load_member, published, topics_of
-from rampart.manager.spec.ros2 import GATEWAY
 from rampart.manager.spec.specification import SystemSpec
 
 _SHIPPED = "rampart."
@@ -107,7 +107,7 @@ def _with_made(known: tuple[Topic[Any], ...], spec: SystemSpec) -> tuple[Topic[A
     """Return topics with those that there are because parameters say so, each key once."""
     found = {topic.key: topic for topic in known}
     for node in spec.nodes if spec.ros2 else ():
-        if node.actor == GATEWAY:
+        if node.actor == TAKES["ros2"]:
             member = load_member(node, spec, spec.name)
             for topic in member.actor.own_topics(member.parameters):
                 found.setdefault(topic.key, topic)

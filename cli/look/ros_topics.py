@@ -21,13 +21,13 @@ from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_nodes import RosNodes
 from rampart.actors.ros2.side import NoSide, ZenohSide
 from rampart.actors.ros2.translation.fields import plain
+from rampart.actors.ros2.translation.tables import GATEWAY, Ros2Link
 from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
 from rampart.actors.ros2.wire import ADMIN, Attachment, Endpoint, EndpointKind, Qos, ros_name
 from rampart.actors.system.members import load_member
 from rampart.cli import systems
 from rampart.cli.look.topic_lines import in_line, print_rate, rate_of
 from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say, warn
-from rampart.manager.spec.ros2 import GATEWAY, Ros2Link
 from rampart.manager.spec.schema import SystemSpec
 
 DOMAIN, DISTRIBUTION = "ROS_DOMAIN_ID", "ROS_DISTRO"

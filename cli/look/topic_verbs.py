@@ -23,6 +23,7 @@ from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.ros2.translation.tables import ROUTER
 from rampart.cli import systems
 from rampart.cli.following import LOOK_S, is_over
 from rampart.cli.look import ros_verbs
@@ -39,7 +40,6 @@ from rampart.cli.output import NoEffectError, positive, print_json, print_table,
 from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
 from rampart.files import streams
-from rampart.manager.spec.ros2 import ROUTER
 
 _WINDOW = 500
 _SHOWN_BYTES = 24

@@ -26,6 +26,7 @@ from rampart.actors.foreign.program import LOGS
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ros2.messages import GRAPH, RosGraphReport
+from rampart.actors.ros2.translation.tables import GATEWAY
 from rampart.cli import systems
 from rampart.cli.following import is_over
 from rampart.cli.operate.operator_verbs import Holdings
@@ -45,7 +46,6 @@ from rampart.cli.run_picture import manager_in_words
 from rampart.cli.session import connect, first_to_expire
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag, option, whole
 from rampart.files.plain_text import printable
-from rampart.manager.spec.ros2 import GATEWAY
 
 MOST_LINES = 1_000_000
 _LONGEST_LINE = 1 << 16

@@ -31,6 +31,7 @@ from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint
 from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.panels import Panel
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import Forms, header_of, renumbered
 from rampart.actors.recording.run_documents import NOT_CHOSEN, SYSTEM, Known, restore
@@ -276,10 +277,13 @@ class Replay:
             restore(self.summary.files, folder)
             run = replace(run, application=self._known.kind.restored(folder))
         kind = page_of(self._known)
+        panels: tuple[Panel, ...] = kind.panels
+        with contextlib.suppress(ValueError):  # panels of another version
+            panels = kind.given(PAGE, run.system, SYSTEM)["panels"]
         page: type[Hmi] = ReplayPage if kind is Hmi else type("ReplayPage", (ReplayPage, kind), {})
         return page(Context(
             PAGE, 1, clock, SharedBus(bus), {"panels": tuple(
-                panel for panel in (*kind.panels, *run.system.panels) if not panel.stick)}, run,
+                panel for panel in panels if not panel.stick)}, run,
             topics={topic.key: topic for topic in self._known.topics}))
 
 

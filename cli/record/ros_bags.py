@@ -10,11 +10,11 @@ from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.ros_bag import RosBag
 from rampart.actors.ros2.gateway import Gateway
+from rampart.actors.ros2.translation.tables import GATEWAY
 from rampart.actors.ros2.translation.types import Types
 from rampart.cli import systems
 from rampart.cli.output import NoEffectError, UsageError, refusing
 from rampart.cli.record.replaying import recorded_system
-from rampart.manager.spec.ros2 import GATEWAY
 from rampart.manager.spec.schema import SystemSpec
 
 

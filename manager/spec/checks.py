@@ -17,8 +17,6 @@ from rampart.manager.model.order import CycleError, find_cycle
 from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
 from rampart.manager.spec.host_checks import find_wrong_hosts
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
-from rampart.manager.spec.panels import problem_of
-from rampart.manager.spec.ros2_checks import find_wrong_links
 from rampart.manager.spec.schema import MechanismSpec, SystemSpec
 from rampart.manager.spec.tables import Finding, find_wrong_names, numbered, unknown
 from rampart.manager.strategies.registry import STRATEGIES
@@ -223,15 +221,6 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
                           f"{', '.join(sorted(used))}", (sorted(recovery.disables),))
 
 
-def _panels(spec: SystemSpec) -> Iterator[Finding]:
-    for path, panel in numbered("panel", spec.panels):
-        if panel.script is not None:
-            yield Finding(f"{path}.script", f"{panel.title!r}: only the class of a page has "
-                          "scripts; a field of a topic is right, e.g. gauge", (panel.script,))
-    if problem := problem_of(spec.panels):
-        yield Finding("$.panel", problem)
-
-
 def _reachability(spec: SystemSpec) -> Iterator[Finding]:
     answers: dict[str, set[str]] = {}  # to a detection module: recoveries
     recovering = {recovery.escalate_to for recovery in spec.recoveries}
@@ -393,5 +382,5 @@ def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
 
 VALIDATORS: tuple[Validator, ...] = (
     find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, find_wrong_hosts,
-    _mechanisms, _reachability, _faults, _panels, find_wrong_links, _wrong_tree, _wrong_policy,
-    _wrong_orders, _contradictions, _wrong_compounds, _wrong_precedence, find_wrong_budget)
+    _mechanisms, _reachability, _faults, _wrong_tree, _wrong_policy, _wrong_orders,
+    _contradictions, _wrong_compounds, _wrong_precedence, find_wrong_budget)

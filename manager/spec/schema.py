@@ -22,8 +22,6 @@ from rampart.manager.model.order import PartialOrder, Tree, refine
 from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.mobile_robot import Hazard, Robot
 from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits, ClassPath, Kind, NodeSpec
-from rampart.manager.spec.panels import Panel
-from rampart.manager.spec.ros2 import Ros2Link
 from rampart.manager.spec.tables import (
     DERIVED,
     End,
@@ -229,8 +227,8 @@ class SystemSpec(Table, frozen=True):
             "" for none.
         order: Name of an order of the recoveries, or several: what the first leaves open the
             next decides. The first is the one that says what is safer.
-        panels: Of the operator's page, besides those of its class.
-        ros2: What is passed on between ROS 2 and the system.
+        panels: Of the operator's page, besides those of its class; see `read_rows`.
+        ros2: What is passed on between ROS 2 and the system, likewise.
     """
 
     name: Name
@@ -254,8 +252,8 @@ class SystemSpec(Table, frozen=True):
     events: tuple[EventSpec, ...] = msgspec.field(name="event", default=())
     orders: dict[str, dict[str, tuple[str, ...]]] = {}
     faults: tuple[FaultSpec, ...] = msgspec.field(name="fault", default=())
-    panels: tuple[Panel, ...] = msgspec.field(name="panel", default=())
-    ros2: tuple[Ros2Link, ...] = ()
+    panels: tuple[dict[str, Any], ...] = msgspec.field(name="panel", default=())
+    ros2: tuple[dict[str, Any], ...] = ()
 
     @property
     def titles(self) -> dict[str, str]:

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from itertools import chain
 from pathlib import PurePath
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -30,8 +30,6 @@ from rampart.manager.model.mechanisms import RecoveryKind
 from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
 from rampart.manager.spec.mobile_robot import Hazard, derive_timeouts
 from rampart.manager.spec.nodes import COMMAND_FIELDS, NODE_KINDS
-from rampart.manager.spec.panels import MAX_PANELS
-from rampart.manager.spec.ros2 import GATEWAY, INTERFACES
 from rampart.manager.spec.schema import (
     TABLES,
     DetectionSpec,
@@ -39,7 +37,9 @@ from rampart.manager.spec.schema import (
     RecoverySpec,
     SystemSpec,
 )
-from rampart.manager.spec.tables import Finding, SpecificationError, by_name
+from rampart.manager.spec.tables import Finding, SpecificationError, Table, by_name
+
+Row = TypeVar("Row", bound=Table)
 
 ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
     ("node", "kind"): NODE_KINDS, ("recovery", "kind"): RecoveryKind,
@@ -53,8 +53,11 @@ limits of a float, and a thousand million seconds are thirty years.
 LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
 
+INTERFACES = "interfaces"
+"""Parameter of a node in a system with `[[ros2]]`: folders, relative to the file of the system."""
+
 MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
-            "host": 16, "fault": 500, "orders": 16, "panel": MAX_PANELS, "ros2": 500}
+            "host": 16, "fault": 500, "orders": 16, "panel": 40, "ros2": 500}
 """Of each table; the shipped systems have 31 actors, and checks compare many with many."""
 
 
@@ -135,7 +138,7 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
     try:
         spec = msgspec.convert(document, SystemSpec)
     except msgspec.ValidationError as error:
-        raise _refusal(file, _explain(error, document), document) from None
+        raise _refusal(file, _explain(str(error), document), document) from None
     spec = replace(spec, timing=derive_timeouts(spec.mobile, spec.timing))
     spec = _resolve_folders(_resolve_timing_names(spec, file), file)
     wrong = find_nonsense(spec)
@@ -146,6 +149,32 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
     if wrong is not None:
         raise _refusal(file, wrong, document)
     return spec
+
+
+def read_rows(rows: Sequence[dict[str, Any]], kind: type[Row], table: str, file: str,
+              text: str = "") -> tuple[Row, ...]:
+    """Read rows of a table that is an actor's, and not known here.
+
+    Args:
+        rows: As the spec has them.
+        kind: What one says.
+        table: Its name in the file.
+        file: Name to use in messages.
+        text: What a text should be that is refused by its form.
+
+    Raises:
+        SpecificationError: A field is missing, unknown or of the wrong type.
+    """
+    found = []
+    for place, row in enumerate(rows):
+        try:
+            found.append(msgspec.convert(row, kind))
+        except msgspec.ValidationError as error:
+            problem, _, path = str(error).rpartition(" - at `$")
+            where = f" - at `$.{table}[{place}]" + (path if problem else "`")
+            raise _refusal(file, _explain(f"{problem or error}{where}", {table: [*rows]},
+                                          {table: kind}, text), {}) from None
+    return tuple(found)
 
 
 def _refusal(file: str, finding: Finding, document: Mapping[str, Any]) -> SpecificationError:
@@ -181,8 +210,8 @@ def _find_unwritable(document: dict[str, Any]) -> Iterator[Finding]:
 def _find_misshapen(document: dict[str, Any]) -> Iterator[Finding]:
     """Find by hand what msgspec gives no path for that ends in the key of a dict."""
     for key, value in document.items():
-        if key not in _known_fields(""):
-            yield _unknown_field(f"$.{key}", "", value)
+        if key not in _fields(SystemSpec):
+            yield _unknown_field(f"$.{key}", _fields(SystemSpec), value, is_top=True)
     for key, most in MAX_ROWS.items():
         rows = document.get(key, ())
         if isinstance(rows, list | dict) and len(rows) > most:
@@ -237,7 +266,7 @@ def _resolve_folders(spec: SystemSpec, file: str) -> SystemSpec:
 
     def resolved(node: NodeSpec) -> NodeSpec:
         named = node.parameters.get(INTERFACES)
-        if node.actor != GATEWAY or not isinstance(named, list):
+        if not isinstance(named, list):
             return node
         above = PurePath(file).parent
         return replace(node, parameters={**node.parameters, INTERFACES: [
@@ -246,11 +275,12 @@ def _resolve_folders(spec: SystemSpec, file: str) -> SystemSpec:
     return replace(spec, nodes=tuple(map(resolved, spec.nodes))) if spec.ros2 else spec
 
 
-def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Finding:
+def _explain(error: str, document: dict[str, Any],
+             tables: Mapping[str, type[Table]] = TABLES, text: str = "") -> Finding:
     """Turn msgspec's words into ours: add the value, and what is known where names are wrong."""
     # A problem may quote a key of the file, the path at the end cannot.
-    found = re.fullmatch(r"(?s)(.*) - at `([^`]*)`", str(error))
-    problem, path = (found[1], found[2]) if found else (str(error), "$")
+    found = re.fullmatch(r"(?s)(.*) - at `([^`]*)`", error)
+    problem, path = (found[1], found[2]) if found else (error, "$")
     steps = re.findall(r"\w+", path)
     value: Any = document
     for step in steps:
@@ -262,8 +292,9 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Findin
     if missing:
         return Finding(path, f"required field {missing[1]!r} is missing")
     if "unknown field `" in problem:
-        key = next(key for key in value if key not in _known_fields(field))
-        return _unknown_field(f"{path}.{key}", field, value[key])
+        known = _fields(tables[field])
+        key = next(key for key in value if key not in known)
+        return _unknown_field(f"{path}.{key}", known, value[key], is_top=not field)
     if (table, field) in ENUMS:
         known = [member.value for member in ENUMS[table, field]]
         problem = f"unknown {field}; known: {', '.join(known)}"
@@ -275,17 +306,17 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Findin
         problem = "expected a name: a small letter, then small letters, digits and hyphens"
     elif "regex" in problem and field in {"actor", "stand_in"}:
         problem = "expected 'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
-    elif "regex" in problem and "panel" in words:
-        problem = "expected 'topic:field', e.g. 'tank/level:height_m'"
+    elif "regex" in problem and text:
+        problem = text
     elif "regex" in problem:
         problem = "expected a name: a letter, then letters, digits and underscores"
     return Finding(path, problem.replace("`", ""), (value,))
 
 
-def _known_fields(table: str) -> list[str]:
-    return [field.encode_name for field in msgspec.structs.fields(TABLES[table])]
+def _fields(table: type[Table]) -> list[str]:
+    return [field.encode_name for field in msgspec.structs.fields(table)]
 
 
-def _unknown_field(path: str, table: str, value: object) -> Finding:
-    return Finding(path, f"unknown field; known: {', '.join(_known_fields(table))}" + (
-        "" if table else "; what an application is told stands in [application]"), (value,))
+def _unknown_field(path: str, known: Iterable[str], value: object, *, is_top: bool) -> Finding:
+    return Finding(path, f"unknown field; known: {', '.join(known)}" + (
+        "; what an application is told stands in [application]" if is_top else ""), (value,))

@@ -19,9 +19,9 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.ros2.side import Side
 from rampart.actors.ros2.stand_in import side_of, wall_ns
+from rampart.actors.ros2.translation.tables import ROUTER
 from rampart.actors.ros2.wire import Qos
 from rampart.actors.runtime.actor import Context, Header
-from rampart.manager.spec.ros2 import ROUTER
 from rampart.sim.osmosis.ros_format import Graph, Reader, Writer, attachment
 from rampart.sim.osmosis.simulator import Simulator
 

@@ -13,11 +13,11 @@ import msgspec
 import pytest
 
 from rampart.actors.ftm.messages import DetectionState
+from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.system.members import load_class
 from rampart.actors.system.topics import system_topics
 from rampart.manager.model.gates import GateError, detection_gate
 from rampart.manager.spec.hosts import HostSpec, Link
-from rampart.manager.spec.ros2 import Ros2Link
 from rampart.manager.spec.schema import (
     DetectionSpec,
     EventSpec,

@@ -36,7 +36,6 @@ from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
-from rampart.actors.runtime.parameters import topics_named
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.system.layout import Layout, load_run
@@ -247,7 +246,7 @@ async def _live(of: System, name: str, incarnation: int, shelf: Shelf, stranger:
     await asyncio.sleep(stranger.dice.choice((0.0, 1.0)))
     inputs = [*(topic for topic in actor.inputs() if actor.listens(topic)),
               *(of.layout.topics[key] for key in dict.fromkeys(named.key for named in
-                                             topics_named(actor.parameters)["heard"]))]
+                                             actor.named(actor.parameters)["heard"]))]
     for _ in range(MESSAGES):
         topic = stranger.dice.choice(inputs)
         payload = stranger.payload(topic, stranger.header(clock.now()))

@@ -18,9 +18,9 @@ from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.translation.forms import READY
 from rampart.actors.ros2.translation.mapping import TF, Inward, NotMeantError
 from rampart.actors.ros2.translation.mirror import topic_of
+from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import Attachment, Endpoint, EndpointKind, Qos
-from rampart.manager.spec.ros2 import Ros2Link
 from tests.fuzz.file_targets import folder, recordings, written
 from tests.fuzz.target import target
 

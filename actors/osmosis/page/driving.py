@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from rampart.actors.bus import messages as bm
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.operating import Operating
+from rampart.actors.operator.panels import Panel
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.manager.spec.panels import Panel
 
 if TYPE_CHECKING:
     from rampart.actors.operator.state import HmiState

@@ -16,6 +16,7 @@ import msgspec
 from rampart.actors.operator.bounds import MAX_NAME
 from rampart.actors.operator.camera_eye import CameraEye, renderer
 from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.panels import Panel
 from rampart.actors.operator.requests import RefusedError, Request
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -29,7 +30,6 @@ from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.actors.osmosis.page.submission import Submission, first_request, system_is_up
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.files.plain_text import one_line
-from rampart.manager.spec.panels import Panel
 
 
 class OsmosisHmi(Hmi):

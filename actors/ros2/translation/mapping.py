@@ -16,8 +16,8 @@ import numpy as np
 from rampart.actors.ros2.translation.expressions import Expression, Plane, Read, reader, steps
 from rampart.actors.ros2.translation.fields import TypeFields, near, plain, reads_of
 from rampart.actors.ros2.translation.forms import ON_PLANE, READY, UNBOUNDED, UNKNOWN, WRITTEN
+from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
-from rampart.manager.spec.ros2 import Ros2Link
 
 NS = 1_000_000_000
 

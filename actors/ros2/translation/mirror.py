@@ -18,8 +18,8 @@ from rampart.actors.ros2.translation.expressions import Expression, Plane
 from rampart.actors.ros2.translation.fields import BULK, LEN, TypeFields
 from rampart.actors.ros2.translation.forms import ON_PLANE, READY, kind_of, may_be_unknown
 from rampart.actors.ros2.translation.mapping import BESIDE, TF
+from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
-from rampart.manager.spec.ros2 import Ros2Link
 
 _BOUNDED: dict[Any, Any] = {
     bytes: Floats32, str: Text, float: float, bool: bool,

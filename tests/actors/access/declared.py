@@ -17,7 +17,7 @@ from rampart.actors.bus.topics import INJECT
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.actors.system.layout import Layout, router
-from rampart.actors.system.members import Member, shows_panels
+from rampart.actors.system.members import Member
 from rampart.actors.system.topics import declared_topics
 
 PEOPLE = ("operator", "viewer")
@@ -101,7 +101,7 @@ class _Declared:
         self._hosts_of_supervisors = {name: host for host, name in hosts.supervisors.items()}
         self._far = {name: host for name, host in routers.items() if host != self._own}
         self.identities = (*layout.members, *self._far, *PEOPLE)
-        self._pages = [m for m in layout.members.values() if shows_panels(m.actor)]
+        self._pages = [m for m in layout.members.values() if m.actor.is_page]
         self._names = [*routers, *layout.members]
         every = (*declared_topics(layout.spec), *BASE_OUTPUTS, *BASE_INPUTS,
                  *layout.topics.values(),

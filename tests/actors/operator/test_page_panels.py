@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from rampart.manager.spec.panels import Panel
+from rampart.actors.operator.panels import Panel
 from tests.actors.operator.browser import browser, mouse
 from tests.actors.operator.extremes import MARKUP
 from tests.actors.operator.page import LIVE, events, page, speaking_world

@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from rampart.manager.spec.panels import Panel
+from rampart.actors.operator.panels import Panel
 from rampart.testing import eventually
 from tests.actors.operator.browser import browser, mouse
 from tests.actors.operator.page import LIVE

@@ -12,13 +12,13 @@ import msgspec
 import pytest
 
 from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.panels import MAX_KEPT, MAX_PANELS, Panel
 from rampart.actors.operator.server import page_files
 from rampart.actors.operator.state import STALE_S, TRACE_POINTS, HmiState
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.system.layout import Layout
-from rampart.manager.spec.panels import MAX_KEPT, MAX_PANELS, Panel
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import eventually, free_port
 from tests import CELL, ROOT
@@ -200,7 +200,7 @@ def test_a_panel_shows_one_thing_and_takes_what_that_needs(rest, words):
 
 
 def test_panels_that_no_node_shows_are_refused():
-    with pytest.raises(ValueError, match=r"^tank.toml: panel 'Level': no node shows it; one of "
+    with pytest.raises(ValueError, match=r"^tank.toml: \$.panel: no node takes it; one of "
                                          r"actor rampart.actors.operator.hmi:Hmi does\Z"):
         layout(panel("Level", 'gauge = "tank/level:height_m"'), "")
 

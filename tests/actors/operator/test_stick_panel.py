@@ -16,12 +16,12 @@ from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.limits import BURST
+from rampart.actors.operator.panels import Panel
 from rampart.actors.operator.stick import TICKET_S
 from rampart.actors.runtime.actor import Actor, Header, on
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import published
 from rampart.cli.analyse.check_verbs import explain
-from rampart.manager.spec.panels import Panel
 from rampart.testing import eventually
 from tests import ROOT
 from tests.actors.operator.test_operating import Hand as Driver

@@ -15,8 +15,8 @@ from rampart.actors.bus.messages import Message
 from rampart.actors.ros2.translation.forms import READY, WRITTEN
 from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward
 from rampart.actors.ros2.translation.mirror import message_of, topic_of
+from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
-from rampart.manager.spec.ros2 import Ros2Link
 
 JAZZY = Types("jazzy")
 ODOMETRY, SCAN = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan"

@@ -1,15 +1,22 @@
-"""What passes between ROS 2 and the system: the tables `[[ros2]]`. Pure.
-
-Which types and fields there are is known to the gateway (`rampart.actors.ros2`).
-"""
+"""What passes between ROS 2 and the system: tables `[[ros2]]`, and what is refused there. Pure."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterator, Sequence
 from typing import Annotated, Literal
 
 import msgspec
 
-from rampart.manager.spec.tables import OptionalName, Positive, Table
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.specification import read_rows
+from rampart.manager.spec.tables import (
+    Finding,
+    OptionalName,
+    Positive,
+    SpecificationError,
+    Table,
+    unknown,
+)
 
 RosName = Annotated[str, msgspec.Meta(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+\Z", max_length=200)]
 OptionalRosName = Annotated[
@@ -21,9 +28,6 @@ Written = dict[str, str | float | bool]
 GATEWAY = "rampart.actors.ros2.gateway:Gateway"
 ROUTER = "tcp/localhost:7447"
 """Where the router of `rmw_zenoh` listens by default."""
-
-INTERFACES = "interfaces"
-"""Its parameter with folders, relative to the file of the system."""
 
 WAYS = {"subscribe": ("to",), "publish": ("from",), "call": ("from", "to"), "serve": ("to",),
          "goal": ("from", "to")}
@@ -102,3 +106,59 @@ class Ros2Link(Table, frozen=True, kw_only=True):
     def name(self) -> str:
         """Name of the topic, service or action of ROS 2."""
         return str(getattr(self, self.way))
+
+
+def read_links(spec: SystemSpec, gateways: Collection[str], file: str) -> tuple[Ros2Link, ...]:
+    """Return the links of a specification.
+
+    Args:
+        spec: the system.
+        gateways: names of the nodes that pass something on.
+        file: name of the specification, for messages.
+
+    Raises:
+        SpecificationError: one says too little, too much, or the same as another.
+    """
+    links = read_rows(spec.ros2, Ros2Link, "ros2", file)
+    for number in range(len(links)):
+        for path, problem, value in _find_wrong(number, links, gateways):
+            raise SpecificationError(file, f"$.ros2[{number}]{path}", problem, *value)
+    return links
+
+
+def _find_wrong(number: int, links: Sequence[Ros2Link],
+                gateways: Collection[str]) -> Iterator[Finding]:
+    """Find what is wrong with a link, with its path in the row."""
+    link = links[number]
+    ways = [way for way in WAYS if getattr(link, way)]
+    if len(ways) != 1:
+        yield Finding("", f"one of {', '.join(WAYS)} is right, and it has "
+                          f"{' and '.join(ways) or 'none'}")
+        return
+    way, = ways
+    yield from _wrong_keys(way, link)
+    kind = {"call": "srv", "serve": "srv", "goal": "action"}.get(way)
+    if kind is not None and link.type.split("/")[1] not in {kind, "action"}:
+        yield Finding(".type", f"with {way}, package/{kind}/Name is right", (link.type,))
+    if link.stop_after_s and way != "publish":
+        yield Finding(".stop_after_s", "is for publish", (link.stop_after_s,))
+    if link.answer and way not in {"call", "serve", "goal"}:
+        yield Finding(".answer", "is for call, serve or goal", (link.answer,))
+    heard = {one.to for one in links if one.subscribe}
+    if link.beside and (way != "subscribe" or link.beside not in heard):
+        yield Finding(".beside", "the `to` of another subscription is right", (link.beside,))
+    if link.gateway and link.gateway not in gateways:
+        yield unknown(".gateway", link.gateway, "gateway", gateways)
+    for place, other in enumerate(links[:number]):
+        if getattr(other, way) == link.name:
+            yield Finding(f".{way}", f"is in ros2[{place}] already", (link.name,))
+        if link.to and other.to == link.to:
+            yield Finding(".to", f"is in ros2[{place}] already", (link.to,))
+
+
+def _wrong_keys(way: str, link: Ros2Link) -> Iterator[Finding]:
+    for field, key in (("to", link.to), ("from", link.from_)):
+        if (field in WAYS[way]) != bool(key):
+            wanted = " and ".join(f"{one} = 'key'" for one in WAYS[way])
+            yield Finding(f".{field}", f"with {way}, {wanted} of a topic of the system is right",
+                          (key,))

@@ -1,18 +1,28 @@
 """Panels of the operator's page, as a specification or the class of a page declares them. Pure.
 
-What is drawn of them is the browser's: `rampart/actors/operator/page/widgets.js`.
+What is drawn of them is the browser's: `rampart/actors/operator/page/widgets.js`. The rows of a
+specification are the tables `[[panel]]`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Annotated, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 
-from rampart.manager.spec.tables import Table
+from rampart.actors.bus.fields import ANYTHING, NUMBER, TEXT, TRUTH, Field, Steered
+from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.runtime.actor import BASE_OUTPUTS
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.specification import read_rows
+from rampart.manager.spec.tables import SpecificationError, Table
 
 MAX_PANELS = 40
+MAX_PLOTS = 8
+"""Panels of a page that declares none."""
 LARGEST = 1e9
 """Greatest number of a stick."""
 MAX_KEPT = 32
@@ -21,9 +31,6 @@ MAX_KEPT = 32
 FieldText = Annotated[str, msgspec.Meta(pattern=r"^[^:]+:[^:]+\Z", max_length=200)]
 """A field of the messages of a topic, "topic:field"."""
 _Short = Annotated[str, msgspec.Meta(max_length=60)]
-
-NUMBER, TEXT, TRUTH = "number", "text", "truth"
-ANYTHING = (NUMBER, TEXT, TRUTH)
 
 _SHOWS: dict[str, tuple[tuple[str, ...], frozenset[str]]] = {
     "gauge": ((NUMBER,), frozenset({"min", "max", "unit"})),
@@ -165,6 +172,62 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         if self.gauge is None:
             return self.min, self.max
         return (0.0 if self.min is None else self.min, 1.0 if self.max is None else self.max)
+
+
+def read_panels(spec: SystemSpec, file: str) -> tuple[Panel, ...]:
+    """Return the panels of a specification.
+
+    Raises:
+        SpecificationError: one makes no sense, or they do not together.
+    """
+    panels = read_rows(spec.panels, Panel, "panel", file,
+                       "expected 'topic:field', e.g. 'tank/level:height_m'")
+    for place, panel in enumerate(panels):
+        if panel.script is not None:
+            raise SpecificationError(
+                file, f"$.panel[{place}].script", f"{panel.title!r}: only the class of a page has "
+                "scripts; a field of a topic is right, e.g. gauge", panel.script)
+    if problem := problem_of(panels):
+        raise SpecificationError(file, "$.panel", problem)
+    return panels
+
+
+def plots_of(topics: Iterable[Topic[Any]]) -> tuple[Panel, ...]:
+    """Return a plot of each topic with numbers that comes regularly, the first `MAX_PLOTS`."""
+    engine = {topic.key for topic in (*ftm_topics.ALL, *BASE_OUTPUTS)}
+    plots = (Panel(title=f"{topic.key} {unit}"[:60].strip(), plot=tuple(fields[:4]))
+             for topic in topics
+             if topic.key not in engine and not topic.is_family and topic.rate_hz > 0
+             for unit, fields in _numbers(topic).items())
+    return tuple(islice({plot.title: plot for plot in plots}.values(), MAX_PLOTS))
+
+
+def _numbers(topic: Topic[Any]) -> dict[str, list[str]]:
+    """Return the numbers of a topic's messages by their unit, the last word of their names."""
+    found: dict[str, list[str]] = {}
+    for path in getattr(topic.type, "__struct_fields__", ()):
+        if _kind(topic, path) == NUMBER:
+            unit = path.rpartition("_")[2] if "_" in path else ""
+            found.setdefault(unit, []).append(f"{topic.key}:{path}")
+    return found
+
+
+def _kind(topic: Topic[Any], path: str) -> str:
+    try:
+        return Field(topic.type, path).kind
+    except ValueError:
+        return ""  # a list, or what has fields itself
+
+
+def steered(panel: Panel, topic: Topic[Any]) -> Steered:
+    """Return what makes the messages of a panel's stick.
+
+    Raises:
+        ValueError: none can be made.
+    """
+    names = [shown.field.partition(":")[2] for shown in panel.fields()]
+    count = len(panel.stick or ())
+    return Steered(topic.type, names[:count], "".join(names[count:]), panel.scale)
 
 
 def problem_of(panels: Sequence[Panel]) -> str:
