@@ -31,14 +31,12 @@ class ClockSync:
     Attributes:
         offset_s: In use, seconds; moves slowly towards the middle of the interval.
         bound_s: By how much it may be wrong at most, if both clocks run evenly.
-        jumps: How often the exchanges contradicted each other, so that it had to begin anew.
     """
 
     def __init__(self, tolerated_s: float = 0.1) -> None:
         self._tolerated_s = tolerated_s
         self.offset_s = 0.0
         self.bound_s = float("inf")
-        self.jumps = 0
         self._kept: deque[tuple[float, float, float]] = deque(maxlen=_KEPT)
 
     def exchanged(self, asked_s: float, told_s: float, heard_s: float) -> None:
@@ -49,20 +47,18 @@ class ClockSync:
             told_s: The other clock, when it was answered.
             heard_s: This clock, when the answer came.
         """
-        is_first = not self._kept
         drift_s = DRIFT * (heard_s - asked_s)  # it was told at some time in between
         self._kept.append((heard_s, told_s - heard_s - drift_s, told_s - asked_s + drift_s))
         low_s, high_s = self._overlap(heard_s)
         if low_s > high_s:
-            self.jumps += 1
-            newest = self._kept[-1]
+            newest = self._kept[-1]  # a clock has jumped
             self._kept.clear()
             self._kept.append(newest)
             low_s, high_s = newest[1:]
         middle_s = (low_s + high_s) / 2
         step_s = middle_s - self.offset_s
         is_wrong = not low_s - self._tolerated_s <= self.offset_s <= high_s + self._tolerated_s
-        if not (is_first or is_wrong) and len(self._kept) > 1:
+        if len(self._kept) > 1 and not is_wrong:
             step_s = min(max(step_s, -_SLEW_S), _SLEW_S)
         self.offset_s += step_s
         self.bound_s = max(high_s - self.offset_s, self.offset_s - low_s)

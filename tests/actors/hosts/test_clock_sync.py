@@ -31,7 +31,6 @@ def test_the_true_offset_lies_within_the_bound(ahead_s, ways, drift):
         true_s = ahead_s + drift * now_s
         assert abs(sync.offset_s - true_s) <= sync.bound_s + 1e-6
         now_s += 0.25
-    assert sync.jumps == 0
 
 
 def test_the_quickest_way_there_and_the_quickest_way_back_count_together():
@@ -66,7 +65,6 @@ def test_a_way_that_becomes_quicker_does_not_leave_a_clock_that_readers_refuse(s
     for turn in range(100, 104):
         exchange(sync, turn / 4, 5.0, 0.001, 0.001)
         assert abs(sync.offset_s - 5.0) <= AHEAD_S
-    assert sync.jumps == 0
 
 
 def test_no_bound_of_two_clocks_is_accepted_that_readers_of_messages_do_not_tolerate():
@@ -81,7 +79,6 @@ def test_a_clock_that_jumps_is_noticed_and_it_begins_anew():
     for turn in range(20):
         exchange(sync, turn / 4, 5.0, 0.01, 0.01)
     exchange(sync, 6.0, 7.0, 0.01, 0.01)
-    assert sync.jumps == 1
     assert sync.offset_s == pytest.approx(7.0, abs=0.01)
 
 

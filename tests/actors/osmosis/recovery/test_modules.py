@@ -6,6 +6,7 @@ import asyncio
 
 import pytest
 
+from rampart.actors.bus.run_folder import EPOCH
 from rampart.actors.ftm import messages as fm
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -344,6 +345,20 @@ async def respawning(system: System) -> tuple[Boss, Supervisor]:
     system.start("RM3", Respawn, nodes=["a", "b"])
     await asyncio.sleep(0.5)
     return boss, supervisor
+
+
+def test_a_module_that_was_taken_over_many_thousand_times_still_respawns():
+    async def scenario() -> None:
+        async with System() as system:
+            system.incarnations["RM3"] = 20_000 * EPOCH
+            boss, supervisor = await respawning(system)
+            await system.kill("a")
+            boss.order("RM3", nodes=("a",))
+            await asyncio.sleep(0.1)
+            assert [r.node for _, r in supervisor.requests] == ["a"]
+            assert boss.phases == ["idle", "acting", "done"]
+
+    run(scenario)
 
 
 def test_a_dead_node_is_asked_for_at_once_and_done_when_it_is_heard():
