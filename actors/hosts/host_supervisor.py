@@ -12,9 +12,10 @@ kept there has come.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from functools import partial
 from pathlib import Path
 from signal import Signals
@@ -43,7 +44,6 @@ from rampart.actors.supervision.kill_node import (
 )
 from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.processes import Processes
-from rampart.actors.supervision.supervised_process import Event
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.manager.spec.schema import Kind
 
@@ -81,8 +81,11 @@ class HostSupervisor(Supervisor):
     def __init__(self, context: Context, processes: Processes | None = None,
                  files: Callable[..., StateFiles] = StateFiles) -> None:
         super().__init__(context, processes)
-        hosts, units = self._layout.hosts, self._layout.units
-        own = self.parameters.host
+        plan, spec, own = context.run.plan, context.run.system, self.parameters.host
+        hosts, units = self.layout.hosts, self.layout.units
+        loop = asyncio.get_running_loop()
+        self._now_s = loop.time
+        self._folder, self._base_port = plan.folder, plan.base_port
         self._supervisors = {hosts.supervisors[host]: host for host in self.parameters.others}
         self._guards = {name: host for host in hosts.supervisors for name in hosts.guards_of(host)}
         self._signalled: deque[fm.ProcessEvent] = deque(maxlen=_ORDERS_KEPT)
@@ -91,20 +94,27 @@ class HostSupervisor(Supervisor):
             {name: Home(hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes),
                         any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
              for name, unit in units.items()},
-            self._guards, hosts.link, self._known, now_s=self._loop.time(), rate=self._plan.rate)
-        self._looked_s = self._loop.time()
+            self._guards, hosts.link, self._known, now_s=loop.time(), rate=plan.rate)
+        self._looked_s = loop.time()
         self._ending: list[HeldProcess] = []
         self._waits: dict[str, Wait] = {}
+        keeps_states = bool(plan.checkpoints) and spec.layers.checkpoints
         self._copies = Copies(
-            self._plan.run_id, own, {} if not self._keeps_states() else {
+            plan.run_id, own, {
                 node.name: home for name, unit in units.items() for node in unit.nodes
-                if (home := hosts.home_of[unit.nodes[0].name]) != FIRST
+                if keeps_states and (home := hosts.home_of[unit.nodes[0].name]) != FIRST
                 and not self._placement.is_fixed(name)},
-            self._runs, lambda node: context.register(node) or 0)
+            self.highest_of, lambda node: context.register(node) or 0)
+
+        def from_thread(call: Callable[..., None], node: str, *what: Any) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(
+                    self.call_soon, f"{call.__name__} {node} {what[1:]}",
+                    partial(call, node, *what))
+
         self._files = files(
-            Path(self._plan.checkpoints), self._plan.run_id, self._copies.nodes,
-            partial(self._from_thread, self._state_kept), partial(
-                self._from_thread, self._state_problem))
+            Path(plan.checkpoints), plan.run_id, self._copies.nodes,
+            partial(from_thread, self._state_kept), partial(from_thread, self._state_problem))
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Supervisor.Parameters) -> Members:
@@ -124,21 +134,19 @@ class HostSupervisor(Supervisor):
             return (name,)
         return super().output_names(topic, name, parameters)
 
-    def on_start(self) -> None:
-        """Adopt what is run here in another host's place as well.
+    def units_at_start(self, running: Collection[str]) -> Iterable[str]:
+        """Return what has its home here, and what runs here already in another host's place.
 
         What ran on another host last is not begun here before the first has given it back.
         """
-        living = {self._layout.unit_of.get(process.names[0], "")
-                  for process in self._machine.living()}
-        for unit in living - self._processes.keys() - {""}:
+        for unit in set(running) - self._placement.held:
             self._placement.adopted(unit)
-            self._processes[unit] = self._held(self._layout.units[unit])
-        for unit in self._placement.waits(
-                lambda unit: unit not in living and any(
-                    is_elsewhere(self._plan.folder, node)
-                    for node in self._processes[unit].names)):
-            del self._processes[unit]
+        self._placement.waits(lambda unit, nodes: unit not in running and any(
+            is_elsewhere(self._folder, node) for node in nodes))
+        return [unit for unit in self.layout.units if unit in self._placement.held]
+
+    def on_start(self) -> None:
+        """Start what is kept here, and look at the other hosts from now on."""
         super().on_start()
         if self._copies.nodes:
             self._files.start()
@@ -159,8 +167,8 @@ class HostSupervisor(Supervisor):
         """Note that another host is there."""
         own = self.parameters.host
         host = self._guards.get(header.source, own)
-        if host != own and self._placement.heard(host, self._loop.time()):
-            self._publish_table()  # each soon knows what the other runs
+        if host != own and self._placement.heard(host, self._now_s()):
+            self.publish_table()  # each soon knows what the other runs
             self.tell_states()
 
     @on(topics.HOST_NODES)
@@ -169,16 +177,16 @@ class HostSupervisor(Supervisor):
         host = self._supervisors.get(header.source)
         if host is None:
             return
-        now_s = self._loop.time()
+        now_s = self._now_s()
         was_missed = self._placement.heard(host, now_s)
         news, drop = self._placement.told(host, table.nodes, now_s)
         news = [row for row in news if row.name != header.source]  # of itself it is believed
+        for unit in drop:  # first: what runs here must not be found with a higher one known
+            self._drop(unit)
         for row in news:
             self._issue(row.name, row.incarnation)
-        for unit in drop:
-            self._drop(unit)
         if news or drop or was_missed:
-            self._publish_table()
+            self.publish_table()
 
     @on(topics.CHECKPOINTS)
     def told_states(self, message: fm.Checkpoints, header: Header) -> None:
@@ -204,7 +212,7 @@ class HostSupervisor(Supervisor):
 
     def _carried_out(self, order: fm.SignalOrder) -> fm.ProcessEvent | None:
         try:
-            victim = find_node(order.node, order.signal, self._plan.base_port)
+            victim = find_node(order.node, order.signal, self._base_port)
         except UnknownNodeError:
             return None
         except SignalError as refusal:
@@ -219,23 +227,22 @@ class HostSupervisor(Supervisor):
 
     def _known(self, node: str) -> int:
         """Return the highest incarnation of a node that was issued anywhere, as known here."""
-        process = self._process_of(node)
-        return max(self.context.register(node) or 0, process.highest if process else 0)
+        return max(self.context.register(node) or 0, self.highest_of(node))
 
     def _issue(self, node: str, incarnation: int) -> None:
         """Have all readers of this host know the incarnation of a node that does not run here."""
         if incarnation > (self.context.register(node) or 0):
             try:
-                issue(self._plan.folder, [node], incarnation)
+                issue(self._folder, [node], incarnation)
             except OSError as error:
                 self.report_diagnostic("incarnation", f"not noted: {error}", node)
 
     def _look_at_hosts(self) -> None:
         # Who stood still has mail to read before others can be said to be silent.
-        stall_s, self._looked_s = self._loop.time() - self._looked_s, self._loop.time()
+        stall_s, self._looked_s = self._now_s() - self._looked_s, self._now_s()
         if stall_s > 4 * _LOOK_S:
             self._placement.excuse(stall_s)
-        changes = self._placement.look(self._loop.time(), self._has_states)
+        changes = self._placement.look(self._now_s(), self._has_states)
         if changes != Changes():
             for host in changes.lost:
                 self._copies.lost(host)
@@ -245,24 +252,15 @@ class HostSupervisor(Supervisor):
             for unit in changes.drop:
                 self._drop(unit)
             for unit, above in changes.take:
-                self._take(unit, above)
-            self._publish_table()
+                self.take_on(unit, above)
+            self.publish_table()
         self.call_later(_LOOK_S * self.clock.rate, self._look_at_hosts)
 
     # -- what follows ---------------------------------------------------------------------------
 
-    def _take(self, unit: str, above: int) -> None:
-        process = self._processes[unit] = self._held(self._layout.units[unit])
-        process.incarnation = process.highest = above
-        self._on(process, Event.START)
-
     def _drop(self, unit: str) -> None:
-        process = self._processes.pop(unit, None)
+        process = self.hand_over(unit)
         if process is not None:
-            self._machine.withdraw(process.names)
-            process.forget_step()
-            process.kill()
-            self._tell(process, "handed over", self.name)
             for node in process.names:  # one that was asked for may have begun
                 self._issue(node, process.highest + process.waits)
             self._copies.unsettle(process.names)
@@ -270,34 +268,7 @@ class HostSupervisor(Supervisor):
                 self.call_later(_ENDING_S * self.clock.rate, self._settle)
             self._ending.append(process)
 
-    def _is_let_go(self, process: HeldProcess) -> bool:
-        return self._processes.get(process.unit.name) is not process
-
-    def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
-        if not self._is_let_go(process):  # while the news waited in the mailbox
-            super()._ended(process, pid, detail)
-
-    def _hold(self, process: HeldProcess, pid: int) -> None:
-        super()._hold(process, pid)
-        if self._is_let_go(process):  # before there was a descriptor to hold it by
-            process.kill()
-
     # -- states of nodes ------------------------------------------------------------------------
-
-    def _keeps_states(self) -> bool:
-        return bool(self._plan.checkpoints) and self._spec.layers.checkpoints
-
-    def _runs(self, node: str) -> int:
-        """Return the highest incarnation of a node that is run here, 0 if it is not."""
-        process = self._process_of(node)
-        return process.highest if process else 0
-
-    def _from_thread(self, call: Callable[..., None], node: str, *what: Any) -> None:
-        """Have a call made as an item of the mailbox."""
-        slot = f"{call.__name__} {node} {what[1:]}"
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(
-                self._dispatcher.put, slot, partial(call, node, *what))
 
     def _state_kept(self, node: str, record: Record | None, is_last: bool) -> None:
         self._copies.kept(node, record)
@@ -322,7 +293,7 @@ class HostSupervisor(Supervisor):
 
     def _has_states(self, unit: str) -> bool:
         """Whether a unit that was given back can go on from what it has kept there."""
-        told, now_s = self._placement.told_of(unit), self._loop.time()
+        told, now_s = self._placement.told_of(unit), self._now_s()
         is_caught_up = self._copies.is_caught_up(told, told)
         wait = self._waits.setdefault(unit, Wait(now_s))
         if not wait.is_vain(now_s, self._copies.come(told)) and not is_caught_up:
@@ -339,22 +310,23 @@ class HostSupervisor(Supervisor):
             self._tell_states()
 
     def _tell_states(self) -> None:
-        self.publish(topics.CHECKPOINTS, self._copies.message(self._loop.time()))
+        self.publish(topics.CHECKPOINTS, self._copies.message(self._now_s()))
 
     # -- what it says ---------------------------------------------------------------------------
 
     def _tell_of(self, host: str, event: str) -> None:
         other, own = host or "the first", self.parameters.host or "the first"
         self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
-            self._layout.hosts.supervisors[host], event, 0, 0, self.name,
+            on_host(SUPERVISOR, host), event, 0, 0, self.name,
             f"host {other}, as seen from {own}"))
 
     def _own_rows(self) -> tuple[fm.NodeInfo, ...]:
         return tuple(fm.NodeInfo(
             row.name, row.kind, row.pid, row.state, row.incarnation, row.restarts, row.late_s,
-            self.parameters.host) for row in super()._rows())
+            self.parameters.host) for row in super().rows())
 
-    def _publish_table(self) -> None:
+    def publish_table(self) -> None:
+        """Publish what runs here, and what was given back."""
         given_back = (fm.NodeInfo(node, "", 0, fm.NodeState.UNREACHABLE, highest, 0, host=home)
                       for node, home, highest in self._placement.given_back())
         self.publish(topics.HOST_NODES, fm.NodeTable((*self._own_rows(), *given_back)))
@@ -369,13 +341,15 @@ class FirstSupervisor(HostSupervisor):
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (*HostSupervisor.outputs, topics.NODES)
 
-    def _rows(self) -> tuple[fm.NodeInfo, ...]:
+    def rows(self) -> tuple[fm.NodeInfo, ...]:
+        """Return the nodes of all hosts."""
         others = tuple(
             row if not self._placement.is_lost(row.host) else fm.NodeInfo(
                 row.name, row.kind, 0, fm.NodeState.UNREACHABLE, row.incarnation, row.restarts,
                 host=row.host) for row in self._placement.rows())
         return (*self._own_rows(), *others)
 
-    def _publish_table(self) -> None:
-        super()._publish_table()
-        self.publish(topics.NODES, fm.NodeTable(self._rows()))
+    def publish_table(self) -> None:
+        """Publish likewise, and what runs on all hosts."""
+        super().publish_table()
+        self.publish(topics.NODES, fm.NodeTable(self.rows()))

@@ -149,18 +149,15 @@ class Placement:
         """Whether a unit runs at its home or nowhere."""
         return self._homes[unit].is_fixed
 
-    def waits(self, is_elsewhere: Callable[[str], bool]) -> list[str]:
-        """Begin without what the first host may be running, and return what that is.
-
-        It is given back.
+    def waits(self, is_elsewhere: Callable[[str, tuple[str, ...]], bool]) -> None:
+        """Begin without what the first host may be running; that will be given back.
 
         Args:
-            is_elsewhere: Asked of a unit of this host: whether it ran on the first one last.
+            is_elsewhere: Asked of a unit of this host and its nodes: whether it ran on the first
+                one last.
         """
-        waiting = [unit for unit in self._homed(self._own)
-                   if not self._homes[unit].is_fixed and is_elsewhere(unit)]
-        self.held.difference_update(waiting)
-        return waiting
+        self.held = {unit for unit in self.held if self._homes[unit].is_fixed
+                     or not is_elsewhere(unit, self._homes[unit].nodes)}
 
     def excuse(self, stall_s: float) -> None:
         """Do not count as silence of the others a time in which nothing could be heard here."""

@@ -235,6 +235,10 @@ class Actor(Declared):
         else:
             self._keeper.keep(form, state)
 
+    def call_soon(self, slot: str, call: Callable[[], None]) -> None:
+        """Have `call` made as a mailbox item, in place of one in the same slot that still waits."""
+        self._dispatcher.put(slot, call)
+
     def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
         """Publish an error report: one a second per context and offender, and few in all."""
         count = self._reports.stands_for(f"{context} {offender}", self.clock.now())

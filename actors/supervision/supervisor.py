@@ -19,7 +19,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, ClassVar
 
 from rampart.actors.bus import topics as bus_topics
@@ -91,9 +91,6 @@ class Supervisor(Actor):
         self._routers = self._layout.routers if self._machine.has_routers else {}
         self._processes = {
             name: self._held(unit) for name, unit in {**self._routers, **self._layout.here}.items()}
-        for node, incarnation in run.known_incarnations.items():
-            if (process := self._process_of(node)) is not None:
-                process.incarnation = process.highest = incarnation
         self._version = (0, run.adapted.version if run.adapted else 0)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
@@ -107,23 +104,75 @@ class Supervisor(Actor):
         return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
     def _held(self, unit: Unit) -> HeldProcess:
+        known = self.context.run.known_incarnations
+        highest = max((known.get(node.name, 0) for node in unit.nodes), default=0)
         return HeldProcess(unit, RestartPolicy(self._spec.supervision),
-                           Patience(2 * _CHECK_S / self._plan.rate))
+                           Patience(2 * _CHECK_S / self._plan.rate),
+                           incarnation=highest, highest=highest)
 
     def _process_of(self, node: str) -> HeldProcess | None:
         return self._processes.get(
             node if node in self._routers else self._layout.unit_of.get(node, ""))
+
+    # -- what it keeps; a supervisor of one host of several decides that -------------------------
+
+    def units_at_start(self, running: Collection[str]) -> Iterable[str]:  # noqa: ARG002
+        """Return the units that it keeps from its start on.
+
+        Args:
+            running: Units that run on its machine already.
+        """
+        return self._layout.here
+
+    def take_on(self, unit: str, above: int) -> None:
+        """Start a unit and keep it running from now on.
+
+        Args:
+            unit: Its name.
+            above: Number that the incarnations of its processes have to exceed.
+        """
+        process = self._processes[unit] = self._held(self._layout.units[unit])
+        process.incarnation = process.highest = above
+        self._on(process, Event.START)
+
+    def hand_over(self, unit: str) -> HeldProcess | None:
+        """End a unit and keep it no more; return its process, which may not have ended yet."""
+        process = self._processes.pop(unit, None)
+        if process is not None:
+            self._machine.withdraw(process.names)
+            process.forget_step()
+            process.kill()
+            self._tell(process, "handed over", self.name)
+        return process
+
+    @property
+    def layout(self) -> Layout:
+        """The layout of the system, as it was changed last."""
+        return self._layout
+
+    def highest_of(self, node: str) -> int:
+        """Return the highest incarnation of a node that it keeps; 0 if it does not."""
+        process = self._process_of(node)
+        return process.highest if process else 0
+
+    def _is_kept(self, process: HeldProcess) -> bool:
+        return self._processes.get(process.unit.name) is process
 
     # -- start and stop -------------------------------------------------------------------------
 
     def on_start(self) -> None:
         """Adopt what runs, start what does not, in the order of the spec."""
         living = self._machine.living()
+        running = {self._layout.unit_of.get(process.names[0], "") for process in living}
+        units = self.units_at_start(running - {""})
+        self._processes = {
+            name: self._processes.get(name) or self._held(self._layout.units[name])
+            for name in (*self._routers, *units)}
         for process in self._processes.values():
             if not self._adopt_living(process, living) and (
                     self._incarnation == self._plan.incarnations + 1 or self._owns(process)):
                 self._on(process, Event.START)
-        self._publish_table()
+        self.publish_table()
         if self._routers:
             self._look_at_routers()
 
@@ -250,13 +299,14 @@ class Supervisor(Actor):
     @every(0.5)
     def repeat(self) -> None:
         """Repeat the node table for those who joined late, and see to the spares."""
-        self._publish_table()
+        self.publish_table()
         self._lateness.turn()
         running = (p for p in self._processes.values() if p.state is State.RUNNING)
         any(p.keep_spare(self._machine, self._layout.spare_of(p.names)) for p in running)
 
     def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
-        if process.pid == pid:  # else it was replaced while the news waited in the mailbox
+        # Else it was replaced, or is kept no more, since the news came to the mailbox.
+        if process.pid == pid and self._is_kept(process):
             process.let_go()
             for name in process.names:
                 self._bus.gone(name, process.incarnation)
@@ -291,7 +341,7 @@ class Supervisor(Actor):
                 case Action.TELL:
                     self._tell(process, step.word, by, detail)
                 case Action.PUBLISH:
-                    self._publish_table()
+                    self.publish_table()
                 case Action.SEARCH:
                     process.searched_s = -math.inf
                     self._look_for(process)
@@ -384,7 +434,7 @@ class Supervisor(Actor):
             self.report_diagnostic("hold", str(error), process.unit.name)
             self.call_later(_RETRY_S * self.clock.rate, lambda: self._hold(process, pid))
         else:
-            if process.waits:
+            if process.waits or not self._is_kept(process):
                 process.kill()
 
     # -- what it says ---------------------------------------------------------------------------
@@ -394,12 +444,14 @@ class Supervisor(Actor):
             self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
                 node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
-    def _rows(self) -> tuple[fm.NodeInfo, ...]:
+    def rows(self) -> tuple[fm.NodeInfo, ...]:
+        """Return itself, and the nodes that it keeps."""
         own = fm.NodeInfo(
             self.name, Kind.SUPERVISION.value, self.context.pid, fm.NodeState.RUNNING,
             self._incarnation, restarts_of(self._incarnation), self._lateness.of(self.name))
         rows = (row for p in self._processes.values() for row in p.rows(self._lateness.of))
         return own, *rows
 
-    def _publish_table(self) -> None:
-        self.publish(topics.NODES, fm.NodeTable(self._rows()))
+    def publish_table(self) -> None:
+        """Publish what it keeps."""
+        self.publish(topics.NODES, fm.NodeTable(self.rows()))

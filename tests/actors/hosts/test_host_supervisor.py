@@ -236,19 +236,16 @@ def test_a_process_that_ends_while_it_is_given_back_is_not_begun_anew(tmp_path, 
     async def scenario() -> None:
         async with world(tmp_path) as made:
             await made.taken_over()
-            supervisor, ended = made.robot.supervisor, []
-            look = supervisor._placement.look
+            ended, hand_over = [], made.robot.supervisor.hand_over
 
-            def look_and_end(*arguments):
-                changes = look(*arguments)
-                for unit in changes.drop:
-                    one = made.robot.processes[supervisor._processes[unit].pid]
+            def end_and_hand_over(unit):
+                for one in made.robot.of(unit):
                     ended.append(one.names)
                     one.killed = True
                     made.robot._exited(one)
-                return changes
+                return hand_over(unit)
 
-            monkeypatch.setattr(supervisor._placement, "look", look_and_end)
+            monkeypatch.setattr(made.robot.supervisor, "hand_over", end_and_hand_over)
             made.is_cut = False
             await eventually(lambda: made.ground.runs("D_VISION_CRASH") == EPOCH + 2)
             await asyncio.sleep(2.0)
@@ -296,11 +293,10 @@ def test_one_that_could_not_be_held_is_ended_as_soon_as_it_can_be(tmp_path, monk
             monkeypatch.setattr(made.robot, "hold", hold_if_there_is_room)
             await made.taken_over()
             made.is_cut = False
-            await eventually(lambda: made.robot.supervisor._process_of("camera") is None)
+            await eventually(lambda: made.robot.supervisor.highest_of("camera") == 0)
             is_full[0] = False
             await eventually(lambda: not made.robot.of("camera"))
             await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
-            assert not made.robot.supervisor._ending
 
     run(scenario)
 

@@ -182,7 +182,7 @@ def test_what_another_runs_already_is_not_taken_back_while_that_host_is_heard():
 
 def test_a_host_that_was_started_anew_waits_until_it_is_given_what_is_its_own():
     ground = Side("ground")
-    assert ground.waits(lambda _: True) == ["page", "modules"]
+    ground.waits(lambda _unit, _nodes: True)
     assert ground.held == {"world"}
     ground.told("", [row("hmi", EPOCH + 1, ""), row("DM1", EPOCH + 1, ""), row("DM2", 1, "")],
                 1.0)

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 
+from rampart.actors.bus import run_info
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.run_folder import ROUTERS
@@ -30,7 +31,7 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import load_system
 from rampart.actors.supervision import guard as guard_module
 from rampart.actors.supervision import launcher as launcher_module
-from rampart.actors.supervision import node_process, run_info
+from rampart.actors.supervision import node_process
 from rampart.actors.supervision.kill_node import main as kill_node
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.supervision.process_title import TITLE_BYTES, find_processes
