@@ -25,6 +25,7 @@ from rampart.actors.runtime.clock import clock_of
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.supervision.unseen import watch
 from rampart.cli.output import FORMAT, UsageError
+from rampart.cli.page_options import audited
 from rampart.cli.run_options import ERROR_LOG, refuse
 from rampart.files.plain_text import one_line
 
@@ -58,7 +59,7 @@ class HostRun:
         self._failure = ""
         self._plan = msgspec.structs.replace(
             plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"),
-            audit_log=str(kept / f"audit-{plan.host}.jsonl") if plan.hmi_port else "")
+            page=audited(plan.page, kept / f"audit-{plan.host}.jsonl"))
 
     async def run(self) -> int:
         """Take part until the run is over, and return the exit code.

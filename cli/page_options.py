@@ -12,9 +12,11 @@ import secrets
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from rampart.actors.web.access import ANY, Access, AccessError, check_token, is_loopback, new_token
+from rampart.actors.web.page_plan import PagePlan
 from rampart.actors.web.tls import Certificate, TlsError, days_left, holds_key, load
 from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.actors.web.visitors import VisitorError, lists_visitors, read_visitors
@@ -61,8 +63,8 @@ def own_token(options: argparse.Namespace) -> str:
 
 
 def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
-            ) -> dict[str, Any]:
-    """Return the fields of the plan that say where the page is, for whom, encrypted how.
+            ) -> PagePlan:
+    """Return where the page is, for whom, encrypted how.
 
     Tokens come from a file or the environment, which other users cannot read as they can read a
     command line; where none is given and one is needed it is made.
@@ -79,7 +81,7 @@ def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
         if options.wait:
             raise UsageError("--wait: the mission is started from the operator's page, which there "
                              f"is not with --{'no-hmi' if options.no_hmi else 'virtual'}")
-        return {"hmi_port": 0 if options.no_hmi else options.hmi_port}
+        return PagePlan(0 if options.no_hmi else options.hmi_port)
     host: str = options.hmi_host
     token, listed = _tokens(options, own)
     is_new = not (token or listed or is_loopback(host))
@@ -92,13 +94,17 @@ def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
     except AccessError as error:
         raise UsageError(f"--hmi-host {host}: {error}") from None
     _check_address(host, options.hmi_port)
-    return {
-        "hmi_port": options.hmi_port, "hmi_host": host, "hmi_token": token,
-        "hmi_token_is_new": is_new, "hmi_token_file": listed,
-        "hmi_cert": str(Path(options.hmi_cert).resolve()) if certificate else "",
-        "hmi_key": str(Path(options.hmi_key).resolve()) if certificate else "",
-        "hmi_unencrypted": options.hmi_unencrypted, "hmi_secret": secrets.token_hex(32),
-        "hmi_shown": _shown(host, certificate)}
+    return PagePlan(
+        options.hmi_port, host, token, is_new, listed,
+        cert=str(Path(options.hmi_cert).resolve()) if certificate else "",
+        key=str(Path(options.hmi_key).resolve()) if certificate else "",
+        unencrypted=options.hmi_unencrypted, secret=secrets.token_hex(32),
+        shown=_shown(host, certificate))
+
+
+def audited(page: PagePlan, file: Path) -> PagePlan:
+    """Return the plan of a page that keeps in a file who did what, if there is a page."""
+    return msgspec.structs.replace(page, audit_log=str(file)) if page.port else page
 
 
 def _tokens(options: argparse.Namespace, own: str) -> tuple[str, str]:

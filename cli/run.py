@@ -29,8 +29,10 @@ from rampart.actors.runtime.run_plan import RunPlan, load_document
 from rampart.actors.supervision.launcher import LaunchError
 from rampart.actors.system.layout import Layout, load_application
 from rampart.actors.system.topics import system_topics
+from rampart.actors.web.page_plan import PagePlan
 from rampart.cli.host import HostRun
 from rampart.cli.output import FORMAT, UsageError
+from rampart.cli.page_options import audited
 from rampart.cli.run_options import ERROR_LOG, MAX_RATE, parse, plan_of, refuse
 from rampart.files import interrupts, streams, working_folder
 from rampart.files.plain_text import one_line
@@ -77,7 +79,7 @@ class Run:
         kept = self._directory.resolve()
         plan = msgspec.structs.replace(
             plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"),
-            audit_log=str(kept / f"audit-{plan.run_id}.jsonl") if plan.hmi_port else "")
+            page=audited(plan.page, kept / f"audit-{plan.run_id}.jsonl"))
         self._kind, self._context = kind, replace(run, plan=plan)
         self._trial = self._made(plan, sys.stderr)
         self._plan = plan
@@ -117,7 +119,7 @@ class Run:
         """Take the rate with which this machine keeps up."""
         def trial(rate: float, run_id: str) -> Trial:
             plan = msgspec.structs.replace(
-                self._plan, rate=rate, run_id=run_id, checkpoints="", hmi_port=0, audit_log="",
+                self._plan, rate=rate, run_id=run_id, checkpoints="", page=PagePlan(),
                 waits=False)
             return self._made(plan, None)
 

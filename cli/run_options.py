@@ -219,7 +219,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
         refuse(options, ("wait", *page_options.NAMES),
                f"no node of {spec.name}{where} serves an operator's page")
         return plan, spec
-    return msgspec.structs.replace(plan, **page_options.page_of(options, token, note)), spec
+    return msgspec.structs.replace(plan, page=page_options.page_of(options, token, note)), spec
 
 
 def _host(options: argparse.Namespace, spec: SystemSpec) -> str:

@@ -12,6 +12,7 @@ from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_context import NO_SYSTEM, RunContext
 from rampart.actors.runtime.run_plan import RunPlan
+from rampart.actors.web.page_plan import PagePlan
 from rampart.manager.spec.specification import SystemSpec, parse_specification
 from rampart.testing import VirtualSystem
 
@@ -32,7 +33,12 @@ def shipped_system() -> SystemSpec:
 def run_context(*, system: SystemSpec = NO_SYSTEM, document: Any = None, adapted: Any = None,
                 airport: Any = None, mission: Any = None, world: Any = None, **plan: Any
                 ) -> RunContext:
-    """Return what actors have in common in a test; `plan` are fields of the `RunPlan`."""
+    """Return what actors have in common in a test; `plan` are fields of the `RunPlan`.
+
+    Those that begin with `hmi_` are of its page.
+    """
+    page = {name: plan.pop(name) for name in [*plan] if name.startswith("hmi_")}
+    plan["page"] = PagePlan(**{name.removeprefix("hmi_"): page[name] for name in page})
     application = Osmosis.on_map(airport, mission, world) if airport else Application()
     return RunContext(RunPlan(**plan), system, document or {}, application, adapted)
 

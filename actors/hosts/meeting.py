@@ -285,8 +285,7 @@ class Attendance:
             await connection.close()
 
 
-_OWN = (*(name for name in RunPlan.__struct_fields__ if name.startswith("hmi_")),
-        "base_port", "launcher_pid", "folder", "audit_log", "error_log", "origin_s", "checkpoints",
+_OWN = ("page", "base_port", "launcher_pid", "folder", "error_log", "origin_s", "checkpoints",
         "system_file", "host", "incarnations", "keys", "ports")
 """Of a plan, what is each host's own."""
 

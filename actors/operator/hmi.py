@@ -157,7 +157,7 @@ class Hmi(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         run, plan = context.run, context.run.plan
-        self._port: int = plan.hmi_port
+        self._port: int = plan.page.port
         self._panels = self.parameters.panels
         self._state = self._make_state()
         self._operating = self._make_operating()
@@ -253,18 +253,18 @@ class Hmi(Actor):
             self._operating.drove = self._server.drove
 
     def _serve(self) -> PageServer:
-        plan, complain = self.context.run.plan, self._complain
-        tls = Tls(Path(plan.hmi_cert), Path(plan.hmi_key), complain) if plan.hmi_cert else None
-        asks = bool(plan.hmi_token or plan.hmi_token_file)
+        page, complain = self.context.run.plan.page, self._complain
+        tls = Tls(Path(page.cert), Path(page.key), complain) if page.cert else None
+        asks = bool(page.token or page.token_file)
         owner = None if asks else Visitor(_user(), Role.INJECT)
-        holder = Visitor(TOKEN_HOLDER, Role.INJECT, digest(plan.hmi_token))
-        register = Register([holder] if plan.hmi_token else [],
-                            Path(plan.hmi_token_file) if plan.hmi_token_file else None, complain)
-        secret = plan.hmi_secret or secrets.token_hex(32)
-        names = () if is_loopback(plan.hmi_host) else (socket.gethostname(),)
-        access = Access(plan.hmi_host, self._port, asks, tls is not None, plan.hmi_unencrypted,
+        holder = Visitor(TOKEN_HOLDER, Role.INJECT, digest(page.token))
+        register = Register([holder] if page.token else [],
+                            Path(page.token_file) if page.token_file else None, complain)
+        secret = page.secret or secrets.token_hex(32)
+        names = () if is_loopback(page.host) else (socket.gethostname(),)
+        access = Access(page.host, self._port, asks, tls is not None, page.unencrypted,
                         (*names, *(tls.says.names if tls else ())))
-        audit = AuditLog(Path(plan.audit_log) if plan.audit_log else None, self.clock.now, complain,
+        audit = AuditLog(Path(page.audit_log) if page.audit_log else None, self.clock.now, complain,
                          asyncio.get_running_loop().time)
         operating = self._operating
         return PageServer(

@@ -14,7 +14,7 @@ import msgspec
 from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in
 from rampart.actors.ftm.messages import NamedFault
-from rampart.actors.web.access import page_url
+from rampart.actors.web.page_plan import PagePlan
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text
 from rampart.manager.spec.schema import SystemSpec
@@ -43,23 +43,12 @@ class RunPlan(msgspec.Struct, frozen=True):
         strategy: name that replaces the spec's strategy; "" for the spec's.
         shadow: name of a strategy to run in shadow; "" for the spec's.
         ftm: False runs the paper's unprotected baseline.
-        hmi_port: port of the operator's page; 0 for none.
+        page: the operator's page of this host.
         launcher_pid: process id of the launcher; set by it.
         folder: folder of the run's sockets, which only its user can enter; made by the launcher.
         error_log: file that collects tracebacks of failed nodes; "" for none.
         origin_s: reading of the monotonic clock at simulated time 0; set when all is loaded.
         checkpoints: directory for the nodes' checkpoints; "" keeps none, whatever the spec says.
-        hmi_host: address at which the operator's page is served.
-        hmi_token: what everybody has to show there; "" for nothing, on loopback, or for tokens that
-            a file lists.
-        hmi_token_is_new: it was made for this run, so the operator has yet to be told.
-        hmi_token_file: path of the list of those who have tokens; "" for none.
-        hmi_cert: path of the certificate with which the page is encrypted; "" for plain HTTP.
-        hmi_key: path of its key.
-        hmi_unencrypted: it need not be, though other machines reach it.
-        hmi_secret: key of the page's cookies; its node makes one for itself where there is none.
-        hmi_shown: address or name under which the page is shown; "" for the one it is served at.
-        audit_log: file that keeps who did what on the page; "" for none.
         faults: what the page offers to inject by name.
         waits: True has the mission wait until the operator starts it from the page.
         virtual: whether time is virtual: nothing outside of the process is used.
@@ -77,23 +66,13 @@ class RunPlan(msgspec.Struct, frozen=True):
     system_file: str = ""
     strategy: str = ""
     ftm: bool = True
-    hmi_port: int = 0
+    page: PagePlan = PagePlan()
     launcher_pid: int = 0
     folder: str = ""
     shadow: str = ""
     error_log: str = ""
     origin_s: float = 0.0
     checkpoints: str = ""
-    hmi_host: str = "127.0.0.1"
-    hmi_token: str = ""
-    hmi_token_is_new: bool = False
-    hmi_token_file: str = ""
-    hmi_cert: str = ""
-    hmi_key: str = ""
-    hmi_unencrypted: bool = False
-    hmi_secret: str = ""
-    hmi_shown: str = ""
-    audit_log: str = ""
     faults: tuple[NamedFault, ...] = ()
     waits: bool = False
     virtual: bool = False
@@ -122,21 +101,6 @@ class RunPlan(msgspec.Struct, frozen=True):
     def credentials(self, name: str) -> Credentials | None:
         """Return those of one of its processes; None in a run without keys."""
         return credentials_in(self.keys, name, self.folder, self.ports)
-
-    @property
-    def hmi_page(self) -> str:
-        """Where the operator's page is, "" if there is none; the token is no part of it."""
-        return page_url(self.hmi_shown or self.hmi_host, self.hmi_port, tls=bool(self.hmi_cert)
-                        ) if self.hmi_port else ""
-
-    @property
-    def hmi_page_to_open(self) -> str:
-        """The same, once, for who has started the run: with the token, if it is new."""
-        if self.hmi_token_is_new:
-            return f"{self.hmi_page} asks for the token {self.hmi_token}"
-        if self.hmi_token or self.hmi_token_file:
-            return f"{self.hmi_page} asks for your token"
-        return self.hmi_page
 
 
 def load_system(plan: RunPlan) -> SystemSpec:

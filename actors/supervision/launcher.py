@@ -272,7 +272,7 @@ class Launcher:
         return run_info.RunInfo(
             os.getpid(), self.plan.base_port, self.plan.rate, self.plan.origin_s,
             self.plan.system_file, self.plan.folder, self.names, self.plan.run_id,
-            self.plan.hmi_port, self._title, self.plan.hmi_page, self.plan.description,
+            self.plan.page.port, self._title, self.plan.page.url, self.plan.description,
             host=self.plan.host, keys=self.plan.keys, ports=self.plan.ports,
             recording=recording, recording_problem=problem)
 

@@ -42,6 +42,7 @@ from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import application_class
 from rampart.actors.system.members import load_class
+from rampart.actors.web.page_plan import PagePlan
 from rampart.cli import systems
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.session import pause
@@ -271,7 +272,7 @@ class Replay:
     def _page(self, bus: ZenohBus, clock: Clock, folder: Path) -> Hmi | None:
         if not self._hmi_port:
             return None
-        run = RunContext(RunPlan(f"replay of {self._path.name}", hmi_port=self._hmi_port),
+        run = RunContext(RunPlan(f"replay of {self._path.name}", page=PagePlan(self._hmi_port)),
                          self._known.system, self._document)
         with contextlib.suppress(ValueError, OSError):  # a page without a map shows the rest
             restore(self.summary.files, folder)

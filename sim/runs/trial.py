@@ -201,7 +201,7 @@ class Trial:
 
     def _seen_to(self, now_s: float) -> dict[str, Any]:
         """Return the fields of a record that come from elsewhere than messages."""
-        log = self.run.plan.audit_log
+        log = self.run.plan.page.audit_log
         return {"faults": self.outcomes(), "audit": read_audit(Path(log)) if log else (),
                 "keeping_up": self._keeping_up.result(now_s) if self._keeping_up else None}
 

@@ -21,6 +21,7 @@ import msgspec
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.actors.system.layout import Layout
+from rampart.actors.web.page_plan import PagePlan
 from rampart.sim.faults.injector import INJECTOR, Branch, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.judge import Verdict
@@ -123,8 +124,8 @@ class VirtualRun:
                  taps: Sequence[Callable[[float, str, bytes], None]] = ()) -> None:
         # Nothing that differs from run to run may get into a message.
         self.plan = msgspec.structs.replace(
-            trial.run.plan, run_id=f"virtual-{trial.run.plan.seed}", rate=1.0, hmi_port=0,
-            launcher_pid=1, virtual=True)
+            trial.run.plan, run_id=f"virtual-{trial.run.plan.seed}", rate=1.0,
+            page=PagePlan(), launcher_pid=1, virtual=True)
         self.trial = trial
         self.interrupted: str | None = None
         self._context = replace(trial.run, plan=self.plan)

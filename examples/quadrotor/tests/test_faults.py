@@ -10,6 +10,7 @@ from quadrotor.faults import QuadrotorFaults
 
 from rampart import INJECTION_REPORT, parse_specification
 from rampart.actors.operator.requests import InjectRequest
+from rampart.actors.web.page_plan import PagePlan
 from rampart.cli.main import main
 from rampart.sim.faults.faults import faults_of
 from rampart.testing import RealRun, VirtualSystem, eventually, free_base_port, run
@@ -59,7 +60,7 @@ def test_a_page_orders_them_of_the_world(file):
     async def scenario():
         faults = faults_of(parse_specification(file.read_text(encoding="utf-8"), file.name))
         async with VirtualSystem.load(
-                file, faults=faults.offered(), hmi_port=free_base_port()) as system:
+                file, faults=faults.offered(), page=PagePlan(free_base_port())) as system:
             for name in ("world", "hmi"):
                 system.start_node(name)
             page, world = system.actors["hmi"], system.actors["world"]

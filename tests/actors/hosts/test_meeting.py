@@ -33,13 +33,14 @@ from rampart.actors.hosts.meeting import (
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.hosts import Hosts
 from rampart.actors.system.layout import load_application
+from rampart.actors.web.page_plan import PagePlan
 from rampart.systems import DEFAULT
 from rampart.testing import eventually
 from rampart.testing.ports import free_port
 from tests.two_hosts import two_hosts
 
-PLAN = RunPlan("r1", 7450, seed=7, system_file="/there/x.toml", hmi_token="t0ken-of-mine",
-               hmi_secret="k3y", folder="/f")
+PLAN = RunPlan("r1", 7450, seed=7, system_file="/there/x.toml", folder="/f",
+               page=PagePlan(token="t0ken-of-mine", secret="k3y"))
 CONTENTS = {"rampart": "aa", "specification": "bb", "airport": "cc"}
 FIRST = {"rampart": "aa", "specification": "bb"}
 

@@ -110,7 +110,7 @@ async def test_the_next_incarnation_knows_a_visitor_and_another_run_does_not(wor
 
 async def test_what_is_no_login_is_refused(world, tmp_path):
     log = tmp_path / "audit.jsonl"
-    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN, audit_log=str(log)) as hmi:
+    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN, hmi_audit_log=str(log)) as hmi:
         at = await served(hmi)
         async with httpx.AsyncClient() as client:
             for body in (b"", b"{", b'{"token": 3}', b'{"token": "a", "more": 1}', b"[]",
@@ -194,7 +194,8 @@ async def test_a_request_is_refused_as_soon_as_the_token_is_withdrawn(
 async def test_what_is_done_on_pages_is_written_down(world, tmp_path):
     file, log = tmp_path / "page.tokens", tmp_path / "audit.jsonl"
     anna, bob = issue(file, "anna", Role.DRIVE), issue(file, "bob", Role.LOOK)
-    async with world.hmi(hmi_port=free_port(), hmi_token_file=str(file), audit_log=str(log)) as hmi:
+    async with world.hmi(hmi_port=free_port(), hmi_token_file=str(file),
+                         hmi_audit_log=str(log)) as hmi:
         at = await served(hmi)
         async with httpx.AsyncClient() as client:
             await post(client, f"http://{at}", anna)
@@ -238,7 +239,7 @@ async def test_what_is_done_on_pages_is_written_down(world, tmp_path):
 
 async def test_an_action_that_is_accepted_is_written_down_before_its_page_is_told(world, tmp_path):
     log = tmp_path / "audit.jsonl"
-    async with world.hmi(hmi_port=free_port(), audit_log=str(log)) as hmi:
+    async with world.hmi(hmi_port=free_port(), hmi_audit_log=str(log)) as hmi:
         async with open_page(await served(hmi)) as page:
             assert (await ask(page, type="strategy", name="mission-first"))["type"] == "done"
             line = read_audit(log)[-1]
@@ -248,7 +249,7 @@ async def test_an_action_that_is_accepted_is_written_down_before_its_page_is_tol
 
 
 async def test_a_log_that_cannot_be_written_is_reported_and_bars_nobody(world, tmp_path):
-    async with world.hmi(hmi_port=free_port(), audit_log=str(tmp_path / "no" / "log")) as hmi:
+    async with world.hmi(hmi_port=free_port(), hmi_audit_log=str(tmp_path / "no" / "log")) as hmi:
         async with open_page(await served(hmi)) as page:
             assert (await ask(page, type="strategy", name="mission-first"))["type"] == "done"
         await eventually(lambda: bool(world.others.diagnostics))

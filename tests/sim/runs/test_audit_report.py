@@ -51,7 +51,7 @@ def test_a_run_reads_what_its_page_has_written_down(tmp_path):
     file = tmp_path / "audit-r1.jsonl"
     log = AuditLog(file, lambda: 3.0, lambda _: None, lambda: 0.0)
     log.write("reset", who="anna")
-    context = run_context(system=shipped_system(), audit_log=str(file), run_id="r1")
+    context = run_context(system=shipped_system(), hmi_audit_log=str(file), run_id="r1")
     assert [(x.who, x.what) for x in Trial(context, 10.0).conclude(5.0, "over").audit] == [
         ("anna", "reset")]
-    assert RunPlan().audit_log == ""
+    assert RunPlan().page.audit_log == ""
