@@ -2,7 +2,7 @@
 
 `python -m benchmarks.checkpoints [DIRECTORY]`: states as the nodes keep them at the end of mission
 AB go through `Actor.keep`'s path, store and all, at 50 a second, many more than a node keeps, while
-the thread syncs and cuts the log. Prints percentiles in microseconds. The directory should be on
+the thread syncs. Prints percentiles in microseconds. The directory should be on
 the disk that is meant; by default it is a temporary one in the working directory, for /tmp may be
 memory.
 """
@@ -29,7 +29,7 @@ from rampart.actors.osmosis.messages import (
     Route,
 )
 from rampart.actors.runtime.checkpoint import Keeper
-from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 
 SAVES = 1500
 PACE_S = 0.02
@@ -70,9 +70,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory(dir=chosen) as directory:
         for name, form, make in (("mission_manager", MISSION_STATE, mission),
                                  ("osmosis_control", CONTROL_STATE, control)):
-            file = Path(directory) / f"{name}.sqlite"
+            folder = Path(directory)
             told: list[str] = []
-            keeper = Keeper(SqliteCheckpoints(file, "bench", 1), told.append, time.monotonic,
+            keeper = Keeper(FileCheckpoints(folder, name, "bench", 1), told.append, time.monotonic,
                             expected=False)
             keeper.kept(form)  # type: ignore[type-var]
             took: list[float] = []
@@ -86,7 +86,7 @@ def main() -> int:
             print(f"{name + ' keeps its state':<34}{size:>6}  {percentiles(took)}")
             opening: list[float] = []
             for incarnation in range(2, 2 + OPENINGS):
-                store = SqliteCheckpoints(file, "bench", incarnation, sync_period_s=0)
+                store = FileCheckpoints(folder, name, "bench", incarnation, syncs=False)
                 begun_s = time.perf_counter()
                 Keeper(store, told.append, time.monotonic, expected=True).kept(form)  # type: ignore[type-var]
                 opening.append(time.perf_counter() - begun_s)

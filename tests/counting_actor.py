@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import random
-
 import msgspec
 
 from rampart.actors.bus.messages import Message
@@ -22,7 +20,6 @@ class State(msgspec.Struct, frozen=True):
     """The same, as it is kept."""
 
     number: int
-    ballast: bytes = b""
 
 
 COUNTED = Topic("counting/counted", Counted, Qos.SENSOR, 20, "", "How far it has come.")
@@ -32,13 +29,6 @@ FORM = StateFormat(State)
 class Counting(Actor):
     """Counts on from where it was."""
 
-    class Parameters(Actor.Parameters, frozen=True):
-        """How long its state is, bytes, and at which numbers it keeps it."""
-
-        ballast: int = 0
-        each: int = 1
-
-    parameters: Parameters
     outputs = (COUNTED,)
     most_spare = "warm"
 
@@ -49,6 +39,5 @@ class Counting(Actor):
     @every(0.05)
     def count(self) -> None:
         self._number += 1
-        if self._number % self.parameters.each == 0:
-            self.keep(FORM, State(self._number, random.randbytes(self.parameters.ballast)))
+        self.keep(FORM, State(self._number))
         self.publish(COUNTED, Counted(self._number))

@@ -30,11 +30,10 @@ from rampart.actors.bus.bounds import (
 from rampart.actors.bus.messages import ON_TIME, Injection, Message
 from rampart.manager.model.mechanisms import RecoveryPhase
 
-PART_BYTES = 64 << 10
-"""Of a state that is copied to another host, in one message at most."""
+LARGEST_STATE_BYTES = 64 << 10
+"""Of the state that a node keeps: thirty times what states are. A larger one is refused."""
 
-KeptBytes = Annotated[bytes, msgspec.Meta(max_length=PART_BYTES)]
-Checksum = Annotated[bytes, msgspec.Meta(max_length=32)]
+KeptBytes = Annotated[bytes, msgspec.Meta(max_length=LARGEST_STATE_BYTES)]
 
 
 class Holds(Message, frozen=True):
@@ -214,12 +213,11 @@ class NodeTable(Message, frozen=True):
     nodes: Many[NodeInfo]
 
 
-class KeptState(Message, frozen=True, omit_defaults=True):
+class KeptState(Message, frozen=True):
     """Which state of a node a host holds: the newest, by incarnation and generation; 0 for none.
 
     `issued` is the highest incarnation of the node that host has issued. `final`: no process of the
-    node is there, and this is the last that any has kept. `coming_…` says of which state how many
-    bytes have come, if not all of it is there, or not kept yet.
+    node is there, and this is the last that any has kept.
     """
 
     node: Name
@@ -227,25 +225,17 @@ class KeptState(Message, frozen=True, omit_defaults=True):
     generation: Count
     issued: Incarnation
     final: bool
-    coming_incarnation: Incarnation = 0
-    coming_generation: Count = 0
-    coming_bytes: Count = 0
 
 
 class StateCopy(Message, frozen=True):
-    """A part of a state that a node has kept: `state` are its bytes from `offset` on.
-
-    `size` is that of the whole; `checksum` is a SHA-256 over all of it, node and run.
-    """
+    """A state that a node has kept."""
 
     node: Name
     incarnation: Incarnation
     generation: Count
     version: Count
-    size: Count
-    offset: Count
+    failures: Count
     state: KeptBytes
-    checksum: Checksum
 
 
 class Checkpoints(Message, frozen=True):

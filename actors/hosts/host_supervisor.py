@@ -29,7 +29,6 @@ from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.hosts.copies import Copies
-from rampart.actors.hosts.parts import Wait
 from rampart.actors.hosts.placement import FIRST, Changes, Home, Placement
 from rampart.actors.hosts.state_files import StateFiles
 from rampart.actors.runtime.actor import Context, Header, every, on
@@ -55,6 +54,9 @@ _SAID_S = 0.1
 
 _ENDING_S = 0.005
 """Real seconds between two looks whether a process that was given back has ended."""
+
+_WAIT_S = 2.0
+"""Real seconds after which the last state of a node that is given back is not waited for."""
 
 _ORDERS_KEPT = 64
 """An order to signal that is repeated gets its old answer, as long as it is among the last ones."""
@@ -97,7 +99,7 @@ class HostSupervisor(Supervisor):
             self._guards, hosts.link, self._known, now_s=loop.time(), rate=plan.rate)
         self._looked_s = loop.time()
         self._ending: list[HeldProcess] = []
-        self._waits: dict[str, Wait] = {}
+        self._waits: dict[str, tuple[float, float]] = {}
         keeps_states = bool(plan.checkpoints) and spec.layers.checkpoints
         self._copies = Copies(
             plan.run_id, own, {
@@ -294,12 +296,15 @@ class HostSupervisor(Supervisor):
     def _has_states(self, unit: str) -> bool:
         """Whether a unit that was given back can go on from what it has kept there."""
         told, now_s = self._placement.told_of(unit), self._now_s()
-        is_caught_up = self._copies.is_caught_up(told, told)
-        wait = self._waits.setdefault(unit, Wait(now_s))
-        if not wait.is_vain(now_s, self._copies.come(told)) and not is_caught_up:
+        since_s, asked_s = self._waits.get(unit, (now_s, now_s))
+        if now_s - asked_s > 4 * _LOOK_S:  # it was run there again meanwhile
+            since_s = now_s
+        self._waits[unit] = since_s, now_s
+        if self._copies.is_caught_up(told, told):
+            return True
+        if now_s - since_s < _WAIT_S:
             return False
-        if not is_caught_up:
-            self._state_problem(unit, "the last state was not sent in time by the host that gave "
+        self._state_problem(unit, "the last state was not sent in time by the host that gave "
                                 "it back; starting with what is here")
         return True
 

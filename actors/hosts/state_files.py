@@ -1,32 +1,24 @@
 """The files of states that two hosts hold: sees what nodes keep here, and keeps what is sent.
 
-A thread of its own does both, so that the supervisor waits for no disk. It looks at each file's
-time and size fifty times a second and reads one that has changed; nodes do not know of it, and
-their saves wait for nothing. It reads as whoever opens a file for the first time does, believing
-nothing; what is damaged is the node's own process to mend.
+A thread does both, so that the supervisor waits for no disk. It looks fifty times a second which
+files there are and how long they are, and reads a node's again when that has changed. Nodes do not
+know of it, and their saves wait for nothing.
 """
 
 from __future__ import annotations
 
+import os
 import threading
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from rampart.actors.runtime.checkpoint import CheckpointError, Record, SupersededError
-from rampart.actors.runtime.checkpoint_file import beside, is_damage, primary_code, words
-from rampart.actors.runtime.checkpoint_store import LOCKED, SqliteCheckpoints, newest
+from rampart.actors.runtime.checkpoint import Record, in_words
+from rampart.actors.runtime.checkpoint_file import files_of, put, read
 
 LOOK_S = 0.02
 """Real seconds between two looks at the files."""
 
-_SETTLED_S = 0.05
-"""A file that has changed within so many seconds before it was read may have changed since, without
-its time or size telling: it is read once more."""
-
 _END_S = 0.5
-
-_Trace = tuple[tuple[int, int, int], ...]
 
 
 class StateFiles:
@@ -44,7 +36,8 @@ class StateFiles:
     def __init__(self, folder: Path, run: str, nodes: Iterable[str],
                  kept: Callable[[str, Record | None, bool], None],
                  problem: Callable[[str, str], None]) -> None:
-        self._files = {node: folder / f"{node}.sqlite" for node in nodes}
+        self._folder = folder
+        self._nodes = tuple(nodes)
         self._run = run
         self._kept = kept
         self._problem = problem
@@ -53,10 +46,10 @@ class StateFiles:
         self._settling: set[str] = set()
         self._wanted = threading.Event()
         self._is_over = False
-        self._seen: dict[str, _Trace] = {}
-        self._told: dict[str, tuple[int, int]] = {}
+        self._seen: dict[str, object] = {}
+        self._suspected: dict[str, object] = {}
+        self._told: dict[str, Record | None] = {}
         self._why_not: dict[str, str] = {}
-        self._stores: dict[str, tuple[int, SqliteCheckpoints]] = {}
         self._thread = threading.Thread(target=self._work, name="states of nodes", daemon=True)
 
     def start(self) -> None:
@@ -72,13 +65,13 @@ class StateFiles:
         self._wanted.set()
 
     def settle(self, node: str) -> None:
-        """Look at a file in any case: no process of the node is there any more."""
+        """Look at a node's files in any case: no process of it is there any more."""
         with self._lock:
             self._settling.add(node)
         self._wanted.set()
 
     def close(self) -> None:
-        """End the thread, and close what it has open."""
+        """End the thread."""
         self._is_over = True
         self._wanted.set()
         if self._thread.is_alive():
@@ -91,70 +84,47 @@ class StateFiles:
             with self._lock:
                 sent, self._sent = self._sent, {}
                 settling, self._settling = self._settling, set()
-            for node, record in sent.items():
-                self._keep(node, record)
-            for node in self._files:
+            for node in self._nodes:
+                if node in sent:
+                    self._keep(node, sent[node])
                 self._look(node, settles=node in settling)
             self._wanted.wait(LOOK_S)
             self._wanted.clear()
-        for _, store in self._stores.values():
-            store.close()
 
-    def _look(self, node: str, *, settles: bool = False) -> None:
-        file, read_s = self._files[node], time.time()
-        trace = _trace(file)
-        if trace == self._seen.get(node) and not settles:
-            return
+    def _look(self, node: str, *, settles: bool) -> None:
         try:
-            record = newest(file, self._run)
-        except Exception as error:  # whatever lies there
-            is_passing = not is_damage(error, file)
-            if is_passing and settles:
-                with self._lock:
-                    self._settling.add(node)
-            if primary_code(error) in LOCKED:  # in this moment
+            trace = {file: os.lstat(file).st_size for file in files_of(self._folder, node).values()}
+            if trace == self._seen.get(node) and not settles:
                 return
-            if words(error) != self._why_not.get(node):
-                self._why_not[node] = words(error)
-                self._problem(node, f"{file.name} cannot be read for another host: {words(error)}")
-            if not is_passing:
-                self._seen[node] = trace
-                if settles:
-                    self._kept(node, None, True)
+            records, problems = read(self._folder, node, self._run)
+        except FileNotFoundError:  # another file has just replaced it
+            if settles:
+                self.settle(node)
             return
-        self._why_not.pop(node, None)
-        changed_s = max((time_ns for _, _, time_ns in trace), default=0) / 1e9
-        if not 0 <= read_s - changed_s <= _SETTLED_S:
-            self._seen[node] = trace
-        age = record.age if record else (0, 0)
-        if age != self._told.get(node, (0, 0)) or settles:
-            self._told[node] = age
-            self._kept(node, record, settles)
+        except OSError as error:
+            self._report(node, in_words(error))
+            if settles:
+                self._kept(node, None, True)
+            return
+        if problems and trace != self._suspected.get(node) and not settles:
+            self._suspected[node] = trace  # it may be half written: looked at once more
+            return
+        self._seen[node] = trace
+        self._report(node, "; ".join(problems))
+        newest = records[0] if records else None
+        if newest != self._told.get(node) or settles:
+            self._told[node] = newest
+            self._kept(node, newest, settles)
+
+    def _report(self, node: str, why: str) -> None:
+        if why != self._why_not.get(node, "") and why:
+            self._problem(node, f"cannot be read for another host: {why}")
+        self._why_not[node] = why
 
     def _keep(self, node: str, record: Record) -> None:
-        incarnation, store = self._stores.get(node, (-1, None))
-        if store is None or incarnation != record.incarnation:
-            if store is not None:
-                store.close()
-            store = SqliteCheckpoints(self._files[node], self._run, record.incarnation)
-            self._stores[node] = record.incarnation, store
         try:
-            store.take(record)
-        except SupersededError:
-            pass  # there is a newer one
-        except CheckpointError as error:
-            self._problem(node, f"a state of another host is not kept: {error}")
-        if trouble := store.trouble():
-            self._problem(node, trouble)
-
-
-def _trace(file: Path) -> _Trace:
-    """Return by what one knows that a file has changed, or its log."""
-    found = []
-    for path in (file, beside(file, "-wal")):
-        try:
-            stat = path.lstat()
-        except OSError:
-            continue
-        found.append((stat.st_ino, stat.st_size, stat.st_mtime_ns))
-    return tuple(found)
+            newest = read(self._folder, node, self._run).records
+            if not newest or record.age > newest[0].age:
+                put(self._folder, node, self._run, record)
+        except OSError as error:
+            self._problem(node, f"a state of another host is not kept: {in_words(error)}")

@@ -45,7 +45,7 @@ from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.foreign.child import CommandError
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
-from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 from rampart.actors.runtime.clock import clock_of
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.supervision.process_title import WAITING, end_run, kill, set_title
@@ -135,7 +135,7 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
     plan = layout.plan
     if not (plan.checkpoints and layout.spec.layers.checkpoints):
         return NoCheckpoints()
-    return SqliteCheckpoints(Path(plan.checkpoints, f"{name}.sqlite"), plan.run_id, incarnation)
+    return FileCheckpoints(Path(plan.checkpoints), name, plan.run_id, incarnation)
 
 
 Waits = Literal["own", "warm", "hot"]

@@ -27,8 +27,7 @@ from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints, StateFormat
-from rampart.actors.runtime.checkpoint_file import SUFFIXES, beside
-from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints, newest
+from rampart.actors.runtime.checkpoint_file import FileCheckpoints, files_of, put, read
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import RunPlan
 
@@ -93,9 +92,9 @@ async def rehearse(plan: RunPlan, bus: ZenohBus) -> None:
     Raises:
         BusError: the session was closed.
     """
-    name, file = f"{os.getpid()}", _file(plan, "")
-    store: CheckpointStore = SqliteCheckpoints(
-        file, plan.run_id, 1, sync_period_s=0) if plan.checkpoints else NoCheckpoints()
+    name, folder = f"{os.getpid()}", _folder(plan)
+    store: CheckpointStore = FileCheckpoints(
+        folder, name, plan.run_id, 1, syncs=False) if plan.checkpoints else NoCheckpoints()
     actor = _Understudy(Context(
         name, 1, Clock(time.monotonic()), SharedBus(bus), {"number": 2.0},
         checkpoints=store, topics={LINE.key: LINE}))
@@ -103,7 +102,7 @@ async def rehearse(plan: RunPlan, bus: ZenohBus) -> None:
         await actor.run()
     finally:
         bus.forget()
-        _remove(file)
+        _remove(folder, name)
 
 
 class Stage(SharedBus):
@@ -119,18 +118,17 @@ class Stage(SharedBus):
     def __init__(self, plan: RunPlan, bus: ZenohBus, name: str, incarnation: int) -> None:
         super().__init__(bus)
         self._bus = bus
-        self._file = _file(plan, name)
+        self._folder, self._name = _folder(plan), name
         self.store: CheckpointStore = NoCheckpoints()
         if plan.checkpoints:
-            self.store = self._copy(Path(plan.checkpoints, f"{name}.sqlite"), plan, incarnation)
+            self.store = self._copy(plan, incarnation)
 
-    def _copy(self, original: Path, plan: RunPlan, incarnation: int) -> CheckpointStore:
-        copy = SqliteCheckpoints(self._file, plan.run_id, incarnation, sync_period_s=0)
+    def _copy(self, plan: RunPlan, incarnation: int) -> CheckpointStore:
         with contextlib.suppress(Exception):  # whatever is wrong with it, the node will report
-            state = newest(original, plan.run_id)
-            if state is not None:
-                copy.take(state)
-        return copy
+            kept = read(Path(plan.checkpoints), self._name, plan.run_id).records
+            if kept:
+                put(self._folder, self._name, plan.run_id, kept[0])
+        return FileCheckpoints(self._folder, self._name, plan.run_id, incarnation, syncs=False)
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Nothing."""
@@ -143,7 +141,7 @@ class Stage(SharedBus):
         self._open = False
         self._bus.forget()
         self.store.close()
-        _remove(self._file)
+        _remove(self._folder, self._name)
 
 
 async def run_for_a_moment(actors: Sequence[Actor], wanted: asyncio.Event) -> None:
@@ -160,11 +158,12 @@ async def run_for_a_moment(actors: Sequence[Actor], wanted: asyncio.Event) -> No
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _file(plan: RunPlan, name: str) -> Path:
-    return Path(plan.folder, f"rehearsal-{os.getpid()}{name and '-'}{name}.sqlite")
+def _folder(plan: RunPlan) -> Path:
+    return Path(plan.folder, f"rehearsal-{os.getpid()}")
 
 
-def _remove(file: Path) -> None:
-    for suffix in SUFFIXES:
-        with contextlib.suppress(OSError):
-            beside(file, suffix).unlink()
+def _remove(folder: Path, node: str) -> None:
+    with contextlib.suppress(OSError):
+        for file in files_of(folder, node).values():
+            file.unlink()
+        folder.rmdir()

@@ -20,7 +20,7 @@ from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.topics import INJECT
 from rampart.actors.machine.patience import AT_LEISURE
 from rampart.actors.runtime.actor import Actor, Context
-from rampart.actors.runtime.checkpoint import MemoryCheckpoints, NoCheckpoints, Shelf
+from rampart.actors.runtime.checkpoint import MemoryCheckpoints, NoCheckpoints, Record
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_system
@@ -92,7 +92,7 @@ class VirtualSystem:
         self.incarnations: dict[str, int] = {}
         self.members = frozenset(layout.members if layout else ())
         self._topics = tuple(topics)
-        self._shelves: dict[str, Shelf] | None = {} if keeps_checkpoints else None
+        self._shelves: dict[str, list[Record]] | None = {} if keeps_checkpoints else None
         self.register: Register = self.incarnations.get
         self.actors: dict[str, Actor] = {}
         self.tasks: dict[str, asyncio.Task[None]] = {}
@@ -135,7 +135,7 @@ class VirtualSystem:
         """Return the context for the next incarnation of an actor."""
         incarnation = self.incarnations[name] = self.incarnations.get(name, 0) + 1
         kept = NoCheckpoints() if self._shelves is None else MemoryCheckpoints(
-            self._shelves.setdefault(name, Shelf()), incarnation)
+            self._shelves.setdefault(name, []), incarnation)
         return Context(name, incarnation, self.clock, VirtualBus(self.hub, name, incarnation),
                        parameters, self.run, checkpoints=kept, members=self.members,
                        register=self.register, topics=self._named(parameters),

@@ -117,7 +117,7 @@ class VirtualMachine:
     def __init__(self, layout: Layout, run: RunContext, hub: Hub, clock: Clock, seed: Any) -> None:
         self.failures: list[tuple[str, BaseException]] = []
         self.on_restart: Callable[[str], None] = lambda _name: None
-        self.shelves: dict[str, checkpoint.Shelf] = {}
+        self.shelves: dict[str, list[checkpoint.Record]] = {}
         self._layout = layout
         self._run = run
         self._hub = hub
@@ -324,7 +324,7 @@ class VirtualMachine:
     def _store(self, name: str, incarnation: int) -> checkpoint.CheckpointStore:
         if not self._layout.spec.layers.checkpoints:
             return checkpoint.NoCheckpoints()
-        shelf = self.shelves.setdefault(name, checkpoint.Shelf())
+        shelf = self.shelves.setdefault(name, [])
         return checkpoint.MemoryCheckpoints(shelf, incarnation)
 
     def _task_done(self, process: VirtualProcess, name: str, task: asyncio.Task[None]) -> None:

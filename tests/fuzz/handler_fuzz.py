@@ -35,7 +35,7 @@ from rampart.actors.machine.patience import AT_LEISURE, Usage
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
-from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
+from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Record
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.system.layout import Layout, load_run
@@ -209,7 +209,7 @@ def fuzz_actor(system_name: str, name: str, seed: int) -> Finding | None:
     """Tell one actor of a system what its types allow, in two lives; return what went wrong."""
     of = system(system_name)
     stranger = Stranger(f"{system_name} {name} {seed}", of)
-    shelf, who = Shelf(), f"{system_name} {name}"
+    shelf, who = list[Record](), f"{system_name} {name}"
     try:
         for incarnation in (1, 2):
             with _patience(), asyncio.Runner(loop_factory=VirtualLoop) as runner:
@@ -221,7 +221,8 @@ def fuzz_actor(system_name: str, name: str, seed: int) -> Finding | None:
     return None
 
 
-async def _live(of: System, name: str, incarnation: int, shelf: Shelf, stranger: Stranger) -> str:
+async def _live(of: System, name: str, incarnation: int, shelf: list[Record],
+                stranger: Stranger) -> str:
     """Let an actor live and be told things; raise what ends it, return what it should not say."""
     loop = asyncio.get_running_loop()
     hub, member = Hub(), of.layout.members[name]

@@ -29,7 +29,7 @@ from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
 from rampart.actors.runtime.checkpoint import StateFormat
-from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint_file import read
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import WAITING, find_processes, process_state
@@ -56,10 +56,6 @@ WORLD_PAUSE_S = 0.4
 emergency stop, the right answer to a robot without senses, would follow after a second."""
 
 _ENDED = re.compile(r"\] mission \S+ (succeeded|failed|cancelled)")
-
-_LATEST = 2**31
-"""An incarnation that no node has reached: whoever reads a store after the run."""
-
 
 @dataclass(frozen=True, slots=True)
 class Hit:
@@ -237,8 +233,8 @@ def _lights_wrong(report: Path, result: dict[str, Any], rows: str) -> list[str]:
     """
     expected = sorted(x["name"] for x in result["lights"] if x["row"] in rows)
     run_id = Path(result["report"]).stem.removeprefix("inspection-")
-    state = _newest(report / "checkpoints" / "mission_manager.sqlite", run_id, MISSION_STATE)
-    kept = _newest(report / "checkpoints" / "osmosis_control.sqlite", run_id, CONTROL_STATE)
+    state = _newest(report / "checkpoints", "mission_manager", run_id, MISSION_STATE)
+    kept = _newest(report / "checkpoints", "osmosis_control", run_id, CONTROL_STATE)
     told = {x["name"]: x["intensity_cd"] for x in result["lights"]
             if x["verdict"] != "not measured"}
     wrong = []
@@ -251,10 +247,6 @@ def _lights_wrong(report: Path, result: dict[str, Any], rows: str) -> list[str]:
     return wrong
 
 
-def _newest(file: Path, run_id: str, form: StateFormat[Any]) -> Any:
-    store = SqliteCheckpoints(file, run_id, _LATEST)
-    try:
-        record = store.load().records[0]
-        return form.decode(record.version, record.state)
-    finally:
-        store.close()
+def _newest(folder: Path, node: str, run_id: str, form: StateFormat[Any]) -> Any:
+    record = read(folder, node, run_id).records[0]
+    return form.decode(record.version, record.state)

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.osmosis import messages as m
-from rampart.actors.runtime.checkpoint import Shelf
+from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import load_run
 from rampart.sim.faults.scenario import parse_fault
@@ -44,7 +44,7 @@ class Watched:
     measured: list[m.LightMeasurement] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
     diagnostics: list[bm.Diagnostic] = field(default_factory=list)
-    shelves: dict[str, Shelf] = field(default_factory=dict)
+    shelves: dict[str, list[Record]] = field(default_factory=dict)
 
 
 class _Mission(MissionTrial):

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
 import signal
-import sqlite3
 import subprocess
 import sys
 import time
@@ -21,7 +19,7 @@ from rampart.actors.recording.message_form import Forms, header_of
 from rampart.testing import RealRun
 from tests import ROOT
 from tests.whole.network import Line, Network, network, why_not
-from tests.whole.test_two_hosts import BAD, CELL_ON_GROUND, host, specification, with_keys
+from tests.whole.test_two_hosts import CELL_ON_GROUND, host, specification, with_keys
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone,
               pytest.mark.skipif(bool(why_not()), reason=f"no two hosts here: {why_not()}")]
@@ -111,46 +109,14 @@ def counted(file: Path) -> dict[int, tuple[int, int]]:
     return found
 
 
-def with_a_camera_that_counts(net: Network, folder: Path, parameters: str = "") -> Path:
+def with_a_camera_that_counts(net: Network, folder: Path) -> Path:
     """Return the specification of a cell whose camera keeps how far it has counted."""
     spec = specification(net, folder, CELL_ON_GROUND, "cell", 0.1)
     spec.write_text(spec.read_text(encoding="utf-8").replace(
         'actor = "rampart.actors.runtime.stub_node:StubNode"',
-        f'actor = "counting_actor:Counting"\n{parameters}', 1), encoding="utf-8")
+        'actor = "counting_actor:Counting"', 1), encoding="utf-8")
     shutil.copy(ROOT / "tests" / "counting_actor.py", folder)
     return spec
-
-
-@pytest.mark.slow
-def test_a_long_state_on_a_bad_line_costs_no_host(net, tmp_path):
-    """300 kB each five seconds, over what carries some 80 a second, and all heartbeats with it."""
-    size = 300_000
-    spec = with_a_camera_that_counts(
-        net, tmp_path, f"parameters = {{ ballast = {size}, each = 100 }}")
-    with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as ground,
-          host(net, "robot", tmp_path / "r", spec, "--no-keys") as robot):
-        ground.wait_for("takes part in run")
-        robot.wait_for("ctrl-C ends it")
-        ground.wait_for("router_b_ground adopted")
-        time.sleep(1.0)
-        net.line = Line(**BAD)
-        [file] = tmp_path.glob("r/**/checkpoints")
-        copied = file / "camera.sqlite"
-        robot.wait_until(lambda: longest(copied) > size, 40, "the state has not come")
-        time.sleep(10.0)
-        assert "unreachable" not in robot.story + ground.story
-        net.line = Line()
-        robot.process.send_signal(signal.SIGINT)
-        assert robot.result(20)[0] == 0
-
-
-def longest(file: Path) -> int:
-    """Return the length of the longest state in a file of checkpoints, 0 if there is none."""
-    try:
-        with contextlib.closing(sqlite3.connect(file, timeout=1.0)) as opened:
-            return opened.execute("SELECT max(length(state)) FROM checkpoint").fetchone()[0] or 0
-    except sqlite3.Error:
-        return 0
 
 
 @pytest.mark.parametrize("keyed", [False, pytest.param(True, marks=pytest.mark.slow)])

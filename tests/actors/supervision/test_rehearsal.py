@@ -13,7 +13,7 @@ from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import StateFormat
-from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints, newest
+from rampart.actors.runtime.checkpoint_file import FileCheckpoints, read
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision import rehearsal
@@ -82,17 +82,15 @@ async def rehearsed(plan: RunPlan, kind: type[Counter], wanted: asyncio.Event) -
 
 async def test_a_node_runs_from_a_copy_of_its_checkpoint_and_keeps_nothing(tmp_path):
     run = plan(tmp_path)
-    file = Path(run.checkpoints, "counter.sqlite")
-    original = SqliteCheckpoints(file, "r", 1)
-    original.save(1, FORM.encode(Count(41)))
+    original = FileCheckpoints(Path(run.checkpoints), "counter", "r", 1)
+    original.save(1, 0, FORM.encode(Count(41)))
     actor = await rehearsed(run, Counter, asyncio.Event())
     assert actor.began == 41
     assert actor.count > 42, "it ran for some turns"
-    kept = newest(file, "r")
-    assert kept is not None
-    assert (kept.incarnation, FORM.decode(1, kept.state)) == (1, Count(41))
-    original.save(1, FORM.encode(Count(42)))  # it has not been superseded
+    original.save(1, 0, FORM.encode(Count(42)))
     original.close()
+    kept = read(Path(run.checkpoints), "counter", "r").records[0]
+    assert (kept.incarnation, FORM.decode(1, kept.state)) == (1, Count(42))
 
 
 async def test_one_that_is_wanted_does_not_rehearse_to_the_end(tmp_path, monkeypatch):
@@ -107,7 +105,7 @@ async def test_one_that_is_wanted_does_not_rehearse_to_the_end(tmp_path, monkeyp
 async def test_what_fails_or_is_damaged_ends_no_rehearsal(tmp_path, damaged):
     run = plan(tmp_path)
     if damaged:
-        Path(run.checkpoints, "counter.sqlite").write_bytes(b"no database" * 100)
+        Path(run.checkpoints, "counter.1.1").write_bytes(b"no state" * 100)
     actor = await rehearsed(run, FailingCounter, asyncio.Event())
     assert (actor.began, actor.count) == (0, 1)
-    assert Path(run.checkpoints, "counter.sqlite").exists() == damaged
+    assert Path(run.checkpoints, "counter.1.1").exists() == damaged

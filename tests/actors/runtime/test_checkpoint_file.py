@@ -1,0 +1,437 @@
+"""Checkpoints on disk: what is found again, and what every kind of damage leads to."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from rampart.actors.ftm.messages import LARGEST_STATE_BYTES
+from rampart.actors.runtime import checkpoint_file
+from rampart.actors.runtime.checkpoint import (
+    GENERATIONS,
+    Keeper,
+    Record,
+    StateFormat,
+    SupersededError,
+)
+from rampart.actors.runtime.checkpoint_file import (
+    LARGEST_FILE_BYTES,
+    FileCheckpoints,
+    files_of,
+    put,
+    read,
+)
+from rampart.testing import wait_until
+from tests import ROOT
+from tests.actors.runtime.checkpoint_crasher import SAVES
+
+Open = Callable[[int], FileCheckpoints]
+
+
+class Counter(msgspec.Struct, frozen=True):
+    count: int
+    label: str = "of some length, so that there are bytes to be wrong"
+
+
+FORM = StateFormat(Counter)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    return tmp_path / "checkpoints"
+
+
+@pytest.fixture
+def store(folder) -> Iterator[Open]:
+    """A function that opens the store of one node for an incarnation, without its thread."""
+    opened: list[FileCheckpoints] = []
+
+    def open_for(incarnation: int) -> FileCheckpoints:
+        opened.append(FileCheckpoints(folder, "node", "run", incarnation, syncs=False))
+        return opened[-1]
+
+    yield open_for
+    for one in opened:
+        one.close()
+
+
+def states(of: FileCheckpoints) -> list[bytes]:
+    return [record.state for record in of.load().records]
+
+
+def counted(folder: Path, last: int = 6) -> Path:
+    """Keep some states, and return the file in which they are."""
+    store = FileCheckpoints(folder, "node", "run", 1, syncs=False)
+    for number in range(1, last + 1):
+        store.save(1, 0, FORM.encode(Counter(number)))
+    store.close()
+    [file] = files_of(folder, "node").values()
+    return file
+
+
+def restarted(folder: Path, incarnation: int = 2) -> tuple[Counter | None, list[str]]:
+    """Return what the next process of the node finds and reports, having kept a state of its own.
+
+    Whatever lies there, the one after it finds that state.
+    """
+    told: list[str] = []
+    store = FileCheckpoints(folder, "node", "run", incarnation, syncs=False)
+    keeper = Keeper(store, told.append, lambda: 0.0, expected=True)
+    found = keeper.kept(FORM)
+    keeper.keep(FORM, Counter(99))
+    keeper.close()
+    after = read(folder, "node", "run").records
+    assert FORM.decode(1, after[0].state) == Counter(99)
+    return found, told
+
+
+# -- what is found again -------------------------------------------------------------------------
+
+
+def test_an_empty_store_has_nothing(store):
+    assert store(1).load() == ((), ())
+
+
+def test_what_was_saved_is_there_for_the_next_incarnation_newest_first(store):
+    first = store(1)
+    for number in range(7):
+        first.save(3, 2, b"state %d" % number)
+    records = store(2).load().records
+    assert [r.state for r in records] == [b"state %d" % n for n in (6, 5, 4, 3)][:GENERATIONS]
+    assert records[0][:4] == (1, 7, 3, 2)
+
+
+def test_generations_go_on_counting_in_the_next_process(store):
+    store(1).save(1, 0, b"a")
+    second = store(2)
+    second.load()
+    second.save(1, 0, b"b")
+    assert [r.generation for r in store(3).load().records] == [2, 1]
+
+
+def test_a_superseded_process_overwrites_nothing_and_loads_nothing(store):
+    old, new = store(1), store(2)
+    old.load()
+    old.save(1, 0, b"old")
+    assert states(new) == [b"old"]  # it has kept nothing yet: to have loaded is enough
+    old.save(1, 0, b"a ghost's")
+    with pytest.raises(SupersededError):
+        store(1).load()
+    assert states(store(2)) == [b"old"]
+    new.save(1, 0, b"new")
+    old.save(1, 0, b"a ghost's")
+    assert states(store(3)) == [b"new", b"old"]
+
+
+def test_a_full_file_is_followed_by_another_and_the_older_ones_go(folder):
+    store = FileCheckpoints(folder, "node", "run", 1)
+    for number in range(60):
+        store.save(1, 0, b"%02d" % number * 5000)
+        time.sleep(0.005)
+    wait_until(lambda: len(files_of(folder, "node")) == 1, what="older files stay")
+    assert all(file.stat().st_size < LARGEST_FILE_BYTES
+               for file in files_of(folder, "node").values())
+    assert read(folder, "node", "run").records[0].state == b"59" * 5000
+    assert store.trouble() == ""
+    store.close()
+
+
+def test_the_generations_of_former_processes_are_still_there_when_the_newest_is_damaged(folder):
+    """Also when the files of those were removed, and each has kept one state only."""
+    for incarnation in range(1, 8):
+        store = FileCheckpoints(folder, "node", "run", incarnation)
+        store.load()
+        store.save(1, 0, FORM.encode(Counter(incarnation)))
+        wait_until(lambda: len(files_of(folder, "node")) == 1, what="older files stay")
+        store.close()
+    [file] = files_of(folder, "node").values()
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-1])
+    found, told = restarted(folder, 8)
+    assert found == Counter(6)
+    assert len(told) == 1
+
+
+def test_what_another_host_kept_is_taken_and_replaces_what_is_older(folder):
+    counted(folder)
+    put(folder, "node", "run", Record(1_000_001, 5, 1, 0, FORM.encode(Counter(50))))
+    assert len(files_of(folder, "node")) == 1
+    assert restarted(folder, 1_000_002) == (Counter(50), [])
+
+
+def test_a_folder_that_was_removed_is_made_again(store, folder):
+    first = store(1)
+    first.save(1, 0, b"a")
+    shutil.rmtree(folder)
+    first.save(1, 0, b"b")
+    assert "vanished" in first.trouble()
+    assert states(store(2)) == [b"b", b"a"]
+
+
+def test_the_disk_confirms_a_state_and_a_disk_that_hangs_holds_up_no_save(folder, monkeypatch):
+    answers, asked = threading.Event(), threading.Event()
+
+    def fsync(_file: int) -> None:
+        asked.set()
+        answers.wait(20)
+
+    monkeypatch.setattr(checkpoint_file.os, "fsync", fsync)
+    store = FileCheckpoints(folder, "node", "run", 1)
+    begun_s = time.monotonic()
+    for number in range(100):
+        store.save(1, 0, b"%d" % number)
+    assert time.monotonic() - begun_s < 5
+    assert asked.wait(10)
+    assert read(folder, "node", "run").records[0].state == b"99"
+    answers.set()
+    store.close()
+
+
+def test_a_sync_that_fails_is_reported_and_the_next_state_begins_another_file(folder, monkeypatch):
+    def fsync(_file: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    store = FileCheckpoints(folder, "node", "run", 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint_file.os, "fsync", fsync)
+        store.save(1, 0, b"a")
+        wait_until(lambda: "Input/output error" in store.trouble(), what="not reported")
+    store.save(1, 0, b"b")
+    assert len(files_of(folder, "node")) == 2
+    store.close()
+    assert read(folder, "node", "run").records[0].state == b"b"
+
+
+# -- damage --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_file_that_is_cut_anywhere_leads_to_the_last_whole_state(tmp_path, every):
+    whole = counted(tmp_path / "whole").read_bytes()
+    ends = [len(counted(tmp_path / f"{n}", n).read_bytes()) for n in range(1, 7)]
+    file = tmp_path / "cut" / "node.1.1"
+    for length in range(0, len(whole), every):
+        file.parent.mkdir()
+        file.write_bytes(whole[:length])
+        found, told = restarted(file.parent)
+        sound = sum(end <= length for end in ends)
+        assert found == (Counter(sound) if sound else None), length
+        assert len(told) == (1 if length not in ends else 0), (length, told)
+        shutil.rmtree(file.parent)
+
+
+@pytest.mark.parametrize("every", [7, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_byte_that_is_wrong_anywhere_costs_one_generation_and_one_line(tmp_path, every):
+    whole = counted(tmp_path / "whole").read_bytes()
+    last = len(counted(tmp_path / "before", 5).read_bytes())
+    file = tmp_path / "damaged" / "node.1.1"
+    for at in range(0, len(whole), every):
+        file.parent.mkdir()
+        for value in (whole[at] ^ 1, whole[at] ^ 0x80, 255 - whole[at]):
+            file.write_bytes(whole[:at] + bytes([value]) + whole[at + 1:])
+            records, problems = read(file.parent, "node", "run")
+            assert FORM.decode(1, records[0].state) == Counter(5 if at >= last else 6), at
+            assert len(problems) == 1, at
+        shutil.rmtree(file.parent)
+
+
+def test_a_state_that_contains_a_frame_is_not_taken_apart(store, folder):
+    inner = counted(folder / "inner").read_bytes()
+    store(1).save(1, 0, b"before")
+    store(2).load()
+    second = store(3)
+    second.load()
+    second.save(1, 0, inner)
+    assert states(store(4))[0] == inner
+
+
+def test_garbage_of_any_kind_is_one_line_and_the_node_runs(tmp_path):
+    whole = counted(tmp_path / "whole").read_bytes()
+    chance = random.Random(1)
+    for trial in range(200):
+        at, data = chance.randrange(len(whole)), chance.randbytes(chance.randrange(1, 400))
+        folder = tmp_path / f"{trial}"
+        folder.mkdir()
+        (folder / "node.1.1").write_bytes(
+            whole[:at] + data + whole[at + chance.randrange(len(data)):])
+        _, told = restarted(folder)
+        assert len(told) == 1
+        assert "\n" not in told[0]
+
+
+@pytest.mark.parametrize("thing", [
+    "folder", "fifo", "socket", "link", "nowhere", "huge", "device", "another run's",
+    "another node's", "of 0.7"])
+def test_something_else_in_the_place_of_a_file_is_one_line_and_the_node_runs(tmp_path, thing):
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    file = folder / "node.1.1"
+    if thing == "folder":
+        file.mkdir()
+    elif thing == "fifo":
+        os.mkfifo(file)
+    elif thing == "socket":
+        with socket.socket(socket.AF_UNIX) as bound:
+            bound.bind(str(file))
+    elif thing == "link":
+        file.symlink_to(counted(tmp_path / "elsewhere"))
+    elif thing == "nowhere":
+        file.symlink_to(tmp_path / "nothing")
+    elif thing == "huge":
+        with file.open("wb") as huge:
+            huge.truncate(1 << 40)
+    elif thing == "device":
+        if os.getuid():
+            pytest.skip("takes root")
+        os.mknod(file, 0o600 | 0o020000, os.makedev(1, 5))  # /dev/zero
+    elif thing == "of 0.7":
+        (folder / "node.sqlite").write_bytes(b"SQLite format 3\0" + bytes(4000))
+    else:
+        run, node = ("other", "node") if thing == "another run's" else ("run", "other")
+        put(folder, node, run, Record(1, 1, 1, 0, FORM.encode(Counter(3))))
+        if node != "node":
+            (folder / "other.1.1").rename(file)
+    begun_s = time.monotonic()
+    found, told = restarted(folder)
+    assert time.monotonic() - begun_s < 5
+    assert found is None
+    assert len(told) == 1
+    assert str(folder) in told[0]
+    assert "\n" not in told[0]
+
+
+@pytest.mark.parametrize("thing", ["folder", "fifo", "link"])
+def test_something_in_the_place_of_the_next_file_is_reported_and_gone_round(folder, thing):
+    counted(folder)
+    file = folder / "node.2.7"
+    if thing == "folder":
+        file.mkdir()
+    elif thing == "fifo":
+        os.mkfifo(file)
+    else:
+        file.symlink_to("/dev/full")
+    told, now_s = list[str](), [0.0]
+    keeper = Keeper(FileCheckpoints(folder, "node", "run", 2, syncs=False), told.append,
+                    lambda: now_s[0], expected=True)
+    assert keeper.kept(FORM) == Counter(6)
+    for moment in (0.0, 1.5, 3.0):
+        now_s[0] = moment
+        keeper.keep(FORM, Counter(99))
+    keeper.close()
+    assert len(told) >= 2, told  # of what is there, of the save, and that they are kept again
+    assert FORM.decode(1, read(folder, "node", "run").records[0].state) == Counter(99)
+
+
+IN_A_PROCESS = """
+import os, resource, sys
+from pathlib import Path
+from rampart.actors.runtime.checkpoint import CheckpointError
+from rampart.actors.runtime.checkpoint_file import FileCheckpoints
+folder, what = Path(sys.argv[1]), sys.argv[2]
+store = FileCheckpoints(folder, "node", "run", 1 if what == "full" else 2, syncs=False)
+if what == "full":  # python ignores SIGXFSZ: writing beyond the limit fails, as on a full disk
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+    saved, error = 0, ""
+    while not error and saved < 100:
+        try:
+            store.save(1, 0, b"%04d" % saved * 500)
+            saved += 1
+        except CheckpointError as problem:
+            error = str(problem)
+    print(saved, error)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    store.save(1, 0, b"room again")
+else:
+    if os.getuid() == 0:
+        os.setuid(65534)
+    for action in (store.load, lambda: store.save(1, 0, b"x")):
+        try:
+            print("worked", action())
+        except CheckpointError as problem:
+            print(problem)
+"""
+
+
+def in_a_process(folder: Path, what: str) -> list[str]:
+    done = subprocess.run([sys.executable, "-c", IN_A_PROCESS, str(folder), what], cwd=ROOT,
+                          capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_a_full_disk_is_one_line_and_the_states_before_it_stay(folder):
+    count, error = in_a_process(folder, "full")[0].split(" ", 1)
+    assert int(count) >= 3
+    assert str(folder) in error
+    records, problems = read(folder, "node", "run")
+    assert [records[0].state, records[1].state] == [
+        b"room again", b"%04d" % (int(count) - 1) * 500]
+    assert problems == ()
+
+
+def test_without_permission_what_can_be_read_is_found_and_the_rest_is_one_line():
+    directory = Path(tempfile.mkdtemp())  # where a user without rights can get to
+    try:
+        counted(directory).chmod(0o444)
+        directory.chmod(0o555)
+        loaded, saved = in_a_process(directory, "read-only")
+    finally:
+        directory.chmod(0o755)
+        shutil.rmtree(directory)
+    assert loaded.startswith("worked Loaded(records=(Record(incarnation=1, generation=6")
+    assert "Permission denied" in saved
+
+
+def test_a_state_of_the_largest_size_is_kept(store, folder):
+    first = store(1)
+    for byte in b"abcdefghijk":
+        first.save(1, 0, bytes([byte]) * LARGEST_STATE_BYTES)
+    loaded = store(2).load()
+    assert [r.state[:1] for r in loaded.records] == [b"k", b"j", b"i", b"h"]
+    assert loaded.problems == ()
+
+
+# -- killed in the middle ------------------------------------------------------------------------
+
+
+def crash(tmp_path: Path, mode: str, first: int, last: int, step: int) -> list[dict]:
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.actors.runtime.checkpoint_crasher", str(tmp_path), mode,
+         str(first), str(last), str(step)], cwd=ROOT, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=100)
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@pytest.mark.parametrize(("mode", "step"), [("limits", 1100), ("random", 500)])
+def test_a_process_that_ends_in_any_write_leaves_its_last_acknowledged_state_or_the_next(
+        tmp_path, mode, step):
+    lives = crash(tmp_path, mode, 0, 60 * step, step)
+    assert len(lives) == 60
+    assert sum(life["is_short"] for life in lives) >= 50
+    assert len({life["acknowledged"] for life in lives}) > 10, "always killed at the same point"
+    before = 0
+    for index, life in enumerate(lives):
+        if index % 7 == 0:
+            before = 0  # an empty directory
+        assert -1 not in life["kept"], "a state that was never saved"
+        oldest = life["acknowledged"] or before
+        start = 1 + 2 * SAVES * (index % 7)
+        following = life["acknowledged"] + 1 if life["acknowledged"] else start
+        assert life["found"] in (oldest, following), life
+        before = life["found"]
+
+
