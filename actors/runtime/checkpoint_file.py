@@ -131,6 +131,8 @@ def read(folder: Path, node: str, run: str) -> Loaded:
     for _, file in sorted(files.items(), reverse=True):
         try:
             frames, damage = _frames(_content(file))
+        except FileNotFoundError:  # a newer one has just replaced it
+            return read(folder, node, run)
         except OSError as error:
             problems.append(f"{file}: {error.strerror}")
             continue
