@@ -22,7 +22,8 @@ from pathlib import Path
 
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 
-SAVES = 2000
+SAVES = 20_000
+"""So many that no child comes to its end."""
 
 
 def state(number: int) -> bytes:
