@@ -266,29 +266,32 @@ class Transitions:
 
     def faults(self, now: Situation) -> Iterator[tuple[str, str]]:
         """Yield each property that fails in a state, and what is wrong."""
+        for problem in self._conflicts(now):
+            yield "no-conflicting-claims", problem
+        in_force = [t.name for t in now.state.recoveries if t.wanted and not t.draining]
+        if self.exclusive and len(in_force) > 1:
+            yield "one-decision", f"{' and '.join(in_force)} are both in force"
+        for index, track in enumerate(now.state.recoveries):
+            waits = track.name in now.state.decision.recoveries and not track.wanted
+            if waits and track.name in self.urgent:
+                yield "emergency-stop-at-once", f"{track.name} was decided on and has to wait"
+            if _is_due(track) and not track.latched and _is_due(
+                    self.pass_deadline(now, index).state.recoveries[index]):
+                yield "recovery-ends", f"{track.name}'s deadline passes and nothing follows"
+            if waits and not self._starts(now, index):
+                yield "recovery-ends", f"{track.name} waits for ever"
+
+    def _conflicts(self, now: Situation) -> Iterator[str]:
+        """Yield in words who may hold what another one holds, or holds it unknown."""
         tracks = now.state.recoveries
         holding = [t for t in tracks if (t.wanted or t.letting_go) and not t.failure]
         for one, other in combinations(holding, 2):
             if self.arbiter.mechanisms.overlap(one.name, other.name):
-                yield "no-conflicting-claims", (
-                    f"{one.name} and {other.name} may both hold what they claim")
+                yield f"{one.name} and {other.name} may both hold what they claim"
         for track, module in zip(tracks, now.modules, strict=self.with_modules):
-            if module.phase is not RecoveryPhase.IDLE and not module.excused \
-                    and not (track.wanted or track.letting_go):
-                yield "no-conflicting-claims", f"{track.name} holds on, and nobody knows"
-        in_force = [t.name for t in tracks if t.wanted and not t.draining]
-        if self.exclusive and len(in_force) > 1:
-            yield "one-decision", f"{' and '.join(in_force)} are both in force"
-        for index, track in enumerate(tracks):
-            waits = track.name in now.state.decision.recoveries and not track.wanted
-            if waits and track.name in self.urgent:
-                yield "emergency-stop-at-once", f"{track.name} was decided on and has to wait"
-            if track.wanted and track.unfinished and not track.failure and not track.latched:
-                after = self.pass_deadline(now, index).state.recoveries[index]
-                if after.wanted and after.unfinished and not after.failure:
-                    yield "recovery-ends", f"{track.name}'s deadline passes and nothing follows"
-            if waits and not self._starts(now, index):
-                yield "recovery-ends", f"{track.name} waits for ever"
+            holds = module.phase is not RecoveryPhase.IDLE and not module.excused
+            if holds and not (track.wanted or track.letting_go):
+                yield f"{track.name} holds on, and nobody knows"
 
     def _starts(self, now: Situation, waiting: int) -> bool:
         """Tell whether a recovery that waits starts once all deadlines of others have passed."""
@@ -313,6 +316,11 @@ class Transitions:
                     and not self.contracts[was.name].interruptible:
                 return was.name
         return ""
+
+
+def _is_due(track: RecoveryTrack) -> bool:
+    """Whether a recovery is at work that has to end."""
+    return track.unfinished and not track.failure
 
 
 def explore(system: Transitions) -> tuple[int, Violations]:

@@ -377,12 +377,11 @@ def _without_incarnation(node: str) -> str:
     return node.partition("#")[0]
 
 
-def build_arbiter(spec: SystemSpec, strategy: str = "", *, first_start: bool = True) -> Arbiter:
+def build_arbiter(spec: SystemSpec, *, first_start: bool = True) -> Arbiter:
     """Build the arbiter of a system.
 
     Args:
         spec: The system.
-        strategy: Name of a strategy; "" for the one that the spec names.
         first_start: Whether modules may be starting as well, and are waited for accordingly; those
             of an arbiter that was respawned run already.
 
@@ -395,5 +394,5 @@ def build_arbiter(spec: SystemSpec, strategy: str = "", *, first_start: bool = T
         spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
     rules = DetectionRules(silence_s, timing.startup_grace_s if first_start else silence_s,
                            timing.release_hold_s, timing.release_hold_max_s)
-    return Arbiter(arrangement, find_strategy(strategy or spec.strategy), rules,
+    return Arbiter(arrangement, find_strategy(spec.strategy), rules,
                    find_strategy(spec.shadow) if spec.shadow else None)

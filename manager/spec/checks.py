@@ -13,7 +13,7 @@ from operator import or_
 
 from rampart.manager.model.fault_tree import FaultTreeError
 from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
-from rampart.manager.model.order import CycleError, find_cycle
+from rampart.manager.model.order import CycleError, PartialOrder, Tree, find_cycle
 from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
 from rampart.manager.spec.host_checks import find_wrong_hosts
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
@@ -347,15 +347,26 @@ def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
     if not spec.mechanisms:
         return
     order, tree = spec.build_safety_order(), spec.build_ftm_tree()
+    for path, mechanism in numbered("mechanism", spec.mechanisms):
+        if tree.root in mechanism.explains:
+            yield Finding(f"{path}.explains", f"{tree.root} is the root of the FTMTree; the last "
+                          "barrier acts whatever explains it", (sorted(mechanism.explains),))
+    yield from _against_tree(spec, order, tree)
+    for path, recovery in numbered("recovery", spec.recoveries):
+        if recovery.escalate_to and order.is_above(recovery.name, recovery.escalate_to):
+            yield Finding(f"{path}.escalate_to", f"{recovery.name} is above it in the order "
+                          f"{spec.criteria[0]!r}; escalation must not lead to less",
+                          (recovery.escalate_to,))
+    yield from _delayed_last_resort(spec, tree.root)
+
+
+def _against_tree(spec: SystemSpec, order: PartialOrder, tree: Tree) -> Iterator[Finding]:
+    """Recoveries of a lower mechanism that are above those of an upper one."""
     safer = spec.criteria[0]
     recover = {mechanism.name: mechanism.recoveries for mechanism in spec.mechanisms}
     own = {name: order.mask(names) for name, names in recover.items()}
     under = {name: reduce(or_, (order.below[order.number[r]] for r in names))
              for name, names in recover.items()}
-    for path, mechanism in numbered("mechanism", spec.mechanisms):
-        if tree.root in mechanism.explains:
-            yield Finding(f"{path}.explains", f"{tree.root} is the root of the FTMTree; the last "
-                          "barrier acts whatever explains it", (sorted(mechanism.explains),))
     for upper in tree.names:
         for lower in tree.members(tree.below[tree.number[upper]]):
             if not under[lower] & own[upper]:
@@ -365,19 +376,19 @@ def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
                     yield Finding(f"$.orders.{safer}.{above}", f"contradicts the FTMTree: {above} "
                                   f"of {lower} is above {below} of {upper}, but {upper} is above "
                                   f"{lower}", (list(spec.orders[safer].get(above, ())),))
-    for path, recovery in numbered("recovery", spec.recoveries):
-        if recovery.escalate_to and order.is_above(recovery.name, recovery.escalate_to):
-            yield Finding(f"{path}.escalate_to", f"{recovery.name} is above it in the order "
-                          f"{safer!r}; escalation must not lead to less", (recovery.escalate_to,))
-    # A recovery of the FTMTree's root is a last resort: nothing may make it wait.
-    claims = {r.name: (f"{path}.claims", r.claims)
-              for path, r in numbered("recovery", spec.recoveries)}
-    for last_resort, name in product(recover[tree.root], order.names):
-        shared = claims[name][1] & claims[last_resort][1]
-        if name != last_resort and shared:
-            yield Finding(claims[name][0], f"{last_resort}, the last resort, would have to wait "
-                          f"for {name}, which claims {', '.join(sorted(shared))} as well",
-                          (sorted(claims[name][1]),))
+
+
+def _delayed_last_resort(spec: SystemSpec, root: str) -> Iterator[Finding]:
+    """A recovery of the FTMTree's root is a last resort: nothing may make it wait."""
+    last_resorts = next(m.recoveries for m in spec.mechanisms if m.name == root)
+    rows = {recovery.name: (path, recovery)
+            for path, recovery in numbered("recovery", spec.recoveries)}
+    for last_resort, (path, recovery) in product(last_resorts, rows.values()):
+        shared = recovery.claims & rows[last_resort][1].claims
+        if recovery.name != last_resort and shared:
+            yield Finding(f"{path}.claims", f"{last_resort}, the last resort, would have to wait "
+                          f"for {recovery.name}, which claims {', '.join(sorted(shared))} as well",
+                          (sorted(recovery.claims),))
 
 
 VALIDATORS: tuple[Validator, ...] = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from unittest import mock
 
+import msgspec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -34,7 +35,7 @@ EVERYBODY = [*(DetectionHeard(name, False) for name in DMS),
 @given(st.sampled_from(STRATEGIES),
        st.lists(st.tuples(INPUTS, st.sampled_from([0.0, 0.05, 0.4, 3.0])), max_size=25))
 def test_the_short_way_leads_where_the_long_way_does(strategy, walk):
-    arbiter = build_arbiter(paper(), strategy)
+    arbiter = build_arbiter(msgspec.structs.replace(paper(), strategy=strategy))
     state, now = arbiter.initial(0.0), 0.0
     for event, wait_s in [*((event, 0.0) for event in EVERYBODY), *walk]:
         now += wait_s
