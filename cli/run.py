@@ -189,7 +189,7 @@ class Run:
                 _say(f"stdout: {why}: the result is lost")
         for node in dict.fromkeys((*record.given_up, *record.failing)):
             _say(f"{node} " + ("was given up" if node in record.given_up else
-                               "ends as soon as it has started, again and again") +
+                               "fails again and again") +
                  f"; it was restarted {record.restarts.get(node, 0)} times")
         broken = bool(failure or record.given_up or record.failing)
         if not self._trial.judges:

@@ -194,7 +194,8 @@ class NodeInfo(Message, frozen=True, omit_defaults=True):
     """One row of the supervisor's table.
 
     `late_s` is how late its loop was at most in the last half or whole second, simulated
-    seconds; left out if none was. `host` is where it runs; "" is the first.
+    seconds; left out if none was. `host` is where it runs; "" is the first. `failing`: its last
+    processes each worked for a short time only.
     """
 
     name: Name
@@ -205,6 +206,7 @@ class NodeInfo(Message, frozen=True, omit_defaults=True):
     restarts: Count
     late_s: Seconds = ON_TIME
     host: Name = ""
+    failing: bool = False
 
 
 class NodeTable(Message, frozen=True):

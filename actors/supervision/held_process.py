@@ -25,11 +25,13 @@ class HeldProcess(SupervisedProcess):
     handle: ProcessHandle = field(default_factory=ProcessHandle)
     next_step: Timer | None = None
 
-    def rows(self, late_s: Callable[[str], float]) -> Iterator[NodeInfo]:
+    def rows(self, late_s: Callable[[str], float], now_s: float) -> Iterator[NodeInfo]:
         """Return the rows of its nodes in the table of all; `late_s` says how late one was."""
+        failing = self.lives.failing(now_s)
         for node in self.unit.nodes:
             yield NodeInfo(node.name, node.kind.value, self.pid, self.shown, self.incarnation,
-                           restarts_of(self.incarnation), late_s(node.name))
+                           restarts_of(self.incarnation), late_s(node.name),
+                           failing=failing)
 
     def keep_spare(self, machine: Processes, kind: Spare) -> bool:
         """Have the spare beside it that it is to have; True if that is under way and is to be all.

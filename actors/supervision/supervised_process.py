@@ -196,6 +196,44 @@ class RestartPolicy:
         self._restarts.append(now_s)
 
 
+FAILING = ((3, 1.0), (20, 10.0))
+"""So many processes of a node in a row, none of which worked for so many wall seconds, are no
+accident, and no single fault."""
+
+
+class Lives:
+    """How long the last processes of a node worked. Pure; times are seconds of the caller's clock.
+
+    A process works from its first heartbeat on; one that is never heard does not.
+    """
+
+    def __init__(self) -> None:
+        self._began_s: float | None = None
+        self._worked_s: deque[float] = deque(maxlen=max(count for count, _ in FAILING))
+
+    def forked(self) -> None:
+        """Note that there is a process."""
+        self._began_s = math.inf
+
+    def heard(self, now_s: float) -> None:
+        """Note a heartbeat of it."""
+        if self._began_s == math.inf:
+            self._began_s = now_s
+
+    def ended(self, now_s: float) -> None:
+        """Note that it ended, or is ended; harmless when repeated."""
+        if self._began_s is not None:
+            self._worked_s.append(max(0.0, now_s - self._began_s))
+            self._began_s = None
+
+    def failing(self, now_s: float) -> bool:
+        """Whether the last ones worked too short a time, and the present one has not for longer."""
+        present_s = 0.0 if self._began_s is None else now_s - self._began_s
+        worked_s = [*self._worked_s, present_s]
+        return any(len(worked_s) > count and max(worked_s[-count - 1:]) < least_s
+                   for count, least_s in FAILING)
+
+
 def _doubled(first_s: float, times: int, most_s: float) -> float:
     return min(first_s * 2.0 ** min(times, _MOST_DOUBLINGS), most_s)
 
@@ -229,6 +267,7 @@ class SupervisedProcess:
     searched_s: float = -math.inf
     heard_s: dict[str, float] = field(default_factory=dict)
     standstill: Standstill = field(default_factory=Standstill)
+    lives: Lives = field(default_factory=Lives)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -272,6 +311,7 @@ class SupervisedProcess:
     def take(self, pid: int, incarnation: int) -> None:
         """Note that another process is the present one."""
         self.pid, self.incarnation, self.heard_s = pid, incarnation, {}
+        self.lives.forked()
         self.highest = max(self.highest, incarnation)
 
     def is_late(self, now_s: float, timeout_s: float) -> bool:

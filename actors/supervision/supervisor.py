@@ -207,7 +207,8 @@ class Supervisor(Actor):
         if process.waits or (
                 header.incarnation, message.pid) != (process.incarnation, process.pid):
             return  # said before it was killed, or by another one
-        process.heard_s[header.source] = self._loop.time()
+        process.heard_s[header.source] = now_s = self._loop.time()
+        process.lives.heard(now_s)
         self._lateness.note(header.source, message.late_s)
         process.requested_by = ""
         self._on(process, Event.HEARD)
@@ -334,6 +335,8 @@ class Supervisor(Actor):
         step, by = process.step(event), by or self.name
         if step is None:
             return
+        if process.waits or process.state is State.CRASHED:
+            process.lives.ended(self._loop.time())
         for action in step.actions:
             if process.state is not step.state:  # the action before has led elsewhere
                 return
@@ -449,7 +452,8 @@ class Supervisor(Actor):
         own = fm.NodeInfo(
             self.name, Kind.SUPERVISION.value, self.context.pid, fm.NodeState.RUNNING,
             self._incarnation, restarts_of(self._incarnation), self._lateness.of(self.name))
-        rows = (row for p in self._processes.values() for row in p.rows(self._lateness.of))
+        rows = (row for p in self._processes.values()
+                for row in p.rows(self._lateness.of, self._loop.time()))
         return own, *rows
 
     def publish_table(self) -> None:

@@ -87,8 +87,8 @@ print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"
     if options.json:
         print_json(table.nodes)
     else:
-        several = any(node.host for node in table.nodes)
-        fields = [name for name in fm.NodeInfo.__struct_fields__ if several or name != "host"]
+        fields = [name for name in fm.NodeInfo.__struct_fields__ if name not in {"host", "failing"}
+                  or any(getattr(node, name) for node in table.nodes)]
         print_table(fields, [[getattr(node, name) for name in fields] for node in table.nodes])
     return 0
 
@@ -255,4 +255,5 @@ def _nodes(table: fm.NodeTable | None) -> str:
     bad = [f"{n.name} {n.state.value}" for n in table.nodes if n.state is not fm.NodeState.RUNNING]
     restarts = sum(n.restarts for n in table.nodes)
     text = f"{len(table.nodes) - len(bad)} of {len(table.nodes)} running, {restarts} restarts"
+    bad += [f"{n.name} fails again and again" for n in table.nodes if n.failing]
     return f"{text}; {', '.join(bad)}" if bad else text

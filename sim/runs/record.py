@@ -88,7 +88,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         decisions: of the FTM Manager.
         restarts: node name to number of restarts; nodes never restarted are left out.
         given_up: nodes that were not restarted any more at its end.
-        failing: nodes that at its end ended again and again, each time as soon as they had started.
+        failing: nodes that at its end failed again and again; see `supervised_process.FAILING`.
         strategy: name of the manager's strategy, empty without FTMs.
         seed: of everything random.
         rate: simulated seconds per second.
@@ -116,31 +116,6 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     audit: tuple[AuditLine, ...] = ()
 
 
-_SOON_S = 1.0
-"""A process that ends within so many simulated seconds of its start did not do what it is for."""
-
-_SHORT_LIVES = 3
-"""So many in a row are no accident, and no single fault."""
-
-
-class _Lives:
-    """How long the last processes of a node lasted."""
-
-    def __init__(self) -> None:
-        self._began_s = -math.inf
-        self._short = 0
-
-    def began(self, now_s: float) -> None:
-        self._began_s = now_s
-
-    def ended(self, now_s: float) -> None:
-        self._short = self._short + 1 if now_s - self._began_s < _SOON_S else 0
-        self._began_s = math.inf
-
-    def failing(self, now_s: float) -> bool:
-        return self._short >= _SHORT_LIVES and now_s - self._began_s < _SOON_S
-
-
 class RunRecorder:
     """Builds a `RunRecord` from the messages of a run.
 
@@ -162,7 +137,7 @@ class RunRecorder:
         self._decisions: Remembered[tuple[int, int], DecisionLine] = Remembered(KEPT)
         self._restarts: dict[str, int] = Remembered(KEPT)
         self._given_up: dict[str, None] = Remembered(KEPT)
-        self._lives: dict[str, _Lives] = Remembered(KEPT)
+        self._failing: dict[str, bool] = Remembered(KEPT)
         self._respawned: Remembered[tuple[str, int], None] = Remembered(KEPT)
         self._injections: dict[str, str] = Remembered(KEPT)
         self._lasts_s: dict[str, float] = Remembered(KEPT)
@@ -199,8 +174,7 @@ class RunRecorder:
             "intervals": tuple(sorted((*self._intervals, *still), key=lambda bar: bar.from_s)),
             "decisions": tuple(self._decisions.values()), "restarts": dict(self._restarts),
             "given_up": tuple(self._given_up),
-            "failing": tuple(name for name, lives in self._lives.items()
-                             if lives.failing(duration_s))}
+            "failing": tuple(name for name, failing in self._failing.items() if failing)}
 
     def _detection(self, report: fm.DetectionReport, header: Header) -> None:
         active = report.state is fm.DetectionState.ACTIVE
@@ -234,10 +208,6 @@ class RunRecorder:
         if not event.news:
             return
         detail = f": {event.detail}" if event.detail else ""
-        if event.event == "crashed":
-            self._lives_of(event.node).ended(header.stamp)
-        elif event.event == "respawned":
-            self._lives_of(event.node).began(header.stamp)
         if event.event in _CRASHES:
             self.turn("down", event.node, True, header.stamp, event.event)
             self._note(header.stamp, "fault", f"{event.node} {event.event}{detail}")
@@ -263,17 +233,12 @@ class RunRecorder:
         What is told while its router dies is lost; the table is repeated.
         """
         for row in table.nodes:
+            self._failing[row.name] = row.failing
             down = self._open.get(("down", row.name))
             if down and row.state is fm.NodeState.RUNNING and header.stamp > down[0]:
                 self.turn("down", row.name, False, header.stamp)
-                self._lives_of(row.name).began(header.stamp)
                 self._given_up.pop(row.name, None)
                 self._note(header.stamp, "clear", f"{row.name} runs again")
-
-    def _lives_of(self, node: str) -> _Lives:
-        if node not in self._lives:
-            self._lives[node] = _Lives()
-        return self._lives[node]
 
     def _injection(self, order: bm.Injection, _header: Header) -> None:
         self._injections[order.injection] = f"{order.mode} {order.topic}"

@@ -24,7 +24,7 @@ export class ProcessTable {
     const nodes = heard ? heard.value.nodes : [];
     const all = [...nodes, ...guards];
     this.count(heard, all);
-    const trouble = (n) => (n.state === "running" ? 1 : 0);
+    const trouble = (n) => (n.state === "running" && !n.failing ? 1 : 0);
     const sorted = all.map((node, i) => [node, i]).sort(([a, i], [b, j]) => trouble(a) - trouble(b) || i - j);
     const names = new Set(all.map((node) => node.name));
     for (const [name, row] of this.rows) {
@@ -38,10 +38,10 @@ export class ProcessTable {
         else this.body.insertBefore(row.line, there || null);
       }
       const used = usage && usage.nodes && Object.hasOwn(usage.nodes, node.name) ? usage.nodes[node.name] : undefined;
-      row.dot.className = `dot ${STATES[node.state] || ""}`;
-      row.line.classList.toggle("troubled", node.state !== "running");
+      row.dot.className = `dot ${node.failing ? "bad" : STATES[node.state] || ""}`;
+      row.line.classList.toggle("troubled", node.state !== "running" || Boolean(node.failing));
       row.line.title = `${node.kind}, incarnation ${node.incarnation}`;
-      say(row.state, node.state);
+      say(row.state, node.failing ? "failing" : node.state);
       say(row.pid, node.pid ? String(node.pid) : "–");
       say(row.restarts, String(node.restarts));
       say(row.age, age(used?.age_s));

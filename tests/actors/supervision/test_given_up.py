@@ -13,8 +13,9 @@ import pytest
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem, RespawnRequest
 from rampart.actors.runtime.run_plan import load_document
-from rampart.actors.supervision.supervised_process import RestartPolicy
+from rampart.actors.supervision.supervised_process import Lives, RestartPolicy
 from rampart.manager.spec.adaptation import Action, Change, adapt
+from rampart.manager.spec.tables import Supervision
 from rampart.sim.campaign.job import Job, run_virtually
 from rampart.sim.faults.scenario import parse_fault
 from rampart.testing import eventually, run
@@ -110,6 +111,56 @@ def test_a_process_that_fails_at_its_start_is_given_up_tried_again_and_comes_bac
             await asyncio.sleep(0.02)
             world.respawn(name, world.row(name)[1])
             await eventually(lambda: world.row(name)[0] == "running", 0.2)
+
+    run(scenario)
+
+
+def lives(*works: tuple[int, float], present_s: float = 0.0) -> bool:
+    """Return whether a node is failing after so many processes that worked for so long."""
+    one, now_s = Lives(), 0.0
+    for count, worked_s in works:
+        for _ in range(count):
+            one.forked()
+            one.heard(now_s + 9.0)  # a cold start of nine seconds counts for nothing
+            now_s += 9.0 + worked_s
+            one.ended(now_s)
+            one.ended(now_s + 5.0)
+    one.forked()
+    one.heard(now_s)
+    return one.failing(now_s + present_s)
+
+
+@pytest.mark.parametrize(("works", "present_s", "failing"), [
+    ([(3, 0.1)], 0.0, True), ([(3, 0.1)], 1.1, False), ([(2, 0.1)], 0.0, False),
+    ([(20, 1.3)], 1.3, True), ([(20, 1.3)], 10.1, False), ([(9, 2.9)], 0.1, False),
+    ([(20, 1.3), (1, 12.0), (9, 1.3)], 0.0, False), ([(1, 300.0)], 0.0, False),
+    ([(1, 300.0), (20, 9.9)], 0.0, True)])
+def test_a_node_is_failing_whose_last_processes_worked_for_a_short_time_only(
+        works, present_s, failing):
+    assert lives(*works, present_s=present_s) == failing
+
+
+@pytest.mark.parametrize("ends", ["dies after 1.3 s", "is never heard", "hangs", "well"])
+def test_the_table_shows_which_node_is_failing(ends):
+    async def scenario() -> None:
+        async with played(Supervision(intensity=50, backoff_s=0.01, backoff_max_s=0.01)) as world:
+            until_s = asyncio.get_running_loop().time() + 100.0
+            while ends != "well" and asyncio.get_running_loop().time() < until_s:
+                (process,) = world.machine.of("DM2")
+                if ends == "is never heard":
+                    process.bound = False
+                await asyncio.sleep(1.3)
+                if ends == "hangs":
+                    world.silent.add(process.pid)
+                elif ends == "dies after 1.3 s":
+                    world.machine.kill(process)
+                await eventually(lambda before=process: before not in world.machine.of("DM2"), 5)
+                await eventually(lambda: world.machine.of("DM2"), 5)
+            rows = world.supervisor._rows()
+            assert [row.name for row in rows if row.failing] == ([] if ends == "well" else ["DM2"])
+            if ends == "dies after 1.3 s":
+                await asyncio.sleep(11.0)
+                assert not [row.name for row in world.supervisor._rows() if row.failing]
 
     run(scenario)
 

@@ -66,3 +66,12 @@ def test_the_bar_of_a_fault_whose_end_nothing_reported_is_as_long_as_the_fault()
 def test_what_came_before_the_start_has_a_sign():
     assert clock(-1.8) == "\N{MINUS SIGN}0:01.8"
     assert clock(61.8) == "1:01.8"
+
+
+def test_the_record_names_the_nodes_that_were_failing_at_the_end():
+    recorder = RunRecorder(RunPlan())
+    for at_s, failing in ((5.0, ("pump", "valve")), (5.5, ("valve",))):
+        rows = tuple(NodeInfo(name, "control", 1, NodeState.RUNNING, 3, 2, failing=name in failing)
+                     for name in ("pump", "valve", "gauge"))
+        recorder.feed(topics.NODES, NodeTable(rows), Header("supervisor", 1, 1, at_s))
+    assert recorder.record(9.0).failing == ("valve",)
