@@ -168,19 +168,6 @@ def hosts_of(layout: Layout) -> dict[str, Host]:
             for name in hosts.supervisors}
 
 
-def rules_as_declared(layout: Layout) -> dict[str, Any]:
-    """Return what routers let through if each process has a certificate of its own name.
-
-    And an operator and a viewer, called so.
-    """
-    hosts = hosts_of(layout)
-    register = Register().issued([OPERATOR], OPERATOR).issued([VIEWER], VIEWER)
-    for host in hosts.values():
-        register = register.issued(host.routers, "router").issued(sorted(host.nodes), "node")
-    return rules_of(hosts[layout.plan.host], list(hosts.values()), rights_of_all(layout),
-                    register).config()
-
-
 def access_of(layout: Layout, keys: str) -> dict[str, Any]:
     """Return what the routers of a run on this host let through, as Zenoh's `access_control`.
 

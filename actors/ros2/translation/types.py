@@ -105,18 +105,6 @@ class Types:
         return dict.fromkeys(self._replaced, replaces) | {
             name: f"left out: {why}" for name, why in self.left_out.items()}
 
-    def is_message(self, name: str) -> bool:
-        """Whether it is the name of a message that is known."""
-        return name in self._store.fielddefs
-
-    def is_service(self, name: str) -> bool:
-        """Whether it is the name of a service that is known."""
-        return name in self._services
-
-    def is_action(self, name: str) -> bool:
-        """Whether it is the name of an action that is known."""
-        return name in self._actions
-
     def fields(self, name: str) -> Fields:
         """Return the fields of a message, each with the description that `rosbags` has of it.
 

@@ -12,6 +12,9 @@ from typing import Any
 import msgspec
 import zenoh
 
+from rampart.actors.access.register import Register
+from rampart.actors.access.rights import OPERATOR, VIEWER, rights_of_all
+from rampart.actors.access.rules import hosts_of, rules_of
 from rampart.actors.bus.topic import ROOT, Members, Qos, Topic
 from rampart.actors.bus.topics import INJECT
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
@@ -56,6 +59,19 @@ def disagreements(layout: Layout, config: Mapping[str, Any]) -> tuple[list[str],
                     wrong.append(f"{name}: {message} of {key!r} ({flow}) is " + (
                         "let through, and not declared" if may else "declared, and refused"))
     return wrong, speakers
+
+
+def rules_as_declared(layout: Layout) -> dict[str, Any]:
+    """Return what routers let through if each process has a certificate of its own name.
+
+    And an operator and a viewer, called so.
+    """
+    hosts = hosts_of(layout)
+    register = Register().issued([OPERATOR], OPERATOR).issued([VIEWER], VIEWER)
+    for host in hosts.values():
+        register = register.issued(host.routers, "router").issued(sorted(host.nodes), "node")
+    return rules_of(hosts[layout.plan.host], list(hosts.values()), rights_of_all(layout),
+                    register).config()
 
 
 def on_each_host(layout: Layout) -> Iterator[Layout]:

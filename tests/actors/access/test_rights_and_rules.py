@@ -9,14 +9,14 @@ import zenoh
 
 from rampart.actors.access.register import Register
 from rampart.actors.access.rights import rights_of_all
-from rampart.actors.access.rules import Host, rules_as_declared, rules_of
+from rampart.actors.access.rules import Host, rules_of
 from rampart.actors.bus.zenoh_session import session_config
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_bus import VirtualBus
 from rampart.testing import virtual_run
 from tests import two_hosts as systems
-from tests.actors.access.declared import disagreements, on_each_host
+from tests.actors.access.declared import disagreements, on_each_host, rules_as_declared
 from tests.actors.access.keyed import layout_of
 
 LAYOUT = layout_of("osmosis")

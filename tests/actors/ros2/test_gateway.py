@@ -518,6 +518,14 @@ def test_a_table_that_cannot_be_is_refused_before_anything_runs(guarded, more, w
     assert why in str(raised.value)
 
 
+def test_links_that_no_node_passes_on_are_refused(guarded):
+    gateway = "rampart.actors.ros2.gateway:Gateway"
+    text = guarded().read_text().replace(gateway, "rampart.actors.runtime.stub_node:StubNode")
+    plan = RunPlan(system_file=str(guarded(base=text)))
+    with pytest.raises(ValueError, match=rf"guarded\.toml: [^\n]+; one of actor {gateway} does\Z"):
+        Layout(plan, load_system(plan))
+
+
 def test_osmosis_on_ros_2_is_osmosis_but_for_what_speaks_ros_2():
     documents = {name: tomllib.loads((SHIPPED / f"{name}.toml").read_text("utf-8"))
                  for name in ("osmosis", "osmosis-ros2")}
