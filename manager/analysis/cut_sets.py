@@ -79,7 +79,6 @@ class CutSets:
 
     Args:
         formula: The fault tree.
-        bounds: On the nodes of a decision diagram.
         progress: Told in words what is being done.
         max_order: Sets with more events are neither made nor counted; None for all.
 
@@ -90,8 +89,8 @@ class CutSets:
         TooLargeError: No variable order keeps a diagram within the last bound.
     """
 
-    def __init__(self, formula: Formula, bounds: Sequence[int] = BOUNDS,
-                 progress: Progress = lambda _: None, max_order: int | None = None) -> None:
+    def __init__(self, formula: Formula, progress: Progress = lambda _: None,
+                 max_order: int | None = None) -> None:
         self.formula = formula
         self._max_order = max_order
         self._gates, modules = prepare(formula)
@@ -100,7 +99,7 @@ class CutSets:
         managers = _Managers()
         for number, name in enumerate(modules, 1):
             progress(f"module {number} of {len(modules)}: {name}")
-            module = self._modules[name] = self._solve(name, bounds, progress, managers)
+            module = self._modules[name] = self._solve(name, progress, managers)
             if module.family in {EMPTY, UNIT}:  # by house events below it, or all sets too large
                 self._constants[name] = module.family == UNIT
         weight = self._kept(self._weight(formula.top))
@@ -177,13 +176,12 @@ class CutSets:
                     known[one] |= known[families.high[one]] << size
         return known[node]
 
-    def _solve(self, top: str, bounds: Sequence[int], progress: Progress, managers: _Managers
-               ) -> _Module:
+    def _solve(self, top: str, progress: Progress, managers: _Managers) -> _Module:
         inside = _Inside(self._gates, self._modules, self._constants, top)
         if len(inside.leaves) > _LEVELS:
             raise TooLargeError(f"gate {top!r} with {len(inside.leaves)} inputs and modules: more "
                                 f"than {_LEVELS}")
-        for bound in bounds:
+        for bound in BOUNDS:
             progress(f"{top}: up to {bound} nodes")
             # To build a diagram is cheap, to find its minimal solutions is not: try all orders.
             built = [(diagram, order) for order in inside.orders()
@@ -202,7 +200,7 @@ class CutSets:
                     families.sizes(family, [self._weight(name) for name in order]))
                 return _Module(order, families, family, weight, {EMPTY: 0, UNIT: 1})
         raise TooLargeError(f"gate {top!r} with {len(inside.leaves)} inputs and modules: more than "
-                            f"{bounds[-1]} nodes with every variable order tried")
+                            f"{BOUNDS[-1]} nodes with every variable order tried")
 
 
 class _Managers:

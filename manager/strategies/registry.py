@@ -11,7 +11,7 @@ recovery module, which know nothing of each other. Each has a file of its own:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from types import MappingProxyType
 
@@ -79,9 +79,8 @@ class Decider:
         return self._explain(decision) if decision.active else decision
 
 
-def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,  # noqa: PLR0917
-           order: PartialOrder, strategy: str = "safety-first", late: Collection[str] = ()
-           ) -> Decision:
+def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,
+           order: PartialOrder, strategy: str = "safety-first") -> Decision:
     """Decide by the strategy of that name, with the certificate.
 
     Raises:
@@ -89,7 +88,7 @@ def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,  # noqa: P
         UnknownStrategyError: No such strategy.
     """
     decider = _decider(find_strategy(strategy), arrange(mechanisms, tree, order))
-    return decider.explain(decider.choose(mechanisms.sort(active), frozenset(late)))
+    return decider.explain(decider.choose(mechanisms.sort(active)))
 
 
 _decider = lru_cache(maxsize=64)(Decider)

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rampart.manager.analysis import cut_sets
 from rampart.manager.analysis.cut_sets import CutSets, TooLargeError
 from rampart.manager.analysis.formula import Connective, Formula, FormulaError
 
@@ -213,15 +214,16 @@ def test_the_diagrams_of_many_modules_share_their_threads_and_little_address_spa
     assert (done.returncode, done.stdout) == (0, f"{comb(100, 2) * 4}\n"), done.stderr
 
 
-def test_a_tree_beyond_every_bound_is_refused_in_one_line():
+def test_a_tree_beyond_every_bound_is_refused_in_one_line(monkeypatch):
     """Rows and columns of a grid: no order of the variables keeps that small."""
+    monkeypatch.setattr(cut_sets, "BOUNDS", (20, 50))
     n = 6
     gates = {f"row{i}": all_of(*(f"x{i}_{j}" for j in range(n))) for i in range(n)}
     gates |= {f"col{j}": any_of(*(f"x{i}_{j}" for i in range(n))) for j in range(n)}
     tree = formula({**gates, "rows": any_of(*(f"row{i}" for i in range(n))),
                     "cols": all_of(*(f"col{j}" for j in range(n))), "top": all_of("rows", "cols")})
     with pytest.raises(TooLargeError, match=r"gate '.*' with 36 inputs and modules: more than 50"):
-        CutSets(tree, bounds=(20, 50))
+        CutSets(tree)
 
 
 @pytest.mark.parametrize(("gates", "words"), [
