@@ -46,9 +46,6 @@ from rampart.actors.supervision.processes import Processes
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.manager.spec.schema import Kind
 
-_LOOK_S = 0.05
-"""Real seconds between two looks at the other hosts."""
-
 _SAID_S = 0.1
 """Simulated seconds after which it is signalled itself: the answer has gone by then."""
 
@@ -97,7 +94,6 @@ class HostSupervisor(Supervisor):
                         any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
              for name, unit in units.items()},
             self._guards, hosts.link, self._known, now_s=loop.time(), rate=plan.rate)
-        self._looked_s = loop.time()
         self._ending: list[HeldProcess] = []
         self._waits: dict[str, tuple[float, float]] = {}
         keeps_states = bool(plan.checkpoints) and spec.layers.checkpoints
@@ -141,11 +137,7 @@ class HostSupervisor(Supervisor):
 
         What ran on another host last is not begun here before the first has given it back.
         """
-        for unit in set(running) - self._placement.held:
-            self._placement.adopted(unit)
-        self._placement.waits(lambda unit, nodes: unit not in running and any(
-            is_elsewhere(self._folder, node) for node in nodes))
-        return [unit for unit in self.layout.units if unit in self._placement.held]
+        return self._placement.begin(running, lambda node: is_elsewhere(self._folder, node))
 
     def on_start(self) -> None:
         """Start what is kept here, and look at the other hosts from now on."""
@@ -155,7 +147,6 @@ class HostSupervisor(Supervisor):
             self._tell_states()
             for node in self._copies.nodes:
                 self._files.settle(node)
-        self._look_at_hosts()
 
     def on_stop(self) -> None:
         """End all processes as any supervisor, and look at no states any more."""
@@ -239,24 +230,27 @@ class HostSupervisor(Supervisor):
             except OSError as error:
                 self.report_diagnostic("incarnation", f"not noted: {error}", node)
 
-    def _look_at_hosts(self) -> None:
-        # Who stood still has mail to read before others can be said to be silent.
-        stall_s, self._looked_s = self._now_s() - self._looked_s, self._now_s()
-        if stall_s > 4 * _LOOK_S:
-            self._placement.excuse(stall_s)
+    def excuse(self, now_s: float, missed_s: float) -> None:
+        """Do not count as silence of other hosts either what could not be received."""
+        super().excuse(now_s, missed_s)
+        self._placement.excuse(now_s, missed_s)
+
+    def check(self) -> None:
+        """Look for processes and for hosts that are silent."""
+        super().check()
         changes = self._placement.look(self._now_s(), self._has_states)
-        if changes != Changes():
-            for host in changes.lost:
-                self._copies.lost(host)
-                self._tell_of(host, "unreachable")
-            for host in changes.back:
-                self._tell_of(host, "back")
-            for unit in changes.drop:
-                self._drop(unit)
-            for unit, above in changes.take:
-                self.take_on(unit, above)
-            self.publish_table()
-        self.call_later(_LOOK_S * self.clock.rate, self._look_at_hosts)
+        if changes == Changes():
+            return
+        for host in changes.lost:
+            self._copies.lost(host)
+            self._tell_of(host, "unreachable")
+        for host in changes.back:
+            self._tell_of(host, "back")
+        for unit in changes.drop:
+            self._drop(unit)
+        for unit, above in changes.take:
+            self.take_on(unit, above)
+        self.publish_table()
 
     # -- what follows ---------------------------------------------------------------------------
 

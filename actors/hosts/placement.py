@@ -21,7 +21,7 @@ So a recovery module obeys one manager at any time: that of the highest incarnat
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -149,28 +149,29 @@ class Placement:
         """Whether a unit runs at its home or nowhere."""
         return self._homes[unit].is_fixed
 
-    def waits(self, is_elsewhere: Callable[[str, tuple[str, ...]], bool]) -> None:
-        """Begin without what the first host may be running; that will be given back.
+    def begin(self, running: Collection[str], is_elsewhere: Callable[[str], bool]) -> list[str]:
+        """Return the units to begin with: those of this host, and what runs here already.
+
+        A host is lost, as far as is known, if what has its home there runs here. What may run
+        on the first host in place of this one will be given back.
 
         Args:
-            is_elsewhere: Asked of a unit of this host and its nodes: whether it ran on the first
-                one last.
+            running: Units that run here.
+            is_elsewhere: Asked of a node: whether its last known process is on another host.
         """
-        self.held = {unit for unit in self.held if self._homes[unit].is_fixed
-                     or not is_elsewhere(unit, self._homes[unit].nodes)}
+        for unit in running:
+            if (host := self._homes[unit].host) != self._own:
+                other = self._others[host]
+                other.is_lost, other.heard_s = True, -math.inf
+        self.held = {unit for unit, home in self._homes.items() if unit in running or (
+            home.host == self._own and (home.is_fixed or not any(map(is_elsewhere, home.nodes))))}
+        return [unit for unit in self._homes if unit in self.held]
 
-    def excuse(self, stall_s: float) -> None:
-        """Do not count as silence of the others a time in which nothing could be heard here."""
+    def excuse(self, now_s: float, missed_s: float) -> None:
+        """Do not count as silence of the others a time in which nothing could be received here."""
         for other in self._others.values():
-            other.heard_s += stall_s
-            other.since_s += stall_s
-            other.told_s += stall_s
-
-    def adopted(self, unit: str) -> None:
-        """Note that a unit of another host runs here already: so that is lost."""
-        self.held.add(unit)
-        other = self._others[self._homes[unit].host]
-        other.is_lost, other.heard_s = True, -math.inf
+            other.heard_s = max(other.heard_s, min(now_s, other.heard_s + missed_s))
+            other.since_s = min(now_s, other.since_s + missed_s)
 
     def heard(self, host: str, now_s: float) -> bool:
         """Note that a guard of another host was heard; return whether that was missed before."""

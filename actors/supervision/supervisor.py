@@ -277,8 +277,8 @@ class Supervisor(Actor):
             stall_s = math.inf
         missed_s = max(FAILOVER_S if self._bus.moved() else 0.0,
                        stall_s if stall_s > _LATE_S else 0.0)
-        for process in self._processes.values() if missed_s else ():
-            process.excuse(now, missed_s)
+        if missed_s:
+            self.excuse(now, missed_s)
         late = sum(process.is_late(now, self._timeout_s) for process in self._processes.values())
         many = late >= MANY
         for process in self._processes.values():
@@ -287,6 +287,11 @@ class Supervisor(Actor):
                 stopped = process.state is State.RUNNING and process.handle.stopped()
                 event = Event.SILENT_STOPPED if stopped else Event.SILENT
                 self._on(process, event, detail=silence)
+
+    def excuse(self, now_s: float, missed_s: float) -> None:
+        """Do not count as silence what could not be received for so long; wall seconds."""
+        for process in self._processes.values():
+            process.excuse(now_s, missed_s)
 
     def _look_at_routers(self) -> None:
         """Find routers that are stopped at once: who is linked to one hears and says nothing."""

@@ -73,6 +73,7 @@ def test_each_begins_with_what_has_its_home_there():
 
 def test_a_host_that_starts_is_waited_for():
     made = Side("")
+    made.excuse(1.0, 0.1)
     assert made.look(9.9) == Changes()
     assert made.look(10.1).lost == ("ground",)
 
@@ -182,7 +183,7 @@ def test_what_another_runs_already_is_not_taken_back_while_that_host_is_heard():
 
 def test_a_host_that_was_started_anew_waits_until_it_is_given_what_is_its_own():
     ground = Side("ground")
-    ground.waits(lambda _unit, _nodes: True)
+    assert ground.begin([], lambda _node: True) == ["world"]
     assert ground.held == {"world"}
     ground.told("", [row("hmi", EPOCH + 1, ""), row("DM1", EPOCH + 1, ""), row("DM2", 1, "")],
                 1.0)
@@ -215,7 +216,7 @@ def test_a_supervisor_is_believed_about_its_own_host_only():
 
 def test_a_unit_that_was_found_running_here_says_that_its_host_is_lost():
     made = Side("")
-    made.adopted("page")
+    assert made.begin(["page"], lambda _node: False) == ["pilot", "page"]
     assert made.is_lost("ground")
     assert [unit for unit, _ in made.look(0.1).take] == ["modules"]
 
@@ -256,7 +257,7 @@ def test_a_host_may_be_lost_more_often_than_anybody_counts():
 
 def test_who_stood_still_does_not_take_the_others_for_silent():
     made = robot()
-    made.excuse(5.0)
+    made.excuse(5.0, 5.0)
     assert made.look(5.0 + LINK.lost_after_s) == Changes()
     assert made.look(5.0 + LOST_S).lost == ("ground",)
 
