@@ -94,8 +94,8 @@ class HostSupervisor(Supervisor):
                         any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
              for name, unit in units.items()},
             self._guards, hosts.link, self._known, now_s=loop.time(), rate=plan.rate)
-        self._ending: list[HeldProcess] = []
-        self._waits: dict[str, tuple[float, float]] = {}
+        self._ending: set[str] = set()
+        self._waits: dict[tuple[str, int], float] = {}
         keeps_states = bool(plan.checkpoints) and spec.layers.checkpoints
         self._copies = Copies(
             plan.run_id, own, {
@@ -260,40 +260,35 @@ class HostSupervisor(Supervisor):
             for node in process.names:  # one that was asked for may have begun
                 self._issue(node, process.highest + process.waits)
             self._copies.unsettle(process.names)
-            if not self._ending:
-                self.call_later(_ENDING_S * self.clock.rate, self._settle)
-            self._ending.append(process)
+            self._ending.update(process.names)
+            self._settle(process)
 
     # -- states of nodes ------------------------------------------------------------------------
 
     def _state_kept(self, node: str, record: Record | None, is_last: bool) -> None:
         self._copies.kept(node, record)
-        if is_last and all(node not in process.names for process in self._ending):
+        if is_last and node not in self._ending:
             self._copies.settled(node)
         self._tell_states()
 
     def _state_problem(self, node: str, problem: str) -> None:
         self.report_diagnostic("checkpoint", problem, node)
 
-    def _settle(self) -> None:
-        """Have what was ended here looked at for the last time."""
-        gone = [process for process in self._ending if process.handle.gone()]
-        for process in gone:
-            self._ending.remove(process)
-            process.let_go()
-            for node in process.names:
-                if node in self._copies.nodes:
-                    self._files.settle(node)
-        if self._ending:
-            self.call_later(_ENDING_S * self.clock.rate, self._settle)
+    def _settle(self, process: HeldProcess) -> None:
+        """Have the states of a process that was handed over looked at when it has ended."""
+        if not process.handle.gone():
+            self.call_later(_ENDING_S * self.clock.rate, partial(self._settle, process))
+            return
+        process.let_go()
+        self._ending.difference_update(process.names)
+        for node in self._copies.nodes:
+            if node in process.names:
+                self._files.settle(node)
 
     def _has_states(self, unit: str) -> bool:
         """Whether a unit that was given back can go on from what it has kept there."""
         told, now_s = self._placement.told_of(unit), self._now_s()
-        since_s, asked_s = self._waits.get(unit, (now_s, now_s))
-        if now_s - asked_s > 4 * _LOOK_S:  # it was run there again meanwhile
-            since_s = now_s
-        self._waits[unit] = since_s, now_s
+        since_s = self._waits.setdefault((unit, max(told.values())), now_s)
         if self._copies.is_caught_up(told, told):
             return True
         if now_s - since_s < _WAIT_S:
