@@ -27,7 +27,8 @@ from rampart.actors.recording.virtual import VirtualRecording
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_document
 from rampart.actors.supervision.launcher import LaunchError
-from rampart.actors.system.layout import Layout, load_application
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import load_application
 from rampart.actors.system.topics import system_topics
 from rampart.actors.web.page_plan import PagePlan
 from rampart.cli.host import HostRun

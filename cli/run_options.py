@@ -31,8 +31,8 @@ from rampart.actors.recording.bag_writer import check_target
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_plan import DEFAULT_PORT, RunPlan, load_system
 from rampart.actors.supervision.launcher import LAST_PORT
-from rampart.actors.system.layout import Layout, application_class
-from rampart.actors.system.members import load_class
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import application_class, load_class
 from rampart.cli import application_options, page_options
 from rampart.cli.output import UsageError, between, positive, refusing, using, warn
 from rampart.cli.verbs import (

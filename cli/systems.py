@@ -8,8 +8,14 @@ import contextlib
 from rampart import systems
 from rampart.actors.bus.run_info import NoRunError, find_run
 from rampart.actors.runtime.run_plan import RunPlan
-from rampart.actors.system.layout import Layout, application_class, load_application
-from rampart.actors.system.members import REPORTS_ON, import_class, load_member
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import (
+    REPORTS_ON,
+    application_class,
+    import_class,
+    load_application,
+    load_member,
+)
 from rampart.actors.system.topics import declared_topics, own_topics, system_topics
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.robot_lines import RobotLines

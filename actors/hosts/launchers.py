@@ -27,7 +27,7 @@ from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_system, on_host
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.system.hosts import Hosts
-from rampart.actors.system.layout import load_application
+from rampart.actors.system.members import load_application
 from rampart.manager.spec.schema import SystemSpec
 
 _RETRY_S = 0.2

@@ -22,7 +22,8 @@ from rampart.actors.ftm.messages import NamedFault
 from rampart.actors.operator.requests import RefusedError
 from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S, FaultWatch, Order
 from rampart.actors.runtime.injection import UNTOUCHED, flaw
-from rampart.actors.system.topics import declared_topics, find_topic, published_keys
+from rampart.actors.system.layout import published_keys
+from rampart.actors.system.topics import declared_topics, find_topic
 from rampart.manager.spec.schema import SystemSpec
 
 TAKE_HOLD_S = 3.0

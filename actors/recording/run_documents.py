@@ -17,8 +17,7 @@ from rampart.actors.recording.views import Views
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.runtime.run_plan import RunPlan, load_system
-from rampart.actors.system.layout import application_class, load_application
-from rampart.actors.system.members import import_class
+from rampart.actors.system.members import application_class, import_class, load_application
 from rampart.files.reading import FileError, read_bytes
 from rampart.manager.spec.specification import SystemSpec
 

@@ -45,8 +45,7 @@ from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.node_process import Role, Told, Waits, live, node_main, wedge
 from rampart.actors.supervision.process_title import end_run, set_title
 from rampart.actors.supervision.spare import Spares, wait
-from rampart.actors.system.layout import Layout, adapted_system, load_run
-from rampart.actors.system.topics import published_keys
+from rampart.actors.system.layout import Layout, adapted_system, load_run, published_keys
 from rampart.files import streams, working_folder
 from rampart.manager.spec.tables import Supervision
 

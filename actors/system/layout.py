@@ -15,7 +15,6 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.application import Application
-from rampart.actors.runtime.declaration import Handlers
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_document, on_host, tailor
@@ -25,17 +24,21 @@ from rampart.actors.system.checks import (
     check_repairs,
     publishers_of,
 )
-from rampart.actors.system.chosen_topics import choose_topics
 from rampart.actors.system.hosts import Hosts
 from rampart.actors.system.members import (
     SPARES,
     Member,
     Spare,
-    import_class,
+    application_class,
+    heard,
+    judge_class,
+    judged_topics,
+    load_application,
     load_class,
     load_member,
-    topics_of,
+    published,
 )
+from rampart.actors.system.topics import choose_topics, stand_in_topics
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 from rampart.manager.spec.specification import check_change, check_document
 from rampart.manager.spec.tables import Layers
@@ -217,66 +220,38 @@ def load_run(plan: RunPlan, spec: SystemSpec) -> RunContext:
     return RunContext(plan, spec, load_document(plan), load_application(plan, spec))
 
 
-def stand_in_topics(spec: SystemSpec) -> list[Topic[Any]]:
-    """Return the topics that are declared by what plays commands in virtual time.
+def published_keys(spec: SystemSpec, layout: Layout | None = None) -> tuple[str, ...]:
+    """Return the keys that the nodes of a system and its supervisor publish, families spelt out.
+
+    Those of the last system are remembered: a page asks for them when it starts, and starts again.
+
+    Args:
+        spec: the system.
+        layout: of it, if there is one; it takes 60 ms to make another.
 
     Raises:
-        ValueError: there is no such class.
+        ValueError: the spec names an actor class that does not exist.
     """
-    classes = [load_class(node.stand_in, field="stand_in") for node in spec.nodes if node.stand_in]
-    return [topic for one in classes for topics in topics_of(one) for topic in topics]
+    global _last  # noqa: PLW0603 one entry, by identity: a spec is no key of a dictionary
+    if _last[0] is not spec:
+        _last = spec, _published_keys(layout or Layout(RunPlan(system_file=spec.name), spec))
+    return _last[1]
 
 
-def judge_class(spec: SystemSpec) -> type[Handlers] | None:
-    """Return the class that a system names under `[judge]`, None if none.
-
-    Raises:
-        ValueError: there is no such class.
-    """
-    path = spec.judge.get("class")
-    if spec.judge and path is None:
-        raise ValueError("$.judge.class: missing; name a class derived from rampart.Judge")
-    if not spec.judge:
-        return None
-    found = import_class(str(path), Handlers, "$.judge.class", "judge")
-    if not callable(getattr(found, "verdict", None)):
-        raise ValueError(f"$.judge.class = {path!r}: no judge; name a class derived from "
-                         "rampart.Judge")
-    return found
+_last: tuple[SystemSpec | None, tuple[str, ...]] = None, ()
 
 
-def judged_topics(spec: SystemSpec, observer: type[Handlers]) -> list[Topic[Any]]:
-    """Return the topics that the judge hears and the observer would not.
-
-    Raises:
-        ValueError: there is no such judge.
-    """
-    judge = judge_class(spec)
-    return [] if judge is None else [t for t in judge.inputs() if t not in observer.inputs()]
-
-
-def application_class(spec: SystemSpec) -> type[Application]:
-    """Return the class that a system names under `[application]`, `Application` if none.
-
-    Raises:
-        ValueError: there is no such class.
-    """
-    path = spec.application.get("class")
-    if path is None:
-        return Application
-    return import_class(str(path), Application, "$.application.class")
-
-
-def load_application(plan: RunPlan, spec: SystemSpec) -> Application:
-    """Return the application of a run: the options of the spec, replaced by those of the plan.
-
-    Raises:
-        ValueError: an option is unknown or unsound; the message names file, field and value.
-    """
-    kind = application_class(spec)
-    said = {name: value for name, value in spec.application.items() if name != "class"}
-    try:
-        options = msgspec.convert({**said, **plan.options}, kind.Options)
-    except msgspec.ValidationError as error:
-        raise ValueError(f"{plan.system_file}: $.application: {error}") from None
-    return kind(options)
+def _published_keys(layout: Layout) -> tuple[str, ...]:
+    members = [m for m in layout.members.values() if m.name != OBSERVER]
+    wanted: dict[str, dict[str, None]] = {}
+    for member in members:
+        for key, names in heard(member).items():
+            wanted.setdefault(key, {}).update(dict.fromkeys(names or ()))
+    found: dict[str, None] = {}
+    for member in members:
+        for key, names in published(member).items():
+            # A node that may publish any member of a family publishes those that somebody hears.
+            chosen = wanted.get(key, {}) if names is None else names
+            spelt = [key.replace("{name}", n) for n in chosen] if "{name}" in key else [key]
+            found.update(dict.fromkeys(spelt))
+    return tuple(sorted(found))

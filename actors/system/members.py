@@ -1,4 +1,4 @@
-"""Who says and hears what, computed from what the actor classes declare."""
+"""The actors of a system: their classes, loaded by name, and what each publishes and hears."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.foreign.command_node import CommandNode
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
+from rampart.actors.runtime.application import Application
+from rampart.actors.runtime.declaration import Handlers
 from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.files import working_folder
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
@@ -207,3 +210,58 @@ def import_class(path: str, base: type[T], field: str, what: str = "") -> type[T
                          "known: "
                          f"{', '.join(known) or 'none'}")
     return found
+
+
+def application_class(spec: SystemSpec) -> type[Application]:
+    """Return the class that a system names under `[application]`, `Application` if none.
+
+    Raises:
+        ValueError: there is no such class.
+    """
+    path = spec.application.get("class")
+    if path is None:
+        return Application
+    return import_class(str(path), Application, "$.application.class")
+
+
+def load_application(plan: RunPlan, spec: SystemSpec) -> Application:
+    """Return the application of a run: the options of the spec, replaced by those of the plan.
+
+    Raises:
+        ValueError: an option is unknown or unsound; the message names file, field and value.
+    """
+    kind = application_class(spec)
+    said = {name: value for name, value in spec.application.items() if name != "class"}
+    try:
+        options = msgspec.convert({**said, **plan.options}, kind.Options)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{plan.system_file}: $.application: {error}") from None
+    return kind(options)
+
+
+def judge_class(spec: SystemSpec) -> type[Handlers] | None:
+    """Return the class that a system names under `[judge]`, None if none.
+
+    Raises:
+        ValueError: there is no such class.
+    """
+    path = spec.judge.get("class")
+    if spec.judge and path is None:
+        raise ValueError("$.judge.class: missing; name a class derived from rampart.Judge")
+    if not spec.judge:
+        return None
+    found = import_class(str(path), Handlers, "$.judge.class", "judge")
+    if not callable(getattr(found, "verdict", None)):
+        raise ValueError(f"$.judge.class = {path!r}: no judge; name a class derived from "
+                         "rampart.Judge")
+    return found
+
+
+def judged_topics(spec: SystemSpec, observer: type[Handlers]) -> list[Topic[Any]]:
+    """Return the topics that the judge hears and the observer would not.
+
+    Raises:
+        ValueError: there is no such judge.
+    """
+    judge = judge_class(spec)
+    return [] if judge is None else [t for t in judge.inputs() if t not in observer.inputs()]

@@ -1,17 +1,25 @@
-"""All topics of a system: the common ones, and what its actors declare besides."""
+"""All topics of a system: the common ones, what its actors declare, and what parameters name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import contextlib
+import difflib
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from rampart.actors import TAKES
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
-from rampart.actors.runtime.run_plan import OBSERVER, RunPlan
-from rampart.actors.system.checks import flaw
-from rampart.actors.system.layout import Layout, application_class
-from rampart.actors.system.members import heard, load_class, load_member, published, topics_of
+from rampart.actors.runtime.actor import BASE_OUTPUTS
+from rampart.actors.system.checks import check_named, check_said, flaw
+from rampart.actors.system.members import (
+    Member,
+    application_class,
+    load_class,
+    load_member,
+    topics_of,
+)
 from rampart.manager.spec.specification import SystemSpec
 
 _SHIPPED = "rampart."
@@ -54,43 +62,6 @@ def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     return _with_made((*known, *own), spec)[len(known):]
 
 
-def published_keys(spec: SystemSpec, layout: Layout | None = None) -> tuple[str, ...]:
-    """Return the keys that the nodes of a system and its supervisor publish, families spelt out.
-
-    Those of the last system are remembered: a page asks for them when it starts, and starts again.
-
-    Args:
-        spec: the system.
-        layout: of it, if there is one; it takes 60 ms to make another.
-
-    Raises:
-        ValueError: the spec names an actor class that does not exist.
-    """
-    global _last  # noqa: PLW0603 one entry, by identity: a spec is no key of a dictionary
-    if _last[0] is not spec:
-        _last = spec, _published_keys(layout or Layout(RunPlan(system_file=spec.name), spec))
-    return _last[1]
-
-
-_last: tuple[SystemSpec | None, tuple[str, ...]] = None, ()
-
-
-def _published_keys(layout: Layout) -> tuple[str, ...]:
-    members = [m for m in layout.members.values() if m.name != OBSERVER]
-    wanted: dict[str, dict[str, None]] = {}
-    for member in members:
-        for key, names in heard(member).items():
-            wanted.setdefault(key, {}).update(dict.fromkeys(names or ()))
-    found: dict[str, None] = {}
-    for member in members:
-        for key, names in published(member).items():
-            # A node that may publish any member of a family publishes those that somebody hears.
-            chosen = wanted.get(key, {}) if names is None else names
-            spelt = [key.replace("{name}", n) for n in chosen] if "{name}" in key else [key]
-            found.update(dict.fromkeys(spelt))
-    return tuple(sorted(found))
-
-
 def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
     """Return the topic of a key below the root, one member's if it is a family, or None."""
     return next((topic for topic in known if topic.member(key) is not None), None)
@@ -128,3 +99,73 @@ def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[An
             found[topic.key] = topic
     return tuple(found.values())
 
+
+def stand_in_topics(spec: SystemSpec) -> list[Topic[Any]]:
+    """Return the topics that are declared by what plays commands in virtual time.
+
+    Raises:
+        ValueError: there is no such class.
+    """
+    classes = [load_class(node.stand_in, field="stand_in") for node in spec.nodes if node.stand_in]
+    return [topic for one in classes for part in topics_of(one) for topic in part]
+
+
+def choose_topics(members: Collection[Member], known: Iterable[Topic[Any]], file: str
+                  ) -> tuple[dict[str, Member], dict[str, Topic[Any]]]:
+    """Return the members with the topics that their parameters name, and those topics by key.
+
+    Args:
+        members: all of a system.
+        known: topics besides those of their classes.
+        file: name of the spec, for messages.
+
+    Raises:
+        ValueError: no actor of the system has such a topic, no actor publishes what is to be heard,
+            or its messages have no such field; the message names node, parameter and value.
+    """
+    every: dict[str, Topic[Any]] = {topic.key: topic for topic in known}
+    for member in members:
+        for topic in (*member.actor.outputs, *BASE_OUTPUTS, *member.actor.inputs()):
+            every.setdefault(topic.key, topic)
+    for member in members:
+        with _of(member, file):
+            for topic in member.actor.own_topics(member.parameters):
+                every.setdefault(topic.key, topic)
+    found: dict[str, Topic[Any]] = {}
+    chosen: dict[str, Member] = {}
+    for member in members:
+        ways: dict[str, dict[str, Members]] = {"heard": {}, "published": {}}
+        for way, names in member.actor.named(member.parameters).items():
+            for one in names:
+                where = f"{file}: {member.name}: {one.row or member.table}{one.name}"
+                found[one.key] = topic = _topic(one.key, every, where)
+                if way == "heard" and topic.is_family and topic in member.actor.inputs():
+                    raise ValueError(f"{where}: {member.actor.__name__} hears {one.key!r} anyway")
+                check_named(topic, one, members, where)
+                name = topic.member(one.key)
+                there = ways[way].get(topic.key, ())
+                ways[way][topic.key] = (*(there or ()), name) if name else None
+        with _of(member, file):
+            member.actor.check_topics(member.parameters, found)
+            check_said(member.parameters, found)
+        chosen[member.name] = replace(member, hears=ways["heard"], publishes=ways["published"])
+    return chosen, found
+
+
+@contextlib.contextmanager
+def _of(member: Member, file: str) -> Iterator[None]:
+    """Name the node in what is wrong with its parameters."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{file}: {member.name}: {error}") from None
+
+
+def _topic(key: str, known: Mapping[str, Topic[Any]], where: str) -> Topic[Any]:
+    topic = known.get(key) or next(
+        (t for t in known.values() if t.member(key) is not None), None)
+    if topic is None:
+        near = difflib.get_close_matches(key, known, 3)
+        hint = f"; the nearest: {', '.join(near)}" if near else ""
+        raise ValueError(f"{where}: no actor has a topic {key!r}{hint}")
+    return topic

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 
-from rampart.actors.system.layout import application_class
+from rampart.actors.system.members import application_class
 from rampart.cli import application_options, systems
 from rampart.cli.verbs import (
     add_options,

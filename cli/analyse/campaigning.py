@@ -17,7 +17,7 @@ import msgspec
 from tqdm import tqdm
 
 from rampart.actors.runtime.run_plan import RunPlan
-from rampart.actors.system.layout import application_class, load_application
+from rampart.actors.system.members import application_class, load_application
 from rampart.cli import application_options, systems
 from rampart.cli.analyse.campaign_tables import show_faults, show_runs
 from rampart.cli.output import (

@@ -19,8 +19,8 @@ from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionState
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.process_title import find_processes
-from rampart.actors.system.layout import Layout, load_application
-from rampart.actors.system.members import Member
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import Member, load_application
 from rampart.cli.bench.figures import Killed, killed
 from rampart.cli.bench.killing import Show, Victim, crashed, heard, in_rounds
 from rampart.cli.bench.processes.observer import Heard

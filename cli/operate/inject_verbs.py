@@ -16,7 +16,8 @@ from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
 from rampart.actors.runtime.fault_watch import Order
 from rampart.actors.runtime.injection import MODES, flaw
-from rampart.actors.system.topics import find_topic, published_keys
+from rampart.actors.system.layout import published_keys
+from rampart.actors.system.topics import find_topic
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
 from rampart.cli.operate.injecting import hit_process, run_fault

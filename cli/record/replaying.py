@@ -40,8 +40,7 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import NO_SYSTEM, RunContext
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
-from rampart.actors.system.layout import application_class
-from rampart.actors.system.members import load_class
+from rampart.actors.system.members import application_class, load_class
 from rampart.actors.web.page_plan import PagePlan
 from rampart.cli import systems
 from rampart.cli.output import UsageError, refusing

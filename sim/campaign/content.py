@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 
 import rampart
-from rampart.actors.system.layout import application_class, judge_class
+from rampart.actors.system.members import application_class, judge_class
 from rampart.manager.spec.specification import check_document
 from rampart.sim.campaign.job import Job, application_of_job, read_document_of
 from rampart.sim.runs.trial import trial_class

@@ -19,7 +19,7 @@ from rampart import systems
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_system, tailor
-from rampart.actors.system.layout import application_class, load_application
+from rampart.actors.system.members import application_class, load_application
 from rampart.files import toml, working_folder
 from rampart.files.reading import read_text
 from rampart.manager.spec.adaptation import Action, Change, adapt

@@ -10,7 +10,8 @@ from itertools import product
 import msgspec
 
 from rampart.actors.bus.topic import ROOT
-from rampart.actors.system.topics import published_keys, system_topics
+from rampart.actors.system.layout import published_keys
+from rampart.actors.system.topics import system_topics
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.campaign.defaults import SEEDS
 from rampart.sim.campaign.job import Job

@@ -16,9 +16,9 @@ import msgspec
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm.messages import FaultOrder, NamedFault
 from rampart.actors.runtime.injection import flaw
-from rampart.actors.system.layout import application_class
-from rampart.actors.system.members import import_class
-from rampart.actors.system.topics import find_topic, published_keys, system_topics
+from rampart.actors.system.layout import published_keys
+from rampart.actors.system.members import application_class, import_class
+from rampart.actors.system.topics import find_topic, system_topics
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import NONSENSE, READING, closed, topic_fault

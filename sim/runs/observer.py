@@ -16,8 +16,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.runtime.actor import BASE_INPUTS, Actor, Context, Header, on
 from rampart.actors.runtime.parameters import TopicsHeard
-from rampart.actors.system.layout import application_class
-from rampart.actors.system.members import import_class
+from rampart.actors.system.members import application_class, import_class
 from rampart.manager.spec.schema import SystemSpec
 
 Sink = Callable[[Topic[Any], Any, Header], None]

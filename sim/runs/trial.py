@@ -25,8 +25,12 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import OBSERVER
-from rampart.actors.system.layout import application_class, judge_class, judged_topics
-from rampart.actors.system.members import import_class
+from rampart.actors.system.members import (
+    application_class,
+    import_class,
+    judge_class,
+    judged_topics,
+)
 from rampart.actors.system.topics import system_topics
 from rampart.actors.web.audit import read_audit
 from rampart.manager.spec.schema import Kind, SystemSpec

@@ -8,8 +8,9 @@ import pytest
 
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
+from rampart.actors.system.layout import published_keys
 from rampart.actors.system.members import load_class
-from rampart.actors.system.topics import own_topics, published_keys, system_topics
+from rampart.actors.system.topics import own_topics, system_topics
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import markdown, uses
 from tests import ROOT, porter_actors, system_file

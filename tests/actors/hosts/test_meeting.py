@@ -32,7 +32,7 @@ from rampart.actors.hosts.meeting import (
 )
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.hosts import Hosts
-from rampart.actors.system.layout import load_application
+from rampart.actors.system.members import load_application
 from rampart.actors.web.page_plan import PagePlan
 from rampart.systems import DEFAULT
 from rampart.testing import eventually

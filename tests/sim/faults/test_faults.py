@@ -19,7 +19,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.corruption import corrupt
 from rampart.actors.runtime.injection import MODES, FaultGate, flaw
-from rampart.actors.system.topics import published_keys
+from rampart.actors.system.layout import published_keys
 from rampart.cli.look.topic_catalogue import resolve, uses
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import DELAY_S, NONSENSE, modes_of, systematic_faults
