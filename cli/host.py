@@ -9,9 +9,10 @@ import argparse
 import asyncio
 import contextlib
 import json
-import signal
+import socket
 import sys
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -33,8 +34,6 @@ _LEFT_TO_THE_FIRST = ("wait", "strategy", "shadow", "no_ftm", "rate", "seed", "p
                       "duration", "record", "overwrite", "virtual", "network", "fault")
 
 EXIT_OVER, EXIT_FAILED = 0, 1
-
-_ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 class HostRun:
@@ -61,27 +60,23 @@ class HostRun:
             plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"),
             page=audited(plan.page, kept / f"audit-{plan.host}.jsonl"))
 
-    async def run(self) -> int:
+    async def run(self, link: socket.socket) -> int:
         """Take part until the run is over, and return the exit code.
+
+        Args:
+            link: connection to the root.
 
         Raises:
             UsageError: this host may not take part.
             LaunchError: its processes cannot be started.
         """
-        host = OtherHost(self._plan, _say)
-        loop, task, why = asyncio.get_running_loop(), asyncio.current_task(), ""
+        host = OtherHost(self._plan, _say, link)
+        launcher, task, why = host.launcher, asyncio.current_task(), ""
         assert task is not None  # noqa: S101 for the type checker
-
-        def interrupt() -> None:
-            for number in _ENDING:
-                loop.add_signal_handler(number, lambda: None)
-            task.cancel()
-
-        for number in _ENDING:
-            loop.add_signal_handler(number, interrupt)
+        launcher.on_interrupt = lambda _signal: _cancel(task)
         try:
-            launcher = await host.join()
-            launcher.begin()
+            await launcher.connect()
+            await host.join()
             await host.start()
             why = await self._stay(host, launcher)
         except asyncio.CancelledError:
@@ -90,8 +85,7 @@ class HostRun:
             raise UsageError(f"--host {self._plan.host}: {error}") from None
         finally:
             await host.close()
-            if host.launcher is not None:
-                await host.launcher.end()
+            await launcher.end()
         _say(f"the run is over: {why or self._failure or 'interrupted'}")
         if self._json:
             print(json.dumps({"format": FORMAT, "host": self._plan.host, "over": why}), flush=True)
@@ -106,13 +100,13 @@ class HostRun:
                 _say(f"{stamp_s:8.2f} s  {event.node} {event.event} "
                      f"{one_line(event.detail)}".rstrip())
 
-        launcher.guard.report = _say
-        launcher.guard.on_restart = lambda name: _say(f"{clock.now():8.2f} s  {name} brought back")
+        launcher.report = _say
+        launcher.on_restart = lambda name: _say(f"{clock.now():8.2f} s  {name} brought back")
         name = on_host(OBSERVER, plan.host)
         observer = HostObserver(Context(
             name, 1, clock, launcher.observers_bus(), {"supervisor": plan.supervisor},
             register=register_of(plan.folder), members=frozenset(launcher.names)),
-            launcher.supervisor_heard, event)
+            event)
         task = asyncio.create_task(observer.run())
         watch(task, f"the launcher's {name}", launcher.failed)
         _say(f"host {plan.host} takes part in run {plan.run_id}; ctrl-C ends it here")
@@ -124,6 +118,10 @@ class HostRun:
             observer.stop()
             with contextlib.suppress(Exception):
                 await task
+
+
+def _cancel(task: asyncio.Task[Any]) -> None:
+    task.cancel()
 
 
 def _say(line: str) -> None:

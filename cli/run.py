@@ -8,10 +8,11 @@ import contextlib
 import json
 import os
 import signal
+import socket
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
@@ -24,9 +25,11 @@ from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.other_hosts import others_of
 from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.virtual import VirtualRecording
+from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_document
 from rampart.actors.supervision.launcher import LaunchError
+from rampart.actors.supervision.root import Root
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import load_application
 from rampart.actors.system.topics import system_topics
@@ -101,15 +104,25 @@ class Run:
         with _kept(self._directory):
             if self._options.virtual:
                 return self._in_virtual_time()
-            if self._options.rate == MAX_RATE:
-                asyncio.run(self._find_rate())
-            run = ProcessRun(self._trial, self._scenario)
-            with _interruptible_between_bytecodes(run, signal.SIGINT):  # until the loop turns
-                run.begin()
-                try:
-                    return asyncio.run(self._on_processes(run))
-                finally:
-                    run.launcher.abort()
+            root = Root(self._context)
+            code = root.run(lambda link: _in_child(lambda: self._watch(link)))
+            return self._not_watched(root) if code is None else code
+
+    async def _watch(self, link: socket.socket) -> int:
+        if self._options.rate == MAX_RATE:
+            await self._find_rate()
+        return await self._on_processes(ProcessRun(self._trial, self._scenario, link))
+
+    def _not_watched(self, root: Root) -> int:
+        """Conclude a run whose watching process has ended without a verdict."""
+        why = ("the process that watched the run was killed" if root.death else
+               "the process that watched the run has failed")
+        _say(f"{why}{root.death and f' by {root.death}'}: the run was ended")
+        plan = root.plan
+        lasted_s = Clock(plan.origin_s, plan.rate).now() if plan.origin_s else 0.0
+        record = self._trial.conclude(max(0.0, lasted_s), why)
+        return self._conclude(msgspec.structs.replace(
+            record, safety="not known", reasons=(*record.reasons, why)), why)
 
     def _made(self, plan: RunPlan, stream: TextIO | None) -> Trial:
         options, kind = self._options, self._kind
@@ -133,7 +146,6 @@ class Run:
         with _recorded(self._options, self._plan, self._trial.run.system) as recorder:
             if recorder is not None:
                 run.launcher.recording = lambda: (recorder.path, recorder.problem())
-            _interruptible(run)
             record = await run.run()
         return self._conclude(record, run.failure,
                               recording=_recording(*run.launcher.recording()))
@@ -153,7 +165,7 @@ class Run:
             raise TypeError("a run from the command line tells its story")
         console.banner(self._trial.about, self._plan, self._trial.run.system, virtual=True)
         try:
-            with _interruptible_between_bytecodes(run, *_ends()):
+            with _interruptible(run, *_ends()):
                 result = run.run()
         finally:
             console.close()
@@ -252,25 +264,6 @@ def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
         recorder.end()
 
 
-def _interruptible(run: ProcessRun) -> None:
-    """Have SIGINT, SIGTERM, and the end of the terminal, end a run; the second one is meant.
-
-    SIGTSTP (ctrl-Z) is refused: it stops the judge, and not the robot.
-    """
-
-    def interrupt(name: str) -> None:
-        if run.interrupted:
-            run.launcher.abort()
-            raise SystemExit(EXIT_FAILED)
-        run.interrupted = f"interrupted by {name}"
-
-    for number in _ends():
-        asyncio.get_running_loop().add_signal_handler(
-            number, interrupt, signal.Signals(number).name)
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTSTP, _say, (
-        "ctrl-Z has no effect; `rampart mission pause` holds the mission, ctrl-C ends the run"))
-
-
 def _ends() -> list[signal.Signals]:
     """Return the signals that end a run; under nohup the end of the terminal does not."""
     ends = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -278,9 +271,8 @@ def _ends() -> list[signal.Signals]:
 
 
 @contextlib.contextmanager
-def _interruptible_between_bytecodes(run: VirtualRun | ProcessRun, *ends: signal.Signals
-                                     ) -> Iterator[None]:
-    """As `_interruptible`, where no loop reads signals from its pipe; what is ignored stays so."""
+def _interruptible(run: VirtualRun, *ends: signal.Signals) -> Iterator[None]:
+    """Have signals end a run, the second one at once; those that are ignored stay so."""
 
     def interrupt(number: int, _frame: object) -> None:
         if run.interrupted:
@@ -296,11 +288,25 @@ def _interruptible_between_bytecodes(run: VirtualRun | ProcessRun, *ends: signal
             signal.signal(number, handler)
 
 
+def _in_child(run: Callable[[], Coroutine[Any, Any, int]]) -> int:
+    """Run what watches a run, in the root's child, and return the verdict."""
+    try:
+        return asyncio.run(run())
+    except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
+        _say(str(error))
+        return EXIT_USAGE
+
+
 def _on_another_host(options: argparse.Namespace, plan: RunPlan, reports: Path) -> int:
     directory = Path(options.report) if options.report else (
         reports / f"{time.strftime('%Y%m%d-%H%M%S')}-{plan.host}")
     with _kept(directory):
-        return asyncio.run(HostRun(options, plan, directory).run())
+        host, root = HostRun(options, plan, directory), Root()
+        code = root.run(lambda link: _in_child(lambda: host.run(link)))
+        if code is None:
+            _say("the process that held this host's part of the run was killed: it was ended here")
+            return EXIT_FAILED
+        return code
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "launch.py",

@@ -30,7 +30,7 @@ from rampart.actors.access.register import KeysError
 from rampart.actors.recording.bag_writer import check_target
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_plan import DEFAULT_PORT, RunPlan, load_system
-from rampart.actors.supervision.launcher import LAST_PORT
+from rampart.actors.supervision.root import LAST_PORT
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import application_class, load_class
 from rampart.cli import application_options, page_options
@@ -207,6 +207,9 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
         shadow=options.shadow, waits=options.wait, virtual=options.virtual, host=host)
     spec = load_system(plan)
+    for node in spec.nodes:
+        if node.spare not in {"", "none", "pool"}:
+            note(f"{system_file}: node {node.name}: spare = {node.spare!r} means 'pool' now")
     layout = Layout(plan, spec)
     _check_network(options, spec)
     if options.keys:

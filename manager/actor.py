@@ -64,7 +64,6 @@ _CALM_REPEATS = 5
 class FtmManager(Actor):
     """Hears all detection and recovery modules, commands the recovery modules."""
 
-    most_spare = "warm"
     outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.SHADOW, topics.RESPAWN,
                topics.MANAGER_STATUS, topics.ADAPTATION, topics.ADAPTED_SYSTEM)
 

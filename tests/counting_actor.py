@@ -30,7 +30,6 @@ class Counting(Actor):
     """Counts on from where it was."""
 
     outputs = (COUNTED,)
-    most_spare = "warm"
 
     def on_start(self) -> None:
         state = self.kept(FORM)

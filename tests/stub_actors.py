@@ -81,7 +81,6 @@ async def launched(plan: RunPlan) -> AsyncIterator[Launcher]:
     """Start a run without observer and end it."""
     os.environ["PYTHONPATH"] = str(ROOT)
     launcher = Launcher(plan, "test")
-    launcher.begin()
     try:
         await launcher.load()
         await launcher.start()

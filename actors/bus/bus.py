@@ -39,15 +39,12 @@ class Bus(Protocol):
     def is_open(self) -> bool:
         """Whether it has been opened, and not closed since."""
 
-    async def open(self, *, announce: bool = True) -> None:
+    async def open(self) -> None:
         """Join the bus, if that has not been done, and announce this node.
 
         Raises:
             BusError: an endpoint is taken or invalid.
         """
-
-    def announce(self) -> None:
-        """Tell those who watch this node that it is there."""
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Send to all present subscribers of the key, without waiting for them."""
@@ -99,14 +96,11 @@ class SharedBus:
         self._owner = owner
         self._open = False
 
-    async def open(self, *, announce: bool = True) -> None:  # noqa: ARG002
+    async def open(self) -> None:
         """Wait until the owner has opened it."""
         while not self._owner.is_open:  # noqa: ASYNC110 polled, some milliseconds at most
             await asyncio.sleep(_LOOK_S)
         self._open = True
-
-    def announce(self) -> None:
-        """Nothing: who shares a session is not announced."""
 
     @property
     def is_open(self) -> bool:

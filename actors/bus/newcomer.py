@@ -1,4 +1,4 @@
-"""What one that joins asks for, and what one that waits to be a node holds back."""
+"""Latest-value queries of a joining node."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Any
 
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.envelope import Header
-from rampart.actors.bus.limits import Remembered
-from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.bus.topic import Topic
 
 PATIENCE_S = 0.02
 """Simulated seconds that one that replaces another waits at most for what was published before."""
@@ -17,8 +16,6 @@ _OFTEN_HZ = 7.0
 _PERIODS = 3
 """What is published so often at least is of no use to a newcomer when it is so many periods old:
 its publisher is silent, and only the next message shows that it is not."""
-
-_UNSENT = 256
 
 Handler = Callable[[Any, Header], None]
 
@@ -57,33 +54,3 @@ class Questions:
         self.open -= 1
         if self.open == 0:
             self._then()
-
-
-class HeldBack:
-    """What one that waits to be a node would have kept and sent: see `Actor.promote`.
-
-    Bounded: the newest message of each topic, and of commands the last.
-
-    Args:
-        kind: "warm" if the node's process has ended before; "hot" if there is one, which gives the
-            commands itself.
-    """
-
-    def __init__(self, kind: str) -> None:
-        self._kind = kind
-        self._unsent: Remembered[tuple[str, int], tuple[Topic[Any], bytes]] = Remembered(_UNSENT)
-        self.keep: Callable[[], None] = lambda: None
-
-    def send(self, topic: Topic[Any], key: str, sequence: int, payload: bytes) -> None:
-        """Hold a message back."""
-        is_command = topic.qos is Qos.COMMAND
-        if not (is_command and self._kind == "hot"):
-            self._unsent[key, sequence if is_command else 0] = topic, payload
-
-    def let_go(self, bus: Bus) -> None:
-        """Keep the state, and send everything."""
-        self.keep()
-        if bus.is_open:  # else it announces itself when that is so, or has ended already
-            bus.announce()
-            for (key, _), (topic, payload) in self._unsent.items():
-                bus.publish(topic, key, payload)

@@ -143,7 +143,7 @@ class ZenohBus:
         """Be the bus of this node from now on; the session may be open already."""
         self._node, self._incarnation, self._recorder = node, incarnation, recorder
 
-    async def open(self, *, announce: bool = True) -> None:
+    async def open(self) -> None:
         """Open the session, unless it is open, and announce this node.
 
         Raises:
@@ -151,8 +151,9 @@ class ZenohBus:
         """
         if self._session is None:
             await self._open()
-        if announce:
-            self.announce()
+        if self._node:
+            self._held.append(self._require().liveliness().declare_token(
+                f"{_ALIVE}/{self._node}/{self._incarnation}"))
 
     async def _open(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -173,12 +174,6 @@ class ZenohBus:
                            else f"cannot open {where} {node}: {text}") from None
         self._routers = self._linked()
         self._loop.add_reader(self._bell.number, self._drain)
-
-    def announce(self) -> None:
-        """Tell those who watch this node that it is there."""
-        if self._node:
-            self._held.append(self._require().liveliness().declare_token(
-                f"{_ALIVE}/{self._node}/{self._incarnation}"))
 
     async def _joined(self, loop: asyncio.AbstractEventLoop) -> zenoh.Session:
         """Return the session of a client, as soon as there is a router."""
@@ -312,15 +307,6 @@ class ZenohBus:
 
     def _linked(self) -> list[str]:
         return [str(router) for router in self._require().info.routers_zid()]
-
-    def forget(self) -> None:
-        """Hear, watch and answer nothing more; the session stays open."""
-        for one in (*self._held, *self._publishers.values()):
-            one.undeclare()
-        for leaving in self._leaving.values():
-            leaving.cancel()
-        self._leaving.clear()
-        self._clear()
 
     async def close(self) -> None:
         """Close the session."""

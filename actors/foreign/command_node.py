@@ -52,7 +52,7 @@ class CommandNode(Actor):
         hears: TopicsHeard = ()
 
     parameters: Parameters
-    most_spare = "none"
+    holds_devices = True
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, on
@@ -21,23 +20,10 @@ class HostObserver(Actor):
     parameters: Parameters
 
     def __init__(self, context: Context,
-                 table: Callable[[fm.NodeTable], None] = lambda _table: None,
                  event: Callable[[fm.ProcessEvent, float], None] = lambda _event, _stamp: None
                  ) -> None:
         super().__init__(context)
-        self._table, self._event = table, event
-
-    @classmethod
-    def names(cls, topic: Topic[fm.NodeTable], name: str, parameters: Actor.Parameters) -> Members:
-        """Hear the table of its supervisor only."""
-        if topic is topics.HOST_NODES and isinstance(parameters, HostObserver.Parameters):
-            return (parameters.supervisor,)
-        return super().names(topic, name, parameters)
-
-    @on(topics.HOST_NODES)
-    def nodes(self, table: fm.NodeTable, _header: Header) -> None:
-        """Take the table."""
-        self._table(table)
+        self._event = event
 
     @on(topics.PROCESS_EVENT)
     def process_event(self, event: fm.ProcessEvent, header: Header) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import time
 from collections.abc import Callable
 
 import msgspec
 
 from rampart.actors.bus import run_folder
-from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.hosts.clock_sync import ClockSync
 from rampart.actors.hosts.meeting import (
     DOOR,
@@ -41,8 +41,8 @@ class FirstLauncher(Launcher):
         is_unwanted: whether the user has had enough of that.
     """
 
-    def __init__(self, run: RunContext, title: str) -> None:
-        super().__init__(run.plan, title)
+    def __init__(self, run: RunContext, title: str, link: socket.socket | None = None) -> None:
+        super().__init__(run.plan, title, link)
         self.say: Callable[[str], None] = lambda _line: None
         self.is_unwanted: Callable[[], bool] = lambda: False
         self._run = run
@@ -69,10 +69,6 @@ class FirstLauncher(Launcher):
         await super().start()
         self._meeting.begin(self.plan.origin_s)
 
-    def info(self) -> RunInfo:
-        """Return what tools need to know of this run, which machines there are among it."""
-        return msgspec.structs.replace(super().info(), hosts=Hosts(self._run.system).called)
-
     async def end(self) -> None:
         """End this host's processes, and have the others end theirs."""
         if self._meeting is not None:
@@ -86,13 +82,13 @@ class OtherHost:
     Args:
         own: what of the plan is this host's own.
         say: is told what happens, in a line.
+        link: connection to this host's root.
 
     Attributes:
-        launcher: of this host's processes, from `join` on.
+        launcher: of this host's processes; it has the plan of the run from `join` on.
     """
 
-    def __init__(self, own: RunPlan, say: Callable[[str], None]) -> None:
-        self.launcher: OtherLauncher | None = None
+    def __init__(self, own: RunPlan, say: Callable[[str], None], link: socket.socket) -> None:
         self._own = own
         self._say = say
         self._spec = load_system(own)
@@ -105,9 +101,10 @@ class OtherHost:
         self._clocks = ClockSync(self._link.clock_s)
         self._said = self._unreachable = ""
         self._is_trusted = True
+        self.launcher = OtherLauncher(own, self._spec, link)
 
-    async def join(self) -> OtherLauncher:
-        """Wait for the first host, and return the launcher of this one's part in the run.
+    async def join(self) -> None:
+        """Wait for the first host, and take the plan of the run from it.
 
         Raises:
             MeetingError: this host may not take part.
@@ -118,8 +115,7 @@ class OtherHost:
         application = load_application(plan, self._spec)
         self._attendance.ready(contents_of(plan, application))
         plan = msgspec.structs.replace(plan, incarnations=(told.starts - 1) * run_folder.EPOCH)
-        self.launcher = OtherLauncher(plan, self._spec, told.incarnations)
-        return self.launcher
+        self.launcher.join(plan, told.incarnations)
 
     async def start(self) -> None:
         """Start this host's processes when the first host says so.
@@ -129,7 +125,6 @@ class OtherHost:
             MeetingError: this host may not take part, or the run is over already, or another.
         """
         launcher = self.launcher
-        assert launcher is not None  # noqa: S101 for the type checker
         await launcher.load()
         while (told := await self._asked()) is None or told.origin_s is None:
             if told is not None:
@@ -147,7 +142,6 @@ class OtherHost:
             MeetingError: the first host runs something else by now.
         """
         launcher = self.launcher
-        assert launcher is not None  # noqa: S101 for the type checker
         while not launcher.failure:
             try:
                 told = await self._asked()
@@ -180,7 +174,7 @@ class OtherHost:
             return None
         if self._said and self._said == self._unreachable:
             self._tell("the first host answers")
-        if self.launcher and told.plan.run_id != self.launcher.plan.run_id:
+        if self.launcher.has_joined and told.plan.run_id != self.launcher.plan.run_id:
             raise MeetingError(f"the first host has begun another run ({told.plan.run_id}); "
                                "start this host again")
         self._clocks.exchanged(asked_s, told.now_s, heard_s)
@@ -205,22 +199,29 @@ class OtherLauncher(Launcher):
     """Another host's launcher.
 
     Args:
+        own: what of the plan is this host's own.
         spec: of the system.
-        incarnations: of the nodes, those that were issued already.
+        link: connection to this host's root.
 
     Attributes:
+        has_joined: whether it has the plan of the run.
         begins_s: reading of this host's monotonic clock at simulated time 0.
     """
 
-    def __init__(self, plan: RunPlan, spec: SystemSpec, incarnations: dict[str, int]) -> None:
-        super().__init__(plan, spec.title)
+    def __init__(self, own: RunPlan, spec: SystemSpec, link: socket.socket) -> None:
+        super().__init__(own, spec.title, link)
+        self.has_joined = False
         self.begins_s = 0.0
-        self._spec = spec
-        self._incarnations = incarnations
+        self._incarnations: dict[str, int] = {}
 
-    def begin(self, *, forks: bool = False) -> None:
-        """Claim what the run needs and start to load, as any launcher."""
-        super().begin(forks=forks)
+    def join(self, plan: RunPlan, incarnations: dict[str, int]) -> None:
+        """Take the plan of the run, and the incarnations of its nodes that were issued already."""
+        self.has_joined = True
+        self.plan, self._incarnations = plan, incarnations
+
+    async def load(self) -> None:
+        """Have the root load the run, as any launcher."""
+        await super().load()
         for name, incarnation in self._incarnations.items():
             run_folder.issue(self.plan.folder, [name], incarnation)
 
@@ -228,10 +229,6 @@ class OtherLauncher(Launcher):
         """Return when simulated time began, or will, as the first host has it."""
         self.follow(self.begins_s)
         return self.begins_s
-
-    def info(self) -> RunInfo:
-        """Return what tools need to know of this run, which machines there are among it."""
-        return msgspec.structs.replace(super().info(), hosts=Hosts(self._spec).called)
 
     def follow(self, origin_s: float) -> None:
         """Have all processes of this host go by this origin."""

@@ -91,9 +91,9 @@ class Hmi(Actor):
     files: ClassVar[Path | None] = None
     badge: ClassVar[str] = "live"
     refuses: ClassVar[str] = ""
-    most_spare = "none"
     tables = ("panel",)
     is_page = True
+    holds_devices = True
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECT, ftm_topics.SIGNAL)
     requests: ClassVar[tuple[type[Request], ...]] = REQUESTS

@@ -97,8 +97,8 @@ class Gateway(Actor):
         ros2: tuple[Ros2Link, ...] = ()
 
     parameters: Parameters
-    most_spare = "none"
     tables = ("ros2",)
+    holds_devices = True
     outputs = (GRAPH,)
 
     def __init__(self, context: Context) -> None:

@@ -29,7 +29,7 @@ class RosRouter(Actor):
         listen: str = LISTEN
 
     parameters: Parameters
-    most_spare = "none"
+    holds_devices = True
     _session: zenoh.Session | None = None
 
     def on_start(self) -> None:

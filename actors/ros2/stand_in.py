@@ -73,7 +73,7 @@ class StandIn(Actor):
         distribution: Distribution = "jazzy"
 
     parameters: Parameters
-    most_spare = "none"
+    holds_devices = True
     node_name: ClassVar[str] = ""
     namespace: ClassVar[str] = "/"
     interfaces: ClassVar[Path | None] = None

@@ -33,7 +33,7 @@ from rampart.actors.bus.envelope import (
 from rampart.actors.bus.fields import Field
 from rampart.actors.bus.limits import ReportLimit
 from rampart.actors.bus.messages import ON_TIME, Diagnostic, Heartbeat, Injection
-from rampart.actors.bus.newcomer import PATIENCE_S, HeldBack, Questions, unless_silent
+from rampart.actors.bus.newcomer import PATIENCE_S, Questions, unless_silent
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, INJECT
 from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
@@ -88,7 +88,6 @@ class Actor(Declared):
         self._dispatcher = Dispatcher(
             context.bus.bursts, self._overflowed, after_burst=context.bus.after_burst)
         self._timers = Timers(context.clock, self._dispatcher)
-        self._held_back = HeldBack(context.waits) if context.waits else None
         self._questions = Questions(
             context.bus, lambda: self._dispatcher.put("go to work", self._go_to_work))
         self._is_at_work = False
@@ -214,14 +213,7 @@ class Actor(Declared):
         return self._timers.later(delay_s, call)
 
     def kept(self, form: StateFormat[S]) -> S | None:
-        """Return the state to go on from, in `on_start`: the newest sound one, or None.
-
-        Raises:
-            RuntimeError: it is a hot spare, and the state still belongs to another process.
-        """
-        if self._held_back is not None and self.context.waits == "hot":
-            raise RuntimeError(f"{type(self).__name__} keeps checkpoints: its class has to say "
-                               "most_spare = 'warm'")
+        """Return the state to go on from, in `on_start`: the newest sound one, or None."""
         return self._keeper.kept(form)
 
     def keep(self, form: StateFormat[S], state: S) -> None:
@@ -230,10 +222,7 @@ class Actor(Declared):
         On return it survives this process. What goes wrong is reported and does not raise: the
         node goes on without.
         """
-        if self._held_back is not None:
-            self._held_back.keep = partial(self._keeper.keep, form, state)
-        else:
-            self._keeper.keep(form, state)
+        self._keeper.keep(form, state)
 
     def call_soon(self, slot: str, call: Callable[[], None]) -> None:
         """Have `call` made as a mailbox item, in place of one in the same slot that still waits."""
@@ -251,12 +240,6 @@ class Actor(Declared):
         self._dispatcher.stop()
 
     # -- what happens to its process ------------------------------------------------------------
-
-    def promote(self) -> None:
-        """Be the node from now on, if it waits for that: keep and send what was held back."""
-        held_back, self._held_back = self._held_back, None
-        if held_back is not None:
-            held_back.let_go(self._bus)
 
     def abandon(self) -> None:
         """Have nothing more run when its task is cancelled: what SIGKILL does."""
@@ -280,7 +263,7 @@ class Actor(Declared):
             BusError: the bus could not be opened.
             Exception: whatever a handler raised.
         """
-        await self._bus.open(announce=self._held_back is None)
+        await self._bus.open()
         try:
             self._set_up()
             await self._dispatcher.run()
@@ -394,9 +377,6 @@ class Actor(Declared):
         if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
             self.report_diagnostic("not sent", too_long(payload), key)
             return
-        if self._held_back is not None:
-            self._held_back.send(topic, key, sequence, payload)
-            return
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
 
@@ -417,8 +397,6 @@ class Actor(Declared):
 
     @on(INJECT)
     def _on_injection(self, order: Injection, _header: Header) -> None:
-        if self._held_back is not None:  # it is meant for the process that was there
-            return
         topic = self.published(order.topic, self.name, self.parameters) or (
             next((self.context.topics[named.key] for named in
                   self.named(self.parameters)["published"] if named.key == order.topic), None))

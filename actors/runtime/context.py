@@ -40,7 +40,6 @@ class Context:
         members: names of all nodes of the system; what others make it remember is bounded.
         command_age_s: commands that are older are not obeyed.
         topics: those that parameters of the system's nodes name, by key.
-        waits: "warm" or "hot" if it is set up as that, to be silent until `promote`.
         usage: returns what a process has used of the machine.
         scheduled: returns what the main thread of a process has run, and waited for a processor.
         is_here: whether the process of a node is on this machine.
@@ -60,7 +59,6 @@ class Context:
     members: frozenset[str] = frozenset()
     command_age_s: float = math.inf
     topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
-    waits: str = ""
     usage: Callable[[int], ProcessCount | None] = read_count
     scheduled: Callable[[int], Usage] = read_usage
     is_here: Callable[[str], bool] = lambda _node: True

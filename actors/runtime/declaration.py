@@ -142,13 +142,10 @@ class Declared(Handlers):
     Class attributes:
         outputs: topics it publishes; publishing another one raises.
         node_kind: what a node of this class has to be, "" for anything.
-        most_spare: the most that a spare process of it may be. "hot": set up beside the one that
-            speaks, in silence. "warm": set up, in silence, when that has ended; for one that keeps
-            checkpoints. "none": neither, for `on_start` takes a port, or starts a program. Of all
-            others a spare of the node's own runs one for a moment beside the node, in rehearsal:
-            what it publishes and keeps then goes nowhere.
         tables: those of a specification whose rows it is given.
         is_page: whether an operator works with it.
+        holds_devices: whether its process holds a port, a device or a program: then the next one
+            is started when these are free.
         Parameters: what the system spec may say of it, by field: type, range and default. A class
             that takes more derives its own from that of its base class.
     """
@@ -159,9 +156,9 @@ class Declared(Handlers):
     parameters: Parameters
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
     node_kind: ClassVar[str] = ""
-    most_spare: ClassVar[str] = "hot"
     tables: ClassVar[tuple[str, ...]] = ()
     is_page: ClassVar[bool] = False
+    holds_devices: ClassVar[bool] = False
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003

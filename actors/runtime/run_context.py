@@ -25,6 +25,7 @@ class RunContext:
         application: what the robot's own actors know of place and task.
         adapted: the last change of the system; None if there was none.
         known_incarnations: for a restarted supervisor, those that were issued.
+        root: for a supervisor, descriptor of its connection to the root; -1 without one.
     """
 
     plan: RunPlan = field(default_factory=RunPlan)
@@ -33,3 +34,4 @@ class RunContext:
     application: Application = field(default_factory=Application)
     adapted: AdaptedSystem | None = None
     known_incarnations: Mapping[str, int] = field(default_factory=dict)
+    root: int = -1

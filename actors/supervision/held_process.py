@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from rampart.actors.bus.run_folder import restarts_of
 from rampart.actors.ftm.messages import NodeInfo
 from rampart.actors.runtime.timer import Timer
-from rampart.actors.supervision.processes import Processes, ProcessHandle
+from rampart.actors.supervision.processes import ProcessHandle
 from rampart.actors.supervision.supervised_process import SupervisedProcess
-from rampart.actors.system.members import Spare
 
 
 @dataclass
@@ -32,28 +31,6 @@ class HeldProcess(SupervisedProcess):
             yield NodeInfo(node.name, node.kind.value, self.pid, self.shown, self.incarnation,
                            restarts_of(self.incarnation), late_s(node.name),
                            failing=failing)
-
-    def keep_spare(self, machine: Processes, kind: Spare) -> bool:
-        """Have the spare beside it that it is to have; True if that is under way and is to be all.
-
-        A hot one is in a hurry, others are made one at a time.
-        """
-        if kind not in {"own", "hot"} or machine.is_ready(self.names):
-            return False
-        machine.prepare(self.names, self.highest + 1, "hot" if kind == "hot" else "own")
-        return kind == "own"
-
-    def prepare(self, machine: Processes) -> Callable[[], None] | None:
-        """Have its next process set up; return what ends that if it has not been needed.
-
-        None if one is set up already.
-        """
-        names, incarnation = self.names, self.highest + 1
-        if not machine.is_ready(names):
-            machine.prepare(names, incarnation, "warm")
-        elif not machine.set_up(names):
-            return None
-        return lambda: machine.forget(names) if self.highest < incarnation else None
 
     def take(self, pid: int, incarnation: int) -> None:
         """Note that another process is the present one, and let go of the one before."""

@@ -1,58 +1,39 @@
-"""The root of a run: starts spawners and supervisor, brings them back, and cleans up after all.
+"""The hold of the process that watches a run on its root: it begins, starts and ends the run.
 
-The launcher owns the lifeline (see `node_process`), is the subreaper of the run (orphans of a dead
-spawner become its children, so no zombie stays), and answers tools that look for the run. It is
-the last guard: the supervisor brings the nodes back, the launcher brings back the supervisor
-(see `guard`).
+As a rule it is the root's child and was born with a connection. One that was not, as a benchmark,
+starts a root of its own.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import ctypes
-import gc
 import os
-import resource
-import signal
+import select
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import BinaryIO
+from typing import TypeVar
 
 import msgspec
 
-from rampart.actors.bus import run_folder, run_info
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
-from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, on_host
-from rampart.actors.supervision.guard import Guard
-from rampart.actors.supervision.process_title import (
-    TITLE_BYTES,
-    end_commands,
-    kill,
-    kill_leftovers,
-    set_title,
-    title_room,
-)
-from rampart.actors.supervision.spawner import NAMES, Loaded, load_and_serve
-from rampart.actors.supervision.spawner_client import (
-    START_PATIENCE_S,
-    SpawnerClient,
-    SpawnerUnavailableError,
-)
-from rampart.actors.supervision.supervised_process import RestartPolicy
+from rampart.actors.supervision import requests
+from rampart.actors.supervision.process_title import TITLE_BYTES, end_run, kill, set_title
+from rampart.actors.supervision.requests import LaunchError
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 from rampart.files import working_folder
+from rampart.files.streams import complain
 
-LOAD_TIMEOUT_S = 60.0
-LAST_PORT = 32_000
-"""Above are those that the kernel gives to outgoing connections."""
+__all__ = ["LaunchError", "Launcher"]
+
+TITLE = "run"
+"""Of the process that watches a run, if it is the root's child."""
 
 STARTUP_S = (0.8, 5.0)
 """Simulated time 0 lies between so many wall seconds after the start of the first actor: until
@@ -61,201 +42,96 @@ then all processes start at once, and silence is no fault."""
 _LOADS = 1.4
 """How many, in times that the machine took to load the first process; all run after 0.9 to 1.25."""
 
-STOP_TIMEOUT_S = 1.2
-_PR_SET_CHILD_SUBREAPER = 36
-
-# A router holds a socket for each process of a run, and the supervisor a descriptor. With too few
-# of them nothing fails at once, and everything fails later.
-_DESCRIPTORS_EACH = 4
-_DESCRIPTORS_BESIDES = 40
-
-
-class LaunchError(Exception):
-    """The run cannot be started; the text is one line for the user."""
+_MAX_LINE = 1 << 26
+_Answer = TypeVar("_Answer", bound=requests.FromRoot)
 
 
 class Launcher:
-    """One run's processes. Use: `load`, then `start` on a running event loop, then `end`.
+    """One run's root, as the process that watches the run holds it.
+
+    Use on a running event loop: `load`, `start`, `end`.
+
+    Args:
+        plan: Of the run.
+        title: Of the run, for people.
+        link: Connection to the root; None to start one.
 
     Attributes:
-        plan: of the run.
-        names: of the actors.
-        guard: brings back supervisor and spawners; tells whom it has brought back, and troubles.
-        failure: why the run has to end, "" as long as it can go on.
+        plan: Of the run; from `load` on with folder, ports and the root's process id.
+        names: Of the actors, from `load` on.
+        failure: Why the run has to end, "" as long as it can go on.
+        recording: Returns the file of the recording, and why nothing more is written to it.
+        on_restart: Called with the name of what the root has brought back.
+        on_interrupt: Called with the name of the signal by which the user wants the run to end.
+        report: Called with one line when something cannot be done.
     """
 
-    def __init__(self, plan: RunPlan, title: str) -> None:
-        self.plan = msgspec.structs.replace(plan, launcher_pid=os.getpid())
+    def __init__(self, plan: RunPlan, title: str, link: socket.socket | None = None) -> None:
+        self.plan = plan
         self.names: tuple[str, ...] = ()
         self.failure = ""
-        self._title = title
-        self._spawners = SpawnerClient("", plan.base_port, os.getpid())
-        self._lifeline: tuple[int, int] = (-1, -1)
-        self._first: subprocess.Popen[bytes] | None = None
-        self._loaded: BinaryIO | None = None
-        self._begun_s = self._load_s = 0.0
         self.recording: Callable[[], tuple[str, str]] = lambda: ("", "")
-        self._info: socket.socket | None = None
-        self._kept_ports: list[socket.socket] = []
-        self._descriptors = 0
-        self.guard = Guard(self.plan, self._spawners, self._load)
-        self._keeping: asyncio.Task[None] | None = None
+        self.on_restart: Callable[[str], None] = lambda _name: None
+        self.on_interrupt: Callable[[str], None] = lambda _signal: None
+        self.report: Callable[[str], None] = complain
+        self._title = title
+        self._link = link
+        self._is_child = link is not None
+        self._root: subprocess.Popen[bytes] | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._reading: asyncio.Task[None] | None = None
+        self._answers: asyncio.Queue[requests.FromRoot | None] = asyncio.Queue()
+        self._recorded = ("", "")
+        self._load_s = 0.0
 
-    # -- start ----------------------------------------------------------------------------------
-
-    def begin(self, *, forks: bool = False) -> None:
-        """Claim the base port and start the first spawner, which then loads in the background.
-
-        Args:
-            forks: as a fork of this process, which has loaded the system already. Not if there is
-                another thread here: what that one holds would be held for ever in the fork.
-
-        Raises:
-            LaunchError: another run has the base port, or there is no place for the run's sockets.
-        """
-        port = self.plan.base_port
-        with contextlib.ExitStack() as on_failure:
-            info = on_failure.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
-            try:
-                info.bind(run_info.address(port))
-            except OSError:
-                raise LaunchError(f"--port {port}: in use by another run; "
-                                  "choose another --port") from None
-            try:
-                folder = run_folder.make(port, os.getpid())
-                run_folder.issue(folder, (OBSERVER,), 1)
-            except OSError as error:
-                raise LaunchError(f"no folder for the run's sockets: {error}") from None
-            if self.plan.keys:
-                self._kept_ports = kept_ports(port)
-            on_failure.pop_all()
-        self._info = info
-        self.plan = msgspec.structs.replace(self.plan, folder=folder, ports=tuple(
-            one.getsockname()[1] for one in self._kept_ports))
-        self._spawners.folder = folder
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-        self._lifeline = os.pipe()
-        _, self._descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (self._descriptors, self._descriptors))
-        self._begun_s = time.monotonic()
-        if forks and _has_one_thread() and title_room() >= TITLE_BYTES:
-            self._begun_s -= _age_s()
-            self._loaded = self._fork(NAMES[0])
-        else:
-            self._first = self._load(NAMES[0])
-            assert self._first.stdout is not None  # noqa: S101 for the type checker
-            self._loaded = self._first.stdout  # type: ignore[assignment]
-
-    def _load(self, name: str) -> subprocess.Popen[bytes]:
-        spawner = subprocess.Popen(  # noqa: S603 our own interpreter and module
-            [sys.executable, "-P", "-m", "rampart.actors.supervision.spawner", name,
-             str(self._lifeline[0])],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
-            env={**working_folder.environment(), "RAMPART_ROOM_FOR_TITLES": "." * TITLE_BYTES},
-            process_group=0)  # see `node_process`
-        assert spawner.stdin is not None  # noqa: S101 for the type checker
-        with contextlib.suppress(BrokenPipeError):  # it has died: what waits for it will notice
-            spawner.stdin.write(msgspec.json.encode(self.plan))
-            spawner.stdin.close()
-        return spawner
-
-    def _fork(self, name: str) -> BinaryIO:
-        """Fork a spawner, and return what it says when it can fork nodes."""
-        output, said = os.pipe()
-        gc.collect()
-        gc.freeze()  # keeps both collectors from touching, and so copying, the shared pages
-        if os.fork():
-            os.close(said)
-            return os.fdopen(output, "rb")
-        code = 1
-        try:
-            os.setpgid(0, 0)  # see `node_process`
-            set_title(self.plan.base_port, self.plan.launcher_pid, (f"spawner_{name}",), 1)
-            os.close(output)
-            os.close(self._lifeline[1])
-            for listener in (self._info, *self._kept_ports):
-                if listener is not None:
-                    listener.close()
-            nothing = os.open(os.devnull, os.O_RDONLY)
-            os.dup2(nothing, 0)
-            os.close(nothing)
-            os.environ.update(working_folder.environment())
-            code = load_and_serve(name, self.plan, self._lifeline[0], said)
-        finally:
-            os._exit(code)
+    async def connect(self) -> None:
+        """Listen to the root, which may be interrupted by the user; `load` does it as well."""
+        if self._writer is not None:
+            return
+        tell_of_callbacks(asyncio.get_running_loop(), lambda line: self.report(line))  # noqa: PLW0108 it may change
+        link = self._link or self._start_root()
+        reader, self._writer = await asyncio.open_unix_connection(sock=link, limit=_MAX_LINE)
+        self._reading = asyncio.create_task(self._read(reader))
+        watch(self._reading, "the connection to the root", self.failed)
 
     async def load(self) -> None:
-        """Wait until the first spawner has loaded the plan.
+        """Have the root claim what the run needs, and load it.
 
         Raises:
-            LaunchError: spec, airport or mission are unsound, or fewer files may be open than the
-                run needs.
+            LaunchError: spec, airport or mission are unsound; another run has the base port; there
+                is no place for the run's sockets, or fewer files may be open than the run needs.
         """
-        output = self._loaded
-        assert output is not None  # noqa: S101 for the type checker
-        try:
-            line = await asyncio.wait_for(asyncio.to_thread(output.readline), LOAD_TIMEOUT_S)
-        except TimeoutError:
-            raise LaunchError(f"the spawner did not load within {LOAD_TIMEOUT_S:.0f} s") from None
-        self._load_s = time.monotonic() - self._begun_s
-        text = line.decode().strip()
-        if text.startswith("error: "):
-            raise LaunchError(text.removeprefix("error: "))
-        if not text.startswith("{"):
-            raise LaunchError("the spawner ended while it loaded")
-        loaded = msgspec.json.decode(text, type=Loaded)
-        self.names = loaded.names
-        self.guard.policy = RestartPolicy(loaded.supervision)
-        needed = needed_descriptors(len(self.names))
-        if self._descriptors < needed:
-            raise LaunchError(f"open files: the hard limit is {self._descriptors}, and "
-                              f"{len(self.names)} processes need {needed}; raise it, as with "
-                              f"`ulimit -Hn {needed}` in the shell of a privileged user")
+        await self.connect()
+        begun = await self._ask(requests.Begin(self.plan, self._title), requests.Begun)
+        self.plan, self.names, self._load_s = begun.plan, begun.names, begun.load_s
+        if self._is_child:
+            set_title(self.plan.base_port, self.plan.launcher_pid, (TITLE,), 1)
+            _clean_up_after(self.plan.launcher_pid, self.plan.folder)
 
     async def start(self) -> None:
-        """Set simulated time 0 and start the second spawner and the supervisor.
+        """Set simulated time 0 and start routers and supervisor, which starts the rest.
 
         Raises:
-            LaunchError: the spawner does not answer.
+            LaunchError: no process can be started.
         """
-        loop = asyncio.get_running_loop()
-        tell_of_callbacks(loop, self._tell)
-        loop.add_signal_handler(signal.SIGCHLD, self._reap)
         self.plan = msgspec.structs.replace(self.plan, origin_s=self.origin_s())
-        try:
-            self._spawners.set_origin(self.plan.origin_s)
-            for name in self.plan.routers:
-                await self.guard.fork(name, self.plan.incarnations + 1, START_PATIENCE_S)
-            await self.guard.fork(f"spawner_{NAMES[1]}", 1, START_PATIENCE_S)
-            await self.guard.start_supervisor(START_PATIENCE_S)
-        except SpawnerUnavailableError as error:
-            raise LaunchError(str(error)) from None
-        if self._info is not None:
-            self._info.listen(8)
-            self._info.setblocking(False)
-            loop.add_reader(self._info, lambda info: run_info.answer(info, self.info()), self._info)
-        self._keeping = asyncio.create_task(self.guard.keep())
-        watch(self._keeping, "the guard of supervisor and spawners", self.failed)
+        await self._ask(requests.Start(self.plan.origin_s), requests.Done)
 
     def origin_s(self) -> float:
         """Return the reading of the monotonic clock at simulated time 0, all being loaded now."""
         return time.monotonic() + min(max(STARTUP_S[0], _LOADS * self._load_s), STARTUP_S[1])
 
     def failed(self, why: str) -> None:
-        """Note that the run has to end, for a part of the launcher's process has failed."""
+        """Note that the run has to end, for a part of this process has failed."""
         self.failure = self.failure or why
 
-    def _tell(self, line: str) -> None:
-        self.guard.report(line)
-
-    def supervisor_heard(self, _table: NodeTable) -> None:
-        """Note that the supervisor is heard."""
-        self.guard.supervisor_heard()
-
-    def _reap(self) -> None:
-        with contextlib.suppress(ChildProcessError):
-            while os.waitpid(-1, os.WNOHANG)[0]:
-                pass
+    def look_at_recording(self) -> tuple[str, str]:
+        """Return file and problem of the recording; the root tells them to tools."""
+        recorded = self.recording()
+        if recorded != self._recorded:
+            self._recorded = recorded
+            self._tell(requests.Recording(*recorded))
+        return recorded
 
     def observers_bus(self) -> ZenohBus:
         """Return the bus of an observer in this process, which hears all nodes; not yet open."""
@@ -264,100 +140,80 @@ class Launcher:
                         recorder=RecorderConnection(self.plan.base_port),
                         credentials=self.plan.credentials(name))
 
-    # -- tools ----------------------------------------------------------------------------------
-
-    def info(self) -> run_info.RunInfo:
-        """Return what tools need to know of this run."""
-        recording, problem = self.recording()
-        return run_info.RunInfo(
-            os.getpid(), self.plan.base_port, self.plan.rate, self.plan.origin_s,
-            self.plan.system_file, self.plan.folder, self.names, self.plan.run_id,
-            self.plan.page.port, self._title, self.plan.page.url, self.plan.description,
-            host=self.plan.host, keys=self.plan.keys, ports=self.plan.ports,
-            recording=recording, recording_problem=problem)
-
-    # -- end ------------------------------------------------------------------------------------
-
     async def end(self) -> None:
         """End all processes of the run: in order if the supervisor can, by force what is left."""
-        if self._keeping is not None:
-            self._keeping.cancel()
-            await asyncio.gather(self._keeping, return_exceptions=True)
-        if self.guard.supervisor_pid:
-            kill(self.guard.supervisor_pid, signal.SIGTERM)
-            await self.guard.supervisor_gone(STOP_TIMEOUT_S)
-        self.abort()
-        if self._info is not None:
-            asyncio.get_running_loop().remove_reader(self._info)
-            self._info.close()
-        asyncio.get_running_loop().remove_signal_handler(signal.SIGCHLD)
-
-    def abort(self) -> None:
-        """End all processes of the run at once. Harmless when there are none."""
-        self._spawners.close()
-        for port in self._kept_ports:
-            port.close()
-        for end in self._lifeline:
-            if end >= 0:
-                os.close(end)
-        self._lifeline = (-1, -1)
-        self.guard.end()
-        if self._first is not None:
-            self._first.kill()
-        deadline = time.monotonic() + 1.0
-        while kill_leftovers(self.plan.launcher_pid) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        if self._loaded is not None:
-            self._loaded.close()  # not while who writes it lives: a thread may still read it
-        if self._first is not None:
-            with self._first:  # which closes what leads to it and waits for it
-                pass
-        end_commands(self.plan.folder)
-        run_folder.remove(self.plan.folder)
-        self._reap()
-
-
-def kept_ports(first: int, number: int = len(run_folder.ROUTERS)) -> list[socket.socket]:
-    """Return sockets that keep ports of loopback for the routers of a run with keys.
-
-    A router listens on a port that is kept all the same, for both have SO_REUSEADDR; no other run
-    takes it while the router is restarted, and the kernel gives it to no outgoing connection.
-
-    Args:
-        first: of the ports that are tried.
-        number: of ports.
-
-    Raises:
-        LaunchError: there are too few.
-    """
-    found: list[socket.socket] = []
-    for port in range(first, LAST_PORT + 1):
-        if len(found) == number:
-            break
-        kept = socket.socket()
+        writer, self._writer = self._writer, None
+        if writer is None or self._reading is None:
+            return
         try:
-            kept.bind(("127.0.0.1", port))
-        except OSError:
-            kept.close()
-            continue
-        kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # not before: it would fit any
-        found.append(kept)
-    if len(found) < number:
-        raise LaunchError(f"--port {first}: no ports for the routers from there to {LAST_PORT}")
-    return found
+            writer.write(msgspec.json.encode(requests.End()) + b"\n")
+            while not isinstance(await self._answers.get(), requests.Done | None):
+                pass
+        finally:
+            self._reading.cancel()
+            await asyncio.gather(self._reading, return_exceptions=True)
+            writer.close()
+            if self._root is not None:
+                await asyncio.to_thread(self._root.wait)
+
+    # -- inside ---------------------------------------------------------------------------------
+
+    def _start_root(self) -> socket.socket:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._root = subprocess.Popen(  # noqa: S603 our own interpreter and module
+                [sys.executable, "-P", "-m", "rampart.actors.supervision.root",
+                 str(theirs.fileno())],
+                stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()], process_group=0,
+                env={**working_folder.environment(), "RAMPART_ROOM_FOR_TITLES": "." * TITLE_BYTES})
+        return ours
+
+    async def _read(self, reader: asyncio.StreamReader) -> None:
+        while line := await reader.readline():
+            message = msgspec.json.decode(line, type=requests.FromRoot)
+            match message:
+                case requests.Restarted():
+                    self.on_restart(message.name)
+                case requests.Trouble():
+                    self.report(message.text)
+                case requests.Interrupt():
+                    self.on_interrupt(message.signal)
+                case _:
+                    self._answers.put_nowait(message)
+        self.failed("the root of the run has ended")
+        self._answers.put_nowait(None)
+
+    def _tell(self, request: requests.FromRun) -> None:
+        if self._writer is not None:
+            self._writer.write(msgspec.json.encode(request) + b"\n")
+
+    async def _ask(self, request: requests.FromRun, kind: type[_Answer]) -> _Answer:
+        """Send a request and return the answer.
+
+        Raises:
+            LaunchError: the root has refused it, or has ended.
+        """
+        self._tell(request)
+        answer = await self._answers.get()
+        if isinstance(answer, requests.Refused):
+            raise LaunchError(answer.why)
+        if not isinstance(answer, kind):
+            raise LaunchError("the root of the run has ended")
+        return answer
 
 
-def _has_one_thread() -> bool:
-    return len(list(Path("/proc/self/task").iterdir())) == 1
+def _clean_up_after(root: int, folder: str) -> None:
+    """Start the thread that ends this process, and all of the run, when the root has ended.
 
+    The kernel ends the root's other children; not what commands have forked, nor the folder.
+    """
+    ended = os.pidfd_open(root)
 
-def _age_s() -> float:
-    """Return for how long this process has existed, real seconds (proc(5), field 22 of stat)."""
-    stat = Path("/proc/self/stat").read_text(encoding="utf-8", errors="replace")
-    begun_s = int(stat.rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
-    return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - begun_s)
+    def wait() -> None:
+        poll = select.poll()
+        poll.register(ended, select.POLLIN)
+        poll.poll()
+        end_run(root, folder)
+        kill(os.getpid())
 
-
-def needed_descriptors(processes: int) -> int:
-    """Return how many files a process of a run with so many processes may have to hold open."""
-    return _DESCRIPTORS_BESIDES + _DESCRIPTORS_EACH * processes
+    threading.Thread(target=wait, name="root", daemon=True).start()

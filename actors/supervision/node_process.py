@@ -1,22 +1,8 @@
-"""What runs in a node's process after the fork: title, lifeline, signals, actors, exit code.
+"""What runs in a node's process after the fork: title, signals, actors, exit code.
 
 SIGTERM asks the actors to end in order; a router it ends at once (see `router`). SIGUSR2 wedges the
 event loop for good, process and liveliness token still there: the fault that only a heartbeat from
 the loop can show.
-
-The lifeline: a pipe whose only write end is in the launcher.
-
-When the launcher ends, however it ends, the kernel closes the write end and every process of
-the run reads end-of-file. A thread does the reading, so that a wedged event loop dies too. A
-stopped process cannot read. Two things end it all the same:
-
-* whichever process reads the end kills all others of the run before itself: one that is not
-  stopped is enough;
-* the launcher has the run in a process group of its own, and when the last process outside that
-  holds it together, the launcher, is gone, the kernel sends SIGHUP and SIGCONT to the group if one
-  of its members is stopped (setpgid(2), "orphaned process group"): with all of them stopped there
-  is still the kernel. Not where what adopts the launcher's children is of the same session, as
-  a shell that is the first process of a container.
 """
 
 from __future__ import annotations
@@ -25,16 +11,13 @@ import asyncio
 import contextlib
 import os
 import signal
-import socket
-import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum, auto
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.bus import Bus, BusError
@@ -48,8 +31,7 @@ from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 from rampart.actors.runtime.clock import clock_of
 from rampart.actors.runtime.run_context import RunContext
-from rampart.actors.supervision.process_title import WAITING, end_run, kill, set_title
-from rampart.actors.supervision.rehearsal import Stage, run_for_a_moment
+from rampart.actors.supervision.process_title import set_title
 from rampart.actors.supervision.unseen import tell_of_callbacks
 from rampart.actors.system.layout import Layout, router
 from rampart.files.streams import complain
@@ -63,23 +45,10 @@ EXIT_FAILED = 1
 EXIT_BUS = 3
 
 
-def exit_with_launcher(lifeline: int, launcher: int, folder: str) -> None:
-    """Start the thread that ends this process, and all of the run, when the launcher has ended."""
-
-    def wait() -> None:
-        while os.read(lifeline, 1):
-            pass
-        end_run(launcher, folder)
-        kill(os.getpid())
-
-    threading.Thread(target=wait, name="lifeline", daemon=True).start()
-
-
 def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
                loop: asyncio.AbstractEventLoop, *,
                failed: Callable[[Exception], None] = lambda _error: None,
-               bus: Bus | None = None, waits: str = "",
-               store: CheckpointStore | None = None) -> Actor:
+               bus: Bus | None = None) -> Actor:
     """Build one actor of the system, not yet running.
 
     Args:
@@ -90,8 +59,6 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         loop: that it will run on.
         failed: is told its error.
         bus: that it is to have; None for one of its own.
-        waits: "warm" or "hot" if it is to be silent until it is promoted.
-        store: where it is to keep its state; None for where the node keeps it.
     """
     member = layout.members.get(name) or router(name)
     clock = clock_of(layout.plan, loop.time)
@@ -99,10 +66,10 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
-        checkpoints=store or make_store(layout, name, incarnation),
+        checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
         is_here=partial(is_here, layout.plan.folder),
-        members=frozenset((*layout.members, *layout.routers)), topics=layout.topics, waits=waits,
+        members=frozenset((*layout.members, *layout.routers)), topics=layout.topics,
         command_age_s=layout.hosts.command_age_s))
 
 
@@ -138,20 +105,6 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
     return FileCheckpoints(Path(plan.checkpoints), name, plan.run_id, incarnation)
 
 
-Waits = Literal["own", "warm", "hot"]
-"""How far one that waits to be a node goes in silence: "own", it has joined the bus, has made its
-actors once in rehearsal, and waits to be told to set them up; "warm" and "hot", it is set up, the
-node's process having ended or beside it."""
-
-
-class Told(Enum):
-    """What one that waits has been told."""
-
-    NOTHING = auto()
-    SET_UP = auto()
-    BE_THE_NODE = auto()
-
-
 @dataclass(frozen=True)
 class Role:
     """Who a process is to be.
@@ -161,38 +114,24 @@ class Role:
         incarnation: of the process.
         born: called when it has its title, before it does anything that others see; it may not
             return, if the process is not wanted any more.
-        waits: how, if it is to wait until it is born, else "".
-        told: if it waits, called when something has come for it by its connection: returns what.
-            It does not return if it is not wanted any more.
-        connection: by which it is told.
     """
 
     names: tuple[str, ...]
     incarnation: int
     born: Callable[[], None] = lambda: None
-    waits: Waits | Literal[""] = ""
-    told: Callable[[], Told] = lambda: Told.BE_THE_NODE
-    connection: socket.socket | None = None
 
 
-def node_main(layout: Layout, role: Role, run: RunContext, lifeline: int) -> int:
-    """Run the actors of one process to their end and return the exit code; see `live`."""
-    return asyncio.run(live(layout, role, run, lifeline))
-
-
-async def live(layout: Layout, role: Role, run: RunContext, lifeline: int,
-               bus: ZenohBus | None = None) -> int:
+async def live(layout: Layout, role: Role, run: RunContext, bus: ZenohBus | None = None) -> int:
     """Run the actors of one process to their end and return the exit code.
 
     Args:
         layout: of the run.
         role: who they are.
         run: what all actors of the run have in common.
-        lifeline: read end of the pipe; see above.
         bus: open already, if there is one.
     """
     told: list[Exception] = []
-    launcher, who = layout.plan.launcher_pid, f"{'+'.join(role.names)} #{role.incarnation}"
+    who = f"{'+'.join(role.names)} #{role.incarnation}"
 
     def tell(error: Exception) -> None:  # at once: what replaces this process may kill it
         told.append(error)
@@ -201,16 +140,10 @@ async def live(layout: Layout, role: Role, run: RunContext, lifeline: int,
             _log_traceback(layout.plan.error_log, who, error)
 
     try:
-        if not role.waits:
-            _take_title(layout, role, role.names)
-            role.born()
-        else:
-            _take_title(layout, role, (f"{WAITING}{'.'.join(role.names)}",))
+        set_title(layout.plan.base_port, layout.plan.launcher_pid, role.names, role.incarnation)
+        role.born()
         if any(node.kind is Kind.WORLD for node in layout.spec.nodes if node.name in role.names):
             go_first()
-        exit_with_launcher(lifeline, launcher, layout.plan.folder)
-        for number in (signal.SIGINT, signal.SIGHUP):  # ctrl-C is the launcher's to handle
-            signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGUSR2, wedge)
         await _run_actors(layout, role, run, tell, bus)
     except BusError as error:
@@ -224,10 +157,6 @@ async def live(layout: Layout, role: Role, run: RunContext, lifeline: int,
     return EXIT_OK
 
 
-def _take_title(layout: Layout, role: Role, names: tuple[str, ...]) -> None:
-    set_title(layout.plan.base_port, layout.plan.launcher_pid, names, role.incarnation)
-
-
 async def _run_actors(layout: Layout, role: Role, run: RunContext,
                       failed: Callable[[Exception], None], bus: ZenohBus | None) -> None:
     loop = asyncio.get_running_loop()
@@ -235,42 +164,15 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
         loop, lambda line: complain(f"{'+'.join(role.names)} #{role.incarnation}: {line}"))
     buses = {name: _bus_of(layout, name, role.incarnation, bus if name == role.names[0] else None)
              for name in role.names}
-    actors: list[Actor] = []
-    wanted = asyncio.Event()
-    waits = "warm" if role.waits == "own" else role.waits
-
-    def made() -> list[Actor]:
-        return [make_actor(layout, name, role.incarnation, run, loop, failed=failed, bus=one,
-                           waits=waits) for name, one in buses.items()]
+    actors = [make_actor(layout, name, role.incarnation, run, loop, failed=failed, bus=one)
+              for name, one in buses.items()]
 
     def stop_all() -> None:
         for actor in actors:
             actor.stop()
 
-    def told(connection: socket.socket) -> None:
-        nonlocal waits
-        what = role.told()
-        if what is not Told.NOTHING:
-            wanted.set()
-        if what is not Told.BE_THE_NODE:
-            return
-        waits = ""
-        loop.remove_reader(connection)
-        _take_title(layout, role, role.names)
-        role.born()
-        for actor in actors:
-            actor.promote()
-
-    if role.connection is not None:
-        loop.add_reader(role.connection, told, role.connection)
-    if role.waits == "own":
-        for one in buses.values():
-            await one.open(announce=False)
-        await _rehearse(layout, role, run, buses, wanted)
-        await wanted.wait()
     if layout.routers.keys().isdisjoint(role.names):
         loop.add_signal_handler(signal.SIGTERM, stop_all)
-    actors += made()
     tasks = [asyncio.create_task(actor.run()) for actor in actors]
     try:
         await asyncio.gather(*tasks)
@@ -278,22 +180,6 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-
-
-async def _rehearse(layout: Layout, role: Role, run: RunContext, buses: Mapping[str, ZenohBus],
-                    wanted: asyncio.Event) -> None:
-    """Have what the actors are made of, and what they use, be this process' own; see `rehearsal`.
-
-    Those of a class that allows no spare are made and not run: `on_start` may take a port.
-    """
-    stages = {name: Stage(layout.plan, bus, name, role.incarnation) for name, bus in buses.items()}
-    made = [make_actor(layout, name, role.incarnation, run, asyncio.get_running_loop(), bus=stage,
-                       store=stage.store) for name, stage in stages.items()]
-    try:
-        await run_for_a_moment([one for one in made if one.most_spare != "none"], wanted)
-    finally:
-        for stage in stages.values():
-            stage.clear()
 
 
 def go_first() -> None:

@@ -21,9 +21,6 @@ from rampart.actors.foreign.program import LOGS
 from rampart.actors.foreign.strays import kill_strays
 from rampart.actors.machine.unix_peer import process_state
 
-WAITING = "spare."
-"""In the title of a process that waits to be a node, before the name of that."""
-
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 
 TITLE_BYTES = 512

@@ -12,20 +12,42 @@ import contextlib
 import os
 import select
 import signal
+import socket
 import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from rampart.actors.bus.run_folder import mark_of
+import msgspec
+
+from rampart.actors.bus.run_folder import change_system, mark_of
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.machine.patience import AT_LEISURE, Usage, usage
 from rampart.actors.machine.process_ends import LocalProcess, Marks
 from rampart.actors.machine.unix_peer import process_id, process_state
-from rampart.actors.supervision.node_process import Waits
-from rampart.actors.supervision.process_title import RunProcess, find_processes
-from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+from rampart.actors.supervision.process_title import RunProcess, find_processes, kill
+from rampart.actors.supervision.requests import REQUEST_BYTES, ForkRequest, Reply
 
-__all__ = ["OsProcesses", "ProcessHandle", "Processes", "RunProcess", "SpawnerUnavailableError"]
+__all__ = ["ForkError", "ForkPendingError", "OsProcesses", "ProcessHandle", "Processes",
+           "RunProcess"]
+
+WORD_S = 0.25
+"""Wall seconds between two words to the root, and between two looks whether that is stopped."""
+
+WAIT_S = 0.05
+"""A fork takes a millisecond or two. So long its caller stands still for it, if it waits for no
+other one."""
+
+PATIENCE_S, PATIENCE_MAX_S = 0.25, 8.0
+"""A request that is not answered is made again; each time later, for on a machine that is busy
+enough the new process cannot answer sooner either."""
+
+
+class ForkError(Exception):
+    """No process could be started; the text is one line."""
+
+
+class ForkPendingError(ForkError):
+    """A process was asked for and has not answered yet."""
 
 
 class ProcessHandle:
@@ -76,26 +98,14 @@ class Processes(Protocol):
         """Start a process for the named actors and return its pid.
 
         Raises:
-            SpawnerBusyError: It is under way; to be called again with the same names and
+            ForkPendingError: It is under way; to be called again with the same names and
                 incarnation.
-            SpawnerUnavailableError: No spawner could do it now; likewise.
+            ForkError: It was not possible; likewise.
             OSError: Likewise, for want of memory or descriptors.
         """
 
-    def prepare(self, names: tuple[str, ...], incarnation: int, kind: Waits) -> None:
-        """Have a process made ready for these actors, silent, for `fork` to take if it can."""
-
-    def is_ready(self, names: tuple[str, ...]) -> bool:
-        """Whether there is one, which neither hangs nor is stopped, as far as is known."""
-
-    def set_up(self, names: tuple[str, ...]) -> bool:
-        """Have that process set up what it has only rehearsed; False if that is not so."""
-
-    def forget(self, names: tuple[str, ...]) -> None:
-        """End a process that was made ready and is not wanted."""
-
     def withdraw(self, names: tuple[str, ...]) -> None:
-        """Likewise, and one that `fork` was called for and is under way."""
+        """End a process that `fork` was called for and that is under way."""
 
     def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> ProcessHandle:
         """Take hold of a process; `ended` is called on the event loop when it ends.
@@ -176,11 +186,107 @@ class OsHandle(ProcessHandle):
             self.pidfd = -1
 
 
-class OsProcesses(SpawnerClient):
-    """Processes of this machine; the run's spawners fork them."""
+class _Asked:
+    """A request to the root, until the new process has answered it or it is withdrawn."""
+
+    def __init__(self, root: socket.socket, request: ForkRequest) -> None:
+        self.incarnation = request.incarnation
+        self.since_s = time.monotonic()
+        self._answer, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            try:
+                socket.send_fds(root, [msgspec.json.encode(request)], [theirs.fileno()])
+            except OSError:
+                self._answer.close()
+                raise
+
+    def reply(self, wait_s: float) -> Reply | None:
+        """Return the answer, or None if there is none after so many seconds."""
+        poll = select.poll()
+        poll.register(self._answer, select.POLLIN)
+        return self._read() if poll.poll(wait_s * 1000) else None
+
+    def withdraw(self) -> Reply:
+        """Take the request back; return the answer if that came first."""
+        self._answer.shutdown(socket.SHUT_RD)
+        return self._read()
+
+    def _read(self) -> Reply:
+        with self._answer:
+            try:
+                data = self._answer.recv(REQUEST_BYTES)
+            except OSError:
+                data = b""
+        return msgspec.json.decode(data, type=Reply) if data else Reply(error="no answer")
+
+
+class OsProcesses:
+    """Processes of this machine, which the root of the run forks. To be made on a running loop.
+
+    Args:
+        folder: Of the run.
+        port: Base port of the run.
+        launcher: Process id of the root.
+        root: Descriptor of the connection to it.
+    """
 
     has_routers = True
-    _marks: Marks | None = None
+
+    def __init__(self, folder: str, port: int, launcher: int, root: int) -> None:
+        self.folder = folder
+        self._port = port
+        self._launcher = launcher
+        self._root = socket.socket(fileno=root)
+        self._root.setblocking(False)
+        self._asked: dict[tuple[str, ...], _Asked] = {}
+        self._patience_s = PATIENCE_S
+        self._marks: Marks | None = None
+        self._loop = asyncio.get_running_loop()
+        self._word()
+
+    def _word(self) -> None:
+        """Show the root that this loop turns, and continue it if it was stopped."""
+        with contextlib.suppress(OSError):
+            self._root.send(b" ")
+        if process_state(self._launcher) == "T":
+            kill(self._launcher, signal.SIGCONT)
+        self._next_word = self._loop.call_later(WORD_S, self._word)
+
+    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
+        """Start a process and return its pid, as `Processes`."""
+        asked = self._asked.get(names)
+        if asked is not None and asked.incarnation != incarnation:  # its place is another's now
+            self.withdraw(names)
+            asked = None
+        wait_s = 0.0 if self._asked else WAIT_S
+        if asked is None:
+            asked = self._asked[names] = _Asked(self._root, ForkRequest(names[0], incarnation))
+        reply = asked.reply(wait_s)
+        if reply is not None:
+            self._patience_s = PATIENCE_S
+        elif time.monotonic() - asked.since_s > self._patience_s:
+            reply = asked.withdraw()
+            self._patience_s = min(2 * self._patience_s, PATIENCE_MAX_S)
+        else:
+            raise ForkPendingError("no answer yet")
+        del self._asked[names]
+        if not reply.pid:
+            raise ForkError(reply.error)
+        return reply.pid
+
+    def withdraw(self, names: tuple[str, ...]) -> None:
+        """End what is under way for these actors."""
+        asked = self._asked.pop(names, None)
+        if asked is not None and (pid := asked.withdraw().pid):
+            kill(pid)
+
+    def adapt(self, adapted: AdaptedSystem) -> None:
+        """Have every process that is forked from now on know a changed system.
+
+        Raises:
+            OSError: the folder of the run is full, or gone.
+        """
+        change_system(self.folder, msgspec.json.encode(adapted))
 
     def living(self) -> list[RunProcess]:
         """Return the processes of this run, found in /proc."""
@@ -208,6 +314,9 @@ class OsProcesses(SpawnerClient):
 
     def close(self) -> None:
         """Let go of everything."""
+        self._next_word.cancel()
+        for names in list(self._asked):
+            self.withdraw(names)
+        self._root.close()
         if self._marks is not None:
             self._marks.close()
-        super().close()

@@ -35,8 +35,14 @@ from rampart.actors.machine.patience import Patience
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.held_process import HeldProcess
-from rampart.actors.supervision.processes import OsProcesses, Processes, ProcessHandle, RunProcess
-from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
+from rampart.actors.supervision.processes import (
+    ForkError,
+    ForkPendingError,
+    OsProcesses,
+    Processes,
+    ProcessHandle,
+    RunProcess,
+)
 from rampart.actors.supervision.supervised_process import (
     MANY,
     STATUS,
@@ -64,9 +70,6 @@ _ROUTERS_S = 0.03
 _SEARCH_S, _GONE_S = 0.05, 0.002
 """Wall seconds between two looks into /proc for one node, and at whether a killed one is gone."""
 
-_WANTED_S = 1.0
-"""Wall seconds that a process which was made ready waits for the decision that it is wanted."""
-
 _RETRY_S, _ASK_AGAIN_S = 0.05, 0.01
 
 
@@ -87,7 +90,7 @@ class Supervisor(Actor):
         self._plan, self._spec = run.plan, run.system
         self._layout = Layout(self._plan, self._spec)
         self._machine: Processes = processes or OsProcesses(
-            self._plan.folder, self._plan.base_port, self._plan.launcher_pid)
+            self._plan.folder, self._plan.base_port, self._plan.launcher_pid, run.root)
         self._routers = self._layout.routers if self._machine.has_routers else {}
         self._processes = {
             name: self._held(unit) for name, unit in {**self._routers, **self._layout.here}.items()}
@@ -304,11 +307,9 @@ class Supervisor(Actor):
 
     @every(0.5)
     def repeat(self) -> None:
-        """Repeat the node table for those who joined late, and see to the spares."""
+        """Repeat the node table for those who joined late."""
         self.publish_table()
         self._lateness.turn()
-        running = (p for p in self._processes.values() if p.state is State.RUNNING)
-        any(p.keep_spare(self._machine, self._layout.spare_of(p.names)) for p in running)
 
     def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
         # Else it was replaced, or is kept no more, since the news came to the mailbox.
@@ -316,15 +317,7 @@ class Supervisor(Actor):
             process.let_go()
             for name in process.names:
                 self._bus.gone(name, process.incarnation)
-            if not self._owns(process):
-                self._prepare(process)
             self._on(process, Event.ENDED, detail=detail)
-
-    def _prepare(self, process: HeldProcess) -> None:
-        """Have the next process made ready while it is decided whether there is to be one."""
-        if (self._layout.spare_of(process.names) != "none"
-                and (forget := process.prepare(self._machine))):
-            self.call_later(_WANTED_S * self.clock.rate, forget)
 
     def _owns(self, process: HeldProcess) -> bool:
         """Whether the supervisor itself brings the process back."""
@@ -389,8 +382,8 @@ class Supervisor(Actor):
         incarnation = process.highest + 1
         try:
             pid = self._machine.fork(process.names, incarnation)
-        except (SpawnerUnavailableError, OSError) as error:
-            is_busy = isinstance(error, SpawnerBusyError)
+        except (ForkError, OSError) as error:
+            is_busy = isinstance(error, ForkPendingError)
             if not is_busy:
                 self.report_diagnostic("fork", str(error), process.unit.name)
             self._fork_in(process, _ASK_AGAIN_S if is_busy else _RETRY_S,

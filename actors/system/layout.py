@@ -26,7 +26,6 @@ from rampart.actors.system.checks import (
 )
 from rampart.actors.system.hosts import Hosts
 from rampart.actors.system.members import (
-    SPARES,
     Member,
     Spare,
     application_class,
@@ -152,13 +151,14 @@ class Layout:
             member.parameters, topics.values(), ordered)) for member in everyone]
 
     def spare_of(self, names: Collection[str]) -> Spare:
-        """Return which spare the process of these actors is to have; the least that one allows."""
-        return SPARES[min(SPARES.index(
-            self.members[name].spare if name in self.members else "none") for name in names)]
+        """Return of what the next process of these actors is made."""
+        return "pool" if all(name in self.members and self.members[name].spare == "pool"
+                             for name in names) else "none"
 
     def may_be_marked(self, names: Collection[str]) -> bool:
         """Whether all that the process of these actors holds is memory: no port, no program."""
-        return all(name in self.members and self.members[name].actor.most_spare != "none"
+        return all(name in self.members and not self.members[name].actor.holds_devices
+                   and self.members[name].kind is not Kind.WORLD
                    for name in names)
 
     def _check(self, judge: Any, everyone: Iterable[Member], known: Collection[Topic[Any]],

@@ -35,10 +35,7 @@ _PLACE = {Kind.DETECTION: "it belongs into [[detection]]",
           Kind.RECOVERY: "it belongs into [[recovery]]",
           Kind.MANAGER: "kind = 'manager' is right"}
 
-Spare = Literal["none", "warm", "own", "hot"]
-SPARES: tuple[Spare, ...] = ("none", "warm", "own", "hot")
-_WITHIN = {"none": SPARES[:1], "warm": SPARES[:3], "hot": SPARES}
-"""What a class allows, by the most that it does."""
+Spare = Literal["none", "pool"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,22 +134,8 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
     given |= {**node.parameters, **actor.given(node.name, spec, file)}
     return Member(node.name, actor, read_parameters(
         actor.Parameters, given, file, f"{path}: parameters", spec), kind=node.kind,
-        spare=_spare(node, actor, f"{file}: {path}"))
-
-
-def _spare(node: NodeSpec, actor: type[Actor], path: str) -> Spare:
-    """Return which spare a node is to have.
-
-    Raises:
-        ValueError: its class does not allow that.
-    """
-    most = "none" if node.kind is Kind.WORLD else actor.most_spare
-    if not node.spare:
-        return "none" if most == "none" else "warm"
-    if node.spare not in _WITHIN[most]:
-        raise ValueError(
-            f"{path}: spare = {node.spare!r}: {actor.__name__} allows {most!r} at most")
-    return node.spare
+        spare="none" if node.spare == "none" or (
+            node.kind is Kind.WORLD and not node.spare) else "pool")
 
 
 def load_class(path: str, kind: Kind | None = None, field: str = "actor") -> type[Actor]:

@@ -26,8 +26,7 @@ Validator = Callable[[SystemSpec], Iterator[Finding]]
 SUPERVISOR = "supervisor"
 MANAGER_CLASS = "rampart.manager.actor:FtmManager"
 RESERVED = frozenset({
-    SUPERVISOR, "spawner", "spawner_a", "spawner_b", "router_a", "router_b", "spare_a", "spare_b",
-    "launch", "observer", "injector"})
+    SUPERVISOR, "root", "run", "pool", "router_a", "router_b", "launch", "observer", "injector"})
 
 
 def find_nonsense(spec: SystemSpec) -> Finding | None:

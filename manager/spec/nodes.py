@@ -82,10 +82,9 @@ class NodeSpec(Table, frozen=True):
         process: Name of the OS process it runs in; "" for one of its own name.
         host: Name of the machine on which it runs; "" for the first.
         respawn: Who brings it back: a recovery module, or "supervisor".
-        spare: What its next process is made of. "none": a new one. "warm": one that is connected
-            and waits for a role. "own": one that waits for this role, and has rehearsed it. "hot":
-            one that hears everything in this role, in silence. "" is the most that its class
-            allows, "warm" at most.
+        spare: What its next process is made of. "pool": one that is connected to the bus and may
+            become any node. "none": a new one. "" is "pool", but for the world. "warm", "own" and
+            "hot" are of version 0.7, and mean "pool".
         parameters: For the actor, or for that which stands in for the command. A value of a key
             in `_s` may name a `[timing]` value.
         command: Executable and arguments, in place of an actor.
@@ -104,7 +103,7 @@ class NodeSpec(Table, frozen=True):
     process: OptionalName = ""
     host: OptionalName = ""
     respawn: Name = "supervisor"
-    spare: Literal["", "none", "warm", "own", "hot"] = ""
+    spare: Literal["", "none", "pool", "warm", "own", "hot"] = ""
     parameters: dict[str, Any] = {}
     command: tuple[str, ...] = ()
     env: dict[str, str] = {}

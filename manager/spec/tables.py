@@ -214,7 +214,7 @@ class Supervision(Table, frozen=True):
         backoff_max_s: ... up to this.
         attempt_s: Between being given up and the next attempt; each that fails doubles it ...
         attempt_max_s: ... up to this.
-        spares: Processes that each of the two spawners keeps ready to be a node.
+        spares: Processes in the pool, each ready to become any node.
     """
 
     intensity: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 50
@@ -223,4 +223,4 @@ class Supervision(Table, frozen=True):
     backoff_max_s: Positive = 2.0
     attempt_s: Positive = 10.0
     attempt_max_s: Positive = 60.0
-    spares: Annotated[int, msgspec.Meta(ge=0, le=16)] = 1
+    spares: Annotated[int, msgspec.Meta(ge=0, le=16)] = 2

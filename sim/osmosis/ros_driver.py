@@ -66,7 +66,7 @@ class RosDriver(Simulator):
 
     parameters: Parameters
     outputs = (topics.TRUTH, topics.OBSTACLES, ftm_topics.HOLDS)
-    most_spare = "none"
+    holds_devices = True
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

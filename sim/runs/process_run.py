@@ -1,8 +1,9 @@
-"""A run on real processes: the launcher, and in this process the observer and the injector."""
+"""A run on real processes: in this process the observer and the injector."""
 
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ _KEYS_S = 5.0
 """Wall seconds between two looks at the certificates."""
 
 _RELINK_S = 1.0
-"""Wall seconds in which a launcher that was stopped is linked to a router again."""
+"""Wall seconds in which a process that was stopped is linked to a router again."""
 
 
 def hit(port: int, what: str, node: str, _pace_s: float) -> bool:
@@ -45,7 +46,7 @@ def excused_s(late_s: float) -> float:
     """Return how long nothing that was not heard counts, wall seconds.
 
     Args:
-        late_s: how much too late the launcher looked again. It was stopped (ctrl-Z) if that is
+        late_s: how much too late this process looked again. It was stopped if that is
             more than a loaded machine does; then what was sent meanwhile comes now, or after it has
             joined a router again.
     """
@@ -53,11 +54,12 @@ def excused_s(late_s: float) -> float:
 
 
 class ProcessRun:
-    """One run on processes. Use: `begin`, which may be left out, and `run`, once.
+    """One run on processes. Use: `run`, once.
 
     Args:
         trial: What is run.
         scenario: What goes wrong, and when.
+        link: Connection to the run's root; None to start one.
 
     Attributes:
         interrupted: Setting it ends the run for this reason.
@@ -65,24 +67,20 @@ class ProcessRun:
         unrecorded: Why it is not recorded to its end, although it was to be; "" if it is.
     """
 
-    def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = ()) -> None:
-        self.launcher = (FirstLauncher(trial.run, trial.title) if trial.run.system.hosts
-                         else Launcher(trial.run.plan, trial.title))
+    def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = (),
+                 link: socket.socket | None = None) -> None:
+        self.launcher = (FirstLauncher(trial.run, trial.title, link) if trial.run.system.hosts
+                         else Launcher(trial.run.plan, trial.title, link))
+        self.launcher.on_interrupt = self.interrupt
         self.interrupted = ""
         self.failure = ""
         self.unrecorded = ""
         self._trial = trial
         self._scenario = tuple(scenario)
-        self._begun = False
 
-    def begin(self) -> None:
-        """Claim what the run needs, and fork what starts processes; before there is a loop.
-
-        Raises:
-            LaunchError: The system cannot be started.
-        """
-        self.launcher.begin(forks=True)
-        self._begun = True
+    def interrupt(self, by: str) -> None:
+        """End the run, for the user wants that: by which signal."""
+        self.interrupted = f"interrupted by {by}"
 
     async def run(self) -> RunRecord:
         """Start everything, run to the end, and return the record.
@@ -90,8 +88,6 @@ class ProcessRun:
         Raises:
             LaunchError: The system cannot be started.
         """
-        if not self._begun:
-            self.launcher.begin()
         try:
             await self.launcher.load()
             if isinstance(self.launcher, FirstLauncher):
@@ -111,9 +107,9 @@ class ProcessRun:
         launcher, trial = self.launcher, self._trial
         spec, plan = trial.run.system, launcher.plan
         clock = Clock(plan.origin_s, plan.rate)
-        launcher.guard.on_restart = lambda name: trial.brought_back(name, clock.now())
+        launcher.on_restart = lambda name: trial.brought_back(name, clock.now())
         if console := trial.console:
-            launcher.guard.report = lambda text: console.line(clock.now(), text)
+            launcher.report = lambda text: console.line(clock.now(), text)
 
         bus = launcher.observers_bus()
 
@@ -123,7 +119,7 @@ class ProcessRun:
                 run=trial.run, register=register_of(plan.folder),
                 members=frozenset(launcher.names))
 
-        actors = trial.outside(context, launcher.supervisor_heard, self._scenario,
+        actors = trial.outside(context, lambda _table: None, self._scenario,
                                partial(hit, plan.base_port), can_be_hit(spec))
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):
@@ -139,7 +135,7 @@ class ProcessRun:
                 await asyncio.sleep(_LOOK_S)
                 if wall_s := excused_s((clock.now() - looked_s) / plan.rate - _LOOK_S):
                     trial.excuse(wall_s * plan.rate)
-                recording, problem = launcher.recording()
+                recording, problem = launcher.look_at_recording()
                 if problem and not self.unrecorded:
                     self.unrecorded = problem
                     actors[0].report_diagnostic("recording", problem, recording)
@@ -147,7 +143,7 @@ class ProcessRun:
                 why = trial.ended(clock.now())
             if launcher.failure:  # before its observer is told to end
                 why = self.failure = launcher.failure
-                launcher.guard.report(why)
+                launcher.report(why)
         finally:
             for actor in reversed(actors):
                 actor.stop()
@@ -170,6 +166,6 @@ class ProcessRun:
             except (KeysError, OSError) as error:
                 found = {plan.keys: str(error)}
             for name in found.keys() - told:
-                self.launcher.guard.report(found[name])
+                self.launcher.report(found[name])
             told = set(found)
             await asyncio.sleep(_KEYS_S)

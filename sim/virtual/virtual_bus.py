@@ -125,17 +125,12 @@ class VirtualBus:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._virtual: VirtualLoop | None = None
 
-    async def open(self, *, announce: bool = True) -> None:
+    async def open(self) -> None:
         """Join the hub."""
         self._hub.add(self)
         self._loop = loop = asyncio.get_running_loop()
         self._virtual = loop if isinstance(loop, VirtualLoop) else None
         self._open = True
-        if announce:
-            self.announce()
-
-    def announce(self) -> None:
-        """Tell those who watch this node that it is there."""
         self._hub.announce(self.node, self._incarnation, alive=True)
 
     @property

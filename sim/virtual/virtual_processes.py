@@ -26,12 +26,8 @@ from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import SUPERVISOR
-from rampart.actors.supervision.guard import PERIOD_S, SUPERVISOR_PATIENCE_S
-from rampart.actors.supervision.processes import (
-    ProcessHandle,
-    RunProcess,
-    SpawnerUnavailableError,
-)
+from rampart.actors.supervision.processes import ForkError, ProcessHandle, RunProcess
+from rampart.actors.supervision.root import PERIOD_S, SUPERVISOR_PATIENCE_S
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.actors.system.layout import Layout, adapted_system
@@ -200,27 +196,13 @@ class VirtualMachine:
         """Return the processes that are there, the supervisor's own included."""
         return [RunProcess(p.pid, 0, 0, p.names, p.incarnation) for p in self._processes.values()]
 
-    def prepare(self, names: tuple[str, ...], incarnation: int, kind: str) -> None:
-        """Nothing to do: how long a process takes to start is what was measured with spares."""
-
-    def is_ready(self, names: tuple[str, ...]) -> bool:  # noqa: ARG002
-        """As if there were one."""
-        return True
-
-    def set_up(self, names: tuple[str, ...]) -> bool:  # noqa: ARG002
-        """As if it were."""
-        return False
-
-    def forget(self, names: tuple[str, ...]) -> None:
-        """Nothing to do either."""
-
     def withdraw(self, names: tuple[str, ...]) -> None:
-        """Likewise."""
+        """Nothing to do: nothing is ever under way."""
 
     def fork(self, names: tuple[str, ...], incarnation: int) -> int:
         """Start a process; its first word comes after the measured time."""
         if self._down:
-            raise SpawnerUnavailableError("the machine is down")
+            raise ForkError("the machine is down")
         pid = next(self._pids)
         process = self._processes[pid] = VirtualProcess(pid, names, incarnation)
         for name in names:

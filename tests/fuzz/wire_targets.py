@@ -25,7 +25,6 @@ from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.runtime.checkpoint import StateError
 from rampart.actors.supervision.process_title import parse_title
-from rampart.actors.supervision.spawner import ForkRequest, Ping, Reply, Request, SetOrigin
 from rampart.actors.web.access import Access
 from rampart.actors.web.gate import Gate
 from rampart.actors.web.visitors import Register, Role, Visitor, VisitorError, digest, parse
@@ -92,12 +91,6 @@ def proc_stat(data: bytes) -> None:
         samples=lambda: [msgspec.json.encode(sample(RunInfo))])
 def run_info(data: bytes) -> None:
     _ = read_info(data).endpoints
-
-
-@target("spawner-request", refuses=UNREADABLE, kind="json", samples=lambda: [
-        msgspec.json.encode(sample(kind)) for kind in (ForkRequest, Ping, SetOrigin, Reply)])
-def spawner_request(data: bytes) -> None:
-    msgspec.json.decode(data, type=Request)
 
 
 # -- operators -------------------------------------------------------------------------------------

@@ -3,14 +3,16 @@
 The plan is pure and seeded: who is hit how, and how long after the one before. The executor waits
 until the victim has gone and another has taken its place, so that hits come in turn.
 
-Three processes are special:
+Some processes are special:
 
-* The launcher is what a run *is*: its end ends the run. That it leaves nothing behind is
+* The root is what a run *is*: its end ends the run. That it leaves nothing behind is
   `tests/whole/test_launch.py`'s subject.
 * The world is only stopped for a moment. It stands for the real one, ground truth included: with
   its process the place of the robot is gone, and nobody can bring that back; the supervisor does
   not try. A wedged loop never turns again, so that would be its death too.
-* A spawner has no heartbeat and only one incarnation: a new pid shows that it is back.
+* The process that watches the run has the verdict: its end ends the run, too. Stopped, it is
+  continued by the root.
+* A process of the pool is no node: another one in its place shows that the pool is full again.
 """
 
 from __future__ import annotations
@@ -32,22 +34,12 @@ from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.checkpoint_file import read
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.kill_node import SIGNALS
-from rampart.actors.supervision.process_title import WAITING, find_processes, process_state
-from rampart.actors.supervision.spawner import NAMES
+from rampart.actors.supervision.process_title import find_processes, process_state
+from rampart.actors.supervision.root import POOL
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.testing import RealRun
 
 WAYS = ("KILL", "STOP", "SEGV", "WEDGE")
-SPAWNERS = tuple(f"spawner_{name}" for name in NAMES)
-SPARES = tuple(f"spare_{name}" for name in NAMES)
-
-
-def is_spare(name: str) -> bool:
-    """Whether a process is a spare, of all nodes or of one."""
-    return name in SPARES or name.startswith(WAITING)
-
-
-
 BACK_WITHIN_S = 10.0
 """Wall seconds after which a victim counts as not having come back; a loaded machine is slow."""
 
@@ -79,8 +71,7 @@ def targets(spec: SystemSpec) -> Targets:
     nodes = {unit: members[0] for unit, members in spec.processes().items()}
     world = tuple(n.name for n in nodes.values() if n.kind is Kind.WORLD)
     mortal = tuple(n.name for n in nodes.values() if n.kind is not Kind.WORLD)
-    beside = tuple(f"{WAITING}{n.name}" for n in nodes.values() if n.spare in {"own", "hot"})
-    return Targets((*mortal, SUPERVISOR, *SPAWNERS, *ROUTERS, *SPARES, *beside), world)
+    return Targets((*mortal, SUPERVISOR, *ROUTERS, POOL), world)
 
 
 def each_in_every_way(of: Targets, seed: int, pause_s: tuple[float, float]) -> list[Hit]:

@@ -1,9 +1,9 @@
 """Chaos in pairs: hits two processes of a run at once, and sees that everything comes back.
 
 The plan is pure and seeded: every pair of the processes once, each of the two killed, stopped or
-wedged as drawn, at the same moment or up to `GAP_S` apart. A pair with a guard (supervisor, a
-spawner, the launcher) comes in all combinations of ways. Two processes are only stopped for a
-moment (`chaos` says why): the world, and the launcher, whose end is the run's: as by Ctrl-Z and fg.
+wedged as drawn, at the same moment or up to `GAP_S` apart. A pair with a guard (supervisor, root)
+comes in all combinations of ways. Two processes are only stopped for a moment (`chaos` says why):
+the world, and the root, whose end is the run's.
 
 Everything is back when both have been replaced, the supervisor's table has all nodes running in
 the processes that /proc shows, and each of them has been heard since. Nothing waits for the
@@ -30,15 +30,16 @@ from rampart.actors.runtime.actor import HEARTBEAT
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import find_processes, process_state
+from rampart.actors.supervision.root import POOL
 from rampart.cli.output import UsageError
 from rampart.cli.session import connect
 from rampart.testing import RealRun
-from tests.whole.chaos import SPAWNERS, WORLD_PAUSE_S, Targets, is_spare, tells_end
+from tests.whole.chaos import WORLD_PAUSE_S, Targets, tells_end
 
-LAUNCHER = "launcher"
+LAUNCHER = "root"
 WAYS = ("KILL", "STOP", "WEDGE")
 PAUSE = "PAUSE"
-GUARDS = (SUPERVISOR, *SPAWNERS, LAUNCHER)
+GUARDS = (SUPERVISOR, LAUNCHER)
 GAP_S = 0.4
 """The second of a pair is hit at once, or up to so many wall seconds later."""
 
@@ -72,7 +73,7 @@ class Pair:
 def plan_pairs(of: Targets, seed: int) -> list[Pair]:
     """Return every pair of a system's processes, in the order of its dice."""
     dice = random.Random(f"pairs {seed}")
-    mortal = [name for name in of.mortal if not is_spare(name)]  # one may become the other's heir
+    mortal = [name for name in of.mortal if name != POOL]  # one may become the other's heir
     everybody = (*mortal, *of.world, LAUNCHER)
     paused = {*of.world, LAUNCHER}
     drawn = []
@@ -193,8 +194,7 @@ class PairChaos:
         pids = {LAUNCHER: self._run.process.pid}
         for process in sorted(find_processes(self._run.port), key=lambda p: p.incarnation):
             for name in process.names:
-                if name not in SPAWNERS or name not in pids:  # their children, for a moment
-                    pids[name] = process.pid
+                pids[name] = process.pid
         return pids
 
     def _is_replaced(self, name: str, old: int) -> bool:
@@ -237,5 +237,4 @@ class PairChaos:
                   if there.get(row.name) != row.pid]
         wrong += [f"{row.name} not heard" for row in table.nodes
                   if heard.get(row.name) != row.pid]
-        wrong += [f"{name} is not there" for name in SPAWNERS if name not in there]
         return ", ".join(wrong)

@@ -21,7 +21,6 @@ from rampart.manager.spec.specification import SystemSpec, check_document, read_
 from rampart.testing import RealRun, free_base_port
 from tests import ROOT
 from tests.whole.chaos import (
-    SPAWNERS,
     Chaos,
     Hit,
     Struck,
@@ -101,7 +100,7 @@ def write_laps(directory: Path, laps: int = LAPS) -> Path:
 def many_deaths(root: Path, seed: int, rate: float, kills: int) -> list[str]:
     """Let so many processes die in ten minutes of one run; return what was wrong or has leaked."""
     everybody = targets(load())
-    survivors = (SUPERVISOR, *SPAWNERS)
+    survivors = (SUPERVISOR,)
     names = [name for name in everybody.mortal if name not in survivors]
     counted = (*survivors, *everybody.world)
     period_s = 60 * MINUTES / kills

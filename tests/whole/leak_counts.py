@@ -1,12 +1,12 @@
 """What a run holds of the machine, counted from outside, and whether it grows with its deaths.
 
-Those that outlive all deaths are looked at: the launcher, the supervisor and the spawners, and the
+Those that outlive all deaths are looked at: the root, the process that watches the run, and the
 world, which stands for any node that loses its partners and finds them again. Counts are compared
 when nothing is under way. What may become more:
 
-* Descriptors of who has a Zenoh session, by one connection for each partner. Zenoh dials a partner
-  that it has lost while that dials it; one of the two connections then idles until either ends.
-* Memory, by the record of the run in the launcher and by what allocators and Zenoh keep.
+* Descriptors of all but the root, which has no session, by one connection for each partner. Zenoh
+  dials a partner that it has lost while that dials it; one of the two connections then idles.
+* Memory, by the record of the run in the process that watches it and by what Zenoh keeps.
 """
 
 from __future__ import annotations
@@ -21,8 +21,6 @@ from rampart.testing import RealRun
 
 LAUNCHER = "launch.py"
 MAX_GROWTH_MB = 15.0
-NO_SESSION = "spawner_"
-"""How the names of those begin that have none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +77,7 @@ def leaks(before: Counts, after: Counts) -> list[str]:
     found = [
         f"{name}: descriptors {old} -> {after.descriptors[name]}"
         for name, old in before.descriptors.items()
-        if after.descriptors[name] > old + before.processes * (not name.startswith(NO_SESSION))]
+        if after.descriptors[name] > old + before.processes * (name != LAUNCHER)]
     found += [
         f"{name}: memory {mb:.1f} -> {after.memory_mb[name]:.1f} MB"
         for name, mb in before.memory_mb.items() if after.memory_mb[name] > mb + MAX_GROWTH_MB]

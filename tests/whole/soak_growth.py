@@ -3,7 +3,7 @@
 Samples of one mission have a level of their own, so each is compared with the mean of its mission
 alone (fixed effects): what differs between missions is no growth. Neighbouring samples say nearly
 the same, so the means of whole minutes are taken. The first five minutes of a mission are left out:
-processes begin as copies of a spawner, and what they share with it becomes their own as they touch
+processes begin as copies of the root, and what they share with it becomes their own as they touch
 it (all together 310 MB after 5 s, 323 after 4 minutes, 329.1 after 7, 329.7 after 9). The slope is
 that of least squares, with 95 % of Student's t; a figure grows if even the low end of it is more
 than what counts.

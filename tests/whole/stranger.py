@@ -73,7 +73,7 @@ def squat(folder: str) -> str:
     """Try to put a socket of one's own into the folder of the run."""
     with socket.socket(socket.AF_UNIX) as own:
         try:
-            own.bind(f"{folder}/spawner_a")
+            own.bind(f"{folder}/router_a~")
         except OSError as error:
             return type(error).__name__
     return "bound"

@@ -30,9 +30,8 @@ def test_everybody_is_hit_in_every_way_and_the_world_is_only_stopped():
     everybody = targets(check_document(
         read_document(SHIPPED.read_text(encoding="utf-8"), SHIPPED.name), SHIPPED.name))
     hits = each_in_every_way(everybody, 1, PAUSE_S)
-    assert {"hmi", "safety_pilot", "ftm_manager", "supervisor", "spawner_a", "spawner_b",
-            "router_a", "router_b", "spare_a", "spare_b", "spare.safety_pilot", "DM13", "RM8",
-            "standby_control"} <= set(everybody.mortal)
+    assert {"hmi", "safety_pilot", "ftm_manager", "supervisor", "router_a", "router_b", "pool",
+            "DM13", "RM8", "standby_control"} <= set(everybody.mortal)
     assert sorted((h.name, h.way) for h in hits) == sorted(
         [*[("simulator", "STOP")] * 4, *((name, way) for name in everybody.mortal for way in WAYS)])
 
@@ -49,21 +48,21 @@ def test_the_plan_follows_from_its_seed_and_gives_everybody_a_moment(hits):
         assert all(a.name != b.name for a, b in pairwise(plan))
 
 
-COUNTS = Counts({"supervisor": 60, "spawner_a": 10}, {"supervisor": 90.0, "spawner_a": 50.0},
+COUNTS = Counts({"supervisor": 60, "launch.py": 10}, {"supervisor": 90.0, "launch.py": 50.0},
                 34, 0, 99, frozenset({"a"}))
 
 
 def test_the_same_or_less_is_no_leak_nor_are_spare_connections_and_a_little_memory():
     assert leaks(COUNTS, COUNTS) == []
     assert leaks(COUNTS, replace(
-        COUNTS, processes=33, descriptors={"supervisor": 94, "spawner_a": 9},
-        memory_mb={"supervisor": 100.0, "spawner_a": 50.0})) == []
+        COUNTS, processes=33, descriptors={"supervisor": 94, "launch.py": 9},
+        memory_mb={"supervisor": 100.0, "launch.py": 50.0})) == []
 
 
 @pytest.mark.parametrize("after", [
-    {"descriptors": {"supervisor": 95, "spawner_a": 10}},
-    {"descriptors": {"supervisor": 60, "spawner_a": 11}},
-    {"memory_mb": {"supervisor": 110.0, "spawner_a": 50.0}},
+    {"descriptors": {"supervisor": 95, "launch.py": 10}},
+    {"descriptors": {"supervisor": 60, "launch.py": 11}},
+    {"memory_mb": {"supervisor": 110.0, "launch.py": 50.0}},
     {"processes": 35}, {"zombies": 1}, {"files": 100},
     {"shared_memory": frozenset("ab")}], ids=" ".join)
 def test_whatever_becomes_more_is_one_leak(after):

@@ -20,17 +20,15 @@ from rampart.files import working_folder
 
 
 class Watch(Actor):
-    """Keeps the launcher's guard informed, and says when all is running."""
+    """Says when all is running."""
 
-    def __init__(self, context: Context, launcher: Launcher) -> None:
+    def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._launcher = launcher
         self._said = False
 
     @on(topics.NODES)
     def nodes(self, table: NodeTable, _header: Header) -> None:
         """Take the supervisor's table."""
-        self._launcher.supervisor_heard(table)
         if not self._said and all(node.state is NodeState.RUNNING for node in table.nodes):
             self._said = True
             print("running", flush=True)
@@ -48,13 +46,12 @@ async def run(port: int, system: str, checkpoints: str, keys: str) -> None:
     await loop.connect_read_pipe(lambda: _UntilClosed(over), sys.stdin)
     launcher = Launcher(RunPlan("bench", port, system_file=system, checkpoints=checkpoints,
                                 keys=keys), "benchmark")
-    launcher.begin()
     try:
         await launcher.load()
         await launcher.start()
         print("begun", flush=True)
         bus, clock = launcher.observers_bus(), Clock(launcher.plan.origin_s)
-        watch = Watch(Context(OBSERVER, 1, clock, bus), launcher)
+        watch = Watch(Context(OBSERVER, 1, clock, bus))
         task = asyncio.create_task(watch.run())
         await over.wait()
         watch.stop()

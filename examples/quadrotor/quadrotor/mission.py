@@ -53,7 +53,6 @@ class Mission(Actor):
 
     parameters: Parameters
     outputs = (t.GOAL, t.MISSION)
-    most_spare = "warm"
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

@@ -120,7 +120,6 @@ class Pilot(Actor):
 
     parameters: Parameters
     outputs = (t.ROTORS, t.PILOT)
-    most_spare = "warm"
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

@@ -64,7 +64,6 @@ class Mission(Actor):
     """Fetches a trailer by each aisle, and goes home."""
 
     outputs = (topics.GOAL,)
-    most_spare = "warm"
     _step, _hitched = 0, False
 
     def on_start(self) -> None:

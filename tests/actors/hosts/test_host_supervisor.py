@@ -24,7 +24,7 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.node_process import make_actor
-from rampart.actors.supervision.spawner_client import SpawnerBusyError
+from rampart.actors.supervision.processes import ForkPendingError
 from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run
@@ -256,7 +256,7 @@ def test_a_process_that_ends_while_it_is_given_back_is_not_begun_anew(tmp_path, 
 
 
 def test_one_that_is_being_forked_when_its_home_is_back_gives_way(tmp_path, monkeypatch):
-    """Spawners may be slow; what they fork yet must not have the number of what the home forks."""
+    """The root may be slow; what it forks yet must not have the number of what the home forks."""
     async def scenario() -> None:
         async with world(tmp_path) as made:
             fork, asked, withdrawn = made.robot.fork, [], []
@@ -264,7 +264,7 @@ def test_one_that_is_being_forked_when_its_home_is_back_gives_way(tmp_path, monk
             def slow(names, incarnation):
                 if "camera" in names:
                     asked.append(incarnation)
-                    raise SpawnerBusyError("no answer yet")
+                    raise ForkPendingError("no answer yet")
                 return fork(names, incarnation)
 
             monkeypatch.setattr(made.robot, "fork", slow)

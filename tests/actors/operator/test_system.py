@@ -93,8 +93,8 @@ class Kernel:
         self.searches = 0
         self.alive = {10, 11, 20, 30}
         self.found = [RunProcess(10, 7450, 5, ("hmi",), 1),
-                      RunProcess(20, 7450, 5, ("spawner_a",), 3),
-                      RunProcess(30, 7450, 99, ("spawner_a",), 1)]
+                      RunProcess(20, 7450, 5, ("pool",), 3),
+                      RunProcess(30, 7450, 99, ("pool",), 1)]
 
     def count(self, pid: int) -> ProcessCount | None:
         return ProcessCount((self.now_s - 90) / 2, 50_000_000, 90.0) if pid in self.alive else None
@@ -119,9 +119,9 @@ def test_nodes_and_guards_are_looked_at_and_processes_of_another_run_are_not():
     looked = kernel.observer().look(table(hmi=10, localization=11))
     assert looked["nodes"] == {
         name: {"cpu": 50.0, "mb": 50.0, "age_s": 10}
-        for name in ("hmi", "localization", "spawner_a")}
+        for name in ("hmi", "localization", "pool")}
     assert [(g["name"], g["pid"], g["state"], g["restarts"]) for g in looked["guards"]] == [
-        ("launch.py", 5, "crashed", 0), ("spawner_a", 20, "running", 2)]
+        ("launch.py", 5, "crashed", 0), ("pool", 20, "running", 2)]
 
 
 def test_a_process_that_died_has_no_figures_and_its_row_stays():
@@ -130,7 +130,7 @@ def test_a_process_that_died_has_no_figures_and_its_row_stays():
     observer.look(table(hmi=10))
     kernel.alive = {20}
     kernel.now_s += 1
-    assert set(observer.look(table(hmi=10, never=0))["nodes"]) == {"spawner_a"}
+    assert set(observer.look(table(hmi=10, never=0))["nodes"]) == {"pool"}
 
 
 def test_all_of_proc_is_searched_now_and_then_only():

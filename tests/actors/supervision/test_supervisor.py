@@ -8,7 +8,6 @@ import errno
 import os
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import replace
 
 import msgspec
 import pytest
@@ -24,7 +23,7 @@ from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan, load_document, load_system
-from rampart.actors.supervision.processes import RunProcess, SpawnerUnavailableError
+from rampart.actors.supervision.processes import ForkError, RunProcess
 from rampart.actors.supervision.supervised_process import MOST_EXCUSED_S
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.actors.system.layout import Layout
@@ -92,33 +91,14 @@ class Machine:
         self.turning = False
         self.questions = 0
         self.searches = 0
-        self.ready: dict[str, tuple[int, str]] = {}
-        self.prepared: list[tuple[str, int, str]] = []
 
     def usage(self, process: Process) -> Usage:
         ran_s = 1.0 + (asyncio.get_running_loop().time() / 100 if self.turning else 0.0)
         return Usage("S", ran_s, max(0.0, asyncio.get_running_loop().time() - self.starves_from_s)
                      if process.names[0] in self.starving else 0.0)
 
-    def prepare(self, names: tuple[str, ...], incarnation: int, kind: str) -> None:
-        self.ready[names[0]] = incarnation, kind
-        self.prepared.append((names[0], incarnation, kind))
-
-    def is_ready(self, names: tuple[str, ...]) -> bool:
-        return names[0] in self.ready
-
-    def set_up(self, names: tuple[str, ...]) -> bool:
-        incarnation, kind = self.ready.get(names[0], (0, ""))
-        if kind != "own":
-            return False
-        self.ready[names[0]] = incarnation, "warm"
-        return True
-
-    def forget(self, names: tuple[str, ...]) -> None:
-        self.ready.pop(names[0], None)
-
     def withdraw(self, names: tuple[str, ...]) -> None:
-        self.forget(names)
+        """Nothing is ever under way."""
 
     def add(self, names: tuple[str, ...], incarnation: int, *, bound: bool = False) -> Process:
         self.issued |= dict.fromkeys(names, incarnation)
@@ -154,7 +134,6 @@ class Machine:
         if self.fork_error:
             raise self.fork_error
         self.forks.append((names[0], incarnation))
-        self.ready.pop(names[0], None)
         return self.add(names, incarnation).pid
 
     def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> Handle:
@@ -520,7 +499,7 @@ def test_a_process_that_was_replaced_is_not_held_in_the_place_of_its_successor()
 def test_what_a_process_said_before_it_was_killed_does_not_make_it_run():
     async def scenario() -> None:
         async with running() as world:
-            world.machine.fork_error = SpawnerUnavailableError("none")
+            world.machine.fork_error = ForkError("none")
             (victim,) = world.machine.of("DM1")
             world.silent.add(victim.pid)
             await eventually(lambda: victim.killed)
@@ -550,7 +529,7 @@ def test_a_fork_that_fails_for_want_of_descriptors_is_tried_again():
 def test_a_living_process_is_replaced_once_however_long_nobody_can_fork(outage_s):
     async def scenario() -> None:
         async with running() as world:
-            world.machine.fork_error = SpawnerUnavailableError("none")
+            world.machine.fork_error = ForkError("none")
             for _ in range(3):  # it is asked for again while nobody answers
                 world.respawn("safety_pilot", 1)
                 await asyncio.sleep(0.01)
@@ -571,7 +550,7 @@ def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(outage_
             document = load_document(PLAN)
             row = next(r for r in document["detection"] if r["name"] == "DM2")
             row["parameters"] = {**row.get("parameters", {}), "hold_s": 0.9}
-            world.machine.fork_error = SpawnerUnavailableError("none")
+            world.machine.fork_error = ForkError("none")
             world.kill("DM2")
             await asyncio.sleep(0.02)
             world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
@@ -608,7 +587,7 @@ def test_a_heartbeat_that_names_a_process_of_somebody_elses_has_nobody_adopted_o
 def test_a_life_that_is_adopted_while_it_is_replaced_is_not_forked_again():
     async def scenario() -> None:
         async with running() as world:
-            world.machine.fork_error = SpawnerUnavailableError("its answer was lost")
+            world.machine.fork_error = ForkError("its answer was lost")
             names = world.kill("DM2").names
             await asyncio.sleep(0.02)
             orphan = world.machine.add(names, 2)
@@ -629,7 +608,7 @@ def test_a_life_without_its_port_leads_to_the_one_that_nobody_holds(name, phase_
             fork, orphans = world.machine.fork, []
 
             def twice(names: tuple[str, ...], incarnation: int) -> int:
-                if not orphans:  # the child of a spawner that was killed before it answered
+                if not orphans:  # a process that has died before it answered
                     orphans.append(world.machine.add(names, incarnation))
                 return fork(names, incarnation)
 
@@ -704,73 +683,5 @@ def test_of_two_lives_of_one_node_a_new_supervisor_adopts_the_higher_and_ends_th
             higher = max(two, key=lambda p: p.incarnation)
             assert world.row("DM2") == ("running", 7, higher.pid)
             assert world.machine.of("DM2") == [higher]
-
-    run(scenario)
-
-
-def test_a_process_is_made_ready_while_its_module_decides_and_forgotten_if_it_is_not_wanted():
-    async def scenario() -> None:
-        async with running() as world:
-            machine = world.machine
-            world.kill("DM1")  # the supervisor's own to bring back: nothing is to be waited for
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-            assert machine.prepared == []
-            world.kill("osmosis_control")
-            await eventually(lambda: machine.prepared == [("osmosis_control", 2, "warm")])
-            await asyncio.sleep(0.5)
-            assert machine.ready
-            await asyncio.sleep(0.6)
-            assert machine.ready == {}
-            world.respawn("osmosis_control", 1)
-            await eventually(lambda: world.row("osmosis_control")[:2] == ("running", 2))
-            world.kill("osmosis_control")
-            await asyncio.sleep(0.1)
-            world.respawn("osmosis_control", 2)
-            await eventually(lambda: world.row("osmosis_control")[:2] == ("running", 3))
-            await asyncio.sleep(1.5)
-            assert machine.prepared[1:] == [("osmosis_control", 3, "warm")]
-
-    run(scenario)
-
-
-def test_a_hot_spare_is_there_before_anything_happens_and_replaced_when_it_is_gone():
-    async def scenario() -> None:
-        async with running() as world:
-            machine = world.machine
-            members = world.supervisor._layout.members
-            members["DM1"] = replace(members["DM1"], spare="hot")
-            await eventually(lambda: machine.ready == {"DM1": (2, "hot")}, 1.0)
-            machine.forget(("DM1",))  # it was killed, or did not answer
-            await eventually(lambda: machine.ready == {"DM1": (2, "hot")}, 1.0)
-            world.kill("DM1")
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-            await eventually(lambda: machine.ready == {"DM1": (3, "hot")}, 1.0)
-            assert [kind for _, _, kind in machine.prepared] == 3 * ["hot"]
-
-    run(scenario)
-
-
-def test_a_spare_of_ones_own_is_set_up_when_its_node_has_ended_and_replaced_if_it_is_not_wanted():
-    async def scenario() -> None:
-        async with running() as world:
-            machine = world.machine
-            members = world.supervisor._layout.members
-            for name in ("osmosis_control", "localization"):
-                members[name] = replace(members[name], spare="own")
-            await eventually(lambda: len(machine.ready) == 1, 1.0)
-            await asyncio.sleep(0.3)
-            assert len(machine.ready) == 1, "they are made one by one"
-            both = {"osmosis_control": (2, "own"), "localization": (2, "own")}
-            await eventually(lambda: machine.ready == both, 1.0)
-            world.kill("osmosis_control")
-            await eventually(lambda: machine.ready["osmosis_control"] == (2, "warm"), 0.1)
-            await eventually(lambda: "osmosis_control" not in machine.ready, 1.2)
-            await asyncio.sleep(1.0)
-            assert "osmosis_control" not in machine.ready, "it is for a node that runs"
-            world.respawn("osmosis_control", 1)
-            await eventually(lambda: machine.ready == both | {"osmosis_control": (3, "own")}, 1.0)
-            world.kill("osmosis_control")
-            world.respawn("osmosis_control", 2)
-            await eventually(lambda: world.row("osmosis_control")[:2] == ("running", 3))
 
     run(scenario)

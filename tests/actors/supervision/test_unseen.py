@@ -13,8 +13,8 @@ import pytest
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import load_system
-from rampart.actors.supervision.launcher import needed_descriptors
 from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.root import needed_descriptors
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 from rampart.actors.system.layout import load_run
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial

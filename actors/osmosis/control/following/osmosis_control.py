@@ -56,7 +56,6 @@ class OsmosisControl(Actor):
         yaw_loop: bool = False
         bridge_m: NonNegative = 0.0
 
-    most_spare = "warm"
     parameters: Parameters
 
     command_topic: ClassVar[Topic[m.Twist]] = topics.COMMAND

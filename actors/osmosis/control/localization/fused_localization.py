@@ -56,7 +56,6 @@ class FusedLocalization(Actor):
 
         bridge_m: NonNegative = FilterLimits().bridge_m
 
-    most_spare = "warm"
     parameters: Parameters
     outputs = (topics.POSE, topics.LOCALIZATION_STATUS)
 

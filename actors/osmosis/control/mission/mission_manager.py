@@ -43,7 +43,6 @@ class MissionManager(Actor):
         held_by: RecoveryNames = ()
 
     parameters: Parameters
-    most_spare = "warm"
     outputs = (topics.GOAL, topics.MISSION_STATUS, topics.MISSION_ORDER_ANSWER)
 
     def __init__(self, context: Context) -> None:

@@ -64,7 +64,6 @@ class GraphPlanner(Actor):
         avoid_gap_m: NonNegative = 1.0
 
     parameters: Parameters
-    most_spare = "warm"
     outputs = (topics.ROUTE,)
 
     def __init__(self, context: Context) -> None:

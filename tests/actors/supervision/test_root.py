@@ -1,0 +1,369 @@
+"""The root: it brings back the supervisor, keeps the pool, and leaves nothing when it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from rampart.actors.bus import run_info
+from rampart.actors.bus.run_info import find_runs
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import AdaptedSystem
+from rampart.actors.runtime.run_plan import load_document
+from rampart.actors.supervision.launcher import Launcher, LaunchError
+from rampart.actors.supervision.process_title import TITLE_BYTES, find_processes
+from rampart.actors.supervision.processes import ForkError, ForkPendingError, OsProcesses
+from rampart.actors.supervision.requests import ForkRequest, Reply
+from rampart.testing import eventually
+from tests import ROOT
+from tests.actors.supervision.test_supervision import process, running
+from tests.stub_actors import IdleDetection, stub_plan, write_stub_system
+
+HURTS = (signal.SIGKILL, signal.SIGSTOP)
+WHO_IS_LEFT = [("DM5",), ("supervisor", "DM1", "DM2", "RM1"), None]
+
+
+def pool(port: int) -> set[int]:
+    return {p.pid for p in find_processes(port) if p.names == ("pool",)}
+
+
+async def filled(port: int, other_than: set[int] = frozenset()) -> set[int]:
+    """Return the pool when it is full, and has had time to be ready."""
+    await eventually(lambda: len(pool(port)) == 2 and other_than.isdisjoint(pool(port)), 20)
+    await asyncio.sleep(0.3)
+    return pool(port)
+
+
+# -- the supervisor --------------------------------------------------------------------------------
+
+
+@pytest.mark.processes
+async def test_the_next_supervisor_is_there_within_thirty_milliseconds_of_the_last_one_s_end(
+        tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        took = []
+        for life in range(2, 9):
+            old = process(launcher.plan.base_port, "supervisor")
+            begun_s = time.monotonic()
+            os.kill(old, signal.SIGKILL)
+            while process(launcher.plan.base_port, "supervisor") in {None, old}:
+                await asyncio.sleep(0.001)
+            took.append(time.monotonic() - begun_s)
+            await eventually(lambda n=life: witness.state("supervisor") == ("running", n))
+        assert sorted(took)[len(took) // 2] < 0.03
+
+
+@pytest.mark.processes
+async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_end(tmp_path):
+    limits = "[supervision]\nintensity = 6\nperiod_s = 6.0\nbackoff_s = 0.05\n\n"
+    file = write_stub_system(tmp_path)
+    text = file.read_text(encoding="utf-8")
+    changed = tmp_path / "limited.toml"
+    changed.write_text(text.replace("[timing]", limits + "[timing]", 1), encoding="utf-8")
+    async with running(tmp_path, system_file=str(changed)) as (launcher, witness):
+        told, lives = [], set()
+        launcher.report = told.append
+        while not told:
+            pid = process(launcher.plan.base_port, "supervisor")
+            if pid is not None:
+                lives.add(pid)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            await asyncio.sleep(0.002)
+        assert len(lives) == 7  # the first and six more
+        await eventually(lambda: witness.state("supervisor") == ("running", 8), 20)
+        assert len(told) == 1
+
+
+@pytest.mark.processes
+async def test_a_stopped_root_is_continued(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        os.kill(launcher.plan.launcher_pid, signal.SIGSTOP)
+        os.kill(witness.pid("DM1"), signal.SIGKILL)
+        await eventually(lambda: witness.state("DM1") == ("running", 2))
+
+
+# -- requests --------------------------------------------------------------------------------------
+
+
+@contextlib.asynccontextmanager
+async def asking():
+    """Yield what asks, and the root's end of its connection."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        machine = OsProcesses("", 1, os.getpid(), ours.detach())
+        try:
+            yield machine, theirs
+        finally:
+            machine.close()
+
+
+def received(root: socket.socket) -> tuple[ForkRequest, socket.socket]:
+    while True:
+        data, descriptors, _, _ = socket.recv_fds(root, 4096, 1)
+        if descriptors:
+            return msgspec.json.decode(data, type=ForkRequest), socket.socket(
+                fileno=descriptors[0])
+
+
+def answer(on: socket.socket, pid: int) -> None:
+    with on:
+        on.send(msgspec.json.encode(Reply(pid)))
+
+
+async def test_a_request_that_is_not_answered_yet_is_not_made_twice():
+    async with asking() as (machine, root):
+        with pytest.raises(ForkPendingError):
+            machine.fork(("DM1",), 2)
+        request, on = received(root)
+        assert request == ForkRequest("DM1", 2)
+        with pytest.raises(ForkPendingError):
+            machine.fork(("DM1",), 2)
+        answer(on, 77)
+        assert machine.fork(("DM1",), 2) == 77
+
+
+async def test_the_answer_to_a_withdrawn_request_is_not_accepted():
+    async with asking() as (machine, root):
+        with pytest.raises(ForkPendingError):
+            machine.fork(("DM1",), 2)
+        _, on = received(root)
+        machine.withdraw(("DM1",))
+        with pytest.raises(BrokenPipeError):
+            answer(on, 77)
+
+
+async def test_what_answered_before_its_request_was_withdrawn_is_killed():
+    async with asking() as (machine, root):
+        with pytest.raises(ForkPendingError):
+            machine.fork(("DM1",), 2)
+        victim = subprocess.Popen(["sleep", "60"])
+        answer(received(root)[1], victim.pid)
+        machine.withdraw(("DM1",))
+        assert victim.wait(5) == -signal.SIGKILL
+
+
+async def test_a_request_whose_process_died_is_refused_and_the_next_one_made():
+    async with asking() as (machine, root):
+        with pytest.raises(ForkPendingError):
+            machine.fork(("DM1",), 2)
+        received(root)[1].close()
+        with pytest.raises(ForkError, match="no answer"):
+            machine.fork(("DM1",), 2)
+        with pytest.raises(ForkPendingError):
+            machine.fork(("DM1",), 2)
+        assert received(root)[0] == ForkRequest("DM1", 2)
+
+
+async def test_another_incarnation_takes_the_place_of_the_one_that_was_asked_for():
+    async with asking() as (machine, root):
+        with pytest.raises(ForkPendingError):
+            machine.fork(("DM1",), 2)
+        first = received(root)[1]
+        with pytest.raises(ForkPendingError):
+            machine.fork(("DM1",), 3)
+        second, on = received(root)
+        assert second.incarnation == 3
+        with pytest.raises(BrokenPipeError):
+            answer(first, 76)
+        answer(on, 77)
+        assert machine.fork(("DM1",), 3) == 77
+
+
+# -- the pool --------------------------------------------------------------------------------------
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+async def test_a_process_of_the_pool_becomes_the_node_and_one_that_cannot_costs_only_itself(
+        tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        there = await filled(port)
+        os.kill(witness.pid("DM1"), signal.SIGKILL)
+        await eventually(lambda: witness.state("DM1") == ("running", 2))
+        assert witness.pid("DM1") in there
+        for number, hurt in enumerate(HURTS):
+            there = await filled(port, {witness.pid("DM1")})
+            for pid in there:
+                os.kill(pid, hurt)
+            os.kill(witness.pid("DM1"), signal.SIGKILL)
+            await eventually(lambda n=number: witness.state("DM1") == ("running", n + 3))
+            assert witness.pid("DM1") not in there
+        there = await filled(port, there)
+        for hurt in HURTS:  # it is replaced though no node needs it
+            for pid in there:
+                os.kill(pid, hurt)
+            there = await filled(port, there)
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+async def test_two_nodes_that_die_together_are_both_made_of_the_pool(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        there = await filled(launcher.plan.base_port)
+        for name in ("DM1", "DM2"):
+            os.kill(witness.pid(name), signal.SIGKILL)
+        await eventually(lambda: all(
+            witness.state(name) == ("running", 2) for name in ("DM1", "DM2")))
+        assert {witness.pid("DM1"), witness.pid("DM2")} == there
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+async def test_without_a_spare_a_node_is_forked(tmp_path):
+    file = write_stub_system(tmp_path)
+    text = file.read_text(encoding="utf-8")
+    changed = tmp_path / "none.toml"
+    changed.write_text(text.replace('name = "safety_pilot"', 'name = "safety_pilot"\n'
+                                    'spare = "none"'), encoding="utf-8")
+    async with running(tmp_path, system_file=str(changed)) as (launcher, witness):
+        there = await filled(launcher.plan.base_port)
+        os.kill(witness.pid("safety_pilot"), signal.SIGKILL)
+        await eventually(lambda: witness.state("safety_pilot") == ("running", 2))
+        assert witness.pid("safety_pilot") not in there
+
+
+class TellingDetection(IdleDetection):
+    """Tells what it was started with."""
+
+    def on_start(self) -> None:
+        self.report_diagnostic("started with", str(self.context.run.document["title"]), "")
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+@pytest.mark.parametrize("characters", [100, 400_000])
+async def test_what_starts_after_a_change_of_the_system_knows_it(tmp_path, characters):
+    file = tmp_path / "telling.toml"
+    file.write_text(write_stub_system(tmp_path).read_text(encoding="utf-8").replace(
+        "tests.stub_actors:IdleDetection",
+        "tests.actors.supervision.test_root:TellingDetection"), encoding="utf-8")
+    async with running(tmp_path, system_file=str(file)) as (launcher, witness):
+        port = launcher.plan.base_port
+        there, start = await filled(port), len(witness.errors)
+        document = load_document(launcher.plan)
+        document["title"] = "changed"
+        document["node"][0].setdefault("parameters", {})["text"] = "x" * characters
+        row = next(row for row in document["detection"] if row["name"] == "DM1")
+        row.setdefault("parameters", {})["margin_m"] = 0.7
+        witness.publish(topics.ADAPTED_SYSTEM, AdaptedSystem(
+            1, "retune DM1", "me", msgspec.json.encode(document).decode()))
+        await eventually(lambda: witness.state("DM1") == ("running", 2))
+        there = await filled(port, there)
+        os.kill(witness.pid("DM2"), signal.SIGKILL)
+        await eventually(lambda: witness.state("DM2") == ("running", 2))
+        assert witness.pid("DM2") in there
+        os.kill(process(port, "supervisor"), signal.SIGKILL)
+        await eventually(lambda: witness.state("supervisor") == ("running", 2))
+        os.kill(witness.pid("DM3"), signal.SIGKILL)
+        await eventually(lambda: witness.state("DM3") == ("running", 2))
+        titles = [e.reason for e in witness.errors[start:] if e.context == "started with"]
+        assert titles == 3 * ["changed"]
+
+
+# -- start and end ---------------------------------------------------------------------------------
+
+
+@pytest.mark.processes
+async def test_the_number_of_another_run_is_refused_before_anything_starts(tmp_path):
+    plan = stub_plan(write_stub_system(tmp_path))
+    launcher = Launcher(plan, "test")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.bind(run_info.address(plan.base_port))
+        with pytest.raises(LaunchError, match=f"--port {plan.base_port}: in use by another run"):
+            await launcher.load()
+        await launcher.end()
+    assert find_processes(plan.base_port) == []
+
+
+def started(tmp_path: Path, **variables: str) -> tuple[subprocess.Popen[str], int]:
+    """Start a run of the stub system by its root; return that and the base port."""
+    plan = stub_plan(write_stub_system(tmp_path))
+    return subprocess.Popen(
+        [sys.executable, "-P", str(ROOT / "launch.py"), "--system", plan.system_file, "--no-hmi",
+         "--port", str(plan.base_port), "--report", str(tmp_path / "report"), "--json"],
+        env={**(variables or os.environ), "PYTHONPATH": str(ROOT)}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True), plan.base_port
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("stopped", WHO_IS_LEFT, ids=["one", "the supervisor too", "all"])
+async def test_a_killed_root_leaves_nothing_within_two_seconds(tmp_path, stopped):
+    root, port = started(tmp_path)
+    with root:
+        try:
+            await eventually(lambda: len(find_processes(port)) >= 26, 20)
+            await asyncio.sleep(0.5)
+            folder = next(run.folder for run in find_runs() if run.base_port == port)
+            os.kill(process(port, "DM6"), signal.SIGUSR2)
+            for one in find_processes(port):
+                if stopped is None or set(one.names) & set(stopped):
+                    os.kill(one.pid, signal.SIGSTOP)
+        finally:
+            root.kill()
+        await eventually(lambda: find_processes(port) == [] and not Path(folder).exists(), 2.0)
+    assert not [run for run in find_runs() if run.base_port == port]
+
+
+@pytest.mark.processes
+async def test_with_the_watching_process_killed_the_run_ends_and_its_verdict_is_not_known(tmp_path):
+    root, port = started(tmp_path)
+    with root:
+        await eventually(lambda: len(find_processes(port)) >= 26, 20)
+        os.kill(process(port, "run"), signal.SIGKILL)
+        out, err = await asyncio.to_thread(root.communicate, timeout=10)
+    assert root.returncode == 4
+    result = msgspec.json.decode(out.splitlines()[-1])
+    assert result["safety"] == "not known"
+    assert any("was killed" in reason for reason in result["reasons"])
+    assert "was killed by SIGKILL" in err
+    assert find_processes(port) == []
+
+
+@pytest.mark.processes
+async def test_a_stopped_watching_process_is_continued(tmp_path):
+    root, port = started(tmp_path)
+    with root:
+        await eventually(lambda: len(find_processes(port)) >= 26, 20)
+        pid = process(port, "run")
+        os.kill(pid, signal.SIGSTOP)
+        await eventually(lambda: Path(f"/proc/{pid}/stat").read_text().split()[2] != "T", 1.0)
+        root.send_signal(signal.SIGTERM)
+        await asyncio.to_thread(root.communicate, timeout=10)
+    assert root.returncode in {1, 4}
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("at_s", [0.05, 0.4, 0.7, 1.0, 1.3])
+async def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(tmp_path, at_s):
+    root, port = started(tmp_path)
+    with root:
+        await asyncio.sleep(at_s)
+        root.send_signal(signal.SIGINT)
+        _, err = await asyncio.to_thread(root.communicate, timeout=20)
+    assert root.returncode in {1, 4}
+    assert "Traceback" not in err
+    assert find_processes(port) == []
+
+
+@pytest.mark.processes
+async def test_a_root_with_little_room_for_titles_makes_some(tmp_path):
+    root, port = started(tmp_path, PATH=os.environ["PATH"])
+    with root:
+        await eventually(lambda: len(find_processes(port)) >= 26, 20)
+        long = [p for p in find_processes(port) if p.names == ("mission_manager",)]
+        room = Path(f"/proc/{long[0].pid}/stat").read_text().rpartition(")")[2].split()
+        assert int(room[48]) - int(room[45]) >= TITLE_BYTES
+        root.send_signal(signal.SIGTERM)
+        await asyncio.to_thread(root.communicate, timeout=10)
