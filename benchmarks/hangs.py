@@ -27,7 +27,7 @@ from typing import Any
 
 from benchmarks.hanging_loop import HANG, HOW, SYSTEM, Hang
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import DetectionReport, DetectionState, NodeTable
+from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.recovery.respawn import accused
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
@@ -45,16 +45,10 @@ class Stopwatch(Actor):
 
     outputs = (HANG,)
 
-    def __init__(self, context: Context, launcher: Launcher) -> None:
+    def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._launcher = launcher
         self.found: list[tuple[float, str, DetectionReport]] = []
         self._named: dict[str, tuple[str, ...]] = {}
-
-    @on(topics.NODES)
-    def nodes(self, table: NodeTable, _header: Header) -> None:
-        """Keep the launcher's guard informed."""
-        self._launcher.supervisor_heard(table)
 
     @on(topics.DETECTION)
     def detection(self, report: DetectionReport, header: Header) -> None:
@@ -91,13 +85,12 @@ async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Run the system, hang the nodes, and return one row per node."""
     plan = RunPlan("bench", options.port, system_file=options.system)
     launcher = Launcher(plan, "benchmark")
-    launcher.begin()
     rows = []
     try:
         await launcher.load()
         await launcher.start()
         watch = Stopwatch(Context(OBSERVER, 1, Clock(launcher.plan.origin_s),
-                                  launcher.observers_bus()), launcher)
+                                  launcher.observers_bus()))
         task = asyncio.create_task(watch.run())
         while watch.clock.now() < _BACK_S:  # noqa: ASYNC110 simulated time 0 is when all are loaded
             await asyncio.sleep(0.1)

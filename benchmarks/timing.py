@@ -19,7 +19,7 @@ from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import NodeTable, RespawnRequest
+from rampart.actors.ftm.messages import RespawnRequest
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR, RunPlan
@@ -34,9 +34,8 @@ QUANTILES = 21
 class Ear(Actor):
     """Notes when things arrive."""
 
-    def __init__(self, context: Context, launcher: Launcher) -> None:
+    def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._launcher = launcher
         self.messages: list[float] = []
         self.deaths: dict[tuple[str, int], float] = {}
         self.asked: dict[str, float] = {}
@@ -46,11 +45,6 @@ class Ear(Actor):
     def watches(cls, name: str, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003
         """Watch those that are killed."""
         return NODES
-
-    @on(topics.NODES)
-    def nodes(self, table: NodeTable, _header: Header) -> None:
-        """Keep the launcher's guard informed."""
-        self._launcher.supervisor_heard(table)
 
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, _message: Any, header: Header) -> None:
@@ -85,14 +79,13 @@ async def measure(port: int, kills: int) -> dict[str, list[float]]:
     """Run the system and return samples in seconds."""
     plan = RunPlan("bench", port, system_file="systems/paper.toml")
     launcher = Launcher(plan, "timing")
-    launcher.begin()
     found: dict[str, list[float]] = {
         "message_ms": [], "death_ms": [], "exit_ms": [], "start_ms": [], "supervisor_back_ms": []}
     back: list[float] = []
     try:
         await launcher.load()
         await launcher.start()
-        launcher.guard.on_restart = lambda _name: back.append(time.monotonic())
+        launcher.on_restart = lambda _name: back.append(time.monotonic())
         bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
         ear = Ear(Context(OBSERVER, 1, clock, bus), launcher)

@@ -49,6 +49,7 @@ from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.machine import turns
+from rampart.actors.machine.absence import Absence
 from rampart.actors.machine.patience import Patience, usage
 from rampart.actors.machine.unix_peer import process_id
 from rampart.actors.runtime.run_context import RunContext
@@ -71,7 +72,7 @@ from rampart.files.plain_text import one_line
 from rampart.files.streams import complain
 
 PERIOD_S = 0.25
-"""Wall seconds between two looks at the supervisor."""
+"""Wall seconds between two looks at the supervisor; the root itself was absent if it is longer."""
 
 SUPERVISOR_PATIENCE_S = 1.5
 """A supervisor that could have said a word for so long is hung; it says four a second."""
@@ -153,6 +154,7 @@ class Root:
         self._pooled = 0
         self._held: list[socket.socket] = []
         self._supervisor = Guarded()
+        self._absence = Absence(time.monotonic())
 
     # -- the whole ------------------------------------------------------------------------------
 
@@ -433,11 +435,14 @@ class Root:
             return None
         now_s, guarded = time.monotonic(), self._supervisor
         wait_s = PERIOD_S
+        self._absence.note(now_s)
         if not guarded.pid:
             wait_s = min(wait_s, self._bring_supervisor_back(now_s))
         elif now_s >= guarded.looked_s + PERIOD_S:
             guarded.looked_s = now_s
-            if guarded.patience.look(now_s, guarded.pid, usage(guarded.pid)
+            if self._absence.excuses(now_s):
+                guarded.patience.answered()
+            elif guarded.patience.look(now_s, guarded.pid, usage(guarded.pid)
                                      ) >= SUPERVISOR_PATIENCE_S:
                 kill(guarded.pid)
         pool_s = self._pool.look()

@@ -23,7 +23,7 @@ from rampart.actors.access.rules import access_of
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, endpoint, session_config
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.actors.runtime.run_plan import RunPlan, load_system
-from rampart.actors.supervision.launcher import kept_ports
+from rampart.actors.supervision.root import kept_ports
 from rampart.actors.system.layout import Layout, router
 from tests import ROOT
 

@@ -13,7 +13,7 @@ from rampart.actors.access.rights import rights_of_all
 from rampart.actors.access.rules import Host, rules_of
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, session_config
-from rampart.actors.supervision.launcher import kept_ports
+from rampart.actors.supervision.root import kept_ports
 from tests.actors.access.keyed import layout_of, make_keys, opened, wait_for
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]

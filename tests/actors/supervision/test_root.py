@@ -162,7 +162,9 @@ async def test_a_request_whose_process_died_is_refused_and_the_next_one_made():
             machine.fork(("DM1",), 2)
         with pytest.raises(ForkPendingError):
             machine.fork(("DM1",), 2)
-        assert received(root)[0] == ForkRequest("DM1", 2)
+        request, on = received(root)
+        assert request == ForkRequest("DM1", 2)
+        on.close()
 
 
 async def test_another_incarnation_takes_the_place_of_the_one_that_was_asked_for():
