@@ -114,7 +114,6 @@ actor = "rampart.actors.detection.watchdog:Watchdog"
 [detection.parameters]
 watch = ["fast", "slow"]
 timeout_s = "heartbeat_timeout_s"
-signs = ["count/fast", "count/slow"]
 
 [[recovery]]
 name = "R"

@@ -53,7 +53,7 @@ def router(folder: str, name: str) -> int:
     async def run() -> None:
         keep_large_apart()  # as `Router` does
         other = next(one for one in ROUTERS if one != name)
-        bus = ZenohBus(name, 1, [endpoint(folder, other)], [endpoint(folder, name)])
+        bus = ZenohBus(name, [endpoint(folder, other)], [endpoint(folder, name)])
         await bus.open()
         asyncio.get_running_loop().add_signal_handler(
             signal.SIGUSR1, write_heap, Path(folder, f"{os.getpid()}"))
@@ -81,18 +81,17 @@ def write_heap(file: Path) -> None:
     file.with_suffix(".new").rename(file)
 
 
-def client(folder: str, number: int, incarnation: int) -> int:
+def client(folder: str, number: int) -> int:
     """Start a client that declares what a node does, and publishes ten times a second."""
 
     async def run() -> None:
-        bus = ZenohBus(f"n{number}", incarnation, endpoints(folder))
+        bus = ZenohBus(f"n{number}", endpoints(folder))
         await bus.open()
         for k in range(6):
             key = f"rampart/t/{(number + k) % (CLIENTS + 1)}/0"
             bus.subscribe(_SENSOR, key, lambda _key, _payload: None)
         for k in range(4):
             bus.publish(_SENSOR, f"rampart/t/{number}/{k}", b"x" * 100)
-            bus.watch(f"n{(number + k) % (CLIENTS + 1)}", lambda *_: None)
         while True:
             bus.publish(_SENSOR, f"rampart/t/{number}/0", b"x" * 200)
             await asyncio.sleep(0.1)
@@ -127,10 +126,10 @@ def main() -> int:
                 routers.append(router(folder, name))
                 started.append(routers[-1])
                 time.sleep(0.5)
-            started += [client(folder, i, 1) for i in range(CLIENTS)]
+            started += [client(folder, i) for i in range(CLIENTS)]
             time.sleep(2.0)
             for kill in range(kills + 1):
-                victim = client(folder, CLIENTS, kill + 1)
+                victim = client(folder, CLIENTS)
                 started.append(victim)
                 time.sleep(LIFE_S)
                 if kill % (kills // _ROWS) == 0:

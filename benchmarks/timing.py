@@ -14,12 +14,11 @@ import random
 import signal
 import sys
 import time
-from collections.abc import Mapping
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import RespawnRequest
+from rampart.actors.ftm.messages import ProcessEvent, RespawnRequest
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR, RunPlan
@@ -41,11 +40,6 @@ class Ear(Actor):
         self.asked: dict[str, float] = {}
         self.words: dict[tuple[str, int], float] = {}
 
-    @classmethod
-    def watches(cls, name: str, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003
-        """Watch those that are killed."""
-        return NODES
-
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, _message: Any, header: Header) -> None:
         """Note how long it took, and a new process's first word."""
@@ -57,10 +51,11 @@ class Ear(Actor):
         """Note when a recovery module asked for a process."""
         self.asked[request.node] = header.stamp
 
-    def on_peer(self, node: str, incarnation: int, alive: bool) -> None:
-        """Note when a process was known to be gone, by the supervisor or by its token."""
-        if not alive:
-            self.deaths.setdefault((node, incarnation), time.monotonic())
+    @on(topics.PROCESS_EVENT)
+    def process_event(self, message: ProcessEvent, _header: Header) -> None:
+        """Note when a process was known to be gone."""
+        if message.event == "crashed":
+            self.deaths.setdefault((message.node, message.incarnation), time.monotonic())
 
     def start_s(self, node: str, incarnation: int, exited_s: float) -> float | None:
         """Return how long a successor took to its first word, from when it was to be started.

@@ -276,7 +276,7 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
     with refusing(NoRunError, BusError, KeysError):
         run = find_run(port)
         shown, kind = tools_credentials(run)
-        bus = ZenohBus("", 0, run.endpoints, recorder=RecorderConnection(run.base_port),
+        bus = ZenohBus("", run.endpoints, recorder=RecorderConnection(run.base_port),
                        credentials=shown)
         await bus.open()
     try:

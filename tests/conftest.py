@@ -87,7 +87,7 @@ def sockets():
 @pytest.fixture
 async def bus_folder(sockets):
     """The folder of a run that has a router, by which sessions of `ZenohBus` hear each other."""
-    router = ZenohBus("router_a", 1, [], [endpoint(sockets, "router_a")])
+    router = ZenohBus("router_a", [], [endpoint(sockets, "router_a")])
     await router.open()
     yield sockets
     await router.close()

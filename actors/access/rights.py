@@ -23,7 +23,6 @@ VIEWER: Final = "viewer"
 """Two kinds of people's certificates: what is done with a tool, and what is only looked at."""
 
 EVERYTHING = f"{ROOT}/**"
-_ALIVE, _GONE = f"{ROOT}/alive", f"{ROOT}/gone"
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +34,12 @@ class Rights:
         hears: what it may subscribe to.
         answers: of what it says, what it may be asked for, the newest message of each key.
         asks: of what it hears, what it may ask for.
-        is_there: liveliness tokens that it may declare.
-        watches: liveliness tokens that it may hear of.
     """
 
     says: frozenset[str] = frozenset()
     hears: frozenset[str] = frozenset()
     answers: frozenset[str] = frozenset()
     asks: frozenset[str] = frozenset()
-    is_there: frozenset[str] = frozenset()
-    watches: frozenset[str] = frozenset()
 
     def __or__(self, other: Rights) -> Rights:
         """Return what either may."""
@@ -71,11 +66,7 @@ def rights_of_all(layout: Layout) -> dict[str, Rights]:
                   for name in hosts.routers_of(host)}, **layout.members}
     topics = _topics(layout)
     found = {name: _rights_of(member, topics) for name, member in members.items()}
-    for host, name in hosts.supervisors.items():  # of those that it runs it may tell the end
-        nodes = (*hosts.routers_of(host), *hosts.may_run(host, layout.members))
-        found[name] |= Rights(says=frozenset(f"{_GONE}/{node}" for node in nodes))
-    viewer = Rights(hears=frozenset({EVERYTHING}), asks=frozenset({EVERYTHING}),
-                    watches=frozenset({f"{_ALIVE}/*/*"}))
+    viewer = Rights(hears=frozenset({EVERYTHING}), asks=frozenset({EVERYTHING}))
     operating = Rights(says=frozenset(_operated(layout, topics)))
     if OBSERVER in found:  # the launcher's, which carries out what `--fault` asks for
         found[OBSERVER] |= operating
@@ -93,21 +84,16 @@ def said_elsewhere(layout: Layout) -> frozenset[str]:
     hosts, rights = layout.hosts, rights_of_all(layout)
     there = {name for host in hosts.supervisors if host != layout.plan.host
              for name in (*hosts.routers_of(host), *hosts.may_run(host, layout.members))}
-    said = together((*(rights[name] for name in there), rights[OPERATOR])).says
-    return frozenset(key for key in said if not key.startswith(f"{_GONE}/"))
+    return together((*(rights[name] for name in there), rights[OPERATOR])).says
 
 
 def _rights_of(member: Member, topics: Mapping[str, Topic[Any]]) -> Rights:
     own = frozenset(f"{ROOT}/{key}" for key in member.actor.own_keys(member.parameters))
     outputs, inputs = published(member), heard(member) | {t.key: None for t in BASE_INPUTS}
-    watched = member.actor.watches(member.name, member.parameters)
     return Rights(
-        says=own | frozenset(_spelt(outputs)), hears=own | frozenset(_spelt(inputs)) | frozenset(
-            f"{_GONE}/{node}" for node in watched),
+        says=own | frozenset(_spelt(outputs)), hears=own | frozenset(_spelt(inputs)),
         answers=frozenset(_spelt(_kept(outputs, topics))),
-        asks=frozenset(_spelt(_kept(inputs, topics))),
-        is_there=frozenset({f"{_ALIVE}/{member.name}/*"}),
-        watches=frozenset(f"{_ALIVE}/{node}/*" for node in watched))
+        asks=frozenset(_spelt(_kept(inputs, topics))))
 
 
 def _spelt(keys: Mapping[str, Members]) -> Iterator[str]:

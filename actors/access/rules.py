@@ -41,10 +41,8 @@ from rampart.actors.system.layout import Layout
 INGRESS, EGRESS = "ingress", "egress"
 PUT, SUBSCRIBER, QUERY, QUERYABLE, REPLY = (
     "put", "declare_subscriber", "query", "declare_queryable", "reply")
-TOKEN, TOKENS, TOKEN_QUERY = (
-    "liveliness_token", "declare_liveliness_subscriber", "liveliness_query")
-MESSAGES = (PUT, SUBSCRIBER, QUERY, QUERYABLE, REPLY, TOKEN, TOKENS, TOKEN_QUERY, "delete")
-"""All that Zenoh can refuse."""
+MESSAGES = (PUT, SUBSCRIBER, QUERY, QUERYABLE, REPLY)
+"""All that is ever let through; of what Zenoh can refuse, liveliness tokens and deleting never."""
 
 Grant = tuple[str, tuple[str, ...], frozenset[str]]
 """Flow, messages, and the key expressions for which they are let through."""
@@ -89,20 +87,16 @@ def grants(own: Rights, everybody: Rights) -> list[Grant]:
         (INGRESS, (SUBSCRIBER,), own.hears),
         (INGRESS, (QUERY,), own.asks),
         (INGRESS, (QUERYABLE, REPLY), own.answers),
-        (INGRESS, (TOKEN,), own.is_there),
-        (INGRESS, (TOKENS, TOKEN_QUERY), own.watches),
         (EGRESS, (PUT,), own.hears),
         (EGRESS, (SUBSCRIBER,), _meet(everybody.hears, own.says)),
         (EGRESS, (QUERY,), _meet(everybody.asks, own.answers)),
         (EGRESS, (QUERYABLE,), _meet(everybody.answers, own.asks)),
-        (EGRESS, (REPLY,), own.asks),
-        (EGRESS, (TOKEN,), own.watches),
-        (EGRESS, (TOKENS, TOKEN_QUERY), _meet(everybody.watches, own.is_there))]
+        (EGRESS, (REPLY,), own.asks)]
     return [grant for grant in found if grant[2]]
 
 
 _BETWEEN_ROUTERS: list[Grant] = [
-    (flow, tuple(one for one in MESSAGES if one != "delete"), frozenset({EVERYTHING}))
+    (flow, MESSAGES, frozenset({EVERYTHING}))
     for flow in (INGRESS, EGRESS)]
 
 

@@ -14,7 +14,6 @@ from rampart.actors.bus.topic import Topic
 Deliver = Callable[[str, bytes], None]
 """Called on the event loop with the concrete key and the payload."""
 
-PeerChange = Callable[[str, int, bool], None]
 """Called on the event loop with node, incarnation, and whether it is there."""
 
 
@@ -40,7 +39,7 @@ class Bus(Protocol):
         """Whether it has been opened, and not closed since."""
 
     async def open(self) -> None:
-        """Join the bus, if that has not been done, and announce this node.
+        """Join the bus, if that has not been done.
 
         Raises:
             BusError: an endpoint is taken or invalid.
@@ -62,12 +61,6 @@ class Bus(Protocol):
         called after the last of them, or when no answer is waited for any more.
         """
 
-    def watch(self, node: str, changed: PeerChange) -> None:
-        """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
-
-    def gone(self, node: str, incarnation: int) -> None:
-        """Tell those who watch a node that a process of it has ended, before they see it."""
-
     def after_burst(self, call: Callable[[], None]) -> None:
         """Have `call` made when what has arrived together was delivered; soon if nothing has."""
 
@@ -83,8 +76,6 @@ class Bus(Protocol):
 
 class SharedBus:
     """Passes everything on to a bus that another actor opens and closes.
-
-    For an actor that is not announced: it is there as long as the owner of the session.
 
     Args:
         owner: The bus; it is opened by somebody else, perhaps later.
@@ -127,15 +118,6 @@ class SharedBus:
         self._owner.latest(
             key_expression, lambda key, payload: deliver(key, payload) if self._open else None,
             lambda: answered() if self._open else None)
-
-    def watch(self, node: str, changed: PeerChange) -> None:
-        """Watch in the owner's session."""
-        self._owner.watch(
-            node, lambda *change: changed(*change) if self._open else None)
-
-    def gone(self, node: str, incarnation: int) -> None:
-        """Tell it over the owner's session."""
-        self._owner.gone(node, incarnation)
 
     def after_burst(self, call: Callable[[], None]) -> None:
         """Have it made after what has arrived in the owner's session."""

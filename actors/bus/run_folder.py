@@ -7,8 +7,7 @@ secret that could leak, no port that could be taken, and no handshake that takes
 An incarnation is a number that a new process issues before it is heard (`issue`); a reader that
 meets a new one looks it up (`Register`). It is kept as the target of a symbolic link, which is
 written and read whole or not at all, in a system call or two and with no byte of a disk. Beside it
-stands which process that is, if it is one of this machine, and in another folder its mark: who
-watches the node has its end from the kernel (`process_of`, `process_ends`).
+stands which process that is, if it is one of this machine.
 
 The folder lies in memory where it can: `$XDG_RUNTIME_DIR`, else `/dev/shm`, else the folder for
 temporary files. What ends a run removes it; what is left when all of a run dies at once goes
@@ -28,7 +27,6 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from rampart.actors.machine.process_ends import LocalProcess, leave_marks
 from rampart.actors.machine.unix_peer import ProcessId
 
 ROUTERS = ("router_a", "router_b")
@@ -44,7 +42,7 @@ _NAME = re.compile(r"rampart-\d+-\d+-\w+\Z")
 _locks: dict[str, int] = {}
 """By folder that was made here, the lock on it; processes that are forked hold it as well."""
 
-_ISSUED, _MARKS, _SYSTEM = "issued", "marks", "system"
+_ISSUED, _SYSTEM = "issued", "system"
 
 
 def make(port: int, launcher: int) -> str:
@@ -62,8 +60,7 @@ def make(port: int, launcher: int) -> str:
         _remove_stale(place)
         try:
             made = Path(tempfile.mkdtemp(prefix=f"rampart-{port}-{launcher}-~", dir=place))
-            for inner in (_ISSUED, _MARKS):
-                (made / inner).mkdir(mode=0o700)
+            (made / _ISSUED).mkdir(mode=0o700)
             lock = os.open(made, os.O_RDONLY | os.O_DIRECTORY)
             fcntl.flock(lock, fcntl.LOCK_EX)
             folder = str(made).replace("~", "")  # only now others look whether it is locked
@@ -191,14 +188,6 @@ def register_of(folder: str) -> Register:
     return look_up
 
 
-def process_of(folder: str, name: str, incarnation: int) -> LocalProcess | None:
-    """Return the process of a node; None unless it is that incarnation, and of this machine."""
-    found = _look_up(folder, name)
-    if found is None or found[0] != incarnation or len(found) < 1 + len(ProcessId._fields):
-        return None
-    return LocalProcess(ProcessId(*found[1:]), mark_of(folder, name))
-
-
 def is_here(folder: str, name: str) -> bool:
     """Whether the incarnation of a node that was issued last is a process of this machine."""
     found = _look_up(folder, name)
@@ -209,16 +198,6 @@ def is_elsewhere(folder: str, name: str) -> bool:
     """Whether the incarnation of a node that was issued last is on another machine."""
     found = _look_up(folder, name)
     return found is not None and len(found) < 1 + len(ProcessId._fields)
-
-
-def mark_of(folder: str, name: str) -> str:
-    """Return the file that is the mark of a node's process, if it has left one."""
-    return f"{folder}/{_MARKS}/{name}"
-
-
-def mark(folder: str, names: Iterable[str]) -> None:
-    """Have the end of this process, which is that of these nodes, be known at once."""
-    leave_marks([mark_of(folder, name) for name in names])
 
 
 def _look_up(folder: str, name: str) -> tuple[int, ...] | None:

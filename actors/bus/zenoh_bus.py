@@ -6,11 +6,6 @@ one that has been there longer, so that a message passes one router as a rule; w
 Zenoh goes over to the other within some milliseconds, with all that was declared. What is sent
 meanwhile is lost, as on any network.
 
-**In that moment the liveliness tokens of all clients vanish and come back.** So a token that
-vanishes says that a node is gone only if it has not come back after `SETTLE_S`. The kernel knows
-at once: of a process of this machine each watcher has its end from there (`ProcessEnds`), and is
-told by who watches the processes besides (`gone`), which reaches other machines.
-
 Zenoh calls back on the thread that reads the socket (`indirect=False`): by default each subscriber
 has a thread of its own, which costs a millisecond to declare, as much again when the process ends,
 and a wake-up for each message. What is called only appends to a deque and wakes the event loop once
@@ -29,10 +24,10 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
-from rampart.actors.bus.bus import BusError, Deliver, PeerChange
+from rampart.actors.bus.bus import BusError, Deliver
 from rampart.actors.bus.limits import RateLimit
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.topic import ROOT, Qos, Topic
+from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.zenoh_session import (
     Credentials,
     answering,
@@ -40,14 +35,9 @@ from rampart.actors.bus.zenoh_session import (
     open_client,
     session_config,
 )
-from rampart.actors.machine.process_ends import LocalProcess, ProcessEnds
-from rampart.actors.machine.unix_peer import is_alive
 
 PATIENCE_S = 10.0
 """Real seconds that a client looks for a router when it starts."""
-
-SETTLE_S = 0.2
-"""Real seconds within which the tokens of nodes are back whose router has died."""
 
 _ANSWERS_PER_S = 500
 """To newcomers, which ask once for each topic that they hear. Who asks more often floods."""
@@ -60,13 +50,6 @@ _LOOK_S = 0.002
 _BURST = 256
 """Messages that are delivered one after the other before something else gets its turn: who floods
 an actor does not keep it from its timers."""
-
-_ALIVE, _GONE = f"{ROOT}/alive", f"{ROOT}/gone"
-"""The incarnation of what is gone is the payload, not in the key: of a subscription with a wildcard
-that others have too, a client that is killed leaves 0.6 kB in its router for good (Zenoh 1.10)."""
-
-_DIGITS = 20
-"""Of an incarnation, at most."""
 
 _DELIVERY = {Qos.SENSOR: zenoh.Priority.DATA, Qos.STATE: zenoh.Priority.INTERACTIVE_HIGH,
              Qos.COMMAND: zenoh.Priority.INTERACTIVE_HIGH}
@@ -99,33 +82,27 @@ class ZenohBus:
     """One actor's Zenoh session.
 
     Args:
-        node: name under which this session announces itself; "" announces nothing (a tool).
-        incarnation: of the node.
+        node: whose session this is; "" for a tool.
         dial: endpoints of the routers; to a router, of the other one. None, where nothing listens
             either: it is alone.
         listen: endpoints of a router, that in the folder first; none for a client.
         recorder: connection to a recorder of the run; None for none.
         credentials: by which it shows who it is; None in a run without keys.
         access: what a router lets through; None for everything.
-        process_of: returns the process of a node's incarnation, if it is one of this machine.
     """
 
     bursts = True
 
-    def __init__(self, node: str, incarnation: int, dial: Sequence[str],
+    def __init__(self, node: str, dial: Sequence[str],
                  listen: Sequence[str] = (), recorder: RecorderConnection | None = None, *,
                  credentials: Credentials | None = None,
-                 access: Mapping[str, Any] | None = None,
-                 process_of: Callable[[str, int], LocalProcess | None] = lambda *_: None) -> None:
+                 access: Mapping[str, Any] | None = None) -> None:
         self._node = node
-        self._incarnation = incarnation
         self._listen = listen
         self._dial = dial
         self._recorder = recorder
         self._credentials = credentials
         self._access = access
-        self._process_of = process_of
-        self._ends: ProcessEnds | None = None
         self._session: zenoh.Session | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._arrived: deque[Callable[[], None]] = deque()
@@ -136,26 +113,20 @@ class ZenohBus:
         self._latest: dict[str, bytes] = {}
         self._answers = RateLimit(_ANSWERS_PER_S)
         self._held: list[Any] = []
-        self._leaving: dict[tuple[str, int, PeerChange], asyncio.TimerHandle] = {}
         self._routers: list[str] = []
 
-    def take_name(self, node: str, incarnation: int, recorder: RecorderConnection | None) -> None:
+    def take_name(self, node: str, recorder: RecorderConnection | None) -> None:
         """Be the bus of this node from now on; the session may be open already."""
-        self._node, self._incarnation, self._recorder = node, incarnation, recorder
+        self._node, self._recorder = node, recorder
 
     async def open(self) -> None:
-        """Open the session, unless it is open, and announce this node.
+        """Open the session, unless it is open.
 
         Raises:
             BusError: the endpoint is in use or invalid, or there is no router.
         """
-        if self._session is None:
-            await self._open()
-        if self._node:
-            self._held.append(self._require().liveliness().declare_token(
-                f"{_ALIVE}/{self._node}/{self._incarnation}"))
-
-    async def _open(self) -> None:
+        if self._session is not None:
+            return
         self._loop = asyncio.get_running_loop()
         try:
             if self._listen:
@@ -251,55 +222,6 @@ class ZenohBus:
         if payload is not None and self._answers.allows(time.monotonic()):
             query.reply(key, payload, express=True)
 
-    def watch(self, node: str, changed: PeerChange) -> None:
-        """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
-        self._ends = self._ends or ProcessEnds()
-
-        def arrived(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
-            incarnation = str(sample.key_expr).rpartition("/")[2]
-            if incarnation.isdecimal():
-                alive = sample.kind == zenoh.SampleKind.PUT
-                self._hand_over(lambda: self._token(node, int(incarnation), alive, changed))
-
-        def ended(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
-            incarnation = sample.payload.to_bytes()
-            if incarnation.isdigit() and len(incarnation) <= _DIGITS:
-                self._hand_over(lambda: changed(node, int(incarnation), False))
-
-        session = self._require()
-        self._held.append(session.liveliness().declare_subscriber(
-            f"{_ALIVE}/{node}/*", _direct(arrived), history=True))
-        self._held.append(session.declare_subscriber(f"{_GONE}/{node}", _direct(ended)))
-
-    def _token(self, node: str, incarnation: int, alive: bool, changed: PeerChange) -> None:
-        assert self._loop is not None  # noqa: S101 for the type checker
-        which = node, incarnation, changed
-        leaving = self._leaving.pop(which, None)
-        if leaving is not None:
-            leaving.cancel()
-        if alive:
-            changed(node, incarnation, True)
-            process = self._process_of(node, incarnation)
-            if process is not None and self._ends is not None:
-                self._ends.hold(which, process, lambda: changed(node, incarnation, False))
-        else:
-            self._leaving[which] = self._loop.call_later(SETTLE_S, self._left, which)
-
-    def _left(self, which: tuple[str, int, PeerChange]) -> None:
-        node, incarnation, changed = which
-        del self._leaving[which]
-        process = self._process_of(node, incarnation)
-        if process is not None and is_alive(process.id):
-            return  # its link was closed, it was paused perhaps; its heartbeats show how it is
-        if self._session is not None:
-            changed(node, incarnation, False)
-
-    def gone(self, node: str, incarnation: int) -> None:
-        """Tell those who watch a node that a process of it has ended."""
-        self._require().put(
-            f"{_GONE}/{node}", str(incarnation), priority=zenoh.Priority.INTERACTIVE_HIGH,
-            congestion_control=_DROP, express=True)
-
     def moved(self) -> bool:
         """Whether it has lost its router since this was last asked; less than a microsecond."""
         before, self._routers = self._routers, self._linked()
@@ -323,9 +245,6 @@ class ZenohBus:
         self._publishers.clear()
         self._latest.clear()
         self._arrived.clear()
-        if self._ends is not None:
-            self._ends.close()
-            self._ends = None
 
     def _require(self) -> zenoh.Session:
         if self._session is None:

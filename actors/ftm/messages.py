@@ -292,6 +292,12 @@ class ProcessEvent(Message, frozen=True):
         return "clear" if self.event in _GOOD_NEWS else "fault"
 
 
+FAILURES = {"crashed": "gone", "stopped": "stopped", "wedged": "hung", "given up": "given up"}
+"""Events after which no process of the node works, with what has become of it."""
+
+NEW_PROCESSES = ("started", "respawned")
+"""Events that name a process which is there, and has not worked yet."""
+
 _ROUTINE = ("started", "running")
 _GOOD_NEWS = ("respawned", "resumed", "adopted", "back")
 

@@ -13,9 +13,6 @@ counts in which the process could have run:
 * and no more than a moment a look, so that a caller that stood still itself blames no other.
 
 A stopped process (state T) is not on the run queue: all of its time counts.
-
-Where several are silent at once it is the machine, or what carries their messages: then a process
-is blamed only on proof that its loop stands still (`Standstill`).
 """
 
 from __future__ import annotations
@@ -64,59 +61,6 @@ def _is_on_run_queue(thread: Path) -> bool:
     except OSError:  # it has ended
         return False
     return stat.rpartition(")")[2].split()[0] == "R"
-
-
-_SPUN_PERIODS = 1.5
-"""A loop that has run for so many without a pause spins."""
-
-_PAUSE = 0.25
-"""Of a period; what a process may seem to have slept because the kernel counts in ticks, and by how
-much its timer may have come later than a period after the one before."""
-
-PROOF_PERIODS = 1 + _PAUSE
-"""So many have to lie between two looks: a loop that turns sleeps for nearly one."""
-
-_SLEEPS = "STt"
-_ROUNDING_S = 1e-9
-
-
-@dataclass(slots=True)
-class Standstill:
-    """Of a loop that has a timer to handle once a period. Pure; seconds of the caller's clock.
-
-    What its process did between two looks is the proof: it slept all the time, though its timer
-    was due; or it did nothing but run, for longer than a turn takes. One that waits for a processor
-    proves nothing, and one that ran and slept turns. What hangs in another way (it sleeps and wakes
-    again and again, or waits for a disk) is not found by this.
-    """
-
-    _at_s: float = 0.0
-    _before: Usage | None = None
-
-    def begin(self) -> None:
-        """Forget what was seen."""
-        self._before = None
-
-    def look(self, now_s: float, used: Usage, period_s: float) -> str:
-        """Return in words how the loop stands still; "" if that is not proved.
-
-        Args:
-            now_s: Now.
-            used: By its process so far.
-            period_s: Within which it has had a timer to handle.
-        """
-        before, passed_s = self._before, now_s - self._at_s
-        if before is not None and used.ran_s:  # else the kernel keeps no figures
-            ran_s, waited_s = used.ran_s - before.ran_s, used.waited_s - before.waited_s
-            if passed_s < period_s * PROOF_PERIODS - _ROUNDING_S:
-                return ""
-            if used.state in _SLEEPS and before.state in _SLEEPS and ran_s == waited_s == 0:
-                return "it sleeps"
-            if used.state == before.state == "R" and (
-                    passed_s - ran_s - waited_s < _PAUSE * period_s):
-                return "it spins" if ran_s >= _SPUN_PERIODS * period_s else ""
-        self._at_s, self._before = now_s, used
-        return ""
 
 
 @dataclass(slots=True)

@@ -7,7 +7,8 @@ For each failed node the supervisor is asked for a new process, and that proves 
 heartbeat. What makes this more than one message is that a request names the *failed incarnation*,
 so that asking twice, or asking about a node that is back already, kills no process that is well:
 
-* An incarnation whose token has vanished, or whose heartbeat is overdue, has failed: it is named.
+* An incarnation that the supervisor has published as failed, or whose heartbeat is overdue, has
+  failed: it is named.
 * One that was heard a moment ago is not accused. The request names its predecessor, and the
   supervisor, which holds the process's pidfd and knows better, respawns it or answers that it is
   there. This happens when this module was itself respawned and is commanded again, and when a
@@ -53,6 +54,7 @@ class Stage(Enum):
 
 
 _WAITING = (Stage.ASKED, Stage.STARTED)
+_LOST = ("crashed", "stopped", "wedged")
 
 
 class Ask(NamedTuple):
@@ -156,32 +158,23 @@ class RespawnCore:
                 and incarnation > node.ask.failed_incarnation and stamp_s >= node.asked_s:
             node.stage = Stage.BACK
 
-    def peer(self, name: str, incarnation: int, alive: bool, now_s: float) -> None:
-        """Take note of a process that appears or is gone."""
-        node = self._nodes.get(name)
-        if node is None or incarnation < node.incarnation:
-            return
-        if incarnation > node.incarnation:
-            node.incarnation = incarnation
-            node.heard_s = now_s  # not heard yet, but not overdue either
-        node.gone_s = None if alive else now_s
-        if not alive and incarnation > node.ask.failed_incarnation \
-                and node.stage in _WAITING:
-            self._ask(name, node, now_s)
-
     def event(self, name: str, event: str, incarnation: int, detail: str, now_s: float) -> None:
-        """Take note of what the supervisor says of a process."""
+        """Take note of what the supervisor has published of a process."""
         node = self._nodes.get(name)
         if node is None:
             return
-
-        if event == "respawned" and node.stage is Stage.ASKED:
+        if incarnation > node.incarnation:
+            node.incarnation = incarnation
+            node.heard_s, node.gone_s = now_s, None  # not heard yet, but not overdue either
+        if event in _LOST and incarnation == node.incarnation:
+            node.gone_s = now_s
+            if incarnation > node.ask.failed_incarnation and node.stage in _WAITING:
+                self._ask(name, node, now_s)
+        elif event == "respawned" and node.stage is Stage.ASKED:
             node.stage = Stage.STARTED
             node.started_s = now_s
             node.ask = node.ask._replace(
                 failed_incarnation=max(node.ask.failed_incarnation, incarnation - 1))
-        elif event == "crashed":
-            self.peer(name, incarnation, False, now_s)
         elif event in ("refused", "given up") and node.stage in _WAITING:
             node.stage = Stage.FAILED
             node.problem = f"{name}: {event}{f', {detail}' if detail else ''}"
@@ -268,11 +261,6 @@ class Respawn(RecoveryModule):
             return parameters.nodes
         return super().names(topic, name, parameters)
 
-    @classmethod
-    def watches(cls, name: str, parameters: Parameters) -> tuple[str, ...]:  # noqa: ARG003
-        """Hear of the processes of its nodes, to know which incarnation has failed."""
-        return parameters.nodes
-
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Ask for the nodes that the command names."""
         if self._core.order(command.nodes, self.clock.now(), renewed=renewed):
@@ -293,11 +281,6 @@ class Respawn(RecoveryModule):
     def unfinished(self) -> str:
         """Name the nodes that are not back."""
         return ", ".join(self._core.pending)
-
-    def on_peer(self, node: str, incarnation: int, alive: bool) -> None:
-        """See a process come or go."""
-        self._core.peer(node, incarnation, alive, self.clock.now())
-        self._settle()
 
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, _message: Heartbeat, header: Header) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from itertools import count
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import xxhash
@@ -26,6 +26,13 @@ _PASSING = Topic("", msgspec.Struct, bus_topic.Qos.COMMAND, 0.0, "", "What they 
 _pack, _unpack = msgspec.msgpack.encode, msgspec.msgpack.decode
 
 
+class WatchedBus(Bus, Protocol):
+    """A bus that knows which nodes are there, as that of virtual time does."""
+
+    def watch(self, node: str, changed: Callable[[str, int, bool], None]) -> None:
+        """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
+
+
 class BusSide:
     """What a node of ROS 2 has of the network, over the bus of an actor.
 
@@ -35,7 +42,7 @@ class BusSide:
         incarnation: of its process.
     """
 
-    def __init__(self, bus: Bus, name: str, incarnation: int) -> None:
+    def __init__(self, bus: WatchedBus, name: str, incarnation: int) -> None:
         self.id = xxhash.xxh3_64_hexdigest(f"{name} {incarnation}".encode())
         self._bus, self._name, self._incarnation = bus, name, incarnation
         self._tokens: list[str] = []

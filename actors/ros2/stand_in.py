@@ -11,12 +11,12 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, cast
 
 import msgspec
 
 from rampart.actors.bus.bus import Bus
-from rampart.actors.ros2.bus_side import BusSide
+from rampart.actors.ros2.bus_side import BusSide, WatchedBus
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import EPOCH_NS, NS
 from rampart.actors.ros2.side import Mode, Record, Side, ZenohSide
@@ -39,7 +39,7 @@ def side_of(actor: Actor, bus: Bus, connect: Sequence[str], mode: Mode,
     """
     context = actor.context
     if context.run.plan.virtual:
-        return BusSide(bus, actor.name, context.incarnation)
+        return BusSide(cast("WatchedBus", bus), actor.name, context.incarnation)
     return ZenohSide(connect, asyncio.get_running_loop(), record, mode=mode)
 
 

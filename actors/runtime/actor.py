@@ -8,7 +8,7 @@ needs no lock and its code no `await`.
 A handler that raises ends the actor: the error is reported on `diagnostic/NAME`, `on_failure`
 is called, and the process exits non-zero so that its supervisor starts a fresh one. The
 heartbeat is an item of the same mailbox: a handler that never returns silences it, although the
-process and its liveliness token are still there.
+process is still there.
 """
 
 from __future__ import annotations
@@ -116,9 +116,6 @@ class Actor(Declared):
 
     def on_failure(self, error: BaseException) -> None:
         """Runs on the loop after a handler raised, before `on_stop`. A raise here is ignored."""
-
-    def on_peer(self, node: str, incarnation: int, alive: bool) -> None:
-        """Runs as a mailbox item when a watched node appears or vanishes."""
 
     def is_well(self) -> bool:
         """Whether its heartbeat is to be sent; asked whenever one is due."""
@@ -288,8 +285,6 @@ class Actor(Declared):
             topic = self.chosen_topic(key)
             where = topic.pattern if key == topic.key else f"{ROOT}/{key}"
             self._hear(topic, where, _all_of(handlers))
-        for node in self.watches(self.name, self.parameters):
-            self._bus.watch(node, self._peer_changed)
         self.on_start()
         self._beat()
         self._timers.every(self.context.heartbeat_period_s, "_beat", self._beat)
@@ -353,10 +348,6 @@ class Actor(Declared):
     def _reject(self, key: str, reason: str) -> None:
         self._rejected += 1
         self.report_diagnostic("payload rejected", reason, key)
-
-    def _peer_changed(self, node: str, incarnation: int, alive: bool) -> None:
-        self._dispatcher.put_message(
-            f"peer {node} {incarnation} {alive}", lambda: self.on_peer(node, incarnation, alive))
 
     def _overflowed(self, _item: Any) -> None:
         self.report_diagnostic("mailbox full", "a message was refused", self.name)

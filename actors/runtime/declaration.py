@@ -109,11 +109,6 @@ class Handlers:
         """Topics it has handlers for, of an actor those that every actor hears included."""
         return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
 
-    @classmethod
-    def periods_s(cls) -> tuple[float, ...]:
-        """Periods of what it does by `every`, simulated seconds."""
-        return tuple(period_s for period_s, _ in cls._periodic)
-
 
 _OF_HANDLER = {1: "(self)", 3: "(self, message, header)"}
 
@@ -175,11 +170,6 @@ class Declared(Handlers):
     def output_names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
         """Which members of an output family a node publishes, likewise; None for any."""
         return (name,)
-
-    @classmethod
-    def watches(cls, name: str, parameters: Any) -> tuple[str, ...]:  # noqa: ARG003
-        """Nodes of which `on_peer` reports that they appear and vanish."""
-        return ()
 
     @classmethod
     def own_keys(cls, parameters: Any) -> tuple[str, ...]:  # noqa: ARG003

@@ -30,9 +30,6 @@ RecoveryNames = Annotated[tuple[Name, ...], msgspec.Meta(extra={"names": "recove
 TopicHeard = Annotated[str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "heard"})]
 """Key of a topic, below `rampart/`, that the node hears because its parameters say so."""
 TopicsHeard = Annotated[tuple[str, ...], msgspec.Meta(extra={"names": "topic", "way": "heard"})]
-SignsOfLife = Annotated[tuple[str, ...], msgspec.Meta(
-    extra={"names": "topic", "way": "heard", "signs_of": "watch"})]
-"""Keys of topics by which the nodes that the parameter `watch` names show that they work."""
 TopicPublished = Annotated[
     str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "published"})]
 """Key of a topic that the node publishes because its parameters say so."""
@@ -101,7 +98,6 @@ class Named(NamedTuple):
         field: of its messages, or "".
         kinds: of which the field may be.
         row: which row that is, for messages; "" of a parameter.
-        signs_of: nodes of which it is a sign of life, if it is.
     """
 
     name: str
@@ -109,7 +105,6 @@ class Named(NamedTuple):
     field: str
     kinds: tuple[str, ...] = ANYTHING
     row: str = ""
-    signs_of: tuple[str, ...] = ()
 
 
 def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
@@ -118,8 +113,7 @@ def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
     for name, marks in _marks(type(parameters)).items():
         said = getattr(parameters, name)
         if "way" in marks and said:
-            nodes = getattr(parameters, marks["signs_of"]) if "signs_of" in marks else ()
-            found[marks["way"]] += [named(name, text, signs_of=nodes)
+            found[marks["way"]] += [named(name, text)
                                     for text in ([said] if isinstance(said, str) else said)]
     return found
 

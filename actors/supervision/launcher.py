@@ -136,7 +136,7 @@ class Launcher:
     def observers_bus(self) -> ZenohBus:
         """Return the bus of an observer in this process, which hears all nodes; not yet open."""
         name = on_host(OBSERVER, self.plan.host)
-        return ZenohBus(name, 1, endpoints(self.plan.folder),
+        return ZenohBus(name, endpoints(self.plan.folder),
                         recorder=RecorderConnection(self.plan.base_port),
                         credentials=self.plan.credentials(name))
 

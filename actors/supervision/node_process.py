@@ -22,7 +22,7 @@ from typing import Any
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.run_folder import ROUTERS, is_here, process_of, register_of
+from rampart.actors.bus.run_folder import ROUTERS, is_here, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.foreign.child import CommandError
@@ -62,7 +62,7 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
     """
     member = layout.members.get(name) or router(name)
     clock = clock_of(layout.plan, loop.time)
-    bus = bus or _bus_of(layout, name, incarnation)
+    bus = bus or _bus_of(layout, name)
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
@@ -73,17 +73,16 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         command_age_s=layout.hosts.command_age_s))
 
 
-def _bus_of(layout: Layout, name: str, incarnation: int, bus: ZenohBus | None = None) -> ZenohBus:
+def _bus_of(layout: Layout, name: str, bus: ZenohBus | None = None) -> ZenohBus:
     """Return the bus of an actor: the one given, under its name from now on, or one of its own."""
     plan = layout.plan
     recorder = RecorderConnection(plan.base_port)
     if bus is not None:
-        bus.take_name(name, incarnation, recorder)
+        bus.take_name(name, recorder)
         return bus
     access = access_of(layout, plan.keys) if plan.keys and name in plan.routers else None
-    return ZenohBus(name, incarnation, *_ends(layout, name), recorder, access=access,
-                    credentials=plan.credentials(name),
-                    process_of=partial(process_of, plan.folder))
+    return ZenohBus(name, *_ends(layout, name), recorder, access=access,
+                    credentials=plan.credentials(name))
 
 
 def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:
@@ -162,7 +161,7 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
     loop = asyncio.get_running_loop()
     tell_of_callbacks(
         loop, lambda line: complain(f"{'+'.join(role.names)} #{role.incarnation}: {line}"))
-    buses = {name: _bus_of(layout, name, role.incarnation, bus if name == role.names[0] else None)
+    buses = {name: _bus_of(layout, name, bus if name == role.names[0] else None)
              for name in role.names}
     actors = [make_actor(layout, name, role.incarnation, run, loop, failed=failed, bus=one)
               for name, one in buses.items()]

@@ -18,10 +18,8 @@ import selectors
 import socket
 import time
 from collections.abc import Awaitable, Callable
-from functools import partial
 
 from rampart.actors.bus.bus import BusError
-from rampart.actors.bus.run_folder import process_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.machine.unix_peer import process_state
@@ -201,8 +199,7 @@ async def _session(plan: RunPlan) -> ZenohBus | None:
         BusError: there is no router.
     """
     shown = plan.credentials("")
-    bus = ZenohBus("", 0, endpoints(plan.folder) if shown is None else [], credentials=shown,
-                   process_of=partial(process_of, plan.folder))
+    bus = ZenohBus("", endpoints(plan.folder) if shown is None else [], credentials=shown)
     await bus.open()
     if shown is None:
         return bus

@@ -19,11 +19,10 @@ from typing import Protocol
 
 import msgspec
 
-from rampart.actors.bus.run_folder import change_system, mark_of
+from rampart.actors.bus.run_folder import change_system
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.machine.patience import AT_LEISURE, Usage, usage
-from rampart.actors.machine.process_ends import LocalProcess, Marks
-from rampart.actors.machine.unix_peer import process_id, process_state
+from rampart.actors.machine.unix_peer import process_state
 from rampart.actors.supervision.process_title import RunProcess, find_processes, kill
 from rampart.actors.supervision.requests import REQUEST_BYTES, ForkRequest, Reply
 
@@ -107,10 +106,8 @@ class Processes(Protocol):
     def withdraw(self, names: tuple[str, ...]) -> None:
         """End a process that `fork` was called for and that is under way."""
 
-    def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> ProcessHandle:
+    def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Take hold of a process; `ended` is called on the event loop when it ends.
-
-        Sooner if it has left a mark as that node (`process_ends`).
 
         Raises:
             ProcessLookupError: It is gone already.
@@ -128,20 +125,15 @@ class Processes(Protocol):
 
 
 class OsHandle(ProcessHandle):
-    """A pidfd, and the mark of the process: of any, not of children only, so it can be adopted."""
+    """A pidfd: of any process, not of children only, so it can be adopted."""
 
-    def __init__(self, pid: int, ended: Callable[[], None], marks: Marks | None = None,
-                 mark: str = "") -> None:
+    def __init__(self, pid: int, ended: Callable[[], None]) -> None:
         self.pidfd = os.pidfd_open(pid)
         self._pid = pid
         self._ended = ended
         self._is_heard = True
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self.pidfd, self._told)
-        self._marks = marks
-        process = process_id(pid)
-        if marks is not None and process is not None:
-            marks.watch(self, LocalProcess(process, mark), self._told)
 
     def _told(self) -> None:
         if self._is_heard:
@@ -176,8 +168,6 @@ class OsHandle(ProcessHandle):
         if self._is_heard:
             self._is_heard = False
             self._loop.remove_reader(self.pidfd)
-            if self._marks is not None:
-                self._marks.let_go(self)
 
     def close(self) -> None:
         if self.pidfd >= 0:
@@ -240,7 +230,6 @@ class OsProcesses:
         self._root.setblocking(False)
         self._asked: dict[tuple[str, ...], _Asked] = {}
         self._patience_s = PATIENCE_S
-        self._marks: Marks | None = None
         self._loop = asyncio.get_running_loop()
         self._word()
 
@@ -292,10 +281,9 @@ class OsProcesses:
         """Return the processes of this run, found in /proc."""
         return find_processes(self._port, self._launcher)
 
-    def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> ProcessHandle:
+    def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Open a pidfd; raises ProcessLookupError if there is no such process."""
-        self._marks = self._marks or Marks()
-        return OsHandle(pid, ended, self._marks, mark_of(self.folder, node) if node else "")
+        return OsHandle(pid, ended)
 
     def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:
         """SIGTERM to all in their sequence, then SIGKILL for those that are there after a while."""
@@ -318,5 +306,3 @@ class OsProcesses:
         for names in list(self._asked):
             self.withdraw(names)
         self._root.close()
-        if self._marks is not None:
-            self._marks.close()

@@ -614,8 +614,6 @@ class Root:
             register = run_folder.register_of(folder)
             if max(register(name) or 0 for name in names) >= incarnation:
                 os._exit(0)  # asked for too late: a later one had its place, or has
-            if self._loaded.may_be_marked(names):  # else its end counts when its ports are free
-                run_folder.mark(folder, names)
             run_folder.issue(folder, names, incarnation, process_id(os.getpid()))
 
         return Role(names, incarnation, born)

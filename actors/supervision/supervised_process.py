@@ -23,16 +23,15 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from rampart.actors.ftm.messages import NodeState
-from rampart.actors.machine.patience import Patience, Standstill, Usage
+from rampart.actors.machine.patience import Patience, Usage
 from rampart.actors.system.layout import Unit
-from rampart.manager.spec.budget import PERIODS_TO_MISS
 from rampart.manager.spec.tables import Supervision
 
 START_TIMEOUT_S = 3.0
 """Wall seconds in which a new process must have sent its first heartbeat."""
 
-MANY = 2
-"""When so many heartbeats are missing it is the machine, or the bus."""
+MANY, MANY_SHARE = 2, 1 / 8
+"""When the heartbeats of so many processes are missing it is the machine, or the bus."""
 
 MOST_EXCUSED_S = 3.0
 """Wall seconds that a process could have run after which it is blamed though many are silent."""
@@ -266,7 +265,6 @@ class SupervisedProcess:
     started_s: float = 0.0
     searched_s: float = -math.inf
     heard_s: dict[str, float] = field(default_factory=dict)
-    standstill: Standstill = field(default_factory=Standstill)
     lives: Lives = field(default_factory=Lives)
 
     @property
@@ -327,15 +325,16 @@ class SupervisedProcess:
             now_s: Now.
             timeout_s: Of a heartbeat.
             used: Returns what the process has used; asked only if that matters.
-            many: Whether many are late: then it has to be proved that it stands still.
+            many: Whether many are late.
         """
         if self.state is State.STARTING:
-            is_silent = self._could_have_been_heard(now_s, self.started_s, START_TIMEOUT_S, used)
-            return "no heartbeat after its start" if is_silent else ""
+            could_s = self._could_answer_s(now_s, self.started_s, START_TIMEOUT_S, used)
+            return "no heartbeat after its start" if could_s > START_TIMEOUT_S else ""
         if self.state is not State.RUNNING:
             return ""
         since_s = min(self.heard_s.values(), default=now_s)
-        if not self._could_have_been_heard(now_s, since_s, timeout_s, used, many=many):
+        could_s = self._could_answer_s(now_s, since_s, timeout_s, used)
+        if could_s <= (max(timeout_s, MOST_EXCUSED_S) if many else timeout_s):
             return ""
         late = [name for name, at_s in self.heard_s.items() if now_s - at_s > timeout_s]
         if not late:
@@ -343,16 +342,12 @@ class SupervisedProcess:
         nodes = ", ".join(name for name in late if name != STATUS)
         return f"no heartbeat from {nodes}" if nodes else f"no {STATUS}"
 
-    def _could_have_been_heard(self, now_s: float, since_s: float, limit_s: float,
-                               used: Callable[[], Usage], *, many: bool = False) -> bool:
+    def _could_answer_s(self, now_s: float, since_s: float, limit_s: float,
+                        used: Callable[[], Usage]) -> float:
         if now_s - since_s <= limit_s / 2:  # not worth a look into /proc
             self.patience.answered()
-            self.standstill.begin()
-            return False
-        usage = used()
-        stands = self.standstill.look(now_s, usage, limit_s / PERIODS_TO_MISS)
-        could_s = self.patience.look(now_s, self.pid, usage, since_s)
-        return could_s > limit_s and (bool(stands) or not many or could_s > MOST_EXCUSED_S)
+            return 0.0
+        return self.patience.look(now_s, self.pid, used(), since_s)
 
     def excuse(self, now_s: float, stall_s: float) -> None:
         """Do not count as silence what the supervisor could not have heard."""

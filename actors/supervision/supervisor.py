@@ -45,6 +45,7 @@ from rampart.actors.supervision.processes import (
 )
 from rampart.actors.supervision.supervised_process import (
     MANY,
+    MANY_SHARE,
     STATUS,
     Action,
     Event,
@@ -283,7 +284,7 @@ class Supervisor(Actor):
         if missed_s:
             self.excuse(now, missed_s)
         late = sum(process.is_late(now, self._timeout_s) for process in self._processes.values())
-        many = late >= MANY
+        many = late >= max(MANY, MANY_SHARE * len(self._processes))
         for process in self._processes.values():
             silence = process.silence(now, self._timeout_s, process.handle.usage, many=many)
             if silence:
@@ -315,8 +316,6 @@ class Supervisor(Actor):
         # Else it was replaced, or is kept no more, since the news came to the mailbox.
         if process.pid == pid and self._is_kept(process):
             process.let_go()
-            for name in process.names:
-                self._bus.gone(name, process.incarnation)
             self._on(process, Event.ENDED, detail=detail)
 
     def _owns(self, process: HeldProcess) -> bool:
@@ -427,7 +426,7 @@ class Supervisor(Actor):
         process.let_go()
         try:
             process.handle = self._machine.hold(pid, lambda: self._dispatcher.put(
-                f"exit {pid}", lambda: self._ended(process, pid)), process.names[0])
+                f"exit {pid}", lambda: self._ended(process, pid)))
         except ProcessLookupError:
             self._ended(process, pid, "it ended before it could be watched")
         except OSError as error:  # no descriptor left: perhaps later

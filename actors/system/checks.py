@@ -9,7 +9,6 @@ as any: it is only silent. So it is refused before a run, in one line.
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from typing import Any
@@ -24,12 +23,6 @@ from rampart.actors.runtime.actor import BASE_OUTPUTS
 from rampart.actors.runtime.parameters import Named, messages_said
 from rampart.actors.system.members import Member, heard, published
 from rampart.manager.spec.schema import Kind, SystemSpec
-
-LEAST_SIGN_HZ = 10.0
-"""What is published less often is no better a sign of life than heartbeats."""
-
-_LATEST_SIGN = 1.5
-"""Periods of such a topic within which a loop that turns has had a timer to handle."""
 
 Published = Mapping[str, list[tuple[Member, Members]]]
 """Topic key → who publishes it, and which members of a family."""
@@ -195,12 +188,11 @@ def check_alone(node: Member, said: Published, declared: Declared, file: str) ->
                         "of; a topic of the stick's own is right (or several = True in the Topic)")
 
 
-def check_named(topic: Topic[Any], named: Named, members: Iterable[Member], where: str) -> None:
-    """Check what a parameter names of a topic: a field, or a sign of life.
+def check_named(topic: Topic[Any], named: Named, where: str) -> None:
+    """Check the field of a topic that a parameter names.
 
     Raises:
-        ValueError: there is no such field, it is of another kind, or the topic is no sign of life
-            of a watched node, or too rare to be a better one than heartbeats.
+        ValueError: there is no such field, or it is of another kind.
     """
     if named.field:
         try:
@@ -210,27 +202,6 @@ def check_named(topic: Topic[Any], named: Named, members: Iterable[Member], wher
         if kind not in named.kinds:
             raise ValueError(f"{where}: topic {topic.key}: {named.field} is a {kind}; a "
                              f"{' or a '.join(named.kinds)} is right")
-    if named.signs_of:
-        _check_sign(topic, named, members, f"{where} = {named.key!r}")
-
-
-def _check_sign(topic: Topic[Any], named: Named, members: Iterable[Member], where: str) -> None:
-    if topic.rate_hz < LEAST_SIGN_HZ:
-        comes = f"comes {topic.rate_hz:g} times a second" if topic.rate_hz else "comes on event"
-        raise ValueError(f"{where}: {comes}, heartbeats show as much; a topic with a rate of "
-                         f"{LEAST_SIGN_HZ:g} Hz or more is right")
-    publishers = [m for m in members if topic.key in published(m)]
-    watched = [m for m in publishers if m.name in named.signs_of]
-    if not watched:
-        names = ", ".join(m.name for m in publishers) or "none"
-        raise ValueError(f"{where}: published by {names}, a topic of "
-                         f"{' or '.join(named.signs_of)} is right")
-    longest_s = _LATEST_SIGN / topic.rate_hz
-    for member in watched:
-        if min(member.actor.periods_s(), default=math.inf) > longest_s:
-            raise ValueError(f"{where}: {member.name} has no timer of {1 / topic.rate_hz:g} s, so "
-                             "it is silent when others are; what is published by a timer (@every) "
-                             "is right")
 
 
 def check_said(parameters: msgspec.Struct, topics: Mapping[str, Topic[Any]]) -> None:

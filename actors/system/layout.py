@@ -155,12 +155,6 @@ class Layout:
         return "pool" if all(name in self.members and self.members[name].spare == "pool"
                              for name in names) else "none"
 
-    def may_be_marked(self, names: Collection[str]) -> bool:
-        """Whether all that the process of these actors holds is memory: no port, no program."""
-        return all(name in self.members and not self.members[name].actor.holds_devices
-                   and self.members[name].kind is not Kind.WORLD
-                   for name in names)
-
     def _check(self, judge: Any, everyone: Iterable[Member], known: Collection[Topic[Any]],
                file: str) -> None:
         """Check who hears and publishes what; raises as the constructor."""

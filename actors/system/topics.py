@@ -141,7 +141,7 @@ def choose_topics(members: Collection[Member], known: Iterable[Topic[Any]], file
                 found[one.key] = topic = _topic(one.key, every, where)
                 if way == "heard" and topic.is_family and topic in member.actor.inputs():
                     raise ValueError(f"{where}: {member.actor.__name__} hears {one.key!r} anyway")
-                check_named(topic, one, members, where)
+                check_named(topic, one, where)
                 name = topic.member(one.key)
                 there = ways[way].get(topic.key, ())
                 ways[way][topic.key] = (*(there or ()), name) if name else None

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR
 from rampart.actors.system.layout import Layout, Unit
 from rampart.cli import systems
@@ -161,9 +162,9 @@ def _guards(layout: Layout) -> Iterator[Guard]:
         yield Guard(name, tuple(units), "restarts it" if name == SUPERVISOR
                     else "has it restarted, when the manager decides so")
     for member in layout.members.values():
-        watched = member.actor.watches(member.name, member.parameters)
-        if watched and member.kind is Kind.DETECTION:
-            yield Guard(member.name, watched, "notices that it is dead, stopped or hung")
+        if isinstance(member.parameters, Watchdog.Parameters):
+            yield Guard(member.name, member.parameters.watch,
+                        "notices that it is dead, stopped or hung")
 
 
 def _consequences(spec: SystemSpec) -> Iterator[Consequence]:

@@ -166,7 +166,7 @@ class Replay:
             folder = Path(stack.enter_context(
                 tempfile.TemporaryDirectory(prefix="rampart-replay-")))
             stack.enter_context(self._answering(clock, folder))
-            bus = ZenohBus("", 0, [], [endpoint(self._sockets, run_info.REPLAY)],
+            bus = ZenohBus("", [], [endpoint(self._sockets, run_info.REPLAY)],
                            RecorderConnection(self._port))
             with refusing(BusError):
                 await bus.open()

@@ -18,12 +18,14 @@ from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.topics import INJECT
+from rampart.actors.ftm.messages import ProcessEvent
+from rampart.actors.ftm.topics import PROCESS_EVENT
 from rampart.actors.machine.patience import AT_LEISURE
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, NoCheckpoints, Record
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
-from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan, load_system
 from rampart.actors.system.layout import Layout, load_run
 from rampart.files import working_folder
 from rampart.sim.faults.scenario import parse_fault
@@ -178,10 +180,12 @@ class VirtualSystem:
         return self.start(name, member.actor, *others, **{**given, **parameters})
 
     async def kill(self, name: str) -> None:
-        """End an actor as SIGKILL would: its token vanishes, it says nothing more."""
+        """End an actor as SIGKILL would, and publish that as the supervisor does."""
         task = self.tasks.pop(name)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+        self.say(PROCESS_EVENT, ProcessEvent(
+            name, "crashed", 1, self.incarnations[name], SUPERVISOR, ""), SUPERVISOR)
 
     async def stop(self, name: str) -> None:
         """End an actor in order; what it raised, if it had ended by itself, is raised."""

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rampart.actors.bus.bus import Deliver, PeerChange
+from rampart.actors.bus.bus import Deliver
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 
@@ -23,6 +23,9 @@ Tap = Callable[[float, str, str, bytes], None]
 Link = Callable[[float], Sequence[float]]
 """Way from one node to another: returns when the copies of a message sent now arrive, if any."""
 
+
+PeerChange = Callable[[str, int, bool], None]
+"""Called with a node, its incarnation, and whether it is there."""
 
 Route = tuple[Link | None, Deliver, Callable[[Deliver, str, bytes], None]]
 """The link to a reader, what there takes the message, and its bus's `arrive`, for other loops."""
@@ -212,9 +215,6 @@ class VirtualBus:
     def after_burst(self, call: Callable[[], None]) -> None:
         """Make a call: each message arrives by itself."""
         call()
-
-    def gone(self, node: str, incarnation: int) -> None:
-        """Nothing to do: watchers are told when it is cut off."""
 
     def moved(self) -> bool:
         """Never: there are no routers."""

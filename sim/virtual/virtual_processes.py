@@ -210,7 +210,7 @@ class VirtualMachine:
         self._loop.call_later(self._start_s(), self._begin, process)
         return pid
 
-    def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> _Handle:  # noqa: ARG002
+    def hold(self, pid: int, ended: Callable[[], None]) -> _Handle:
         """Take hold of a process."""
         process = self._processes.get(pid)
         if process is None:
@@ -243,7 +243,7 @@ class VirtualMachine:
     def hit(self, what: str, node: str, pace_s: float = 0.0) -> bool:
         """Do something to a node's process, as a `ProcessControl`.
 
-        A wedged process is still there, with its token. A slow node is slow after a restart, too.
+        A wedged process is still there. A slow node is slow after a restart, too.
         """
         if what == "slow":
             self._slow[node] = pace_s

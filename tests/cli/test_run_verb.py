@@ -54,29 +54,6 @@ def test_a_run_whose_page_would_have_another_program_s_port_is_refused(tmp_path,
     assert not (tmp_path / "report").exists()
 
 
-@pytest.mark.parametrize(("signs", "problem"), [
-    ("plan/route", "comes 5 times a second, heartbeats show as much; a topic with a rate of 10 Hz "
-     "or more is right"),
-    ("mission/order", "comes on event, heartbeats show as much; a topic with a rate of 10 Hz or "
-     "more is right"),
-    ("summit_xl/odom", "published by simulator, a topic of mission_manager or graph_planner or "
-     "osmosis_control is right"),
-    ("localization/pose", "localization has no timer of 0.05 s, so it is silent when others are; "
-     "what is published by a timer (@every) is right")])
-def test_what_is_no_sign_of_life_is_refused_in_one_line(tmp_path, capsys, signs, problem):
-    text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
-    if signs == "localization/pose":
-        watch = 'watch = ["localization"],'
-        text = text.replace(watch, f'{watch} signs = ["{signs}"],')
-    else:
-        text = text.replace('signs = ["control/command"]', f'signs = ["{signs}"]')
-    (tmp_path / "own.toml").write_text(text, encoding="utf-8")
-    assert launch.main(["--virtual", "--system", str(tmp_path / "own.toml")]) == 2
-    told = capsys.readouterr().err
-    module = "DM7" if signs == "localization/pose" else "DM4"
-    assert told.endswith(f"own.toml: {module}: parameters.signs = '{signs}': {problem}\n")
-
-
 def test_a_system_without_an_application_offers_no_options_or_examples_of_a_robot(capsys):
     with pytest.raises(SystemExit):
         launch.main(["--system", str(CELL), "--help"])

@@ -137,7 +137,7 @@ async def run(monkeypatch, bus_folder):
     async with AsyncExitStack() as stack:
         nodes = []
         for name, cls in (("simulator", Everything), ("DM1", Bystander)):
-            bus = ZenohBus(name, 1, endpoints(bus_folder))
+            bus = ZenohBus(name, endpoints(bus_folder))
             node = cls(Context(name, 1, clock, bus))
             task = asyncio.create_task(node.run())
             stack.push_async_callback(asyncio.wait_for, task, 5)

@@ -25,17 +25,16 @@ from rampart.actors.system.topics import declared_topics
 
 PEOPLE = ("operator", "viewer")
 
-_INCARNATION = "1"
-_FOREIGN = ("nothing/declared", "**", "*/*", "heartbeat/*", "alive/*/*", "gone/*")
+_FOREIGN = ("nothing/declared", "**", "*/*", "heartbeat/*", "alive/DM5/1")
 """What nobody declares; as keys, expressions with wildcards included."""
 
 _CLAIMS = (
     ("ingress", "put", "says"), ("ingress", "declare_subscriber", "hears"),
     ("egress", "put", "hears"), ("ingress", "declare_queryable", "answers"),
     ("ingress", "reply", "answers"), ("ingress", "query", "asks"), ("egress", "reply", "asks"),
-    ("ingress", "liveliness_token", "is there"), ("ingress", "delete", "never"),
+    ("ingress", "liveliness_token", "never"), ("ingress", "delete", "never"),
     ("egress", "delete", "never"))
-"""Flow, message, and whether that is to say, to hear, to answer, to ask, or to be there."""
+"""Flow, message, and whether that is to say, to hear, to answer, to ask, or nothing."""
 
 
 def disagreements(layout: Layout, config: Mapping[str, Any]) -> tuple[list[str], dict[str, set]]:
@@ -114,7 +113,6 @@ class _Declared:
         self._members = {**layout.members, **{name: router(name) for name in routers}}
         self._may_run = {host: {*hosts.may_run(host, layout.members), *hosts.routers_of(host)}
                          for host in hosts.supervisors}
-        self._hosts_of_supervisors = {name: host for host, name in hosts.supervisors.items()}
         self._far = {name: host for name, host in routers.items() if host != self._own}
         self.identities = (*layout.members, *self._far, *PEOPLE)
         self._pages = [m for m in layout.members.values() if m.actor.is_page]
@@ -132,9 +130,6 @@ class _Declared:
                 yield topic.key.replace("{name}", name)
         for member in self._members.values():
             yield from member.actor.own_keys(member.parameters)
-        for name in self._names:
-            yield f"alive/{name}/{_INCARNATION}"
-            yield f"gone/{name}"
         yield from _FOREIGN
 
     def may(self, identity: str, what: str, key: str) -> bool:
@@ -150,8 +145,6 @@ class _Declared:
             self._may(identity, what, key))
 
     def _may(self, identity: str, what: str, key: str) -> bool:
-        if what == "is there":
-            return key == f"alive/{identity}/{_INCARNATION}"
         if what == "never":
             return False
         of_person, kept = identity in PEOPLE, self._is_kept(key)
@@ -167,8 +160,6 @@ class _Declared:
         if identity in PEOPLE:
             return identity == "operator" and self._is_operated(key)
         member = self._members[identity]
-        if node := _gone(key):
-            return node in self._may_run.get(self._hosts_of_supervisors.get(identity, "?"), ())
         return (key in member.actor.own_keys(member.parameters) or _says(member, key)
                 or (identity == OBSERVER and self._is_operated(key)))
 
@@ -176,8 +167,6 @@ class _Declared:
         if identity in PEOPLE:
             return True
         member = self._members[identity]
-        if node := _gone(key):
-            return node in member.actor.watches(identity, member.parameters)
         return key in member.actor.own_keys(member.parameters) or _hears(member, key)
 
     def _is_operated(self, key: str) -> bool:
@@ -190,12 +179,6 @@ class _Declared:
     def _is_kept(self, key: str) -> bool:
         return any(topic.member(key) is not None and topic.qos is not Qos.COMMAND
                    for topic in self._topics.values())
-
-
-def _gone(key: str) -> str:
-    """Return the node of whose end a key tells, "" if it is no such key."""
-    place, _, node = key.partition("/")
-    return node if place == "gone" else ""
 
 
 def _says(member: Member, key: str) -> bool:

@@ -66,17 +66,10 @@ def test_it_is_known_which_process_an_incarnation_is(sockets):
     run_folder.issue(sockets, ["DM1"], 3, own)
     assert run_folder.register_of(sockets)("DM1") == 3
     assert run_folder.issued(sockets) == {"DM1": 3}
-    found = run_folder.process_of(sockets, "DM1", 3)
-    assert found is not None
-    assert found.id == own
-    assert found.mark == run_folder.mark_of(sockets, "DM1")
-    assert run_folder.process_of(sockets, "DM1", 2) is None
-    assert run_folder.process_of(sockets, "DM2", 3) is None
     assert run_folder.is_here(sockets, "DM1")
     assert not run_folder.is_here(sockets, "DM2")
     run_folder.issue(sockets, ["DM1"], 4)  # of another machine
     assert not run_folder.is_here(sockets, "DM1")
-    assert run_folder.process_of(sockets, "DM1", 4) is None
 
 
 def test_a_number_that_was_half_issued_is_issued_again(sockets):

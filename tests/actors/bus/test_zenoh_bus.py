@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
-import sys
 import time
-from functools import partial
 from itertools import pairwise
 
 import pytest
 import zenoh
 
-from rampart.actors.bus import run_folder
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints, open_client
 from rampart.actors.ftm import topics
-from rampart.actors.machine.unix_peer import ProcessId, process_id
 from rampart.testing import eventually
 
 MANY = 1500
 
 
 async def test_who_is_flooded_gets_round_to_its_timers(bus_folder):
-    reader = ZenohBus("reader", 1, endpoints(bus_folder))
+    reader = ZenohBus("reader", endpoints(bus_folder))
     await reader.open()
     heard, begun = [], asyncio.Event()
 
@@ -54,36 +49,8 @@ async def test_who_is_flooded_gets_round_to_its_timers(bus_folder):
     assert max(later - one for one, later in pairwise([*turns, MANY])) <= MANY / 2
 
 
-def _sleeper() -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-
-
-async def test_a_watcher_has_the_end_of_a_process_from_the_kernel(bus_folder):
-    """Its liveliness token is still there: as if its router were the last to know."""
-    watcher = ZenohBus("watcher", 1, endpoints(bus_folder),
-                       process_of=partial(run_folder.process_of, bus_folder))
-    await watcher.open()
-    seen: list[tuple[int, bool]] = []
-    with open_client(endpoints(bus_folder)) as member, _sleeper() as first, _sleeper() as second:
-        run_folder.issue(bus_folder, ["worker"], 3, process_id(first.pid))
-        watcher.watch("worker", lambda _node, incarnation, alive: seen.append((incarnation, alive)))
-        tokens = [member.liveliness().declare_token("rampart/alive/worker/3")]
-        await eventually(lambda: seen == [(3, True)])
-        first.kill()
-        await eventually(lambda: seen == [(3, True), (3, False)], 0.5)
-        run_folder.issue(bus_folder, ["worker"], 4, ProcessId(second.pid, 1))  # another's number
-        tokens.append(member.liveliness().declare_token("rampart/alive/worker/4"))
-        await eventually(lambda: seen[2:] == [(4, True)])
-        second.kill()
-        await asyncio.sleep(0.2)
-        assert seen[3:] == [], "a process was taken for one that had its number before"
-        tokens[1].undeclare()
-        await eventually(lambda: seen[3:] == [(4, False)])
-    await watcher.close()
-
-
 async def test_what_is_forgotten_is_heard_and_answered_no_more(bus_folder):
-    bus = ZenohBus("one", 1, endpoints(bus_folder))
+    bus = ZenohBus("one", endpoints(bus_folder))
     await bus.open()
     heard: list[bytes] = []
     bus.subscribe(topics.DETECTION, topics.DETECTION.at("DM1"), lambda _key, it: heard.append(it))
@@ -105,4 +72,4 @@ async def test_a_session_that_cannot_be_opened_says_why(monkeypatch):
 
     monkeypatch.setattr(zenoh, "open", fail)
     with pytest.raises(BusError, match=r"\(node one\): no memory left"):
-        await ZenohBus("one", 1, []).open()
+        await ZenohBus("one", []).open()

@@ -15,29 +15,34 @@ from rampart.actors.system.members import Member, heard
 from rampart.testing import Ear, play, run, table
 from tests.osmosis_system import System
 
-# One node. b heartbeat of the first life, B of the second, g one sent before the last change;
-# x first token vanishes, p it appears, X and P the second's.
+# One node. b heartbeat of the first process, B of the second, g one sent before the last event;
+# what the supervisor publishes: p the first is started, x it has crashed, s it is stopped, w it
+# hangs; P and X of the second.
 TIMELINES = {
     "it lives": ("pbbbbbbb", "--------"),
     "it hangs, and goes on": ("pbb....bb", "-----AA--"),
     "it is never heard: the start is forgiven for 500 ms": ("......", "-----A"),
-    "its process exists but is never heard": ("p.....", "-----A"),
+    "its process is there but is never heard": ("p.....", "-----A"),
     "it dies: seen at once": ("pbbx..", "---AAA"),
     "it dies before its first heartbeat": ("px.", "-AA"),
     "it comes back as a new life": ("pbbx.PBBB", "---AAA---"),
     "a process is not enough, a heartbeat is": ("pbbxP....B", "---AAAAAA-"),
-    "the new life is heard before its token": ("pbbx.BPB", "---AA---"),
+    "the new life is heard before it is published": ("pbbx.BPB", "---AA---"),
     "the old life's death is told after the new one's birth": ("pbbPBxBB", "--------"),
     "the old life's death is told after the first heartbeat": ("pbbBxBBB", "--------"),
     "the old life's death is told twice": ("pbbxPBxBB", "---AA----"),
     "a heartbeat was under way when it died": ("pbbxg..", "---AAAA"),
-    "replaced without a death notice, the new life never works": ("pbbP....", "------AA"),
+    "replaced without a crash, the new life never works": ("pbbP....", "------AA"),
     "it dies twice": ("pbxPBBXX", "--AA--AA"),
     "the new life hangs": ("pbxPB....", "--AA---AA"),
-    "a link was cut and mended: the same token comes again": ("pbxpb", "--AA-"),
-    "a link was cut and mended: only heartbeats come again": ("pbxbb", "--A--"),
+    "it is stopped, and goes on": ("pbbs.b", "---AA-"),
+    "it hangs, and goes on sooner than its own timeout": ("pbwb", "--A-"),
+    "it hangs and is replaced": ("pbw.PB", "--AAA-"),
     "a heartbeat of the old life after the new one's": ("pbxPB.b..", "--AA---AA"),
 }
+
+
+EVENTS = {"p": "respawned", "x": "crashed", "s": "stopped", "w": "wedged"}
 
 
 def watch(core: WatchdogCore):
@@ -51,7 +56,7 @@ def watch(core: WatchdogCore):
                 core.beat("node", 1, last["change"] - 0.001, now_s)
             case _:
                 last["change"] = now_s
-                core.peer("node", 1 if event in "px" else 2, event in "pP", now_s)
+                core.event("node", EVENTS[event.lower()], 1 if event.islower() else 2, now_s, now_s)
 
     return handle
 
@@ -64,8 +69,8 @@ def test_watchdog_timeline(events, expected):
 
 @pytest.mark.parametrize(("events", "expected"), **table({
     "it knows with the first heartbeat": ("p.b", "??-"),
-    "a token is not enough to know": ("p....", "???AA"),
-    "no token at all": (".....", "???AA"),
+    "a process is not enough to know": ("p....", "???AA"),
+    "no process at all": (".....", "???AA"),
 }))
 def test_a_respawned_watchdog_claims_nothing_before_it_knows(events, expected):
     core = WatchdogCore(["node"], timeout_s=0.3, start_s=0.0, grace_s=0.3, known=False)
@@ -76,7 +81,7 @@ def test_it_names_those_who_failed_and_why():
     core = WatchdogCore(["a", "b", "c"], 0.3, 0.0, 0.5)
     core.beat("a", 1, 0.0, 0.0)
     core.beat("b", 4, 0.0, 0.0)
-    core.peer("b", 4, False, 0.1)
+    core.event("b", "crashed", 4, 0.1, 0.1)
     core.expire(0.3)
     assert core.nodes == ("a", "b")
     assert core.reason == "a: no heartbeat for 0.3 s; b: process of incarnation 4 is gone"
@@ -90,7 +95,7 @@ def test_it_names_those_who_failed_and_why():
 def test_a_heartbeat_of_no_possible_time_does_not_bring_the_dead_to_life(stamp_s):
     core = WatchdogCore(["a"], 0.3, 0.0, 0.5)
     core.beat("a", 1, 0.0, 0.0)
-    core.peer("a", 1, False, 0.1)
+    core.event("a", "crashed", 1, 0.1, 0.1)
     core.beat("a", 1, stamp_s, 0.11)
     assert core.nodes == ("a",)
     core.beat("a", 1, 0.12, 0.12)
@@ -99,15 +104,14 @@ def test_a_heartbeat_of_no_possible_time_does_not_bring_the_dead_to_life(stamp_s
 
 def test_strangers_are_ignored():
     core = WatchdogCore(["a"], 0.3, 0.0, 0.5)
-    core.peer("z", 1, False, 0.1)
+    core.event("z", "crashed", 1, 0.1, 0.1)
     core.beat("z", 1, 0.1, 0.1)
     assert core.nodes == ()
 
 
 def test_it_hears_the_heartbeats_of_its_nodes_only():
     member = Member("DM4", Watchdog, Watchdog.Parameters(watch=("a", "b")))
-    assert heard(member) == {"heartbeat/{name}": ("a", "b")}
-    assert Watchdog.watches("DM4", Watchdog.Parameters(watch=("a", "b"))) == ("a", "b")
+    assert heard(member) == {"heartbeat/{name}": ("a", "b"), "supervisor/event": None}
 
 
 @pytest.mark.parametrize("watch_list", ["a", [], [1], [""]])
@@ -142,7 +146,7 @@ def test_a_killed_node_is_reported_without_any_time_passing():
     run(scenario)
 
 
-def test_a_node_whose_loop_hangs_is_reported_after_the_timeout():
+def test_without_a_supervisor_a_node_whose_loop_hangs_is_reported_after_twice_the_timeout():
     async def scenario() -> None:
         async with System() as system:
             ear = system.start("ear", Ear)
@@ -150,11 +154,11 @@ def test_a_node_whose_loop_hangs_is_reported_after_the_timeout():
             system.start("DM4", Watchdog, watch=["a"], timeout_s=0.35)
             await asyncio.sleep(0.55)
             node.hold(True)
-            await asyncio.sleep(0.2)
+            await asyncio.sleep(0.5)
             assert ear.states == ["idle"]
             await asyncio.sleep(0.2)
-            assert ear.heard[-1][1].reason == "a: no heartbeat for 0.35 s"
+            assert ear.heard[-1][1].reason == "a: no heartbeat for 0.7 s"
             active_s = next(at for at, r in ear.heard if r.state is m.DetectionState.ACTIVE)
-            assert active_s == pytest.approx(0.5 + 0.35, abs=1e-3)
+            assert active_s == pytest.approx(0.5 + 2 * 0.35, abs=1e-3)
 
     run(scenario)

@@ -87,7 +87,7 @@ async def reading(port, *keys):
         return [run for run in run_info.find_runs() if run.base_port == port]
 
     await eventually(lambda: bool(found()))
-    bus = ZenohBus("", 0, found()[0].endpoints)
+    bus = ZenohBus("", found()[0].endpoints)
     await bus.open()
     for key in keys:
         bus.subscribe(topics.POSE, key, lambda key, payload: heard.append((key, payload)))

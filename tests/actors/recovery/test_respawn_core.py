@@ -23,14 +23,14 @@ def core(*nodes: str) -> RespawnCore:
 
 
 def seen(core: RespawnCore, node: str = "a", incarnation: int = 1, now_s: float = 1.0) -> None:
-    core.peer(node, incarnation, True, 0.0)
+    core.event(node, "started", incarnation, "", 0.0)
     core.beat(node, incarnation, now_s, now_s)
 
 
 def test_a_dead_node_is_asked_for_with_the_incarnation_that_died():
     rm = core()
     seen(rm, incarnation=3)
-    rm.peer("a", 3, False, 1.05)
+    rm.event("a", "crashed", 3, "", 1.05)
     assert rm.order(["a"], 1.06, renewed=False)
     assert rm.take_requests() == [Ask(100, "a", 3)]
     assert rm.take_requests() == []
@@ -103,14 +103,14 @@ STORIES = {
     "respawned and heard": (["started 4", "beat 4"], "back"),
     "heard before the supervisor says so": (["beat 4", "started 4"], "back"),
     "the answer is lost": (["beat 4"], "back"),
-    "a token is not enough": (["started 4", "born 4"], "pending"),
+    "a process is not enough": (["started 4", "born 4"], "pending"),
     "a heartbeat of the dead life": (["started 4", "beat 3"], "pending"),
     "a heartbeat that was under way": (["ghost 3"], "pending"),
     "an answer about an old life that lives": (["started 3", "beat 3"], "pending"),
     "the supervisor refuses": (["refused"], "failed"),
     "the supervisor gives up": (["started 4", "died 4", "given up"], "failed"),
     "given up, and yet it comes": (["given up", "beat 4"], "back"),
-    "events of no interest": (["running", "wedged"], "pending"),
+    "events of no interest": (["running", "resumed"], "pending"),
 }
 
 
@@ -118,7 +118,7 @@ STORIES = {
 def test_a_node_counts_as_back_when_its_new_life_is_heard(events, end):
     rm = core()
     seen(rm, incarnation=3)
-    rm.peer("a", 3, False, 1.05)
+    rm.event("a", "crashed", 3, "", 1.05)
     rm.order(["a"], 1.06, renewed=False)
     for step, text in enumerate(events):
         now_s = 1.1 + step / 10
@@ -131,9 +131,9 @@ def test_a_node_counts_as_back_when_its_new_life_is_heard(events, end):
             case "ghost":
                 rm.beat("a", 3, 1.04, now_s)
             case "born":
-                rm.peer("a", int(number), True, now_s)
+                rm.event("a", "adopted", int(number), "", now_s)
             case "died":
-                rm.peer("a", int(number), False, now_s)
+                rm.event("a", "crashed", int(number), "", now_s)
             case _:
                 rm.event("a", text, 3, "", now_s)
     assert (rm.back == ("a",), rm.pending == ("a",), rm.problem != "") == (
@@ -152,21 +152,19 @@ def test_a_heartbeat_sent_before_the_order_proves_nothing_one_sent_after_it_does
 
 def test_a_new_life_that_dies_is_asked_for_again():
     rm = core()
-    rm.peer("a", 3, False, 1.0)
+    rm.event("a", "crashed", 3, "", 1.0)
     rm.order(["a"], 1.0, renewed=False)
     rm.event("a", "respawned", 4, "", 1.1)
     rm.take_requests()
-    rm.peer("a", 4, True, 1.15)
-    rm.peer("a", 4, False, 1.2)
+    rm.event("a", "crashed", 4, "", 1.2)
     assert rm.take_requests() == [Ask(101, "a", 4)]
 
 
 def test_a_new_life_that_is_not_heard_is_asked_for_again():
     rm = core()
-    rm.peer("a", 3, False, 1.0)
+    rm.event("a", "crashed", 3, "", 1.0)
     rm.order(["a"], 1.0, renewed=False)
     rm.event("a", "respawned", 4, "", 1.1)
-    rm.peer("a", 4, True, 1.12)
     rm.take_requests()
     rm.retry(2.0)
     assert rm.take_requests() == []
@@ -176,7 +174,7 @@ def test_a_new_life_that_is_not_heard_is_asked_for_again():
 
 def test_a_wedged_life_that_the_supervisor_takes_for_well_is_named_in_the_next_request():
     rm = core()
-    rm.peer("a", 3, True, 0.0)  # just started itself, it knows the token only
+    rm.event("a", "adopted", 3, "", 0.0)  # not heard yet
     rm.order(["a"], 0.01, renewed=False)
     assert rm.take_requests() == [Ask(100, "a", 2)]
     rm.event("a", "respawned", 3, "already", 0.02)
@@ -186,14 +184,14 @@ def test_a_wedged_life_that_the_supervisor_takes_for_well_is_named_in_the_next_r
 
 def test_a_repeated_order_respawns_a_node_that_came_back_and_died_again_but_no_other():
     rm = core("a", "b")
-    rm.peer("a", 1, False, 1.0)
-    rm.peer("b", 1, False, 1.0)
+    rm.event("a", "crashed", 1, "", 1.0)
+    rm.event("b", "crashed", 1, "", 1.0)
     rm.order(["a", "b"], 1.0, renewed=False)
     for node in ("a", "b"):
         rm.beat(node, 2, 1.1, 1.1)
     rm.take_requests()
     assert not rm.order(["a", "b"], 1.15, renewed=True)
-    rm.peer("b", 2, False, 1.2)
+    rm.event("b", "crashed", 2, "", 1.2)
     assert rm.order(["a", "b"], 1.21, renewed=True)
     assert rm.take_requests() == [Ask(102, "b", 2)]
 
@@ -221,5 +219,5 @@ def test_release_forgets_everything():
     rm.order(["a", "z"], 0.0, renewed=False)
     rm.release()
     assert (rm.take_requests(), rm.pending, rm.back, rm.problem) == ([], (), (), "")
-    rm.peer("a", 5, False, 0.1)
+    rm.event("a", "crashed", 5, "", 0.1)
     assert rm.take_requests() == []

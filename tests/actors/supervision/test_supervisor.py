@@ -136,7 +136,7 @@ class Machine:
         self.forks.append((names[0], incarnation))
         return self.add(names, incarnation).pid
 
-    def hold(self, pid: int, ended: Callable[[], None], node: str = "") -> Handle:
+    def hold(self, pid: int, ended: Callable[[], None]) -> Handle:
         if self.hold_error:
             raise self.hold_error
         process = self.processes.get(pid)
@@ -350,20 +350,11 @@ def test_where_many_are_silent_at_once_who_runs_is_blamed_for_nothing(silent, ki
     run(scenario)
 
 
-def test_where_many_stand_still_all_are_replaced_in_time():
+@pytest.mark.parametrize("turning", [False, True])
+def test_where_many_are_silent_for_long_all_are_replaced_whatever_they_do(turning):
     async def scenario() -> None:
         async with running() as world:
-            processes = [world.machine.of(f"DM{i}")[0] for i in range(1, 6)]
-            world.silent |= {process.pid for process in processes}
-            await eventually(lambda: all(p.killed for p in processes), 1.2)
-
-    run(scenario)
-
-
-def test_where_many_are_silent_for_long_all_are_replaced_whatever_they_do():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.turning = True
+            world.machine.turning = turning
             processes = [world.machine.of(f"DM{i}")[0] for i in range(1, 6)]
             world.silent |= {process.pid for process in processes}
             await eventually(lambda: all(p.killed for p in processes), MOST_EXCUSED_S + 1.0)

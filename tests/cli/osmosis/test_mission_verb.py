@@ -50,7 +50,7 @@ async def run(monkeypatch, bus_folder):
     nodes, tasks = [], []
     for name, cls, parameters in (
             ("mission_manager", MissionManager, {"held_by": ["RM2"]}), ("planner", Planner, {})):
-        bus = ZenohBus(name, 1, endpoints(bus_folder))
+        bus = ZenohBus(name, endpoints(bus_folder))
         node = cls(Context(name, 1, clock, bus, parameters,
                            run=RunContext(application=Osmosis.on_map(load_airport("vallombre")))))
         tasks.append(asyncio.create_task(node.run()))
