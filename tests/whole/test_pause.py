@@ -53,7 +53,7 @@ def restarted_by(run: RealRun, seconds: float, order: str, killed: str = "", lef
     time.sleep(4.0)
     after = {(p.names, p.incarnation) for p in find_processes(run.port)}
     return {names for names, incarnation in after - before
-            if incarnation > 1 and not names[0].startswith("spare.")}
+            if incarnation > 1 and names != ("pool",)}
 
 
 SHORT = {(0.5, "reversed"), (3.0, "supervisor last")}

@@ -168,6 +168,7 @@ class World:
         self.bus = VirtualBus(self.hub, "tester", 1)
         self.events: list[tuple[str, str, int]] = []
         self.silent: set[int] = set()
+        self.failing: set[str] = set()
         self.hub.taps.append(self.see)
         self.spec = msgspec.structs.replace(load_system(PLAN), supervision=supervision)
         self.lives = 0
@@ -195,6 +196,9 @@ class World:
         if key == topics.PROCESS_EVENT.at():
             event = decode(topics.PROCESS_EVENT, payload)[1]
             self.events.append((event.node, event.event, event.incarnation))
+        elif key == topics.NODES.at():
+            self.failing = {row.name for row in decode(topics.NODES, payload)[1].nodes
+                            if row.failing}
 
     def beat(self, process: Process) -> None:
         for name in process.names:
