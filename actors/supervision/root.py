@@ -151,7 +151,6 @@ class Root:
         self._has_ended = False
         self._children: dict[int, tuple[str, ...]] = {}
         self._pool: Pool | None = None
-        self._pooled = 0
         self._held: list[socket.socket] = []
         self._supervisor = Guarded()
         self._absence = Absence(time.monotonic())
@@ -583,7 +582,6 @@ class Root:
         return pid
 
     def _fork_pooled(self, control: socket.socket) -> int:
-        self._pooled += 1
         pid = self._forked()
         if pid == 0:
             self._in_child(self._be_pooled(control), control)
@@ -597,7 +595,7 @@ class Root:
             return await live(self._loaded, role, self._known(None), bus)
 
         def be_pooled() -> int:
-            set_title(self.plan.base_port, self._pid, (POOL,), self._pooled)
+            set_title(self.plan.base_port, self._pid, (POOL,), 1)
             return asyncio.run(wait(control, self.plan, become))
 
         return be_pooled

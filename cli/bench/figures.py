@@ -71,7 +71,7 @@ class Kill(msgspec.Struct, frozen=True):
     Attributes:
         detected: That the process is gone is told by whoever keeps it alive.
         decided: The manager of a system decides on a recovery.
-        begun: The replacement runs its first line; a hot spare has before.
+        begun: The replacement runs its first line.
         output: An independent process hears the replacement's first valid output.
     """
 
@@ -150,7 +150,7 @@ class Size(msgspec.Struct, frozen=True):
     """A system of so many processes.
 
     Attributes:
-        processes: Supervisor, spawners and routers included, launcher not.
+        processes: Root, supervisor, routers and pool included.
         start_s: From the command until all processes run.
         pss_mb: Proportional memory of one process at the mean; what is shared is divided.
         uss_mb: Memory that one process has for itself, at the mean.

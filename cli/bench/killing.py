@@ -144,8 +144,6 @@ class Victim:
             self._teller.wait_for(lambda line: self._ended(line) or None, PAUSE_S, "", told)
         lines = self._teller.lines[told:]
         begun_s = found.body.get("begun_s") if isinstance(found.body, dict) else None
-        if begun_s is not None and begun_s < at_s:  # a hot spare
-            begun_s = None
         self.kills.append(Kill(*(None if then_s is None else round((then_s - at_s) * 1e3, 3) for
                                  then_s in (_first_s(lines, self._ended),
                                             _first_s(lines, self._decided),

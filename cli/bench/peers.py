@@ -103,9 +103,8 @@ PEERS = {peer.name: peer for peer in (
 )}
 """By name."""
 
-ACTOR, HOT, COMMAND = "rampart-actor", "rampart-hot", "rampart-command"
+ACTOR, COMMAND = "rampart-actor", "rampart-command"
 OURS = {ACTOR: "Rampart, the node as an actor",
-        HOT: "Rampart, the actor with a hot spare",
         COMMAND: "Rampart, the same program as a command"}
 """How Rampart keeps the node, by name, as on the command line."""
 

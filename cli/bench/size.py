@@ -63,7 +63,7 @@ def _one(processes: int, kills: int, folder: Path, show: Show) -> Size:
         time.sleep(_SETTLE_S)
         found = find_processes(system.port)
         again = sum(one.incarnation > 1 for one in found)
-        pids = [system.program.pid, *(one.pid for one in found)]
+        pids = [system.program.pid, *{one.launcher for one in found}, *(one.pid for one in found)]
         cores = cores_of(pids, _REST_S)
         memory = [used for pid in pids if (used := memory_of(pid))]
         pss, uss = sum(one[0] for one in memory), sum(one[1] for one in memory)

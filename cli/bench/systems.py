@@ -43,13 +43,13 @@ intensity = 10000
 name = "none"
 '''
 
-BESIDES = 8
-"""Processes of a system that are none of its nodes: launcher, supervisor, and two each of spawners,
-routers and spares."""
+BESIDES = 7
+"""Processes of a system that are none of its nodes: the root, the process that watches the run, the
+supervisor, two routers, and two of the pool."""
 
 
 def peers_system(command: Sequence[str]) -> str:
-    """Return a system with the peers' node: an actor, one with a hot spare, and a command."""
+    """Return a system with the peers' node: an actor, and a command."""
     return _HEAD.format(name="bench_peers", title="The peers' node") + f'''
 [[node]]
 name = "source"
@@ -60,12 +60,6 @@ kind = "non-control"
 name = "actor"
 actor = "rampart.cli.bench.actors:Worker"
 kind = "control"
-
-[[node]]
-name = "hot"
-actor = "rampart.cli.bench.actors:Worker"
-kind = "control"
-spare = "hot"
 
 [[node]]
 name = "command"

@@ -12,7 +12,7 @@ Some processes are special:
   not try. A wedged loop never turns again, so that would be its death too.
 * The process that watches the run has the verdict: its end ends the run, too. Stopped, it is
   continued by the root.
-* A process of the pool is no node: another one in its place shows that the pool is full again.
+* A process of the pool is no node: any other one of the pool counts as its replacement.
 """
 
 from __future__ import annotations

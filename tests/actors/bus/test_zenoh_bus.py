@@ -13,7 +13,6 @@ from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints, open_client
 from rampart.actors.ftm import topics
-from rampart.testing import eventually
 
 MANY = 1500
 
@@ -47,23 +46,6 @@ async def test_who_is_flooded_gets_round_to_its_timers(bus_folder):
         await saying
     await reader.close()
     assert max(later - one for one, later in pairwise([*turns, MANY])) <= MANY / 2
-
-
-async def test_what_is_forgotten_is_heard_and_answered_no_more(bus_folder):
-    bus = ZenohBus("one", endpoints(bus_folder))
-    await bus.open()
-    heard: list[bytes] = []
-    bus.subscribe(topics.DETECTION, topics.DETECTION.at("DM1"), lambda _key, it: heard.append(it))
-    bus.publish(topics.DETECTION, topics.DETECTION.at("DM1"), b"before")
-    await eventually(lambda: heard == [b"before"])
-    bus.forget()
-    with open_client(endpoints(bus_folder)) as member:
-        member.put(topics.DETECTION.at("DM1"), b"after")
-        answers = [reply.ok for reply in await asyncio.to_thread(
-            lambda: list(member.get(topics.DETECTION.at("DM1"), timeout=1.0)))]
-    await asyncio.sleep(0.1)
-    assert (heard, answers) == ([b"before"], [])
-    await bus.close()
 
 
 async def test_a_session_that_cannot_be_opened_says_why(monkeypatch):

@@ -24,6 +24,8 @@ from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.supervision.process_title import TITLE_BYTES, find_processes
 from rampart.actors.supervision.processes import ForkError, ForkPendingError, OsProcesses
 from rampart.actors.supervision.requests import ForkRequest, Reply
+from rampart.actors.system.layout import Layout
+from rampart.cli.run_options import parse, plan_of
 from rampart.testing import eventually
 from tests import ROOT
 from tests.actors.supervision.test_supervision import process, running
@@ -234,6 +236,19 @@ async def test_without_a_spare_a_node_is_forked(tmp_path):
         os.kill(witness.pid("safety_pilot"), signal.SIGKILL)
         await eventually(lambda: witness.state("safety_pilot") == ("running", 2))
         assert witness.pid("safety_pilot") not in there
+
+
+@pytest.mark.parametrize("word", ["warm", "own", "hot"])
+def test_a_spare_of_version_0_7_means_the_pool_and_is_reported(tmp_path, word):
+    file = tmp_path / "old.toml"
+    file.write_text(write_stub_system(tmp_path).read_text(encoding="utf-8").replace(
+        'name = "safety_pilot"', f'name = "safety_pilot"\nspare = "{word}"'), encoding="utf-8")
+    notes: list[str] = []
+    options, kind = parse(["--system", str(file), "--no-hmi"], "launch.py")
+    plan, spec = plan_of(options, kind, notes.append)
+    assert Layout(plan, spec).spare_of(["safety_pilot"]) == "pool"
+    assert len(notes) == 1
+    assert f"safety_pilot: spare = '{word}'" in notes[0]
 
 
 class TellingDetection(IdleDetection):

@@ -18,7 +18,7 @@ from rampart.actors.machine.unix_peer import process_state
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
 from rampart.cli.bench.measuring import bench  # noqa: F401 imported once, before a test is timed
-from rampart.cli.bench.peers import HOT, OURS
+from rampart.cli.bench.peers import OURS
 from rampart.cli.bench.processes.observer import Heard
 from rampart.cli.bench.restart import members_of, output_of, regular_topics, usual
 from rampart.cli.bench.systems import BESIDES, peers_system, sized_system, talking_system
@@ -30,14 +30,14 @@ from tests import CELL
 @pytest.mark.parametrize(("arguments", "told"), [
     (["--kills", "0"], "--kills 0: must be between 1 and 1000"),
     (["--peer", "docker"], "unknown peer 'docker'; known: dora, supervisord, circus, subprocess, "
-                           "rampart-actor, rampart-hot, rampart-command"),
+                           "rampart-actor, rampart-command"),
     (["--only", "floors", "--peer", "dora"], "--peer: only with the part peers; leave out --only, "
                                              "or say --only peers"),
     (["--only", "size", "--node", "x"], "--node: only with the part restart or keys; leave "
                                         "out --only, or say --only restart"),
     (["--sizes", "10,many"], "--sizes 10,many: 'many' is no number of processes; whole numbers "
                              "with commas between are right, as 10,35,70,140"),
-    (["--sizes", "9"], "--sizes 9: must be between 10 and 500"),
+    (["--sizes", "8"], "--sizes 8: must be between 9 and 500"),
     (["--system", "nowhere.toml"], "nowhere.toml: No such file or directory; a spec is right, or "
                                    "the name of a shipped one: osmosis, osmosis-ros2, paper"),
     (["--only", "restart", "--system", str(CELL), "--node", "grip"], "unknown node 'grip'; "),
@@ -55,10 +55,9 @@ def test_what_makes_no_sense_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize(("text", "nodes"), [
-    (peers_system(["/bin/true", "with \"quotes\""]), {"source", "actor", "hot", "command"}),
+    (peers_system(["/bin/true", "with \"quotes\""]), {"source", "actor", "command"}),
     (talking_system(), {"asker", "answerer"}),
-    (sized_system(10), {"n0", "n1"}),
-    (sized_system(11), {"n0", "n1", "n2"}),
+    (sized_system(10), {"n0", "n1", "n2"}),
     (sized_system(140), {f"n{i}" for i in range(140 - BESIDES)})])
 def test_the_systems_that_are_measured_are_sound(tmp_path, text, nodes):
     file = tmp_path / "system.toml"
@@ -131,10 +130,7 @@ def test_the_smallest_benchmark_measures_something_of_each(tmp_path):
         assert row["output_ms"]["n"] == len(heard) > 0
         for kill in heard:
             assert min(kill["detected"], kill["output"]) > 0
-            if name == HOT:
-                assert kill["begun"] is None
-            else:
-                assert 0 < kill["begun"] < kill["output"]
+            assert 0 < kill["begun"] < kill["output"]
     assert peers["rampart-actor"]["times"]["median"] == 1
     for floor in found["floors"]:
         assert floor["note"] == ""
