@@ -52,7 +52,6 @@ class CommandNode(Actor):
         hears: TopicsHeard = ()
 
     parameters: Parameters
-    holds_devices = True
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

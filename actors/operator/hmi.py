@@ -93,7 +93,6 @@ class Hmi(Actor):
     refuses: ClassVar[str] = ""
     tables = ("panel",)
     is_page = True
-    holds_devices = True
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECT, ftm_topics.SIGNAL)
     requests: ClassVar[tuple[type[Request], ...]] = REQUESTS

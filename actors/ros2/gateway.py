@@ -98,7 +98,6 @@ class Gateway(Actor):
 
     parameters: Parameters
     tables = ("ros2",)
-    holds_devices = True
     outputs = (GRAPH,)
 
     def __init__(self, context: Context) -> None:

@@ -29,7 +29,6 @@ class RosRouter(Actor):
         listen: str = LISTEN
 
     parameters: Parameters
-    holds_devices = True
     _session: zenoh.Session | None = None
 
     def on_start(self) -> None:

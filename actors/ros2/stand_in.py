@@ -73,7 +73,6 @@ class StandIn(Actor):
         distribution: Distribution = "jazzy"
 
     parameters: Parameters
-    holds_devices = True
     node_name: ClassVar[str] = ""
     namespace: ClassVar[str] = "/"
     interfaces: ClassVar[Path | None] = None

@@ -66,7 +66,6 @@ class RosDriver(Simulator):
 
     parameters: Parameters
     outputs = (topics.TRUTH, topics.OBSTACLES, ftm_topics.HOLDS)
-    holds_devices = True
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
