@@ -122,8 +122,6 @@ class RunEnd:
 
     def ended(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
-        if gone := self.world_gone(now_s):
-            return gone
         why, since_s = self._outcome(now_s)
         if not why or (self._moves and now_s - since_s < WATCH_S):
             return None

@@ -21,5 +21,5 @@ def test_a_launcher_that_was_stopped_dials_its_partners_again_before_the_world_c
     awake_s = 10.0 + 7.0 * rate  # stopped for seven seconds of wall time
     end.excuse(excused_s(7.0) * rate)
     relinked_s = awake_s + _RELINK_S * rate
-    assert end.ended(relinked_s) is None
-    assert "the world is gone" in end.ended(relinked_s + WORLD_LATE_S + 0.1)
+    assert end.world_gone(relinked_s) == ""
+    assert "the world is gone" in end.world_gone(relinked_s + WORLD_LATE_S + 0.1)

@@ -38,8 +38,8 @@ def test_what_nobody_could_hear_does_not_count_as_silence():
     end = RunEnd(patience_s=60.0, waits=True)
     end.truth(Twist(0.0, 0.0), 10.0)
     end.excuse(40.0)
-    assert end.ended(49.9 + WORLD_LATE_S) is None
-    assert end.ended(50.1 + WORLD_LATE_S) == (
+    assert end.world_gone(49.9 + WORLD_LATE_S) == ""
+    assert end.world_gone(50.1 + WORLD_LATE_S) == (
         "the world is gone: no ground truth from the simulator")
 
 
@@ -111,13 +111,13 @@ def test_a_run_whose_mission_the_operator_starts_waits_for_it_and_then_is_like_a
     assert end.ended(10_010.1) == "no progress for 10 s"
 
 
-def test_a_mission_nobody_takes_and_a_world_that_is_gone_end_the_run():
+def test_a_mission_nobody_takes_ends_the_run_and_a_world_that_is_gone_is_noticed():
     assert RunEnd(100.0).ended(ACCEPT_WITHIN_S) is None
     assert "no mission was accepted" in (RunEnd(100.0).ended(ACCEPT_WITHIN_S + 0.1) or "")
     end = RunEnd(100.0, waits=True)
     end.truth(STANDS, 2.0)
-    assert end.ended(2.0 + WORLD_LATE_S) is None
-    assert "the world is gone" in (end.ended(2.1 + WORLD_LATE_S) or "")
+    assert end.world_gone(2.0 + WORLD_LATE_S) == ""
+    assert "the world is gone" in end.world_gone(2.1 + WORLD_LATE_S)
 
 
 def test_a_way_round_something_is_progress_once_and_the_longer_way_is_measured_anew():
@@ -154,7 +154,7 @@ def test_a_world_whose_process_has_ended_is_not_waited_for():
     end.truth(STANDS, 2.0)
     for node, event in (("simulator", "running"), ("localization", "crashed")):
         end.take(ProcessEvent(node, event, 1, 1, "supervisor", ""), 2.0)
-    assert end.ended(2.1 + WORLD_SILENT_S) is None
+    assert end.world_gone(2.1 + WORLD_SILENT_S) == ""
     end.take(ProcessEvent("simulator", "crashed", 1, 1, "supervisor", ""), 2.0)
-    assert end.ended(2.0 + WORLD_SILENT_S) is None
-    assert "the world is gone" in (end.ended(2.1 + WORLD_SILENT_S) or "")
+    assert end.world_gone(2.0 + WORLD_SILENT_S) == ""
+    assert "the world is gone" in end.world_gone(2.1 + WORLD_SILENT_S)
