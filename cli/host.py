@@ -12,7 +12,6 @@ import json
 import socket
 import sys
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -73,7 +72,12 @@ class HostRun:
         host = OtherHost(self._plan, _say, link)
         launcher, task, why = host.launcher, asyncio.current_task(), ""
         assert task is not None  # noqa: S101 for the type checker
-        launcher.on_interrupt = lambda _signal: _cancel(task)
+
+        def interrupt(_signal: str) -> None:
+            launcher.on_interrupt = lambda _signal: None  # it ends already
+            task.cancel()
+
+        launcher.on_interrupt = interrupt
         try:
             await launcher.connect()
             await host.join()
@@ -118,10 +122,6 @@ class HostRun:
             observer.stop()
             with contextlib.suppress(Exception):
                 await task
-
-
-def _cancel(task: asyncio.Task[Any]) -> None:
-    task.cancel()
 
 
 def _say(line: str) -> None:
