@@ -139,10 +139,6 @@ class Declared(Handlers):
         node_kind: what a node of this class has to be, "" for anything.
         tables: those of a specification whose rows it is given.
         is_page: whether an operator works with it.
-        tables: those of a specification whose rows it is given.
-        is_page: whether an operator works with it.
-        holds_devices: whether its process holds a port, a device or a program: then the next one
-            is started when these are free.
         Parameters: what the system spec may say of it, by field: type, range and default. A class
             that takes more derives its own from that of its base class.
     """
