@@ -1,1 +1,1 @@
-"""Nodes in any language: an actor that runs a command, and the process that keeps it."""
+"""Nodes in any language: an actor that runs a command, and what it holds of its program."""

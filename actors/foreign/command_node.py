@@ -1,11 +1,11 @@
-"""A node that is a command: the actor that stands for it, and starts and ends it.
+"""A node that is a command: the actor that stands for it, and starts and ends its program.
 
-For the rest of the system this actor is the node: it has the heartbeat, the liveliness token, the
-incarnation, and publishes what the command says on its socket, so that faults can be injected into
-it and recorders and other nodes find it. The command lives below a keeper
-(`rampart.actors.foreign.keeper`). When the command ends, this actor fails; when the command is
-silent for too long, the heartbeat of this actor stops; when this actor ends, however it does, so
-does the command with all that it has forked.
+For the rest of the system this actor is the node: it sends the heartbeat, and publishes what the
+program sends on its socket, so that faults can be injected into it and recorders and other nodes
+find it. When the program ends, or hangs and is killed for that, the incarnation has failed: the
+actor reports that to the supervisor and stays. It starts the program again, as the next
+incarnation, when the supervisor has decided that. When this actor ends, however it does, so does
+the program with all that it has forked.
 """
 
 from __future__ import annotations
@@ -13,27 +13,29 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import os
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.zenoh_session import endpoints
-from rampart.actors.foreign import strays
 from rampart.actors.foreign.channel import Channel
-from rampart.actors.foreign.child import Child, CommandError, environment
+from rampart.actors.foreign.output_log import OutputLog
 from rampart.actors.foreign.program import LOGS, find_program, folder_of, log_folder
-from rampart.actors.foreign.pulse import NotifySocket, Pulse
-from rampart.actors.runtime.actor import Actor, Context, Header
+from rampart.actors.foreign.program_process import ProgramProcess
+from rampart.actors.foreign.pulse import NotifySocket, Pulse, extension_s
+from rampart.actors.ftm.messages import ProcessEvent
+from rampart.actors.ftm.topics import PROCESS_EVENT
+from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.parameters import TopicsHeard, TopicsPublished
 from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits
 
-_EXTEND = "EXTEND_TIMEOUT_USEC="
-_DIGITS, _MOST_S = 12, 3600.0
-"""Of what it may ask for, and real seconds that it gets at most."""
-
+_EXTEND, _STATUS = "EXTEND_TIMEOUT_USEC=", "STATUS="
 _ANYTHING = Topic("", msgspec.Struct, Qos.STATE, 0.0, "", "What is not decoded.")
 
 
@@ -52,20 +54,21 @@ class CommandNode(Actor):
         hears: TopicsHeard = ()
 
     parameters: Parameters
+    outputs = (PROCESS_EVENT,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._child = Child(self._over)
+        self._timing = context.run.system.timing
+        self._heartbeat = self.parameters.heartbeat or ChildHeartbeat(
+            self._timing.heartbeat_timeout_s)
+        self._log = OutputLog(log_folder(context.run.plan) / f"{self.name}.log")
+        self._program: ProgramProcess | None = None
         self._channel: Channel | None = None
         self._notify: NotifySocket | None = None
-        self._pulse: Pulse | None = None
-        beat = self.parameters.heartbeat
-        if beat is not None:
-            system = context.run.system
-            self._pulse = Pulse(beat.timeout_s, system.timing.startup_grace_s,
-                                2 * context.heartbeat_period_s)
-            if beat.topic:  # by a client of its own; by its socket see `_take`
-                self.hear_topic(beat.topic, self._own_topic)
+        self._pulse = self._new_pulse()
+        self._failure = ""  # of this incarnation
+        if self._heartbeat.topic:  # by a client of its own; by its socket see `_take`
+            self.hear_topic(self._heartbeat.topic, self._own_topic)
         for key in self.parameters.hears:
             self.hear_topic(key, partial(self._pass_on, key))
 
@@ -76,129 +79,178 @@ class CommandNode(Actor):
         return (beat.key,) if beat is not None and beat.key else ()
 
     def on_start(self) -> None:
-        """Start the command; what an earlier one has left is killed first.
-
-        Raises:
-            CommandError: it cannot be started.
-        """
-        parameters, plan = self.parameters, self.context.run.plan
-        if not strays.kill_strays(plan.folder, self.name):
-            raise CommandError("processes of its predecessor do not end")
-        folder = folder_of(plan, parameters.folder)
-        if not folder.is_dir():
-            raise CommandError(f"folder {folder}: there is none")
-        program = find_program(parameters.command[0], folder, parameters.env.get("PATH"))
-        if program is None:
-            raise CommandError(f"{parameters.command[0]}: no such program in {folder}")
-        publishes = {key: self.chosen_topic(key) for key in parameters.publishes}
-        channel = self._channel = Channel(publishes, self._take, self._refuse, self.clock.now)
-        own = {strays.NODE: self.name, strays.FOLDER: plan.folder,
-               "RAMPART_INCARNATION": str(self.context.incarnation),
-               "RAMPART_ORIGIN_S": repr(self.clock.source_time(0.0)),
-               "RAMPART_RATE": repr(self.clock.rate), "RAMPART_SEED": str(plan.seed),
-               "RAMPART_SOCKET": str(channel.other.fileno()),
-               **self._reached()}
-        own |= self._watch()
-        self._child.start(
-            who=f"{self.name} #{self.context.incarnation}",
-            command=[program, *parameters.command[1:]], folder=folder,
-            environment=environment(parameters.env, own), limits=parameters.limits,
-            log=self._log(), inherited=[channel.other.fileno()])
-        channel.other.close()
+        """Start the program."""
+        if self._heartbeat.key:
+            self._bus.subscribe(_ANYTHING, f"{ROOT}/{self._heartbeat.key}",
+                                lambda _key, _load: self._alive())
+        self._make_log_folder()
+        self._start()
 
     def is_well(self) -> bool:
-        """Whether the command is heard as often as it has to be."""
-        if self._pulse is None or self._pulse.is_well(self.clock.now()):
+        """Whether the program is there and shows that it works; one that hangs is killed."""
+        if self._failure or self._program is None:
+            self._report_failure()
+            return False
+        if self.parameters.heartbeat is None:
+            self._alive()
+        if self._pulse.is_well(self.clock.now()):
             return True
-        how = "" if self._pulse.heard else (
-            " after its start; a larger startup_grace_s in [timing] gives it more time")
-        self.report_diagnostic(
-            "command", f"not heard for {self._pulse.limit_s:g} s{how}", self.name)
+        silent = f"for {self._pulse.limit_s:g} s"
+        if self._program.is_stopped:
+            self._failure = f"was stopped {silent}"
+        elif self._pulse.heard:
+            self._failure = f"hung: not heard {silent}"
+        else:
+            self._failure = (f"hung: not heard {silent} after its start; a larger startup_grace_s "
+                             "in [timing] gives it more time")
+        self._program.kill()
         return False
 
     def on_stop(self) -> None:
-        """End the command, and everything that it has forked."""
-        self._child.end()
+        """End the program, and everything that it has forked."""
+        if self._program is not None:
+            self._program.end()
+        self._close()
+        self._log.close()
+
+    @on(PROCESS_EVENT)
+    def respawned(self, message: ProcessEvent, _header: Header) -> None:
+        """Start the program again when the supervisor has decided that it is to be."""
+        if (message.node, message.event, message.pid) == (
+                self.name, "respawned", self.context.pid
+                ) and message.incarnation > self._incarnation and self._program is None:
+            self.renew(message.incarnation)
+            self._start()
+
+    # -- the program ------------------------------------------------------------------------------
+
+    def _new_pulse(self) -> Pulse:
+        return Pulse(self._heartbeat.timeout_s, self._timing.startup_grace_s,
+                     2 * self.context.heartbeat_period_s)
+
+    def _start(self) -> None:
+        self._failure, self._pulse = "", self._new_pulse()
+        parameters, plan = self.parameters, self.context.run.plan
+        name, folder = parameters.command[0], folder_of(plan, parameters.folder)
+        program = find_program(name, folder, parameters.env.get("PATH"))
+        if program is None:
+            self._failed(f"no such program in {folder}")
+            return
+        channel = self._channel = Channel(
+            {key: self.chosen_topic(key) for key in parameters.publishes}, self._take,
+            self._refuse, self.clock.now)
+        who = f"{self.name} #{self._incarnation}"
+        try:
+            self._program = ProgramProcess(
+                program, parameters.command, folder=folder,
+                environment=self._environment(channel.other.fileno()), limits=parameters.limits,
+                log=self._log, inherited=[channel.other.fileno()], ended=self._ended)
+        except FileNotFoundError:  # the file itself was there a moment ago
+            self._failed("cannot be started: there is no interpreter as its first line names it")
+        except (OSError, ValueError) as error:
+            self._failed(f"cannot be started: {getattr(error, 'strerror', None) or error}")
+        else:
+            channel.other.close()
+            self._log.note(f"{who} is process {self._program.pid}")
+            if self._notify is not None:  # not before: a sender has to be below the program
+                asyncio.get_running_loop().add_reader(self._notify.socket, self._notified)
+
+    def _environment(self, channel: int) -> Mapping[str, str]:
+        """Return the variables of this process, those of the node, and those of the run.
+
+        Without the search path for modules, by which the processes of a run find this Rampart:
+        another virtual environment has its own.
+        """
+        inherited = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        plan = self.context.run.plan
+        own = {"RAMPART_NODE": self.name, "RAMPART_INCARNATION": str(self._incarnation),
+               "RAMPART_ORIGIN_S": repr(self.clock.source_time(0.0)),
+               "RAMPART_RATE": repr(self.clock.rate), "RAMPART_SEED": str(plan.seed),
+               "RAMPART_SOCKET": str(channel)}
+        where, shown = endpoints(plan.folder), plan.credentials(self.name)
+        if shown is None:
+            own["RAMPART_ZENOH"] = ",".join(where)
+        else:
+            own |= {"RAMPART_ZENOH": ",".join(map(shown.door, where)),
+                    "RAMPART_AUTHORITY": shown.authority, "RAMPART_KEY": shown.own}
+        if self._heartbeat.notify:
+            self._notify = NotifySocket(self.name, self._refuse)
+            own |= {"NOTIFY_SOCKET": self._notify.name, "WATCHDOG_USEC": str(
+                math.ceil(self._heartbeat.timeout_s / self.clock.rate * 1e6))}
+        return {**inherited, **self.parameters.env, **own}
+
+    def _ended(self, how: str) -> None:
+        self._log.note(f"{self.name} #{self._incarnation} {how}")
+        self._failed(self._failure or how)
+
+    def _failed(self, why: str) -> None:
+        """Note why this incarnation has failed, and report it until there is another one."""
+        self._close()
+        self._program = None
+        self._failure = clip(f"{self.parameters.command[0]} {why}; `rampart node log {self.name}`"
+                             " shows its output")
+        self._report_failure()
+
+    def _report_failure(self) -> None:
+        if self._program is None:
+            self.publish(PROCESS_EVENT, ProcessEvent(
+                self.name, "ended", self.context.pid, self._incarnation, self.name, self._failure))
+
+    def _close(self) -> None:
         if self._channel is not None:
             self._channel.close()
         if self._notify is not None:
             asyncio.get_running_loop().remove_reader(self._notify.socket)
             self._notify.close()
-        strays.kill_strays(self.context.run.plan.folder, self.name)
+        self._channel = self._notify = None
 
-    # -- what becomes of it -----------------------------------------------------------------------
-
-    def _over(self, why: str) -> None:
-        def fail() -> None:
-            raise CommandError(f"{self.parameters.command[0]} {why}; `rampart node log {self.name}`"
-                               " shows its output")
-
-        self.call_later(0.0, fail)  # in its mailbox, where an error ends the actor
-
-    def _reached(self) -> dict[str, str]:
-        """Return the variables by which a Zenoh client of its own reaches the routers."""
+    def _make_log_folder(self) -> None:
+        """Make the folder for its output; a link in the folder of the run leads tools there."""
         plan = self.context.run.plan
-        where, shown = endpoints(plan.folder), plan.credentials(self.name)
-        if shown is None:
-            return {"RAMPART_ZENOH": ",".join(where)}
-        return {"RAMPART_ZENOH": ",".join(map(shown.door, where)),
-                "RAMPART_AUTHORITY": shown.authority, "RAMPART_KEY": shown.own}
-
-    def _watch(self) -> dict[str, str]:
-        """Listen for its heartbeat; return the variables that say where it is awaited."""
-        beat, pulse = self.parameters.heartbeat, self._pulse
-        if beat is None or pulse is None:
-            return {}
-        if beat.key:
-            self._bus.subscribe(_ANYTHING, f"{ROOT}/{beat.key}", lambda _key, _load: pulse.beat())
-        if not beat.notify:
-            return {}
-        self._notify = NotifySocket(self.name)
-        asyncio.get_running_loop().add_reader(
-            self._notify.socket, self._notified, self._notify, pulse)
-        return {"NOTIFY_SOCKET": self._notify.name,
-                "WATCHDOG_USEC": str(math.ceil(beat.timeout_s / self.clock.rate * 1e6))}
-
-    def _notified(self, notify: NotifySocket, pulse: Pulse) -> None:
-        for said in notify.take():
-            if said in {"READY=1", "WATCHDOG=1"}:
-                pulse.beat()
-            elif said == "WATCHDOG=trigger":
-                pulse.trigger()
-            elif said == "STOPPING=1":
-                pulse.stopping()
-            elif said.startswith(_EXTEND) and said.removeprefix(_EXTEND).isdecimal():
-                pulse.extend(min(float(said.removeprefix(_EXTEND)[:_DIGITS]) * 1e-6, _MOST_S)
-                             * self.clock.rate)
-
-    def _log(self) -> Path:
-        """Return the file for its output; the folder of the run says to tools where that is."""
-        plan = self.context.run.plan
-        folder = log_folder(plan)
+        folder, here = log_folder(plan), Path(plan.folder, LOGS)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             self.report_diagnostic("command", f"its output is not kept: {error}", self.name)
-        here = Path(plan.folder, LOGS)
         if plan.folder and here != folder:
             with contextlib.suppress(FileExistsError):
                 here.symlink_to(folder)
-        return folder / f"{self.name}.log"
+
+    # -- its heartbeat --------------------------------------------------------------------------
+
+    def _alive(self) -> None:
+        """Note that it shows that it works; what it has forked cannot while it is stopped."""
+        if self._program is not None and not self._program.is_stopped:
+            self._pulse.beat()
+
+    def _own_topic(self, _message: Any, header: Header) -> None:
+        if header.source == self.name:
+            self._alive()
+
+    def _notified(self) -> None:
+        for assignment in self._notify.take() if self._notify is not None else ():
+            if assignment in {"READY=1", "WATCHDOG=1"}:
+                self._alive()
+            elif assignment == "WATCHDOG=trigger":
+                self._pulse.trigger()
+            elif assignment == "STOPPING=1":
+                self._pulse.stopping()
+            elif assignment.startswith(_STATUS):
+                self._log.note(f"{self.name} #{self._incarnation} {assignment}")
+            elif assignment.startswith(_EXTEND):
+                seconds = extension_s(assignment.removeprefix(_EXTEND))
+                if seconds is not None and self._program and not self._program.is_stopped:
+                    self._pulse.extend(seconds * self.clock.rate)
 
     # -- messages -------------------------------------------------------------------------------
 
     def _take(self, key: str, topic: Topic[Any], body: msgspec.Struct, stamp: float | None) -> None:
-        beat = self.parameters.heartbeat
-        if self._pulse is not None and beat is not None and key == beat.topic:
-            self._pulse.beat()
+        if key == self._heartbeat.topic:
+            self._alive()
         self.publish(topic, body, stamp, name=topic.member(key) or None)
 
     def _refuse(self, key: str, why: str) -> None:
         self.report_diagnostic("command's socket", why, key or self.name)
-
-    def _own_topic(self, _message: Any, header: Header) -> None:
-        if self._pulse is not None and header.source == self.name:
-            self._pulse.beat()
 
     def _pass_on(self, key: str, message: Any, header: Header) -> None:
         if self._channel is not None:

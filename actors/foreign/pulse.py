@@ -7,11 +7,15 @@ import math
 import os
 import secrets
 import socket
+from collections.abc import Callable
 from dataclasses import dataclass
 
+from rampart.actors.foreign.descendants import is_below
 from rampart.actors.machine.unix_peer import receive_signed
 
 _DATAGRAM_BYTES = 8192
+_DIGITS, _MOST_S = 12, 3600.0
+"""Of an extension of the timeout, and real seconds that it allows at most."""
 
 
 @dataclass(slots=True)
@@ -67,14 +71,33 @@ class Pulse:
         return self.silent_s <= self.limit_s
 
 
+def extension_s(microseconds: str) -> float | None:
+    """Return the real seconds that `EXTEND_TIMEOUT_USEC=` asks for, an hour at most.
+
+    Returns:
+        None if that is not a number.
+    """
+    if not (microseconds.isascii() and microseconds.isdecimal()):
+        return None
+    digits = microseconds.lstrip("0") or "0"
+    return min(int(digits) * 1e-6, _MOST_S) if len(digits) <= _DIGITS else _MOST_S
+
+
 class NotifySocket:
-    """Hears what a command tells its service manager, from processes of this user only.
+    """Receives what a program sends to its service manager (sd_notify(3)).
+
+    A sender that is not below this process, or has ended by the time of reading, is refused.
+
+    Args:
+        node: Name of the node.
+        refuse: Called with "" and the reason.
 
     Attributes:
         name: For `$NOTIFY_SOCKET`; an abstract address.
     """
 
-    def __init__(self, node: str) -> None:
+    def __init__(self, node: str, refuse: Callable[[str, str], None]) -> None:
+        self._refuse = refuse
         self.name = f"@rampart-{os.getpid()}-{secrets.token_hex(4)}-{node}"
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
@@ -87,8 +110,11 @@ class NotifySocket:
         with contextlib.suppress(OSError):
             for _ in range(most):
                 data, sender = receive_signed(self.socket, _DATAGRAM_BYTES)
-                if sender:
+                if sender and is_below(sender, os.getpid()):
                     found += data.decode(errors="replace").splitlines()
+                else:
+                    self._refuse("NOTIFY_SOCKET", "a datagram is refused: its sender is not a "
+                                                  "process of the command, or has ended")
         return found
 
     def close(self) -> None:

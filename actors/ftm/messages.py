@@ -274,7 +274,8 @@ class SignalOrder(Message, frozen=True):
 class ProcessEvent(Message, frozen=True):
     """Something happened to a process: crashed, stopped, wedged, respawned, refused, given up.
 
-    And *signalled*, `by` the id of the order.
+    And *signalled*, `by` the id of the order. The process of a command reports itself that its
+    program has *ended*.
     """
 
     node: Name
@@ -298,7 +299,7 @@ FAILURES = {"crashed": "gone", "stopped": "stopped", "wedged": "hung", "given up
 NEW_PROCESSES = ("started", "respawned")
 """Events that name a process which is there, and has not worked yet."""
 
-_ROUTINE = ("started", "running")
+_ROUTINE = ("started", "running", "ended")
 _GOOD_NEWS = ("respawned", "resumed", "adopted", "back")
 
 _Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]

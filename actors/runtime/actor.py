@@ -236,6 +236,11 @@ class Actor(Declared):
         """End the actor after the items that already wait."""
         self._dispatcher.stop()
 
+    def renew(self, incarnation: int) -> None:
+        """Be another incarnation of the node, in the same process."""
+        self._incarnation = incarnation
+        self.context.renewed(incarnation)
+
     # -- what happens to its process ------------------------------------------------------------
 
     def abandon(self) -> None:

@@ -35,6 +35,7 @@ class Context:
         pid: number of the process that it runs in.
         checkpoints: where this node's state is kept.
         heartbeat_period_s: simulated seconds between two heartbeats.
+        renewed: called when this process becomes another incarnation of the node.
         failed: told of the error that ends the actor, while its peers still see it alive.
         register: returns the incarnation of a node that was issued last, None if it is not known.
         members: names of all nodes of the system; what others make it remember is bounded.
@@ -54,6 +55,7 @@ class Context:
     pid: int = field(default_factory=os.getpid)
     checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
     heartbeat_period_s: float = 0.1
+    renewed: Callable[[int], None] = lambda _incarnation: None
     failed: Callable[[Exception], None] = lambda _error: None
     register: Register = lambda _node: None
     members: frozenset[str] = frozenset()

@@ -44,9 +44,10 @@ class HeldProcess(SupervisedProcess):
         self.handle = ProcessHandle()
 
     def kill(self) -> None:
-        """End it at once, and do not hear of that."""
-        self.handle.ignore()
-        self.handle.kill()
+        """End it at once, and do not report that; not if only its program has to be replaced."""
+        if not self.stays:
+            self.handle.ignore()
+            self.handle.kill()
 
     def forget_step(self) -> None:
         """Have the next step towards a fork not taken."""

@@ -22,10 +22,10 @@ from typing import Any
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.run_folder import ROUTERS, is_here, register_of
+from rampart.actors.bus.run_folder import ROUTERS, is_here, issue, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
-from rampart.actors.foreign.child import CommandError
+from rampart.actors.machine.unix_peer import process_id
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
@@ -63,11 +63,17 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
     member = layout.members.get(name) or router(name)
     clock = clock_of(layout.plan, loop.time)
     bus = bus or _bus_of(layout, name)
+
+    def renewed(incarnation: int) -> None:
+        set_title(layout.plan.base_port, layout.plan.launcher_pid, (name,), incarnation)
+        issue(layout.plan.folder, (name,), incarnation, process_id(os.getpid()))
+
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
-        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
+        heartbeat_period_s=layout.spec.timing.heartbeat_period_s,
+        renewed=renewed, failed=failed,
         is_here=partial(is_here, layout.plan.folder),
         members=frozenset((*layout.members, *layout.routers)), topics=layout.topics,
         command_age_s=layout.hosts.command_age_s))
@@ -135,8 +141,7 @@ async def live(layout: Layout, role: Role, run: RunContext, bus: ZenohBus | None
     def tell(error: Exception) -> None:  # at once: what replaces this process may kill it
         told.append(error)
         complain(f"{who} failed: {type(error).__name__}: {error}")
-        if not isinstance(error, CommandError):  # of a command that ended this code has no more
-            _log_traceback(layout.plan.error_log, who, error)
+        _log_traceback(layout.plan.error_log, who, error)
 
     try:
         set_title(layout.plan.base_port, layout.plan.launcher_pid, role.names, role.incarnation)

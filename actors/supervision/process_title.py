@@ -17,8 +17,7 @@ from pathlib import Path
 import setproctitle
 
 from rampart.actors.bus.run_folder import remove
-from rampart.actors.foreign.program import LOGS
-from rampart.actors.foreign.strays import kill_strays
+from rampart.actors.foreign.descendants import kill_programs
 from rampart.actors.machine.unix_peer import process_state
 
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
@@ -104,12 +103,6 @@ def kill_leftovers(launcher: int) -> list[int]:
 
 def end_run(launcher: int, folder: str) -> None:
     """Leave nothing of a run whose launcher has ended: neither processes nor its folder."""
+    kill_programs(process.pid for process in find_processes(launcher=launcher))
     kill_leftovers(launcher)
-    end_commands(folder)
     remove(folder)
-
-
-def end_commands(folder: str) -> None:
-    """SIGKILL what is left of the commands of a run, if it has any."""
-    if os.path.lexists(f"{folder}/{LOGS}"):
-        kill_strays(folder)

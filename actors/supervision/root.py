@@ -17,7 +17,8 @@ socket; the kernel decides which of the two was first.
 
 **Nothing is orphaned.** Every process of the run is a child of the root, and asks the kernel to be
 killed with it (prctl(2), PR_SET_PDEATHSIG), stopped ones included. Only the watching process is
-continued instead: it ends what is left of commands and removes the folder of the run. A stopped
+continued instead: it ends commands and removes the folder of the run. And the process of a command
+is asked to end, to end first what its program has forked. A stopped
 root is continued by the supervisor, and the root continues the watching process.
 """
 
@@ -46,6 +47,7 @@ import msgspec
 from rampart.actors.bus import run_folder, run_info
 from rampart.actors.bus.envelope import decoder
 from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.foreign.descendants import kill_orphans
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.machine import turns
@@ -59,7 +61,6 @@ from rampart.actors.supervision.node_process import Role, live
 from rampart.actors.supervision.pool import Pool, wait
 from rampart.actors.supervision.process_title import (
     TITLE_BYTES,
-    end_commands,
     kill,
     set_title,
     title_room,
@@ -411,7 +412,7 @@ class Root:
         for pid in self._children:
             kill(pid)
         self._await_end(lambda: not self._children, _KILLED_S)
-        end_commands(self.plan.folder)
+        kill_orphans(self._pid)
         run_folder.remove(self.plan.folder)
         for one in self._held:
             if one in self._selector.get_map():

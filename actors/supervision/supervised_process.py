@@ -248,6 +248,7 @@ class SupervisedProcess:
         incarnation: Of the present process.
         highest: The highest incarnation that there was.
         requested_by: The module that asked for it, until it was heard.
+        stays: Whether it is there and starts its program again, which has ended.
         delay_s: How long to wait before the fork that was granted last.
         heard_s: When each of its nodes was last heard, and the manager's status.
     """
@@ -261,6 +262,7 @@ class SupervisedProcess:
     incarnation: int = 0
     highest: int = 0
     requested_by: str = ""
+    stays: bool = False
     delay_s: float = 0.0
     started_s: float = 0.0
     searched_s: float = -math.inf
@@ -308,7 +310,7 @@ class SupervisedProcess:
 
     def take(self, pid: int, incarnation: int) -> None:
         """Note that another process is the present one."""
-        self.pid, self.incarnation, self.heard_s = pid, incarnation, {}
+        self.pid, self.incarnation, self.heard_s, self.stays = pid, incarnation, {}, False
         self.lives.forked()
         self.highest = max(self.highest, incarnation)
 

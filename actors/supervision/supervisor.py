@@ -9,7 +9,9 @@
 Who waits for a processor is neither (see `patience`). What follows is in `supervised_process`.
 
 What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
-Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order, stop
+Manager arbitrates; everything else by the supervisor itself. So is a command whose program has
+ended: its process stays, reports that, and starts the program again when it reads "respawned",
+which makes it the next incarnation. OTP's rules hold: start in order, stop
 in reverse, SIGTERM before SIGKILL, a bounded restart intensity. A request is carried out when the
 new process was heard: until then it is repeated, for who asked may have missed its deadline.
 """
@@ -27,6 +29,7 @@ from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.run_folder import restarts_of
 from rampart.actors.bus.topic import Members, Topic
+from rampart.actors.foreign.descendants import kill_orphans
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.lateness import Lateness
@@ -107,6 +110,10 @@ class Supervisor(Actor):
         """Hear the heartbeats of the nodes that it starts."""
         return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
+    def listens(self, topic: Topic[Any]) -> bool:
+        """Receive what becomes of programs if there is any."""
+        return topic is not topics.PROCESS_EVENT or any(node.command for node in self._spec.nodes)
+
     def _held(self, unit: Unit) -> HeldProcess:
         known = self.context.run.known_incarnations
         highest = max((known.get(node.name, 0) for node in unit.nodes), default=0)
@@ -173,6 +180,7 @@ class Supervisor(Actor):
             name: self._processes.get(name) or self._held(self._layout.units[name])
             for name in (*self._routers, *units)}
         for process in self._processes.values():
+            self._end_programs(process)
             if not self._adopt_living(process, living) and (
                     self._incarnation == self._plan.incarnations + 1 or self._owns(process)):
                 self._on(process, Event.START)
@@ -189,7 +197,7 @@ class Supervisor(Actor):
         for name, process in reversed(self._processes.items()):
             if not self._dispatcher.stopping:
                 process.let_go()
-            elif process.shown is not fm.NodeState.CRASHED:
+            elif process.stays or process.shown is not fm.NodeState.CRASHED:
                 process.handle.ignore()
                 handles[name in self._routers].append(process.handle)
         for some in handles.values():
@@ -267,6 +275,21 @@ class Supervisor(Actor):
             process.requested_by = request.by
             self._restart(process, request.by)
 
+    @on(topics.PROCESS_EVENT)
+    def program_ended(self, message: fm.ProcessEvent, header: Header) -> None:
+        """Take the end of a command's program as that of its incarnation; it is repeated."""
+        process = self._process_of(header.source)
+        if message.event != "ended" or process is None or message.pid != process.pid:
+            return
+        if message.incarnation < process.incarnation:
+            self._tell(process, "respawned", self.name, "already")
+        elif process.state is not State.CRASHED and not process.waits:
+            if len(process.names) > 1:  # they share an incarnation
+                process.handle.kill()
+                return
+            process.stays = True
+            self._on(process, Event.ENDED, detail=message.detail)
+
     # -- watching -------------------------------------------------------------------------------
 
     @every(_CHECK_S)
@@ -313,10 +336,17 @@ class Supervisor(Actor):
         self._lateness.turn()
 
     def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
+        self._end_programs(process)
         # Else it was replaced, or is kept no more, since the news came to the mailbox.
         if process.pid == pid and self._is_kept(process):
             process.let_go()
+            process.stays = False
             self._on(process, Event.ENDED, detail=detail)
+
+    def _end_programs(self, process: HeldProcess) -> None:
+        """End what the program of a command has left, whose process has ended."""
+        if any(node.command for node in process.unit.nodes):
+            kill_orphans(self._plan.launcher_pid)
 
     def _owns(self, process: HeldProcess) -> bool:
         """Whether the supervisor itself brings the process back."""
@@ -370,17 +400,19 @@ class Supervisor(Actor):
 
     def _fork_when_gone(self, process: HeldProcess, by: str, delay_s: float = 0.0) -> None:
         # The socket is free only when the old process is gone: a few more milliseconds.
-        if delay_s > 0 or not process.handle.gone():
+        if delay_s > 0 or not (process.stays or process.handle.gone()):
             self._fork_in(process, max(delay_s, _GONE_S),
                           lambda: self._fork_when_gone(process, by))
             return
+        if not process.stays:
+            self._end_programs(process)
         process.policy.restarted(self._loop.time())
         self._fork(process, by)
 
     def _fork(self, process: HeldProcess, by: str) -> None:
         incarnation = process.highest + 1
         try:
-            pid = self._machine.fork(process.names, incarnation)
+            pid = process.pid if process.stays else self._machine.fork(process.names, incarnation)
         except (ForkError, OSError) as error:
             is_busy = isinstance(error, ForkPendingError)
             if not is_busy:
@@ -397,7 +429,7 @@ class Supervisor(Actor):
     def _look_for(self, process: HeldProcess) -> None:
         """Adopt what runs and was not known, as the kernel knows it: a message may name any pid."""
         now = self._loop.time()
-        if now - process.searched_s < _SEARCH_S:
+        if process.stays or now - process.searched_s < _SEARCH_S:
             return
         process.searched_s = now
         try:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self, TypeVar
 
-from rampart.actors.foreign.keeper import kill_all
+from rampart.actors.foreign.descendants import kill_all
 from rampart.files import working_folder
 
 T = TypeVar("T")

@@ -11,8 +11,9 @@ import sys
 import msgspec
 import pytest
 
-from rampart.actors.foreign import child, keeper
+from rampart.actors.foreign import output_log
 from rampart.actors.foreign.channel import MAX_PACKET
+from rampart.actors.foreign.program_process import GRACE_S
 from rampart.manager.spec.nodes import COMMAND_FIELDS, ChildLimits
 from rampart.testing import RealRun, VirtualSystem, run
 from tests import ROOT
@@ -43,9 +44,9 @@ def test_each_field_and_each_number_is_on_the_page():
     for field in (*COMMAND_FIELDS, *ChildLimits.__struct_fields__):
         assert f"`{field}`" in TEXT
     assert f"{MAX_PACKET:,} bytes" in TEXT
-    assert f"{child.GRACE_S} s later SIGKILL" in TEXT
-    assert f"{keeper.LOG_BYTES_PER_S // 10**6} MB per second in two files of " in TEXT
-    assert f"of {keeper.LOG_BYTES // 10**6} MB" in TEXT
+    assert f"{GRACE_S} s later SIGKILL" in TEXT
+    assert f"{output_log.LOG_BYTES_PER_S // 10**6} MB per second in two files of " in TEXT
+    assert f"of {output_log.LOG_BYTES // 10**6} MB" in TEXT
 
 
 def test_the_stand_in_plays_the_command_in_virtual_time(tmp_path, monkeypatch):

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
 
-from rampart.actors.foreign.keeper import LOG_BYTES, descendants
-from rampart.actors.foreign.strays import find_strays
-from rampart.actors.supervision.process_title import process_state
+from rampart.actors.foreign.descendants import descendants
+from rampart.actors.foreign.output_log import LOG_BYTES
+from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.testing import RealRun
 from tests.documents.test_foreign_nodes import TUG, nodes, write_tug
 
@@ -58,10 +59,10 @@ def system_of(folder: Path, *more: str) -> None:
 
 
 def below(tug: RealRun, node: str) -> dict[int, str]:
-    """Return what runs below a node: number and command line, the keeper included."""
+    """Return what runs below a node: number and command line."""
     pid = tug.pid(node)
     found = {}
-    for one in descendants(pid) if pid else ():
+    for one in sorted(descendants(pid)) if pid else ():
         try:
             line = Path(f"/proc/{one}/cmdline").read_bytes()
         except OSError:
@@ -75,6 +76,14 @@ def find(tug: RealRun, node: str, text: str) -> int:
     tug.wait_until(lambda: any(text in line for line in below(tug, node).values()), 10,
                    f"no {text} below {node}")
     return next(pid for pid, line in below(tug, node).items() if text in line)
+
+
+def folder_of(pid: str) -> str:
+    """Return the working folder of a process; "" if there is none."""
+    try:
+        return os.readlink(f"/proc/{pid}/cwd")  # noqa: PTH115 it is read for each process
+    except OSError:
+        return ""
 
 
 def gone(*pids: int) -> bool:
@@ -104,41 +113,39 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
     system_of(tmp_path, MORE.partition('[[node]]\nname = "flood"')[0])
     with RealRun(tmp_path, "tug.toml") as tug:
         tug.sleep_until(0)
-        folder = tug.info.folder
+        node = tug.pid("wheels")
 
-        os.kill(find(tug, "wheels", "wheels"), signal.SIGKILL)  # the command
-        tug.wait_for("rampart: wheels #1 failed: CommandError: ./wheels ended: signal SIGKILL; "
-                     "`rampart node log wheels` shows its output")
-        stopped = comes_back(tug, "wheels", 2, "wheels")
+        os.kill(find(tug, "wheels", "wheels"), signal.SIGKILL)  # the program
+        tug.wait_for("wheels crashed, incarnation 1 (./wheels ended: signal SIGKILL; "
+                     "`rampart node log wheels` shows its output)")
+        program = comes_back(tug, "wheels", 2, "wheels")
 
-        os.kill(stopped, signal.SIGSTOP)  # without its heartbeat the node has none
+        os.kill(program, signal.SIGSTOP)
+        tug.wait_for("wheels crashed, incarnation 2 (./wheels was stopped for 0.5 s;")
         comes_back(tug, "wheels", 3, "wheels")
-        assert gone(stopped)
+        assert gone(program)
 
-        program = tmp_path / "wheels"
-        program.rename(tmp_path / "away")  # while it runs
+        file = tmp_path / "wheels"
+        file.rename(tmp_path / "away")  # while it runs
         os.kill(find(tug, "wheels", "wheels"), signal.SIGSEGV)
-        tug.wait_for(f"wheels #4 failed: CommandError: ./wheels: no such program in {tmp_path}")
-        (tmp_path / "away").rename(program)
+        tug.wait_for(f"wheels crashed, incarnation 4 (./wheels no such program in {tmp_path};")
+        (tmp_path / "away").rename(file)
+        tug.wait_until(lambda: state(tug, "wheels")[0] == "running", 10, "wheels did not come")
+        assert tug.pid("wheels") == node, "its process has stayed"
+
+        incarnation = 1
+        for victims in (["forking"], ["forking", "supervisor"]):
+            pids = all_forked(tug)
+            for victim in victims:
+                tug.kill(victim)
+            tug.wait_until(lambda: gone(*pids), 3, f"something is left of {victims}")  # noqa: B023
+            incarnation += 1
+            comes_back(tug, "forking", incarnation, "forking")
 
         pids = all_forked(tug)
-        tug.kill("forking")  # the node
-        comes_back(tug, "forking", 2, "forking")
+        tug.kill("forking", signal.SIGSTOP)  # the node
+        comes_back(tug, "forking", incarnation + 1, "forking")
         assert gone(*pids)
-
-        pids = all_forked(tug)
-        os.kill(find(tug, "forking", "keeper.py"), signal.SIGSTOP)
-        tug.kill("forking")
-        comes_back(tug, "forking", 3, "forking")
-        tug.wait_until(lambda: gone(*pids), 5, "the stopped keeper left something")
-
-        pids = all_forked(tug)
-        bare = find(tug, "forking", "sleep 601")
-        os.kill(find(tug, "forking", "keeper.py"), signal.SIGKILL)
-        tug.wait_for("forking #3 failed: CommandError: ./forking ended: its keeper is gone")
-        comes_back(tug, "forking", 4, "forking")
-        assert gone(*(pid for pid in pids if pid != bare))  # which has lost keeper and environment
-        os.kill(bare, signal.SIGKILL)
 
         pids = all_forked(tug)
         log = tug.tool("node", "log", "wheels", "--lines", "100")
@@ -148,8 +155,12 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
         assert (none.returncode, none.stderr) == (1, (
             "rampart: driver: no command, or its output is not kept; there is output of: forking, "
             "wheels\n"))
-        assert not list(tmp_path.rglob("errors.log"))  # what a command does is no traceback of ours
-    tug.wait_until(lambda: gone(*pids) and find_strays(folder) == [], 3, "something is left")
+        assert tug.story.count("wheels crashed, incarnation 1 ") == 1
+        exits = [line for line in tug.story.splitlines() if "wheels" in line and "SIGKILL" in line]
+        assert len(exits) == 1, exits
+        assert "Traceback" not in tug.story
+        assert not list(tmp_path.rglob("errors.log"))  # what a program does is no traceback of ours
+    tug.wait_until(lambda: gone(*pids), 3, "something is left")
     assert "wheels #1 ended: signal SIGKILL" in (tmp_path / "report/logs/wheels.log").read_text()
 
 
@@ -158,7 +169,7 @@ def test_a_flood_and_one_that_ends_at_once_harm_nobody_and_a_killed_launcher_end
     system_of(tmp_path, MORE)
     with RealRun(tmp_path, "tug.toml") as tug:
         tug.sleep_until(0)
-        tug.wait_for("quitter #1 failed: CommandError: sh ended: exit code 3")
+        tug.wait_for("quitter crashed, incarnation 1 (sh ended: exit code 3;")
         tug.wait_until(lambda: state(tug, "quitter")[0] == "given up", 20, "no end of restarts")
         quitter = state(tug, "quitter")[1]
         assert quitter >= 6
@@ -175,8 +186,7 @@ def test_a_flood_and_one_that_ends_at_once_harm_nobody_and_a_killed_launcher_end
         folder = tug.info.folder
         tug.process.kill()
         tug.process.wait()
-        tug.wait_until(lambda: gone(*pids) and find_strays(folder) == [], 5, "something is left")
-        assert not Path(folder).exists()
+        tug.wait_until(lambda: gone(*pids) and not Path(folder).exists(), 5, "something is left")
 
 
 def test_a_topic_may_be_the_heartbeat_and_two_commands_share_a_process(tmp_path):
@@ -220,6 +230,95 @@ kind = "non-control"
 
 [[event]]"""))
     with RealRun(tmp_path, "tug.toml", "--duration", "3") as tug:
-        tug.wait_for("hungry #1 failed: CommandError: python3 ended: exit code 1")
-        tug.wait_for("odd #1 failed: CommandError: ./odd cannot be started: Exec format error")
+        tug.wait_for("hungry crashed, incarnation 1 (python3 ended: exit code 1;")
+        tug.wait_for("odd crashed, incarnation 1 (./odd cannot be started: Exec format error;")
         assert "MemoryError" in tug.tool("node", "log", "hungry").stdout
+
+
+PROGRAM = """
+import os, signal, socket, sys, time
+
+notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+
+def tell(what):
+    notify.sendto(what.encode(), "\\0" + os.environ["NOTIFY_SOCKET"][1:])
+
+def beat(seconds):
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        tell("WATCHDOG=1")
+        time.sleep(0.05)
+
+first = os.environ["RAMPART_INCARNATION"] == "1"
+how = sys.argv[1]
+tell("READY=1\\nSTATUS=up and well")
+if first and how == "its child beats":
+    beat(0.5)
+    if os.fork() == 0:
+        beat(600)
+    os.kill(os.getpid(), signal.SIGSTOP)
+if first and how == "says that it ends":
+    tell("STOPPING=1")
+    beat(600)
+if first and how == "needs time":
+    tell("EXTEND_TIMEOUT_USEC=000000000000003000000")
+    time.sleep(2.0)
+    beat(0.5)
+    time.sleep(600)
+beat(600)
+"""
+
+COLD = """
+import os, time
+
+with open("starts", "a") as starts:
+    starts.write("x")
+time.sleep(9)
+"""
+
+
+def test_what_sd_notify_says_is_taken_as_it_is_documented(tmp_path):
+    write_tug(tmp_path, compiled=False)
+    (tmp_path / "program.py").write_text(PROGRAM)
+    (tmp_path / "cold.py").write_text(COLD)
+    spoken = {"child": "its child beats", "stopping": "says that it ends", "slow": "needs time"}
+    head, _, rest = TUG.partition('[[node]]\nname = "driver"')
+    head = head.replace("[timing]", "[timing]\nstartup_grace_s = 2.5")
+    (tmp_path / "tug.toml").write_text(head + "".join(f"""
+[[node]]
+name = "{name}"
+command = {json.dumps(["python3", "program.py", how])}
+kind = "non-control"
+heartbeat = {{ notify = true, timeout_s = 1.0 }}
+""" for name, how in spoken.items()) + """
+[[node]]
+name = "cold"
+command = ["python3", "cold.py"]
+kind = "non-control"
+heartbeat = { notify = true, timeout_s = 1.0 }
+
+""" + rest[rest.index("[[event]]"):])
+    with RealRun(tmp_path, "tug.toml") as tug:
+        tug.wait_for("child crashed, incarnation 1 (python3 was stopped for 1 s;")
+        tug.wait_for("stopping crashed, incarnation 1 (python3 hung: not heard for 1 s;")
+        tug.wait_for("cold crashed, incarnation 2 (python3 hung: not heard for 2.5 s after its "
+                     "start; a larger startup_grace_s in [timing] gives it more time;")
+        tug.wait_for("slow crashed, incarnation 1 (python3 hung: not heard for 1 s;")
+        for name in spoken:
+            comes_back(tug, name, 2, "program.py")
+        (cold,) = (row for row in nodes(tug) if row["name"] == "cold")
+        assert cold["restarts"] == cold["incarnation"] - 1 >= 1
+        assert len((tmp_path / "starts").read_text()) >= 2
+        assert "STATUS=up and well" in tug.tool("node", "log", "slow").stdout
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.1, 0.3, 0.6])
+def test_ctrl_c_in_the_start_leaves_no_traceback_and_no_program(tmp_path, after_s):
+    system_of(tmp_path, MORE.partition('[[node]]\nname = "flood"')[0])
+    with RealRun(tmp_path, "tug.toml") as tug:
+        tug.wait_until(lambda: find_processes(tug.port) != [], 20, "no process was started")
+        time.sleep(after_s)
+        tug.process.send_signal(signal.SIGINT)
+        tug.process.wait(20)
+    assert "Traceback" not in tug.story
+    assert [pid for pid in os.listdir("/proc") if folder_of(pid) == str(tmp_path)] == []  # noqa: PTH208

@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from rampart.actors.foreign.pulse import NotifySocket, Pulse
+from rampart.actors.foreign.pulse import NotifySocket, Pulse, extension_s
 
 
 def test_silence_counts_from_the_last_beat():
@@ -64,9 +64,20 @@ def test_one_that_says_that_it_ends_has_to_end():
     assert not wells[-1]
 
 
+@pytest.mark.parametrize(("text", "seconds"), [
+    ("5000000", 5.0), ("0", 0.0), ("000000000000000000005000000", 5.0), ("00", 0.0),
+    ("3600000000", 3600.0), ("3600000001", 3600.0), ("9" * 6000, 3600.0),
+    ("0" * 7000 + "1000000", 1.0), ("18446744073709551615", 3600.0),
+    ("", None), ("-1", None), ("+1", None), (" 1", None), ("1 ", None), ("1e6", None),
+    ("1_000", None), ("0x10", None), ("1.5", None), ("nan", None), ("\u0663", None),
+    ("\ufffd", None)])
+def test_how_much_time_it_asks_for(text, seconds):
+    assert extension_s(text) == seconds
+
+
 @pytest.fixture
 def notify():
-    made = NotifySocket("wheels")
+    made = NotifySocket("wheels", lambda *_: None)
     yield made
     made.close()
 

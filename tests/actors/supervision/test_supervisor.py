@@ -27,6 +27,7 @@ from rampart.actors.supervision.processes import ForkError, RunProcess
 from rampart.actors.supervision.supervised_process import MOST_EXCUSED_S
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.actors.system.layout import Layout
+from rampart.manager.spec.nodes import Kind, NodeSpec
 from rampart.manager.spec.tables import Supervision
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run, turns
@@ -160,7 +161,7 @@ class Machine:
 class World:
     """A supervisor, its machine, and the bus between them."""
 
-    def __init__(self, supervision: Supervision) -> None:
+    def __init__(self, supervision: Supervision, commands: Sequence[str] = ()) -> None:
         loop = asyncio.get_running_loop()
         self.machine = Machine()
         self.clock = Clock(loop.time(), source=loop.time)
@@ -170,7 +171,10 @@ class World:
         self.silent: set[int] = set()
         self.failing: set[str] = set()
         self.hub.taps.append(self.see)
-        self.spec = msgspec.structs.replace(load_system(PLAN), supervision=supervision)
+        spec = load_system(PLAN)
+        self.spec = msgspec.structs.replace(spec, supervision=supervision, nodes=(
+            *spec.nodes, *(NodeSpec(f"of_{respawn}", Kind.NON_CONTROL, respawn=respawn,
+                                    command=("true",)) for respawn in commands)))
         self.lives = 0
         self._sequence = 0
         self.supervisor, self.task = self.start()
@@ -229,8 +233,9 @@ class World:
 
 
 @asynccontextmanager
-async def running(supervision: Supervision = USUAL) -> AsyncIterator[World]:
-    world = World(supervision)
+async def running(supervision: Supervision = USUAL,
+                  commands: Sequence[str] = ()) -> AsyncIterator[World]:
+    world = World(supervision, commands)
     await world.bus.open()
     beats = asyncio.create_task(world.beats())
     await eventually(world.all_run)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rampart.actors.foreign.keeper import descendants
+from rampart.actors.foreign.descendants import descendants
 from rampart.actors.machine.unix_peer import process_state
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout

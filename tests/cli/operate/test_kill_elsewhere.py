@@ -10,9 +10,10 @@ from contextlib import contextmanager
 
 import pytest
 
+from rampart.actors.bus import run_info
 from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable
-from rampart.actors.supervision import kill_node, run_info
+from rampart.actors.supervision import kill_node
 from rampart.actors.supervision.kill_node import Elsewhere, OtherProcess, RunElsewhere
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.cli.operate import kill_elsewhere

@@ -1,0 +1,87 @@
+"""What programs of commands have forked, found in /proc and killed.
+
+The process of a command's node is the subreaper of its program (prctl(2)): whatever is forked below
+it, in any session, stays below it. When that process itself has ended, the root of the run adopts
+what is left. All of that is in sessions of its own, which the root and the nodes never are: a
+program is started in one, and no process can go back into the session of another.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+END_S = 2.0
+"""Wall seconds in which what was killed has to be gone; what is not waits for a disk."""
+
+
+def _living() -> dict[int, tuple[int, int]]:
+    """Return parent and session of each process that has not ended."""
+    pids = [int(entry.name) for entry in os.scandir("/proc") if entry.name.isdecimal()]
+    return {pid: found for pid in pids if (found := _parent_and_session(pid))}
+
+
+def _parent_and_session(pid: int) -> tuple[int, int] | None:
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_bytes()
+    except OSError:
+        return None
+    state, parent, _group, session = stat.rpartition(b")")[2].split()[:4]
+    return None if state in b"ZX" else (int(parent), int(session))
+
+
+def _below(living: dict[int, tuple[int, int]], tops: Iterable[int]) -> set[int]:
+    found, fresh = set[int](), set(tops)
+    while fresh:
+        found |= fresh
+        fresh = {pid for pid, (parent, _) in living.items() if parent in fresh} - found
+    return found
+
+
+def descendants(*of: int) -> set[int]:
+    """Return the living processes below these."""
+    return _below(_living(), of) - set(of)
+
+
+def is_below(pid: int, top: int) -> bool:
+    """Whether a living process is below another one."""
+    while pid != top and (found := _parent_and_session(pid)):
+        pid = found[0]
+    return pid == top
+
+
+def kill_all(find: Callable[[], Iterable[int]], within_s: float = END_S) -> bool:
+    """Kill what is found until nothing is; False if something is left after so many seconds."""
+    until_s = time.monotonic() + within_s
+    while left := list(find()):
+        for pid in left:
+            with contextlib.suppress(OSError):
+                os.kill(pid, signal.SIGKILL)
+        if time.monotonic() > until_s:
+            return False
+        time.sleep(0.001)
+    return True
+
+
+def kill_programs(nodes: Iterable[int]) -> None:
+    """Kill what is below the processes of a run."""
+    tops = list(nodes)
+    kill_all(lambda: descendants(*tops))
+
+
+def kill_orphans(root: int) -> None:
+    """Kill what the root of a run has adopted from nodes that have ended; nothing if it is 0."""
+    if root == 0:
+        return
+
+    def orphans() -> set[int]:
+        living = _living()
+        session = living.get(root, (0, 0))[1]
+        return _below(living, (pid for pid, (parent, own) in living.items()
+                               if parent == root and own != session))
+
+    kill_all(orphans)
