@@ -255,7 +255,7 @@ def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
         yield None
         return
     recorder = RecorderProcess(Order(
-        options.port, str(Path(options.record).resolve()), os.getpid(), options.overwrite,
+        options.port, str(Path(options.record).resolve()), os.getppid(), options.overwrite,
         others_of(Layout(plan, spec))))
     recorder.start()
     try:
