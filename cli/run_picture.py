@@ -6,12 +6,9 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from rampart.actors.bus import messages as bm
-from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
@@ -21,7 +18,7 @@ from rampart.cli.robot_lines import SILENT, RobotLines
 
 DECODED: tuple[Topic[Any], ...] = (
     ftm_topics.MANAGER_STATUS, ftm_topics.DETECTION, ftm_topics.RECOVERY, ftm_topics.DECISION,
-    ftm_topics.NODES, ftm_topics.PROCESS_EVENT, bus_topics.HEARTBEAT)
+    ftm_topics.NODES, ftm_topics.PROCESS_EVENT)
 """What is read besides what the lines of the robot need; all other messages are counted."""
 
 STALE_S = 2.0
@@ -49,15 +46,6 @@ def _report(module: str, report: Any, busy: StrEnum, newest: dict[str, Any],
     newest[module] = report
 
 
-@dataclass(frozen=True, slots=True)
-class Beat:
-    """The last heartbeat of a node: which life sent it, and when it was heard."""
-
-    incarnation: int
-    heard_s: float
-    message: bm.Heartbeat
-
-
 class RunPicture:
     """One run as a tool has heard it.
 
@@ -66,7 +54,6 @@ class RunPicture:
         messages: messages heard so far, by topic key as declared.
         detections: newest report of each detection module.
         recoveries: newest report of each recovery module.
-        beats: newest heartbeat of each node.
         decisions: the last decisions, each with its stamp, newest last.
         decisions_total: decisions heard, by strategy.
         detections_total: how often each module was seen to become active.
@@ -79,7 +66,6 @@ class RunPicture:
         self.messages: Counter[str] = Counter()
         self.detections: dict[str, m.DetectionReport] = Remembered(_NAMES)
         self.recoveries: dict[str, m.RecoveryReport] = Remembered(_NAMES)
-        self.beats: dict[str, Beat] = Remembered(_NAMES)
         self.decisions: deque[tuple[float, m.DecisionRecord]] = deque(maxlen=_KEPT)
         self.decisions_total: Counter[str] = Counter()
         self.detections_total: Counter[str] = Counter()
@@ -95,9 +81,7 @@ class RunPicture:
     def heard(self, topic: Topic[Any], header: Header, body: Any, now_s: float) -> None:
         """Take a message that is read, heard at a simulated time."""
         self.messages[topic.key] += 1
-        if topic is bus_topics.HEARTBEAT:
-            self.beats[header.source] = Beat(header.incarnation, now_s, body)
-        elif topic is ftm_topics.DETECTION:
+        if topic is ftm_topics.DETECTION:
             _report(header.source, body, m.DetectionState.ACTIVE, self.detections,
                     self.detections_total)
         elif topic is ftm_topics.RECOVERY:

@@ -57,9 +57,6 @@ MANAGER_STATE = StateFormat(Memory, version=1, objection=objection)
 DECISIONS_PER_INCARNATION = 10_000
 """Each incarnation numbers its decisions from a multiple of this."""
 
-_CALM_REPEATS = 5
-"""While nothing is active or activated, each so many-th time is what is wanted repeated."""
-
 
 class FtmManager(Actor):
     """Hears all detection and recovery modules, commands the recovery modules."""
@@ -82,13 +79,17 @@ class FtmManager(Actor):
         self._remembered: tuple[int, tuple[str, ...]] | None = None
         self._replaced: dict[str, int] = {}
         self._request = 0
-        self._repeats = 0
 
     @classmethod
     def output_names(cls, topic: Topic[Any], name: str, parameters: Any) -> tuple[str, ...] | None:
         """Command any recovery module."""
         return None if topic is topics.RECOVERY_COMMAND else super().output_names(
             topic, name, parameters)
+
+    def reads(self, topic: Topic[Any]) -> tuple[str, ...]:
+        """Read the reports of all modules."""
+        modules = self._system.detections if topic is topics.DETECTION else self._system.recoveries
+        return tuple(topic.at(module.name) for module in modules)
 
     def on_start(self) -> None:
         """Say at once that the manager runs, and what it has latched."""
@@ -148,6 +149,7 @@ class FtmManager(Actor):
     @every(0.1)
     def tick(self) -> None:
         """Let time pass, and show that the manager runs."""
+        self.read_postings()
         self._step(Tick())
         self._show()
         if self._system.layers.supervisor_respawn:
@@ -155,11 +157,8 @@ class FtmManager(Actor):
 
     @every(0.2)
     def repeat(self) -> None:
-        """Repeat what is wanted, in case it was lost; once a second while nothing is wanted."""
+        """Repeat what is wanted, in case it was lost."""
         state = self.arbiter_state
-        self._repeats += 1
-        if self._repeats % _CALM_REPEATS and self._shown is not None and _is_calm(self._shown):
-            return
         for command in state.desired.values():
             # One that has just started does not know yet what is in force: it releases nothing.
             if command.activate or state.oriented:

@@ -48,6 +48,12 @@ class Bus(Protocol):
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Send to all present subscribers of the key, without waiting for them."""
 
+    def post(self, key: str, payload: bytes) -> bool:
+        """Put a message where the nodes of this host look; False if it has to be sent instead."""
+
+    def posted(self, key: str) -> bytes | None:
+        """Return the newest message that was posted by a node of this host; None if none was."""
+
     def has_readers(self, key: str) -> bool:
         """Whether somebody hears a key now; True if that cannot be known."""
 
@@ -102,6 +108,14 @@ class SharedBus:
         """Send over the owner's session."""
         if self._open:
             self._owner.publish(topic, key, payload)
+
+    def post(self, key: str, payload: bytes) -> bool:
+        """Post by the owner."""
+        return self._open and self._owner.post(key, payload)
+
+    def posted(self, key: str) -> bytes | None:
+        """Return what is posted."""
+        return self._owner.posted(key)
 
     def has_readers(self, key: str) -> bool:
         """Whether somebody hears a key, as far as the owner knows."""

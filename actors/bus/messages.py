@@ -40,8 +40,8 @@ class Message(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True)
 class Heartbeat(Message, frozen=True, omit_defaults=True):
     """Sent from the actor's own loop; `progress` counts what the mailbox has handled.
 
-    `late_s` is how late that loop was at most since the heartbeat before, simulated
-    seconds; it is left out if none was.
+    `late_s` is how late that loop was at most in the last two periods, simulated seconds; it is
+    left out if none was.
     """
 
     pid: Pid

@@ -27,6 +27,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from rampart.actors.bus.board import FileBoard
 from rampart.actors.machine.unix_peer import ProcessId
 
 ROUTERS = ("router_a", "router_b")
@@ -42,7 +43,7 @@ _NAME = re.compile(r"rampart-\d+-\d+-\w+\Z")
 _locks: dict[str, int] = {}
 """By folder that was made here, the lock on it; processes that are forked hold it as well."""
 
-_ISSUED, _SYSTEM = "issued", "system"
+_ISSUED, _SYSTEM, _BOARD = "issued", "system", "board"
 
 
 def make(port: int, launcher: int) -> str:
@@ -60,7 +61,8 @@ def make(port: int, launcher: int) -> str:
         _remove_stale(place)
         try:
             made = Path(tempfile.mkdtemp(prefix=f"rampart-{port}-{launcher}-~", dir=place))
-            (made / _ISSUED).mkdir(mode=0o700)
+            for inner in (_ISSUED, _BOARD):
+                (made / inner).mkdir(mode=0o700)
             lock = os.open(made, os.O_RDONLY | os.O_DIRECTORY)
             fcntl.flock(lock, fcntl.LOCK_EX)
             folder = str(made).replace("~", "")  # only now others look whether it is locked
@@ -198,6 +200,11 @@ def is_elsewhere(folder: str, name: str) -> bool:
     """Whether the incarnation of a node that was issued last is on another machine."""
     found = _look_up(folder, name)
     return found is not None and len(found) < 1 + len(ProcessId._fields)
+
+
+def board_of(folder: str) -> FileBoard:
+    """Return this process's access to what the nodes of a run have posted."""
+    return FileBoard(f"{folder}/{_BOARD}")
 
 
 def _look_up(folder: str, name: str) -> tuple[int, ...] | None:

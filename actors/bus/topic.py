@@ -52,6 +52,11 @@ class Topic(Generic[T]):
         outside: tools, or the driver of a device, publish it: no node of the system has to.
         several: more than one node may publish it. Commands always may be given by several; of
             what is measured, or is the case, the latest message wins, so that is one node's to say.
+        resend_s: above 0 the newest message is posted where the nodes of the host look
+            (`rampart.actors.bus.board`), and sent only if it differs from the one sent last, or so
+            many simulated seconds have passed since; in a system of several hosts, always.
+        compared: a message that differs from the one sent last is news. If not, it only shows that
+            its publisher works.
     """
 
     key: str
@@ -62,6 +67,8 @@ class Topic(Generic[T]):
     doc: str
     outside: bool = False
     several: bool = False
+    resend_s: float = 0.0
+    compared: bool = True
 
     @property
     def is_family(self) -> bool:

@@ -8,7 +8,7 @@ from rampart.actors.bus.messages import Diagnostic, Heartbeat, Injection, Inject
 from rampart.actors.bus.topic import Qos, Topic
 
 HEARTBEAT = Topic("heartbeat/{name}", Heartbeat, Qos.STATE, 7, "",
-                  "Proof that the event loop of node {name} turns.")
+                  "Proof that the event loop of node {name} turns.", resend_s=5, compared=False)
 DIAGNOSTIC = Topic("diagnostic/{name}", Diagnostic, Qos.COMMAND, 0, "",
                    "Error report of node {name}.")
 INJECT = Topic("inject/order", Injection, Qos.COMMAND, 0, "",

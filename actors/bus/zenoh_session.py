@@ -57,8 +57,13 @@ _THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: 
             "acc: (handover: app), net: (handover: app))")
 """Of Zenoh in a client: one that reads and one that writes. By default a thread that waits for
 sockets wakes one of two others for each message that has come, which reads it. Reading and writing
-on one thread is no choice: most nodes were never heard then. Routers keep a thread for each
-task: many links come and go there, and Zenoh holds locks while it waits for other tasks.
+on one thread is no choice: most nodes were never heard then.
+"""
+_ROUTER_THREADS = "(acc: (handover: rx))"
+"""Of Zenoh in a router: those that read wait for the sockets as well. By default another thread
+does, and wakes them for each message: a quarter of what a router costs. It keeps several threads
+for reading, and others for the rest: many links come and go there, and Zenoh holds locks while it
+waits for other tasks.
 """
 
 _REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
@@ -199,6 +204,16 @@ def open_client(dial: Sequence[str], credentials: Credentials | None = None) -> 
     return _open(session_config((), dial, credentials))
 
 
+def open_router(listen: Sequence[str], dial: Sequence[str], credentials: Credentials | None,
+                access: Mapping[str, Any] | None) -> zenoh.Session:
+    """Open the session of a router; see `session_config`.
+
+    Raises:
+        ZError: an endpoint is in use, or invalid.
+    """
+    return _open(session_config(listen, dial, credentials, access), _ROUTER_THREADS)
+
+
 def open_alone(credentials: Credentials | None = None) -> zenoh.Session:
     """Open a session without any link; the next one of this process opens sooner."""
     config = session_config((), [], credentials)
@@ -206,10 +221,10 @@ def open_alone(credentials: Credentials | None = None) -> zenoh.Session:
     return _open(config)
 
 
-def _open(config: zenoh.Config) -> zenoh.Session:
+def _open(config: zenoh.Config, threads: str = _THREADS) -> zenoh.Session:
     if _RUNTIME in os.environ:
         return zenoh.open(config)
-    os.environ[_RUNTIME] = _THREADS  # read when a process opens its first session
+    os.environ[_RUNTIME] = threads  # read when a process opens its first session
     try:
         return zenoh.open(config)
     finally:

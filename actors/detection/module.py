@@ -164,7 +164,7 @@ class DetectionModule(Actor):
         self._told = True
         self.publish(topics.DETECTION, report)
 
-    @every(0.2)
+    @every(0.2, with_heartbeat=True)
     def repeat(self) -> None:
         """Say it again, for nodes that have joined since."""
         self.note_absence()
@@ -232,6 +232,7 @@ class DetectionModule(Actor):
         if monitor is None:
             return
         due_s, self._wake_s, self._alarm = self._wake_s, math.inf, None
+        self.read_postings()
         self.note_absence()
         now_s = self.clock.now()
         if monitor.due_s <= now_s:

@@ -113,7 +113,7 @@ class Overload(DetectionModule):
         """Hear how late a node was; before simulated time 0 the system is starting."""
         now_s = self.clock.now()
         self._pids[header.source] = self.context.local_pid(header.source, message.pid)
-        late_s = max(message.late_s, now_s - header.stamp)
+        late_s = max(message.late_s, self.came_s(header) - header.stamp)
         if late_s > self._too_late_s and header.stamp > 0 and not self._absence.excuses(now_s):
             told = self.parameters
             self._late_until_s[header.source] = now_s + max(

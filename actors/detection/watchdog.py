@@ -167,7 +167,7 @@ class Watchdog(DetectionModule):
     @on(topics.HEARTBEAT)
     def heartbeat(self, _message: m.Heartbeat, header: Header) -> None:
         """Take note that a loop turns."""
-        self.monitor.beat(header.source, header.incarnation, header.stamp, self.clock.now())
+        self.monitor.beat(header.source, header.incarnation, header.stamp, self.came_s(header))
         self.follow()
 
     @on(ftm_topics.PROCESS_EVENT)

@@ -195,7 +195,8 @@ class NodeInfo(Message, frozen=True, omit_defaults=True):
 
     `late_s` is how late its loop was at most in the last half or whole second, simulated
     seconds; left out if none was. `host` is where it runs; "" is the first. `failing`: its last
-    processes each worked for a short time only.
+    processes each worked for a short time only. `heard_s` is the stamp of its last heartbeat, which
+    says how many messages it has refused so far, and why.
     """
 
     name: Name
@@ -207,6 +208,9 @@ class NodeInfo(Message, frozen=True, omit_defaults=True):
     late_s: Seconds = ON_TIME
     host: Name = ""
     failing: bool = False
+    heard_s: Seconds = 0.0
+    rejected_payloads: Count = 0
+    overflowed: Count = 0
 
 
 class NodeTable(Message, frozen=True):

@@ -13,12 +13,11 @@ HOLDS = Topic("holds/{name}", m.Holds, Qos.STATE, 5, "",
               "Holders of {name} that are no recovery modules of the system; silent while there "
               "are none. `rampart reset` lets go in their place.")
 DETECTION = Topic("detection/{name}", m.DetectionReport, Qos.STATE, 5, "",
-                  "State of detection module {name}.")
-RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 1, "",
-                         "What the manager orders recovery module {name} to do; 5 Hz while any is "
-                         "activated.")
-RECOVERY = Topic("recovery/{name}/state", m.RecoveryReport, Qos.STATE, 1, "",
-                 "State of recovery module {name}; 5 Hz while it is activated.")
+                  "State of detection module {name}.", resend_s=1)
+RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 5, "",
+                         "What the manager orders recovery module {name} to do.", resend_s=1)
+RECOVERY = Topic("recovery/{name}/state", m.RecoveryReport, Qos.STATE, 5, "",
+                 "State of recovery module {name}.", resend_s=1)
 DECISION = Topic("manager/decision", m.DecisionRecord, Qos.COMMAND, 0, "",
                  "Each decision of the FTM Manager with its certificate.")
 SHADOW = Topic("manager/shadow", m.ShadowRecord, Qos.COMMAND, 0, "",
@@ -30,7 +29,7 @@ ADAPTATION = Topic("manager/adaptation", m.AdaptationAnswer, Qos.COMMAND, 0, "",
 ADAPTED_SYSTEM = Topic("manager/system", m.AdaptedSystem, Qos.STATE, 1, "",
                        "The changed system, whole; silent while nothing was changed.")
 MANAGER_STATUS = Topic("manager/status", m.ManagerStatus, Qos.STATE, 10, "",
-                       "The FTM Manager's view; its silence stops the robot.")
+                       "The FTM Manager's view; its silence stops the robot.", resend_s=1)
 RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched recovery.",
               outside=True)
 

@@ -69,6 +69,7 @@ class Hmi(Actor):
     Class attributes:
         requests: what its page may ask for.
         shown: topics that are heard for the page alone.
+        drawn: those of them of which the page shows the newest alone: heard once one was opened.
         panels: of the page, besides those that every page has and those of the specification.
         files: folder of the JavaScript and CSS that `panels` need; None for none.
         badge: what the page calls its connection.
@@ -99,6 +100,7 @@ class Hmi(Actor):
     shown: ClassVar[tuple[Topic[Any], ...]] = (
         ftm_topics.ADAPTED_SYSTEM, ftm_topics.PROCESS_EVENT, bus_topics.DIAGNOSTIC,
         ftm_topics.ADAPTATION, bus_topics.INJECTION_REPORT)
+    drawn: ClassVar[tuple[Topic[Any], ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -165,6 +167,7 @@ class Hmi(Actor):
         self._server: PageServer | None = None
         self._observer = ProcessObserver(plan.base_port, plan.launcher_pid, plan.host)
         self._version = -1
+        self._is_seen = False
         self._unheard: list[str] = []
         if self._port:
             self._hear_panels()
@@ -232,7 +235,7 @@ class Hmi(Actor):
 
     def listens(self, topic: Topic[Any]) -> bool:
         """Without a page, hear only what this node does without one."""
-        return bool(self._port) or topic not in self.shown
+        return topic not in (self.drawn if self._port else self.shown)
 
     def on_start(self) -> None:
         """Open the page's port; the robot drives without the page."""
@@ -285,6 +288,11 @@ class Hmi(Actor):
             self._server.stop()
 
     def _look(self) -> None:
+        if not self._is_seen:
+            self._is_seen = True
+            for topic, method in self._handlers:
+                if topic in self.drawn:
+                    self.hear_after_all(topic, getattr(self, method))
         self._state.picture.put("usage", self._observer.look(self._table), urgent=False)
 
     def _show_system(self, system: SystemSpec, version: int) -> None:

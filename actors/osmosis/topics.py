@@ -39,9 +39,10 @@ MISSION_ORDER = Topic("mission/order", m.MissionOrder, Qos.COMMAND, 0, "",
 MISSION_ORDER_ANSWER = Topic("mission/order_answer", m.MissionOrderAnswer, Qos.COMMAND, 0, "",
                              "Whether an order was obeyed, and why not.")
 MISSION_STATUS = Topic("mission/status", m.MissionStatus, Qos.STATE, 2, "map",
-                       "Progress and results of the mission.")
-GOAL = Topic("mission/goal", m.GoalOrder, Qos.STATE, 5, "map", "The current goal.")
-ROUTE = Topic("plan/route", m.Route, Qos.STATE, 5, "map", "The way to the current goal.")
+                       "Progress and results of the mission.", resend_s=1)
+GOAL = Topic("mission/goal", m.GoalOrder, Qos.STATE, 5, "map", "The current goal.", resend_s=1)
+ROUTE = Topic("plan/route", m.Route, Qos.STATE, 5, "map", "The way to the current goal.",
+              resend_s=1)
 COMMAND = Topic("control/command", m.Twist, Qos.SENSOR, 20, "base_link",
                 "Velocity that Osmosis Control computes.")
 STANDBY_COMMAND = Topic("control/standby_command", m.Twist, Qos.SENSOR, 20, "base_link",
@@ -62,7 +63,7 @@ TELEOP_COMMAND = Topic("teleoperation/command", m.StickTwist, Qos.SENSOR, 20, "b
 PILOT_ORDER = Topic("pilot/order/{name}", m.PilotOrder, Qos.STATE, 5, "",
                     "Order of the recovery module {name} to the Safety Pilot.")
 PILOT_STATUS = Topic("pilot/status", m.PilotStatus, Qos.STATE, 5, "",
-                     "What the Safety Pilot does, and why.")
+                     "What the Safety Pilot does, and why.", resend_s=1)
 
 WAY_OUT = Topic("way_out/request", m.WayOutRequest, Qos.COMMAND, 0, "",
                 "Let a robot be driven out of a prohibited area, with the emergency stop in force.",

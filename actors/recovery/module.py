@@ -1,8 +1,7 @@
 """What all recovery modules have in common: states, obedience, reports.
 
 A recovery module does what the FTM Manager last told it, and says on `recovery/NAME/state` how
-far it is: at once when that changes, five times a second while it is activated and for a second
-after a change, and once a second while it is idle.
+far it is: at once when that changes, and five times a second.
 
 * *The same command again is one command.* The manager repeats what it wants; only a new decision
   number is a new order, given because the cause has come back.
@@ -81,7 +80,6 @@ class RecoveryModule(Actor):
         self._excused = False
         self._release: RecoveryCommand | None = None
         self._told: RecoveryReport | None = None
-        self._repeats = 0
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
@@ -233,12 +231,9 @@ class RecoveryModule(Actor):
 
     def _tell_change(self) -> None:
         if self.report != self._told:
-            self._repeats = 0
             self._tell()
 
-    @every(1.0 / _REPEATS_PER_S)
+    @every(1.0 / _REPEATS_PER_S, with_heartbeat=True)
     def _repeat(self) -> None:
         self.repeat()
-        self._repeats += 1
-        if self.activated or self._repeats <= _REPEATS_PER_S or self._repeats % _REPEATS_PER_S == 0:
-            self._tell()
+        self._tell()

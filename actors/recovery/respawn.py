@@ -263,6 +263,7 @@ class Respawn(RecoveryModule):
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Ask for the nodes that the command names."""
+        self.read_postings()
         if self._core.order(command.nodes, self.clock.now(), renewed=renewed):
             self._send_requests()
             self.resume(command.reason)
@@ -285,7 +286,7 @@ class Respawn(RecoveryModule):
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, _message: Heartbeat, header: Header) -> None:
         """Hear that a node works."""
-        self._core.beat(header.source, header.incarnation, header.stamp, self.clock.now())
+        self._core.beat(header.source, header.incarnation, header.stamp, self.came_s(header))
         self._settle()
 
     @on(topics.PROCESS_EVENT)

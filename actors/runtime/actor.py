@@ -14,7 +14,7 @@ process is still there.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -48,6 +48,13 @@ from rampart.actors.runtime.timer import Timer, Timers
 __all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
 
 _LATE_DIGITS = 3  # milliseconds
+
+_EARLY_S = 0.05
+"""Simulated seconds by which what is repeated by a timer may be early."""
+
+
+def _ignore(_key: str, _reason: str) -> None:
+    """Do nothing about a posting that is not to be believed: whoever posts it is silent."""
 
 
 def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any, Header], None]:
@@ -93,6 +100,7 @@ class Actor(Declared):
         self._is_at_work = False
         self._sequence = 0
         self._beat_due_s = math.inf
+        self._late_s = 0.0
         self._rejected = 0
         self._abandoned = False
         self._reports = ReportLimit()
@@ -101,12 +109,22 @@ class Actor(Declared):
         self._may_publish.update(
             self.chosen_topic(name.key).key for name in self.named(self.parameters)["published"])
         self._chosen: dict[str, list[Callable[[Any, Header], None]]] = {}
+        self._beside: list[Callable[[], None]] = []
+        self._sent: dict[str, tuple[msgspec.Struct, float]] = {}
+        self._postings: dict[str, Callable[[str, bytes], None]] = {}
+        self._last_read: dict[str, bytes] = {}
+        self._is_reading = False
+        self._has_read_s = -math.inf
 
     # -- what a subclass may override, besides what `Declared` has ---------------------------------
 
     def listens(self, topic: Topic[Any]) -> bool:  # noqa: ARG002
         """Whether this process of the node has any use for one of its inputs."""
         return True
+
+    def reads(self, topic: Topic[Any]) -> Iterable[str]:  # noqa: ARG002
+        """Return the keys of a posted topic, all members of which it hears, that it reads too."""
+        return ()
 
     def on_start(self) -> None:
         """Runs on the loop when the bus is open, before the first message. A raise ends it."""
@@ -199,6 +217,21 @@ class Actor(Declared):
         outlet = topic.at(name or self.name) if topic.is_family else topic.at()
         self._outlets[topic.key if name is None else (topic.key, name)] = outlet
         return outlet
+
+    def read_postings(self) -> None:
+        """Take what was posted for it; to be called before a conclusion is drawn from silence."""
+        self._is_reading, self._has_read_s = True, self.clock.now()
+        for key, receive in self._postings.items():
+            payload = self._bus.posted(key)
+            if payload is not None and payload != self._last_read.get(key):
+                self._last_read[key] = payload
+                receive(key, payload)
+        self._is_reading = False
+
+    def came_s(self, header: Header) -> float:
+        """Return when the message that is being handled came: what was read, when it was posted."""
+        now_s = self.clock.now()
+        return min(header.stamp, now_s) if self._is_reading else now_s
 
     def has_readers(self, topic: Topic[Any]) -> bool:
         """Whether somebody may be listening to one of its topics, as far as the bus can know."""
@@ -303,8 +336,11 @@ class Actor(Declared):
         if not self._is_at_work:
             self._is_at_work = True
             for period_s, method in self._periodic:
-                self._timers.every(period_s, method, getattr(self, method),
-                                   at_once=self._incarnation > 1)
+                call, beat_s = getattr(self, method), self.context.heartbeat_period_s
+                if method in self._with_heartbeat and beat_s <= period_s:
+                    self._beside.append(call)
+                else:
+                    self._timers.every(period_s, method, call, at_once=self._incarnation > 1)
 
     async def _tear_down(self) -> None:
         self._timers.cancel()
@@ -331,6 +367,10 @@ class Actor(Declared):
     def _hear(self, topic: Topic[Any], where: str, handler: Callable[[Any, Header], None]) -> None:
         """Hear what is published from now on, and what was published last if it is no command."""
         self._bus.subscribe(topic, where, self._receiver(topic, handler))
+        if topic.resend_s:
+            for key in self.reads(topic) if "*" in where else (where,):
+                self._postings[key] = self._guard.receiver(
+                    topic, lambda _key, message: handler(message.body, message), _ignore)
         if topic.qos is not Qos.COMMAND:
             self._questions.ask(where, self._receiver(
                 topic, unless_silent(topic, self.clock.now, handler)))
@@ -373,13 +413,24 @@ class Actor(Declared):
         if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
             self.report_diagnostic("not sent", too_long(payload), key)
             return
+        if topic.resend_s and self._bus.post(key, payload):
+            before, now_s = self._sent.get(key), self.clock.now()
+            if before is not None and now_s - before[1] < topic.resend_s - _EARLY_S and (
+                    not topic.compared or before[0] == body):
+                return
+            self._sent[key] = body, now_s
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
 
     def _beat(self) -> None:
         context, now_s = self.context, self.clock.now()
+        if now_s - self._has_read_s > context.heartbeat_period_s / 2:
+            self.read_postings()
+        for call in self._beside:
+            call()
         late_s = max(self._timers.lateness_s(), now_s - self._beat_due_s)  # it waits for mail, too
         self._beat_due_s = now_s + context.heartbeat_period_s
+        late_s, self._late_s = max(late_s, self._late_s), late_s  # who reads may miss one
         if not self.is_well():
             return
         self.publish(HEARTBEAT, Heartbeat(

@@ -43,8 +43,13 @@ def on(topic: Topic[Any]) -> Callable[[F], F]:
     return mark
 
 
-def every(period_s: float) -> Callable[[F], F]:
+def every(period_s: float, *, with_heartbeat: bool = False) -> Callable[[F], F]:
     """Declare a method to be called each `period_s` simulated seconds, first after one period.
+
+    Args:
+        period_s: simulated seconds.
+        with_heartbeat: it may be called more often: with each heartbeat, if these come as often as
+            `period_s`. That wakes the process once instead of twice.
 
     Raises:
         ValueError: the period is no time that can pass.
@@ -55,6 +60,7 @@ def every(period_s: float) -> Callable[[F], F]:
 
     def mark(function: F) -> F:
         function.__dict__["_rampart_period_s"] = period_s
+        function.__dict__["_rampart_with_heartbeat"] = with_heartbeat
         return function
 
     return mark
@@ -82,6 +88,7 @@ class Handlers:
     optional_inputs: ClassVar[tuple[Topic[Any], ...]] = ()
     _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ()
     _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
+    _with_heartbeat: ClassVar[frozenset[str]] = frozenset()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -92,17 +99,21 @@ class Handlers:
                                 "name already; call the handler something else")
         handlers: dict[tuple[str, str], tuple[Topic[Any], str]] = {}
         periodic: dict[str, float] = {}
+        beside: set[str] = set()
         for base in reversed(cls.__mro__):
             for name, member in vars(base).items():
                 for topic in getattr(member, "_rampart_topics", ()):
                     handlers[(topic.key, name)] = (topic, name)
                 if hasattr(member, "_rampart_period_s"):
                     periodic[name] = member._rampart_period_s
+                    if member._rampart_with_heartbeat:
+                        beside.add(name)
         for name, arguments in (*((name, 3) for _, name in handlers.values()),
                                 *((name, 1) for name in periodic)):
             _check_call(cls, name, arguments)
         cls._handlers = tuple(handlers.values())
         cls._periodic = tuple((period, name) for name, period in periodic.items())
+        cls._with_heartbeat = frozenset(beside)
 
     @classmethod
     def inputs(cls) -> tuple[Topic[Any], ...]:

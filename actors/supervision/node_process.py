@@ -22,7 +22,7 @@ from typing import Any
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.run_folder import ROUTERS, is_here, issue, register_of
+from rampart.actors.bus.run_folder import ROUTERS, board_of, is_here, issue, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.machine.unix_peer import process_id
@@ -83,12 +83,13 @@ def _bus_of(layout: Layout, name: str, bus: ZenohBus | None = None) -> ZenohBus:
     """Return the bus of an actor: the one given, under its name from now on, or one of its own."""
     plan = layout.plan
     recorder = RecorderConnection(plan.base_port)
+    board = None if layout.hosts.several else board_of(plan.folder)
     if bus is not None:
-        bus.take_name(name, recorder)
+        bus.take_name(name, recorder, board)
         return bus
     access = access_of(layout, plan.keys) if plan.keys and name in plan.routers else None
     return ZenohBus(name, *_ends(layout, name), recorder, access=access,
-                    credentials=plan.credentials(name))
+                    credentials=plan.credentials(name), board=board)
 
 
 def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:

@@ -24,6 +24,8 @@ import math
 from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, ClassVar
 
+from msgspec.structs import replace
+
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.messages import Heartbeat
@@ -104,6 +106,7 @@ class Supervisor(Actor):
         self._checked_s = self._loop.time()
         self._absence = Absence(self._checked_s)
         self._lateness = Lateness()
+        self._beats: dict[str, tuple[float, Heartbeat]] = {}
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
@@ -219,9 +222,11 @@ class Supervisor(Actor):
         if process.waits or (
                 header.incarnation, message.pid) != (process.incarnation, process.pid):
             return  # said before it was killed, or by another one
-        process.heard_s[header.source] = now_s = self._loop.time()
-        process.lives.heard(now_s)
+        age_s = (self.clock.now() - self.came_s(header)) / self._plan.rate
+        process.heard_s[header.source] = heard_s = self._loop.time() - age_s
+        process.lives.heard(heard_s)
         self._lateness.note(header.source, message.late_s)
+        self._beats[header.source] = header.stamp, message
         process.requested_by = ""
         self._on(process, Event.HEARD)
 
@@ -297,6 +302,7 @@ class Supervisor(Actor):
         """Look for processes whose loops are silent."""
         # Silence counts only while this loop turned (one that was stopped, starved or waiting for a
         # hung spawner has mail to read first), and not if the router died over which it hears all.
+        self.read_postings()
         now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
         stall_s, self._checked_s = now - self._checked_s - period_s, now
         self._absence.note(now)
@@ -483,7 +489,13 @@ class Supervisor(Actor):
             self._incarnation, restarts_of(self._incarnation), self._lateness.of(self.name))
         rows = (row for p in self._processes.values()
                 for row in p.rows(self._lateness.of, self._loop.time()))
-        return own, *rows
+        return own, *map(self._with_beat, rows)
+
+    def _with_beat(self, row: fm.NodeInfo) -> fm.NodeInfo:
+        beat = self._beats.get(row.name)
+        return row if beat is None else replace(
+            row, heard_s=beat[0], rejected_payloads=beat[1].rejected_payloads,
+            overflowed=beat[1].overflowed)
 
     def publish_table(self) -> None:
         """Publish what it keeps."""

@@ -82,7 +82,7 @@ def _filled(family: GaugeMetricFamily | CounterMetricFamily, rows: Iterable[Row]
 def _nodes(now: Exposition) -> Iterator[Metric]:
     table: fm.NodeTable | None = now.picture.latest(ftm_topics.NODES)
     nodes = table.nodes if table else ()
-    beats = sorted(now.picture.beats.items())
+    beats = [n for n in nodes if n.heard_s]
     yield gauge("node_up", "Whether a node runs, as the supervisor sees it.", ("node", "kind"), [
         ((n.name, n.kind), float(n.state is fm.NodeState.RUNNING)) for n in nodes])
     yield gauge("node_incarnation", "Which life of a node this is.", ("node",), [
@@ -90,11 +90,11 @@ def _nodes(now: Exposition) -> Iterator[Metric]:
     yield counter("node_restarts", "How often a node was restarted in this run.", ("node",), [
         ((n.name,), n.restarts) for n in nodes])
     yield gauge("heartbeat_age_seconds", "Simulated seconds since a node's last heartbeat.",
-                ("node",), [((name,), max(0.0, now.time_s - beat.heard_s)) for name, beat in beats])
+                ("node",), [((n.name,), max(0.0, now.time_s - n.heard_s)) for n in beats])
     yield counter("rejected_payloads", "Payloads that a node refused, in this life.", ("node",), [
-        ((name,), beat.message.rejected_payloads) for name, beat in beats])
+        ((n.name,), n.rejected_payloads) for n in beats])
     yield counter("overflowed_commands", "Commands that found a node's mailbox full, in this life.",
-                  ("node",), [((name,), beat.message.overflowed) for name, beat in beats])
+                  ("node",), [((n.name,), n.overflowed) for n in beats])
     yield counter("process_events", "What happened to processes.", ("node", "event"),
                   sorted(now.picture.process_events_total.items()))
 

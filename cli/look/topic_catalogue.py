@@ -160,7 +160,8 @@ def _who(topic: Topic[Any], of_all: Collection[Topic[Any]],
 
 def rate(topic: Topic[Any]) -> str:
     """Return the nominal rate of a topic in words."""
-    return f"{topic.rate_hz:g} Hz" if topic.rate_hz else "on event"
+    sent = f", sent every {topic.resend_s:g} s" if topic.resend_s else ""
+    return f"{topic.rate_hz:g} Hz{sent}" if topic.rate_hz else "on event"
 
 
 def _messages(used: Iterable[Topic[Any]]) -> list[type[msgspec.Struct]]:

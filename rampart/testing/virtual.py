@@ -217,7 +217,7 @@ class VirtualSystem:
         return heard
 
     def overhear(self, name: str) -> list[tuple[str, Any]]:
-        """Return a list to which all that an actor publishes is added: key, and body as it travels.
+        """Return a list to which all that an actor sends is added: key, and body as it travels.
 
         The key is below `rampart/`; the body consists of dictionaries, lists and numbers.
         """

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from rampart.actors.bus.board import MemoryBoard
 from rampart.actors.bus.bus import Deliver
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.sim.virtual.virtual_loop import VirtualLoop
@@ -46,6 +47,7 @@ class Hub:
                  ) -> None:
         self._link = link
         self.taps: list[Tap] = []
+        self.board = MemoryBoard()
         self.alive: dict[str, set[int]] = {}
         self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
         self._routes: dict[str, dict[str, list[Route]]] = {}
@@ -166,6 +168,17 @@ class VirtualBus:
                     virtual.post_at(at_s, deliver, key, payload)
         if topic.qos is not Qos.COMMAND:
             self.latest_sent[key] = payload
+
+    def post(self, key: str, payload: bytes) -> bool:
+        """Put a message where the other nodes look."""
+        if self._open:
+            self.latest_sent[key] = payload
+            self._hub.board.post(key, payload)
+        return True
+
+    def posted(self, key: str) -> bytes | None:
+        """Return the newest message that was posted on a key."""
+        return self._hub.board.read(key)
 
     def answer(self, route: Route, key: str) -> None:
         """Send what was published last on a key by one route, past the taps."""

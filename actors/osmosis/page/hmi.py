@@ -58,6 +58,7 @@ class OsmosisHmi(Hmi):
     shown = (*Hmi.shown, topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE,
              topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES, topics.LIGHT_MEASURED,
              topics.BASE_STATUS)
+    drawn = (topics.SCAN, topics.UPPER_SCAN)
     _state: OsmosisState
     _operating: Driving
 

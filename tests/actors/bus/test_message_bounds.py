@@ -13,7 +13,7 @@ from rampart.actors.bus import envelope
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, TEXT_CHARS, bare, clip, oversized
-from rampart.actors.bus.envelope import ArrivalGuard
+from rampart.actors.bus.envelope import ArrivalGuard, decode
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
@@ -129,7 +129,10 @@ def lived(kind, during=lambda _hub: None):
             during(system.bus)
             await asyncio.sleep(1.0)
             await system.stop("node")
-            return sent
+            posted = system.hub.board.read(bus_topics.HEARTBEAT.at("node"))
+            assert posted is not None
+            beat = msgspec.to_builtins(decode(bus_topics.HEARTBEAT, posted)[1])
+            return [*sent, ("heartbeat/node", beat)]
 
     return run(scenario)
 

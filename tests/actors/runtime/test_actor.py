@@ -16,6 +16,7 @@ import pytest
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.board import MemoryBoard
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.envelope import ArrivalGuard, encode
 from rampart.actors.bus.zenoh_bus import ZenohBus
@@ -396,7 +397,7 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
     assert len(classes) > 15
     own = assigned(Actor) | {name for base in (Actor, Declared) for name in vars(base)
                              if name.startswith("_") and not name.startswith("__")}
-    own -= {"_handlers", "_periodic"}  # of each class its own
+    own -= {"_handlers", "_periodic", "_with_heartbeat"}  # of each class its own
     taken = {cls.__name__: names for cls in classes if (names := assigned(cls) & own)}
     assert taken == {}
 
@@ -431,8 +432,14 @@ def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(
 
 async def test_the_heart_beats_at_the_period_that_the_system_states():
     hub, beats = Hub(), []
-    hub.taps.append(lambda at_s, _source, key, _payload: key == bus_topics.HEARTBEAT.at("talker")
-                    and beats.append(at_s))
+
+    class Noted(MemoryBoard):
+        def post(self, key: str, payload: bytes) -> bool:
+            if key == bus_topics.HEARTBEAT.at("talker"):
+                beats.append(asyncio.get_running_loop().time())
+            return super().post(key, payload)
+
+    hub.board = Noted()
     clock = Clock(asyncio.get_running_loop().time(), 100.0)
     node = Talker(Context("talker", 1, clock, VirtualBus(hub, "talker"), heartbeat_period_s=3.0))
     task = asyncio.create_task(node.run())

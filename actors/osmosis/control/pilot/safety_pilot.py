@@ -115,6 +115,7 @@ class SafetyPilot(Actor):
     @every(_PERIOD_S)
     def repeat(self) -> None:
         """Repeat the command in force, unless fresh ones go out at this rate anyway."""
+        self.read_postings()
         if self.clock.now() - self._sent_s > 1.2 * _PERIOD_S:
             self._act()
 

@@ -1,0 +1,83 @@
+"""What is posted is read as it was posted, or not at all."""
+
+import os
+import socket
+
+import pytest
+
+from rampart.actors.bus.board import MOST_BYTES, FileBoard
+from rampart.actors.bus.zenoh_bus import ZenohBus
+
+KEY = "rampart/heartbeat/a"
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Return the file of a posting that was read once."""
+    FileBoard(str(tmp_path)).post(KEY, b"message")
+    (file,) = tmp_path.iterdir()
+    assert FileBoard(str(tmp_path)).read(KEY) == b"message"
+    return file
+
+
+def test_the_newest_is_read_by_another_process_of_the_host(tmp_path):
+    first, second = FileBoard(str(tmp_path)), FileBoard(str(tmp_path))
+    assert first.post(KEY, b"a long message")
+    assert first.post(KEY, b"short")
+    assert second.read(KEY) == b"short"
+    assert second.post(KEY, b"of the next incarnation")
+    assert first.read(KEY) == b"of the next incarnation"
+    assert first.read("rampart/heartbeat/b") is None
+
+
+@pytest.mark.parametrize("place", range(0, 15, 2))
+def test_a_damaged_posting_counts_as_none(file, place):
+    data = bytearray(file.read_bytes())
+    data[place] ^= 0x10
+    file.write_bytes(data)
+    assert FileBoard(str(file.parent)).read(KEY) is None
+
+
+@pytest.mark.parametrize("length", range(15))
+def test_a_posting_whose_writer_died_counts_as_none_until_the_next(file, length):
+    os.truncate(file, length)
+    board = FileBoard(str(file.parent))
+    assert board.read(KEY) is None
+    assert board.post(KEY, b"next")
+    assert board.read(KEY) == b"next"
+
+
+def make_socket(file):
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(str(file))
+
+
+@pytest.mark.parametrize("make", [
+    os.mkdir, os.mkfifo, make_socket, lambda file: file.symlink_to("/dev/zero"),
+    lambda file: file.write_bytes(bytes(10 * MOST_BYTES))])
+def test_what_is_no_posting_counts_as_none_and_keeps_no_reader_waiting(file, make):
+    file.unlink()
+    make(file)
+    assert FileBoard(str(file.parent)).read(KEY) is None
+
+
+@pytest.mark.parametrize("make", [os.mkdir, os.mkfifo, make_socket,
+                                  lambda file: file.symlink_to("/dev/full")])
+def test_what_cannot_be_posted_is_to_be_sent(file, make):
+    file.unlink()
+    make(file)
+    assert not FileBoard(str(file.parent)).post(KEY, b"message")
+
+
+def test_what_is_too_long_is_to_be_sent_and_so_is_everything_after_the_end_of_a_run(tmp_path):
+    board = FileBoard(str(tmp_path / "run"))
+    assert not board.post(KEY, b"message")
+    (tmp_path / "run").mkdir()
+    assert board.post(KEY, bytes(MOST_BYTES))
+    assert not board.post(KEY, bytes(MOST_BYTES + 1))
+
+
+def test_of_several_hosts_everything_is_to_be_sent():
+    bus = ZenohBus("a", [])
+    assert not bus.post(KEY, b"message")
+    assert bus.posted(KEY) is None
