@@ -357,9 +357,11 @@ class Started:
     """What `OtherHost` has of a launcher; it starts nothing."""
 
     failure = ""
+    has_joined = False
 
-    def __init__(self, plan):
-        self.plan = plan
+    def join(self, plan, incarnations):
+        self.plan, self.has_joined = plan, True
+        assert incarnations == {}
 
     async def load(self):
         pass
@@ -382,8 +384,10 @@ async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path):
     contents = contents_of(plan, load_application(plan, load_system(plan)))
     first = Meeting(plan, ("ground",), contents, dict)
     await first.open("127.0.7.1", port)
-    ground = OtherHost(own, said.append)
-    ground.launcher = Started((await ground.join()).plan)
+    link, root = socket.socketpair()
+    ground = OtherHost(own, said.append, link)
+    ground.launcher = Started()
+    await ground.join()
     starting = asyncio.create_task(ground.start())
     await first.all_ready(said.append)
     first.begin(100.0)
@@ -396,3 +400,5 @@ async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path):
         await asyncio.wait_for(ground.stay(), 15)
     await ground.close()
     await again.close()
+    link.close()
+    root.close()
