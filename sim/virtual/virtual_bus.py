@@ -41,12 +41,14 @@ class Hub:
 
     Args:
         link: returns the one link from a node to another; None if everything arrives at once.
+        several_hosts: the nodes are on several hosts, and so nothing is posted.
     """
 
-    def __init__(self, link: Callable[[str, str], Link | None] = lambda _source, _reader: None
-                 ) -> None:
+    def __init__(self, link: Callable[[str, str], Link | None] = lambda _source, _reader: None,
+                 *, several_hosts: bool = False) -> None:
         self._link = link
         self.taps: list[Tap] = []
+        self.several_hosts = several_hosts
         self.board = MemoryBoard()
         self.alive: dict[str, set[int]] = {}
         self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
@@ -170,7 +172,9 @@ class VirtualBus:
             self.latest_sent[key] = payload
 
     def post(self, key: str, payload: bytes) -> bool:
-        """Put a message where the other nodes look."""
+        """Put a message where the other nodes look; False if not all nodes are on this host."""
+        if self._hub.several_hosts:
+            return False
         if self._open:
             self.latest_sent[key] = payload
             self._hub.board.post(key, payload)

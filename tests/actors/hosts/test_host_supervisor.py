@@ -130,7 +130,7 @@ class World:
         self.clock = Clock(loop.time(), source=loop.time)
         self.is_cut = False
         self.delay_s = DELAY_S
-        self.hub = Hub(self.link)
+        self.hub = Hub(self.link, several_hosts=True)
         self.checkpoints = checkpoints
         self.file = folder / "two.toml"
         self.file.write_text(two_hosts({"robot": "10.0.0.1", "ground": "10.0.0.2"},
