@@ -30,6 +30,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
+from websockets.exceptions import InvalidState
 
 from rampart.actors.web import guests
 from rampart.actors.web.guests import Bucket, Guest, Guests
@@ -283,7 +284,8 @@ class WebServer:
         for arriving in self._arriving:
             arriving.cancel()
         for connection in list(self._state.connections):
-            connection.shutdown()
+            with contextlib.suppress(InvalidState):  # it is closing already
+                connection.shutdown()
 
     async def _accept(self) -> None:
         """Take one connection after the other, at the pace that leaves time for those there are."""

@@ -136,7 +136,8 @@ def test_the_summary_says_what_was_and_what_is_wrong(file):
     assert lines[0] == ("0.33 hours, 1 missions: 1 of 1 safe, 1 successful, 0 cut, 1 resets of the "
                         "emergency stop")
     assert lines[1].startswith("2 faults: 1 of processes, 1 of messages")
-    assert any("memory of its own, launcher" in line and "within noise" in line for line in lines)
+    assert any(f"memory of its own, {LAUNCHER}" in line and "within noise" in line
+               for line in lines)
     assert wrong(soak.records) == []
     soak.add("blow", at_s=20.0, mission=0, into_s=20.0, name="hmi", way="STOP", pid=8, back_s=None,
              absent=False)
@@ -170,7 +171,7 @@ def test_routers_that_change_over_do_not_grow_and_a_leak_of_theirs_is_found(file
 
 
 @pytest.mark.parametrize(("name", "verdict"), [
-    ("launcher", "within noise"), ("router_a", "within noise"),
+    (LAUNCHER, "within noise"), ("router_a", "within noise"),
     ("localization", "grows, less than counts")])
 def test_what_is_known_to_grow_hides_nothing(file, name, verdict):
     soak = Soak(file, 1)

@@ -74,6 +74,7 @@ async def test_a_page_that_reconnects_shows_the_whole_new_picture_and_nothing_of
                 await tab.until(f"{events('active')} === 'FTM4'")
                 await tab.until("document.querySelectorAll('#events .fault').length === 1")
         await tab.until("document.body.classList.contains('offline')")
+        world.others.manager()
         async with world.hmi(incarnation=2, hmi_port=port, system=SPEC):
             async with repeated(world.others.manager):
                 await tab.until(f"{LIVE} && {events('active')} === ''"

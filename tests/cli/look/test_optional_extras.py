@@ -12,8 +12,6 @@ import httpx
 import msgspec
 import pytest
 
-from rampart.actors.bus import messages as bm
-from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.ftm import messages as fm
@@ -91,7 +89,8 @@ def test_the_handbook_lists_every_metric_with_its_labels():
 
     picture = busy()
     for topic, body in (
-            (bus_topics.HEARTBEAT, bm.Heartbeat(1, 0, 0.1, 0, 0)),
+            (ftm_topics.NODES, fm.NodeTable((fm.NodeInfo(
+                "hmi", "operator", 13, fm.NodeState.RUNNING, 1, 0, heard_s=1.0),))),
             (ftm_topics.PROCESS_EVENT, fm.ProcessEvent("hmi", "crashed", 1, 1, "", "")),
             (ftm_topics.RECOVERY, fm.RecoveryReport(
                 fm.RecoveryState.ACTIVATED, fm.RecoveryPhase.ACTING, 1, ""))):

@@ -214,8 +214,8 @@ REFUSED = {
                            ["$.node[4].name = 'supervisor': duplicate name, reserved"]),
     "reserved name of a router": ([('name = "hmi"', 'name = "router_b"')],
                                   ["$.node[4].name = 'router_b': duplicate name, reserved"]),
-    "reserved process": ([('name = "hmi"', 'name = "hmi"\nprocess = "spawner"')],
-                         ["node hmi: process = 'spawner': reserved"]),
+    "reserved process": ([('name = "hmi"', 'name = "hmi"\nprocess = "pool"')],
+                         ["node hmi: process = 'pool': reserved"]),
     "duplicate mechanism": ([('name = "FTM2"', 'name = "FTM1"')],
                             ["$.mechanism[1].name = 'FTM1': duplicate name, already at "
                              "$.mechanism[0].name; nodes, detection and recovery modules and "
