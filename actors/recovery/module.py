@@ -177,6 +177,7 @@ class RecoveryModule(Actor):
             self._obey_release(message)
 
     def _obey_order(self, message: RecoveryCommand) -> None:
+        self.read_postings()
         renewed = self.activated and message.decision != self.decision
         self.decision = message.decision
         if not self.activated:
@@ -233,7 +234,7 @@ class RecoveryModule(Actor):
         if self.report != self._told:
             self._tell()
 
-    @every(1.0 / _REPEATS_PER_S, with_heartbeat=True)
+    @every(1.0 / _REPEATS_PER_S)
     def _repeat(self) -> None:
         self.repeat()
         self._tell()

@@ -263,7 +263,6 @@ class Respawn(RecoveryModule):
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Ask for the nodes that the command names."""
-        self.read_postings()
         if self._core.order(command.nodes, self.clock.now(), renewed=renewed):
             self._send_requests()
             self.resume(command.reason)

@@ -220,6 +220,8 @@ class Actor(Declared):
 
     def read_postings(self) -> None:
         """Take what was posted for it; to be called before a conclusion is drawn from silence."""
+        if self._is_reading:  # a handler of one that is being read asks for more
+            return
         self._is_reading, self._has_read_s = True, self.clock.now()
         for key, receive in self._postings.items():
             payload = self._bus.posted(key)

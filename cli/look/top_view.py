@@ -150,11 +150,19 @@ def _decisions(frame: Frame, count: int) -> list[Text]:
 # -- the tables ---------------------------------------------------------------------------------
 
 
+def _row(node: fm.NodeInfo) -> dict[str, Any]:
+    """Return what is shown of a node."""
+    row = msgspec.structs.asdict(node)
+    for counted in ("heard_s", "rejected_payloads", "overflowed"):  # in the metrics
+        del row[counted]
+    return row
+
+
 def _rows(frame: Frame) -> list[Mapping[str, Any]]:
     """Return a row for each process: those in trouble first, then as asked for."""
     table: fm.NodeTable | None = frame.picture.latest(ftm_topics.NODES)
     rows: list[Mapping[str, Any]] = [
-        *map(msgspec.structs.asdict, table.nodes if table else ()), *frame.guards]
+        *map(_row, table.nodes if table else ()), *frame.guards]
 
     def place(row: Mapping[str, Any]) -> tuple[bool, float]:
         busy = frame.usage.get(row["name"], {}).get("cpu", 0.0) if frame.by_cpu else 0.0

@@ -90,7 +90,7 @@ def test_the_handbook_lists_every_metric_with_its_labels():
     picture = busy()
     for topic, body in (
             (ftm_topics.NODES, fm.NodeTable((fm.NodeInfo(
-                "hmi", "operator", 13, fm.NodeState.RUNNING, 1, 0, heard_s=1.0),))),
+                "hmi", "support", 1, fm.NodeState.RUNNING, 1, 0, heard_s=0.5),))),
             (ftm_topics.PROCESS_EVENT, fm.ProcessEvent("hmi", "crashed", 1, 1, "", "")),
             (ftm_topics.RECOVERY, fm.RecoveryReport(
                 fm.RecoveryState.ACTIVATED, fm.RecoveryPhase.ACTING, 1, ""))):
