@@ -21,6 +21,10 @@ class Lateness:
         """Forget what is older than a period."""
         self._before, self._now = self._now, {}
 
+    def count(self, late_s: float) -> int:
+        """Return how many nodes were late by so many simulated seconds or more."""
+        return sum(self.of(node) >= late_s for node in self._now.keys() | self._before.keys())
+
     def of(self, node: str) -> float:
         """Return by how many simulated seconds a node was late at most."""
         return max(self._now.get(node, 0.0), self._before.get(node, 0.0)) or ON_TIME

@@ -313,7 +313,9 @@ class Supervisor(Actor):
         if missed_s:
             self.excuse(now, missed_s)
         late = sum(process.is_late(now, self._timeout_s) for process in self._processes.values())
-        many = late >= max(MANY, MANY_SHARE * len(self._processes))
+        # Late loops that still beat are the machine's overload as much as missing heartbeats.
+        behind = self._lateness.count(self._spec.timing.heartbeat_timeout_s / 4)
+        many = max(late, behind) >= max(MANY, MANY_SHARE * len(self._processes))
         for process in self._processes.values():
             silence = process.silence(now, self._timeout_s, process.handle.usage, many=many)
             if silence:

@@ -79,7 +79,7 @@ def test_it_becomes_active_exactly_when_the_age_reaches_the_timeout():
     assert monitor.reason == "command not updated for 0.3 s"
 
 
-def test_the_actor_reports_at_once_and_repeats_at_5_hz():
+def test_the_actor_reports_at_once_and_repeats_what_has_not_changed_each_second():
     async def scenario() -> None:
         async with System() as system:
             ear = system.start("ear", Ear)
@@ -92,7 +92,7 @@ def test_the_actor_reports_at_once_and_repeats_at_5_hz():
             await asyncio.sleep(2.0)
             first = next(at for at, report in ear.heard if report.state == "active")
             assert first == pytest.approx(sent_s + 0.3, abs=1e-6)
-            assert len(ear.heard) == pytest.approx(2.0 * 5, abs=2)
+            assert len(ear.heard) == pytest.approx(2.0 + 1, abs=1)
             for _ in range(10):
                 source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
                 await asyncio.sleep(0.05)
@@ -254,9 +254,9 @@ def test_a_respawned_module_without_a_monitor_is_silent_until_it_says_that_it_kn
             await asyncio.sleep(1.0)
             assert ear.heard == []
             source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
-            await asyncio.sleep(1.0)
+            await asyncio.sleep(3.0)
             assert ear.states == ["idle"]
-            assert len(ear.heard) == pytest.approx(5, abs=1)
+            assert len(ear.heard) == pytest.approx(3, abs=1)
             source.publish(topics.COMMAND, m.Twist(1.5, 0.0))
             await system.settle()
             source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
@@ -275,7 +275,7 @@ def test_a_respawned_stand_in_is_idle_and_not_silent_for_ever():
             await system.kill("D_LEVEL")
             ear.heard.clear()
             system.start("D_LEVEL", StubDetection)
-            await asyncio.sleep(1.0)
+            await asyncio.sleep(4.5)
             assert ear.states == ["idle"]
             assert len(ear.heard) >= 4
 

@@ -357,7 +357,6 @@ def test_a_loop_that_only_listens_adds_what_the_other_does_until_that_is_silent(
 
 def test_a_life_that_is_accused_by_its_number_is_respawned_though_it_is_well():
     core = RespawnCore(("a",), first_request=100, start_s=0.0)
-    core.peer("a", 3, True, 0.0)
     core.beat("a", 3, 1.0, 1.0)
     assert core.order(["a#3"], 1.01, renewed=False)
     assert core.take_requests() == [Ask(100, "a", 3)]
@@ -367,7 +366,6 @@ def test_a_life_that_is_accused_by_its_number_is_respawned_though_it_is_well():
 
 def test_a_later_life_is_not_accused_by_the_number_of_an_earlier_one():
     core = RespawnCore(("a",), first_request=100, start_s=0.0)
-    core.peer("a", 4, True, 0.0)
     core.beat("a", 4, 1.0, 1.0)
     core.order(["a#2"], 1.01, renewed=False)
     assert core.take_requests() == [Ask(100, "a", 3)]
