@@ -36,10 +36,9 @@ WAIT_S = 0.05
 """A fork takes a millisecond or two. So long its caller stands still for it, if it waits for no
 other one."""
 
-PATIENCE_S, PATIENCE_MAX_S = 3.0, 24.0
-"""A request that is not answered is made again, each time later. At a start the root has all of
-them at once, and one that is made again too soon makes the queue longer. The death of a process
-that has not answered is known at once."""
+PATIENCE_S, PATIENCE_MAX_S = 0.25, 8.0
+"""A request that is not answered is made again; each time later, for on a machine that is busy
+enough the new process cannot answer sooner either."""
 
 
 class ForkError(Exception):
