@@ -51,6 +51,9 @@ class Bus(Protocol):
     def post(self, key: str, payload: bytes) -> bool:
         """Put a message where the nodes of this host look; False if it has to be sent instead."""
 
+    def record(self, key: str, payload: bytes) -> None:
+        """Have a message that was posted and is not sent recorded: a recording has no gaps."""
+
     def posted(self, key: str) -> bytes | None:
         """Return the newest message that was posted by a node of this host; None if none was."""
 
@@ -112,6 +115,10 @@ class SharedBus:
     def post(self, key: str, payload: bytes) -> bool:
         """Post by the owner."""
         return self._open and self._owner.post(key, payload)
+
+    def record(self, key: str, payload: bytes) -> None:
+        """Record by the owner."""
+        self._owner.record(key, payload)
 
     def posted(self, key: str) -> bytes | None:
         """Return what is posted."""

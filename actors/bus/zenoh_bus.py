@@ -213,6 +213,11 @@ class ZenohBus:
         self._latest[key] = payload
         return True
 
+    def record(self, key: str, payload: bytes) -> None:
+        """Have a message that was posted and is not sent recorded: a recording has no gaps."""
+        if self._recorder is not None:
+            self._recorder.take(key, payload)
+
     def posted(self, key: str) -> bytes | None:
         """Return the newest message that was posted by a node of this host."""
         return None if self._board is None else self._board.read(key)

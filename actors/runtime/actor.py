@@ -419,6 +419,7 @@ class Actor(Declared):
             before, now_s = self._sent.get(key), self.clock.now()
             if before is not None and now_s - before[1] < topic.resend_s - _EARLY_S and (
                     not topic.compared or before[0] == body):
+                self._bus.record(key, payload)
                 return
             self._sent[key] = body, now_s
         for _ in range(copies):
