@@ -67,11 +67,14 @@ def regular_topics(member: Member) -> list[Topic[Any]]:
     return [*own, HEARTBEAT]
 
 
-def output_of(member: Member, said: Sequence[Heard]) -> str | None:
-    """Return the key of a node's output, by what was heard; None if nothing was."""
+def output_of(member: Member, said: Sequence[Heard]) -> str:
+    """Return the key of a node's output, by what was heard; that of its heartbeat if nothing was.
+
+    A heartbeat is sent at the start of each process, and seldom afterwards.
+    """
     keys = [one.key for one in said if one.source == member.name]
     return next((key for topic in regular_topics(member) for key in keys
-                 if topic.member(key) is not None), None)
+                 if topic.member(key) is not None), HEARTBEAT.key.replace("{name}", member.name))
 
 
 def measure_restart(file: Path, names: Sequence[str], kills: int, folder: Path,
@@ -112,7 +115,7 @@ def _decides(line: Line) -> bool:
             and bool(found.body["recoveries"]))
 
 
-def _victim(system: System, name: str, key: str | None) -> Victim:
+def _victim(system: System, name: str, key: str) -> Victim:
     def process(_found: Heard) -> int:
         running = [one for one in find_processes(system.port) if name in one.names]
         if not running:
@@ -129,6 +132,6 @@ def _victim(system: System, name: str, key: str | None) -> Victim:
             and name in found.body["nodes"])
 
     return Victim(
-        name, key or "nothing was heard of it", ear=system.ear, keeper=system.program,
+        name, key, ear=system.ear, keeper=system.program,
         teller=system.ear, ended=detected, decided=_decides,
         finds=lambda found: found.source == name and found.key == key, pid_of=process)

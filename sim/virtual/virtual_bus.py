@@ -180,7 +180,7 @@ class VirtualBus:
             self._hub.board.post(key, payload)
         return True
 
-    def record(self, key: str, payload: bytes) -> None:  # noqa: ARG002
+    def record(self, key: str, payload: bytes) -> None:
         """Nothing: a virtual run is recorded from what is sent."""
 
     def posted(self, key: str) -> bytes | None:
