@@ -63,7 +63,7 @@ async def test_the_next_supervisor_is_there_within_thirty_milliseconds_of_the_la
                 await asyncio.sleep(0.001)
             took.append(time.monotonic() - begun_s)
             await eventually(lambda n=life: witness.state("supervisor") == ("running", n))
-        assert min(took) < 0.03  # the mechanism's own time: others may have the processor
+        assert sorted(took)[len(took) // 2] < 0.03
 
 
 @pytest.mark.processes
