@@ -42,7 +42,7 @@ campaign: setup
 # Kills the same node under dora-rs, supervisord, circus, a loop and Rampart; two minutes. The peers
 # are installed into an environment of their own. BENCH="--kills 30" says more.
 bench-peers: setup .venv-peers/installed
-	$(BIN)/rampart bench --only peers $(BENCH)
+	$(BIN)/python -m benchmarks.peers $(BENCH)
 
 .venv-peers/installed: benchmarks/peers.txt
 	$(PYTHON) -m venv .venv-peers

@@ -19,7 +19,7 @@ Examples:
   rampart tree                                   see fault tree, FTMTree and orders
   rampart campaign --paper                       break it a hundred times, and count
   rampart verify                                 prove it, or show where it fails
-  rampart bench                                  how fast is it, beside its peers?
+  rampart bench                                  kill each node, and time its restart
 `rampart VERB --help` shows more.
 """
 
@@ -38,10 +38,10 @@ from rampart.cli.analyse import (
     tree_verbs,
     verify_verb,
 )
-from rampart.cli.bench import verb as bench_verb
 from rampart.cli.look import ros_verbs, serving_verbs, topic_verbs
 from rampart.cli.operate import (
     adapt_verb,
+    bench_verb,
     inject_verbs,
     keys_verb,
     node_verbs,
@@ -54,7 +54,7 @@ from rampart.cli.verbs import FORMATTER, PORT, help_of
 from rampart.files import interrupts, streams, working_folder
 
 _OF_A_RUN = (node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs,
-             adapt_verb, record_verbs, keys_verb, token_verbs)
+             adapt_verb, record_verbs, keys_verb, token_verbs, bench_verb)
 _OF_A_SYSTEM = (check_verbs, cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
 # Each adds its verbs, in this order in the help.
 
@@ -74,7 +74,6 @@ def build_parser() -> argparse.ArgumentParser:
     verbs.add_parser("campaign", add_help=False, help="run many missions with faults in them")
     for module in _OF_A_SYSTEM:
         module.add(verbs)
-    bench_verb.add(verbs)
     common = argparse.ArgumentParser(add_help=False)
     PORT(common)
     for found in sorted(entry_points(group="rampart.verbs"), key=lambda verb: verb.name):

@@ -27,7 +27,7 @@ ROOMS = (
     "actors.ros2.translation", "actors.ros2", "actors.system", "manager.actor",
     "actors.access", "actors.supervision", "actors.hosts", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
-    "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.bench",
+    "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse",
     "cli.host", "cli.run", "cli.new", "cli.main",
     "testing",
 )

@@ -182,7 +182,7 @@ async def test_it_ignores_no_signal_that_this_process_ignores(tmp_path):
         started = Started(tmp_path, "grep SigIgn /proc/$$/status")
         await started.end()
         ignored = int(started.log.read_text().split()[1], 16)
-        # 32 and 33 are the C library's own: what ignores them cannot be undone through it (signal(7))
+        # signal(7): 32 and 33 are the C library's own, and cannot be reset through it
         assert not [one for one in signal.valid_signals() if ignored >> (one - 1) & 1]
     finally:
         for number, handler in zip((signal.SIGINT, signal.SIGHUP), before, strict=True):

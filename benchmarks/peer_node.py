@@ -1,6 +1,6 @@
-"""The node that every peer keeps alive: Zenoh and numpy, one input, one output.
+"""The node that each keeper of `benchmarks.peers` restarts: Zenoh and numpy, an input, an output.
 
-A program of its own that imports nothing of Rampart: `python -P peer_node.py NAME ENDPOINT`.
+It imports nothing of Rampart: `python -P peer_node.py NAME ENDPOINT`.
 """
 
 import time
@@ -17,7 +17,7 @@ import zenoh  # noqa: E402
 
 
 def main(name: str, endpoint: str) -> None:
-    """Hear scans, and publish the mean of each with who has computed it."""
+    """Publish the mean of each scan, and which process has computed it."""
     config = zenoh.Config()
     for key, value in (("mode", "client"), ("connect/endpoints", [endpoint]),
                        ("scouting/multicast/enabled", False), ("scouting/delay", 0)):
@@ -34,4 +34,7 @@ def main(name: str, endpoint: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:3])
+    if sys.argv[1:] in ([], ["--help"]):
+        print("usage: peer_node.py NAME ENDPOINT\n\n" + __doc__)
+    else:
+        main(*sys.argv[1:3])

@@ -1,1 +1,0 @@
-"""What the benchmark runs in processes of their own."""

@@ -1,0 +1,256 @@
+"""`rampart bench`: how soon each node of a running system works again after a SIGKILL.
+
+Times count from the call of kill(2) until this process receives the replacement's first message.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import random
+import signal
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topics import HEARTBEAT
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.system.layout import Layout
+from rampart.actors.system.members import Member, load_application
+from rampart.cli.output import (
+    UsageError,
+    between,
+    print_json,
+    print_table,
+    progress,
+    refusing,
+    unknown,
+    warn,
+)
+from rampart.cli.session import Session, connect
+from rampart.cli.verbs import JSON, PORT, add_verb, several, whole
+from rampart.manager.spec.nodes import Kind
+
+WARM_S = 3.0
+"""Real seconds to find out on which topics each node publishes."""
+
+BACK_S = 20.0
+"""Real seconds within which a replacement has to publish."""
+
+CALM_S = 1.0
+"""Real seconds between two kills: detection modules become idle, the pool is full again."""
+
+MOST_KILLS = 1000
+
+_ALIKE = (Kind.DETECTION, Kind.RECOVERY)
+
+
+class Spread(msgspec.Struct, frozen=True):
+    """Samples in four numbers: how many, median, 5th and 95th percentile."""
+
+    n: int
+    median: float
+    low: float
+    high: float
+
+
+class Row(msgspec.Struct):
+    """What was measured of a node, milliseconds.
+
+    Attributes:
+        node: its name.
+        topic: on which its output was awaited.
+        detected_ms: until a detection module or the supervisor reported it; a sample per kill.
+        output_ms: until its replacement published; a sample per kill.
+        failure: why it was not killed again; "" if it was.
+    """
+
+    node: str
+    topic: str
+    detected_ms: list[float] = []
+    output_ms: list[float] = []
+    failure: str = ""
+
+
+def add(verbs: Any) -> None:
+    """Add the verb to the parser."""
+    add_verb(verbs, "bench", "how soon each node works again after a SIGKILL", bench, PORT,
+             several("--node", "NAME", "kill only this node; may be repeated (default: all nodes, "
+                     "one detection and one recovery module)"),
+             whole("--kills", "N", "kills of each node (default 5)", 5), JSON)
+
+
+async def bench(options: argparse.Namespace) -> int:
+    """Measure restarts.
+
+    Kill each node of the running system with SIGKILL, one after the other, and measure
+    how long it takes until a detection module or the supervisor reports it, and until
+    its replacement publishes. Kills go in rounds, so a slow moment of the machine
+    affects all nodes. The system should not do anything that matters meanwhile.
+
+    Examples:
+      rampart bench
+      rampart bench --node localization --kills 20
+    """
+    between("--kills", options.kills, 1, MOST_KILLS)
+    async with connect(options.port) as session:
+        run = session.run
+        if run.replay_of:
+            raise UsageError(f"port {run.base_port} is a replay of {run.replay_of}: no node runs")
+        with refusing(ValueError):
+            members = {name: member for name, member in members_of(run.system_file).items()
+                       if name in run.nodes}
+        names = options.node or usual(members)
+        for name in names:
+            if name not in members:
+                raise unknown("node", name, members)
+        with progress() as show:
+            rows = await Restarts(session, {name: members[name] for name in names}).measure(
+                options.kills, show)
+    failed = [row for row in rows if row.failure]
+    if options.json:
+        print_json([{**msgspec.to_builtins(row), "detected": spread(row.detected_ms),
+                     "output": spread(row.output_ms)} for row in rows])
+    else:
+        print_table(("node", "topic", "kills", "detected, ms", "output, ms (5 to 95 %)"), [
+            (row.node, row.topic, len(row.output_ms), in_words(row.detected_ms),
+             in_words(row.output_ms)) for row in rows])
+    for row in failed:
+        warn(f"{row.node}: {row.failure}")
+    return 1 if failed else 0
+
+
+def members_of(system_file: str) -> dict[str, Member]:
+    """Return what can be killed of a system, by name: all but its world.
+
+    Raises:
+        ValueError: it cannot be loaded.
+    """
+    plan = RunPlan(system_file=system_file)
+    spec = load_system(plan)
+    layout = Layout(plan, spec, load_application(plan, spec))
+    return {name: layout.members[name] for name in layout.unit_of
+            if layout.members[name].kind is not Kind.WORLD}
+
+
+def usual(members: Mapping[str, Member]) -> list[str]:
+    """Return the default nodes: all of them, but of modules, which are alike, one of each kind."""
+    first = {kind: next((m.name for m in members.values() if m.kind is kind), "")
+             for kind in _ALIKE}
+    return [name for name, member in members.items()
+            if member.kind not in _ALIKE or first[member.kind] == name]
+
+
+def regular_topics(member: Member) -> list[Topic[Any]]:
+    """Return what a node publishes regularly, the fastest first, and its heartbeat last."""
+    own = sorted((t for t in member.actor.outputs if t.rate_hz > 0), key=lambda t: -t.rate_hz)
+    return [*own, HEARTBEAT]
+
+
+class Restarts:
+    """Kills nodes and measures their restarts.
+
+    Args:
+        session: of the run.
+        members: the nodes to be killed, by name.
+    """
+
+    def __init__(self, session: Session, members: Mapping[str, Member]) -> None:
+        self._session, self._members = session, members
+        self._newest: dict[tuple[str, str], tuple[int, float]] = {}  # incarnation, since when
+        self._detected: dict[str, float] = {}
+        self._news = asyncio.Event()
+
+    async def measure(self, kills: int, show: Any) -> list[Row]:
+        """Kill each node so many times, in rounds.
+
+        Args:
+            kills: of each node.
+            show: called with a line about the progress.
+        """
+        for topic in {t.key: t for m in self._members.values() for t in regular_topics(m)}.values():
+            self._session.listen(topic, topic.pattern, self._output)
+        self._session.listen(ftm_topics.PROCESS_EVENT, ftm_topics.PROCESS_EVENT.pattern,
+                             self._event)
+        self._session.listen(ftm_topics.DETECTION, ftm_topics.DETECTION.pattern, self._detection)
+        show("listening")
+        await asyncio.sleep(WARM_S)
+        rows = [Row(name, self._topic_of(member)) for name, member in self._members.items()]
+        for number in range(kills):
+            for row in rows:
+                if not row.failure:
+                    show(f"round {number + 1} of {kills}: {row.node}")
+                    await self._kill(row)
+                    await asyncio.sleep(CALM_S * random.uniform(1, 1.1))  # noqa: S311 out of step
+        return rows
+
+    def _topic_of(self, member: Member) -> str:
+        """Return the fastest topic on which a node was received, else that of its heartbeat."""
+        keys = [key for key, source in self._newest if source == member.name]
+        return next((key for topic in regular_topics(member) for key in keys
+                     if topic.member(key) is not None),
+                    HEARTBEAT.key.replace("{name}", member.name))
+
+    def _output(self, key: str, header: Header, _body: Any) -> None:
+        known = self._newest.get((key, header.source))
+        if known is None or header.incarnation > known[0]:
+            self._newest[key, header.source] = header.incarnation, time.monotonic()
+            self._news.set()
+
+    def _event(self, _key: str, _header: Header, event: fm.ProcessEvent) -> None:
+        if event.event == "crashed":
+            self._detected.setdefault(event.node, time.monotonic())
+
+    def _detection(self, _key: str, _header: Header, report: fm.DetectionReport) -> None:
+        if report.state is fm.DetectionState.ACTIVE:
+            for node in report.nodes:
+                self._detected.setdefault(node, time.monotonic())
+
+    async def _kill(self, row: Row) -> None:
+        running = [one for one in find_processes(self._session.run.base_port)
+                   if row.node in one.names]
+        if not running:
+            row.failure = "it has no process"
+            return
+        victim = max(running, key=lambda one: one.incarnation)
+        self._detected.pop(row.node, None)
+        killed_s = time.monotonic()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(victim.pid, signal.SIGKILL)
+        while (found := self._newest.get((row.topic, row.node), (0, 0.0)))[0] <= victim.incarnation:
+            self._news.clear()
+            try:
+                await asyncio.wait_for(self._news.wait(), killed_s + BACK_S - time.monotonic())
+            except TimeoutError:
+                row.failure = f"no message on {row.topic} within {BACK_S:g} s of a SIGKILL"
+                return
+        row.output_ms.append(round((found[1] - killed_s) * 1e3, 2))
+        if row.node in self._detected:
+            row.detected_ms.append(round((self._detected[row.node] - killed_s) * 1e3, 2))
+
+
+def spread(samples: Sequence[float]) -> Spread | None:
+    """Return the spread of samples; None without any."""
+    if not samples:
+        return None
+    if len(samples) == 1:
+        return Spread(1, samples[0], samples[0], samples[0])
+    twentieths = statistics.quantiles(samples, n=20, method="inclusive")
+    return Spread(len(samples), round(statistics.median(samples), 2), round(twentieths[0], 2),
+                  round(twentieths[-1], 2))
+
+
+def in_words(samples: Sequence[float]) -> str:
+    """Return the spread of samples for a table; "" without any."""
+    found = spread(samples)
+    return f"{found.median:.1f} ({found.low:.1f} to {found.high:.1f})" if found else ""
