@@ -4,7 +4,7 @@
 
 Each round of a benchmark of decisions asks many questions; `each_us` in its extra information, and
 the list at the end, is the time for one. None of them asserts a time: the figures are noted in
-docs/measurements.md.
+docs/log.
 """
 
 from __future__ import annotations

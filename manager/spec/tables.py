@@ -108,7 +108,7 @@ PERIODS = {
 
 FAILOVER_S = 0.3
 """For so long, real seconds, nothing may be heard when a router of the bus dies: some milliseconds
-as a rule, 0.26 s were measured when it was stopped before. See docs/measurements.md."""
+as a rule, 0.26 s were measured when it was stopped before."""
 
 GUARDED = frozenset({"heartbeat_timeout_s", "command_timeout_s", "localization_timeout_s"})
 """Timeouts of detection modules and the supervisor, which blame nobody for what is lost then."""

@@ -1,7 +1,7 @@
 """Missions with an overload of the machine on the way, `make overload`.
 
 `python -m tests.whole.overload_runs [--tries N] [--seconds S] [--only KIND]`: a line for each try,
-a row of the table in docs/measurements.md for each kind; exit code 1 if a mission was not completed
+a row for each kind; exit code 1 if a mission was not completed
 or not safe. A try takes 40 to 90 s.
 """
 

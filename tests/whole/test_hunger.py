@@ -160,7 +160,7 @@ def test_a_member_that_hears_all_and_reads_nothing_is_let_go_of(tmp_path):
 
 @pytest.mark.parametrize("thief", ["", "DM5", "ada"])
 def test_a_member_that_floods_delays_no_emergency_stop_and_harms_nobody(tmp_path, thief):
-    """The budget of the arbitration is kept by most stops; the tail is in `measurements.md`.
+    """The budget of the arbitration is kept by most stops.
 
     In a run with keys the member has the stolen key of another detection module, and floods what
     that may publish, or an operator's.
