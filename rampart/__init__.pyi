@@ -13,7 +13,7 @@ from rampart.actors.ftm.messages import DetectionState as DetectionState
 from rampart.actors.ftm.messages import RecoveryCommand as RecoveryCommand
 from rampart.actors.operator.hmi import Hmi as Hmi
 from rampart.actors.operator.panels import Panel as Panel
-from rampart.actors.recovery.holding import HeldOrder as HeldOrder
+from rampart.actors.recovery.holding import HeldRecovery as HeldRecovery
 from rampart.actors.recovery.module import RecoveryModule as RecoveryModule
 from rampart.actors.recovery.respawn import Respawn as Respawn
 from rampart.actors.runtime.actor import Actor as Actor

@@ -4,109 +4,85 @@ They act by giving an order to another node and repeating it, have acted when th
 confirms it, and then stay: the robot is in a degraded mode until they are released.
 
 The confirmation may be lost again, when the node that obeyed is respawned. The order is then
-given again at once, and only if the status does not come round within the deadline is that a
-failure.
+given again at once, and only if it is not confirmed again within the deadline is that a failure.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 from rampart.actors.ftm.messages import RecoveryCommand, RecoveryPhase
 from rampart.actors.recovery.module import RecoveryModule
+from rampart.actors.runtime.actor import Context
 
-_FAREWELLS = 5
-"""How often the end of an order is said: one second long, for a node that is being respawned."""
+_ENDINGS = 5
+"""How often the end of an order is repeated: for one second, for a node that is being respawned."""
 
 
-class HeldOrder:
-    """An order that is in force while its module is activated.
+class HeldRecovery(RecoveryModule):
+    """A recovery that consists of an order, which is in force while the module is activated.
 
-    Args:
-        module: whose order it is; told of how it goes.
-        give: publishes the order with its reason, or its end.
-        inherits: an earlier incarnation of the module may have left an order behind.
+    A subclass gives the order in `give`, and calls `confirm` with each status that shows whether
+    the order is obeyed.
     """
 
-    def __init__(self, module: RecoveryModule, give: Callable[[bool, str], None], *,
-                 inherits: bool) -> None:
-        self._module = module
-        self._give = give
-        self._inherits = inherits
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
         self.why = ""
-        self._farewells = 0
+        self._inherits = context.incarnation > 1  # a predecessor may have left an order behind
+        self._endings = 0
         self._lost_s = math.inf
 
-    def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Give the order, unless it is in force already."""
-        self._farewells = 0
-        self._inherits = False
-        self.why = command.reason
-        if self._module.phase is not RecoveryPhase.DEGRADED:
-            self._give(True, self.why)
-        if renewed and self._module.phase is RecoveryPhase.FAILED:
-            self._module.resume(command.reason)
+    def give(self, in_force: bool, why: str) -> None:
+        """Publish the order with its reason, or its end."""
+        raise NotImplementedError
 
-    def let_go(self) -> None:
-        """End the order."""
-        self._lost_s = math.inf
-        self._farewells = _FAREWELLS
-        self._give(False, "")
-
-    def stay_idle(self) -> None:
-        """End an order that an earlier incarnation may have left behind."""
-        if self._inherits:
-            self._inherits = False
-            self.let_go()
-
-    def repeat(self) -> None:
-        """Repeat the order while it is in force, and a while its end."""
-        if self._module.activated:
-            self._give(True, self.why)
-        elif self._farewells > 0:
-            self._farewells -= 1
-            self._give(False, "")
-
-    def status(self, *, in_force: bool, reason: str, stamp_s: float) -> None:
+    def confirm(self, *, in_force: bool, reason: str, stamp_s: float) -> None:
         """Take note of whether the order is obeyed.
 
         Args:
             in_force: whether it is.
             reason: in words.
-            stamp_s: when that was true; what was true before the order says nothing.
+            stamp_s: when that was true; what was true before the order does not count.
         """
-        module = self._module
-        if not module.activated or stamp_s < module.ordered_s:
+        if not self.activated or stamp_s < self.ordered_s:
             return
         if in_force:
             self._lost_s = math.inf
-            module.degrade(reason)
-        elif module.phase is RecoveryPhase.DEGRADED:
+            self.degrade(reason)
+        elif self.phase is RecoveryPhase.DEGRADED:
             self._lost_s = min(self._lost_s, stamp_s)
-            if stamp_s - self._lost_s > module.deadline_s:
-                module.fail(f"no longer in force: {reason}")
+            if stamp_s - self._lost_s > self.deadline_s:
+                self.fail(f"no longer in force: {reason}")
             else:
-                self._give(True, self.why)
-
-
-class HeldRecovery(RecoveryModule):
-    """A recovery that is nothing but such an order; a subclass sets it."""
-
-    order: HeldOrder
+                self.give(True, self.why)
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Give the order."""
-        self.order.act(command, renewed=renewed)
+        """Give the order, unless it is in force already."""
+        self._endings = 0
+        self._inherits = False
+        self.why = command.reason
+        if self.phase is not RecoveryPhase.DEGRADED:
+            self.give(True, self.why)
+        if renewed and self.phase is RecoveryPhase.FAILED:
+            self.resume(command.reason)
 
     def let_go(self) -> None:
-        """End it."""
-        self.order.let_go()
+        """End the order."""
+        self._lost_s = math.inf
+        self._endings = _ENDINGS
+        self.give(False, "")
 
     def stay_idle(self) -> None:
-        """End what an earlier incarnation of this module may have left."""
-        self.order.stay_idle()
+        """End an order that a predecessor may have left behind."""
+        if self._inherits:
+            self._inherits = False
+            self.let_go()
 
     def repeat(self) -> None:
-        """Repeat the order, or its end for a while."""
-        self.order.repeat()
+        """Repeat the order while it is in force, and for a while its end."""
+        if self.activated:
+            self.give(True, self.why)
+        elif self._endings > 0:
+            self._endings -= 1
+            self.give(False, "")

@@ -87,11 +87,6 @@ class RecoveryModule(Actor):
         return (name,) if topic is topics.RECOVERY_COMMAND else None
 
     @property
-    def state(self) -> RecoveryState:
-        """Idle or activated."""
-        return RecoveryState.IDLE if self.phase is RecoveryPhase.IDLE else RecoveryState.ACTIVATED
-
-    @property
     def activated(self) -> bool:
         """Whether it is activated."""
         return self.phase is not RecoveryPhase.IDLE
@@ -221,18 +216,17 @@ class RecoveryModule(Actor):
 
     # -- reports --------------------------------------------------------------------------------
 
-    @property
-    def report(self) -> RecoveryReport:
-        """What it has to say at the moment."""
-        return RecoveryReport(self.state, self.phase, self.decision, self._reason)
-
     def _tell(self) -> None:
-        self._told = self.report
+        self._told = self._report()
         self.publish(topics.RECOVERY, self._told)
 
     def _tell_change(self) -> None:
-        if self.report != self._told:
+        if self._report() != self._told:
             self._tell()
+
+    def _report(self) -> RecoveryReport:
+        state = RecoveryState.ACTIVATED if self.activated else RecoveryState.IDLE
+        return RecoveryReport(state, self.phase, self.decision, self._reason)
 
     @every(1.0 / _REPEATS_PER_S)
     def _repeat(self) -> None:

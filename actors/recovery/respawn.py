@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Heartbeat
@@ -42,6 +42,9 @@ _BLOCKS = 1 << 32
 _OVERDUE_S, _OVERDUE = 0.25, 0.57
 """Age at which a heartbeat is overdue: this, or in a faster system this share of its timeout."""
 
+_START_TIMEOUT_S = 1.0
+"""How long a new process may take until it is received."""
+
 
 class Stage(Enum):
     """How far the respawn of one node is."""
@@ -57,17 +60,6 @@ _WAITING = (Stage.ASKED, Stage.STARTED)
 _LOST = ("crashed", "stopped", "wedged")
 
 
-class Ask(NamedTuple):
-    """A request to the supervisor; repeated with the same number until it is answered."""
-
-    request: int
-    node: str
-    failed_incarnation: int
-
-
-_NOTHING_ASKED = Ask(0, "", 0)
-
-
 @dataclass(slots=True)
 class _Node:
     """What is known of one node. Times are simulated seconds."""
@@ -76,7 +68,8 @@ class _Node:
     incarnation: int = 0
     gone_s: float | None = None
     stage: Stage = Stage.NONE
-    ask: Ask = _NOTHING_ASKED
+    request: int = 0
+    failed_incarnation: int = 0
     asked_s: float = 0.0
     started_s: float = 0.0
     problem: str = ""
@@ -86,21 +79,21 @@ class RespawnCore:
     """The respawns of one recovery module. Requests pile up until `take_requests`.
 
     Args:
+        by: name of the module.
         nodes: the nodes that it may respawn.
         first_request: number of the first request.
         start_s: now.
         overdue_s: age at which a heartbeat is overdue.
-        start_timeout_s: how long a new process may take to be heard.
     """
 
-    def __init__(self, nodes: Iterable[str], first_request: int, start_s: float,
-                 overdue_s: float = _OVERDUE_S, start_timeout_s: float = 1.0) -> None:
+    def __init__(self, by: str, nodes: Iterable[str], first_request: int, start_s: float,
+                 overdue_s: float = _OVERDUE_S) -> None:
+        self._by = by
         self._nodes = {name: _Node(heard_s=start_s) for name in nodes}
         self._next_request = first_request
         self._overdue_s = overdue_s
-        self._start_timeout_s = start_timeout_s
         self._strangers: tuple[str, ...] = ()
-        self._requests: list[Ask] = []
+        self._requests: list[RespawnRequest] = []
 
     # -- orders ---------------------------------------------------------------------------------
 
@@ -135,7 +128,7 @@ class RespawnCore:
         for node in self._nodes.values():
             node.stage = Stage.NONE
 
-    def take_requests(self) -> list[Ask]:
+    def take_requests(self) -> list[RespawnRequest]:
         """Return the requests to send now, each once."""
         requests, self._requests = self._requests, []
         return requests
@@ -155,7 +148,7 @@ class RespawnCore:
         node.heard_s = now_s
         # A heartbeat that was under way when the order came proves nothing.
         if node.stage in (Stage.ASKED, Stage.STARTED, Stage.FAILED) \
-                and incarnation > node.ask.failed_incarnation and stamp_s >= node.asked_s:
+                and incarnation > node.failed_incarnation and stamp_s >= node.asked_s:
             node.stage = Stage.BACK
 
     def event(self, name: str, event: str, incarnation: int, detail: str, now_s: float) -> None:
@@ -168,13 +161,12 @@ class RespawnCore:
             node.heard_s, node.gone_s = now_s, None  # not heard yet, but not overdue either
         if event in _LOST and incarnation == node.incarnation:
             node.gone_s = now_s
-            if incarnation > node.ask.failed_incarnation and node.stage in _WAITING:
+            if incarnation > node.failed_incarnation and node.stage in _WAITING:
                 self._ask(name, node, now_s)
         elif event == "respawned" and node.stage is Stage.ASKED:
             node.stage = Stage.STARTED
             node.started_s = now_s
-            node.ask = node.ask._replace(
-                failed_incarnation=max(node.ask.failed_incarnation, incarnation - 1))
+            node.failed_incarnation = max(node.failed_incarnation, incarnation - 1)
         elif event in ("refused", "given up") and node.stage in _WAITING:
             node.stage = Stage.FAILED
             node.problem = f"{name}: {event}{f', {detail}' if detail else ''}"
@@ -183,8 +175,8 @@ class RespawnCore:
         """Repeat requests that are unanswered; ask anew for a new process that is not heard."""
         for name, node in self._nodes.items():
             if node.stage is Stage.ASKED:
-                self._requests.append(node.ask)
-            elif node.stage is Stage.STARTED and now_s - node.started_s >= self._start_timeout_s:
+                self._request(name, node)
+            elif node.stage is Stage.STARTED and now_s - node.started_s >= _START_TIMEOUT_S:
                 self._ask(name, node, now_s)
 
     # -- how it stands --------------------------------------------------------------------------
@@ -216,11 +208,15 @@ class RespawnCore:
 
     def _ask(self, name: str, node: _Node, now_s: float, wrong: int = 0) -> None:
         failed = node.incarnation if self._has_failed(node, now_s) else node.incarnation - 1
-        node.ask = Ask(self._next_request, name, max(0, failed, wrong))
+        node.request, node.failed_incarnation = self._next_request, max(0, failed, wrong)
         node.stage = Stage.ASKED
         node.asked_s = now_s
         self._next_request += 1
-        self._requests.append(node.ask)
+        self._request(name, node)
+
+    def _request(self, name: str, node: _Node) -> None:
+        self._requests.append(RespawnRequest(
+            node.request, name, node.failed_incarnation, self._by))
 
 
 def accused(node: str) -> tuple[str, int]:
@@ -251,7 +247,8 @@ class Respawn(RecoveryModule):
         # Whoever is silent for long enough to be reported is overdue here as well.
         overdue_s = min(_OVERDUE_S, _OVERDUE * context.run.system.timing.heartbeat_timeout_s)
         self._core = RespawnCore(
-            self.parameters.nodes, context.incarnation % _BLOCKS * _REQUESTS_PER_INCARNATION,
+            self.name, self.parameters.nodes,
+            context.incarnation % _BLOCKS * _REQUESTS_PER_INCARNATION,
             self.clock.now(), overdue_s)
 
     @classmethod
@@ -296,9 +293,8 @@ class Respawn(RecoveryModule):
         self._settle()
 
     def _send_requests(self) -> None:
-        for ask in self._core.take_requests():
-            self.publish(topics.RESPAWN, RespawnRequest(
-                ask.request, ask.node, ask.failed_incarnation, self.name))
+        for request in self._core.take_requests():
+            self.publish(topics.RESPAWN, request)
 
     def _settle(self) -> None:
         self._send_requests()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import PilotMode, PilotOrder, PilotStatus
-from rampart.actors.recovery.holding import HeldOrder, HeldRecovery
-from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.recovery.holding import HeldRecovery
+from rampart.actors.runtime.actor import Header, on
 
 
 class PilotRecovery(HeldRecovery):
@@ -22,19 +22,16 @@ class PilotRecovery(HeldRecovery):
     confirming: tuple[PilotMode, ...] = (PilotMode.STOP,)
     top_speed_mps = 0.0
 
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        self.order = HeldOrder(self, self._give, inherits=context.incarnation > 1)
-
-    def _give(self, engaged: bool, why: str) -> None:
+    def give(self, in_force: bool, why: str) -> None:
+        """Order the mode, or end the order."""
         self.publish(topics.PILOT_ORDER, PilotOrder(
-            engaged, self.mode, why, self.top_speed_mps if engaged else 0.0))
+            in_force, self.mode, why, self.top_speed_mps if in_force else 0.0))
 
     @on(topics.PILOT_STATUS)
     def pilot_status(self, message: PilotStatus, header: Header) -> None:
         """See which mode the Safety Pilot is in."""
-        self.order.status(in_force=message.mode in self.confirming,
-                          reason=f"safety pilot in mode {message.mode}", stamp_s=header.stamp)
+        self.confirm(in_force=message.mode in self.confirming, stamp_s=header.stamp,
+                     reason=f"safety pilot in mode {message.mode}")
 
 
 class ControlledStop(PilotRecovery):

@@ -23,7 +23,7 @@ from rampart.actors.osmosis.messages import (
     WayOutRequest,
 )
 from rampart.actors.osmosis.recovery.way_out import PERIOD_S, TAKE_S, TOP_SPEED_MPS, Look, WayOut
-from rampart.actors.recovery.holding import HeldOrder, HeldRecovery
+from rampart.actors.recovery.holding import HeldRecovery
 from rampart.actors.runtime.actor import Context, Header, on
 
 _LOOKED_AT = (topics.POSE, topics.GPS, topics.TELEOP_COMMAND, topics.PILOT_STATUS)
@@ -62,8 +62,6 @@ class EmergencyStop(HeldRecovery):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        # If the brake is found engaged this module is not idle, so it inherits nothing to end.
-        self.order = HeldOrder(self, self._brake, inherits=False)
         self._looking = context.incarnation > 1
         self._look = Look()
         self._hears_all = False
@@ -91,9 +89,10 @@ class EmergencyStop(HeldRecovery):
             self._looking = False
             self._tell_change()
 
-    def _brake(self, engaged: bool, why: str) -> None:
+    def give(self, in_force: bool, why: str) -> None:
+        """Engage the brake, or let go of it."""
         driven = self._out is not None and self._out.open
-        self.publish(topics.BRAKE, BrakeCommand(engaged and not driven, why))
+        self.publish(topics.BRAKE, BrakeCommand(in_force and not driven, why))
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Engage the brake."""
@@ -106,7 +105,7 @@ class EmergencyStop(HeldRecovery):
         if self._looking:
             self._looking = False
             if message.brake_engaged:
-                self.order.why = _FOUND_ENGAGED
+                self.why = _FOUND_ENGAGED
                 self.ordered_s = header.stamp
                 self.resume(_FOUND_ENGAGED)
             else:
@@ -115,7 +114,7 @@ class EmergencyStop(HeldRecovery):
         self._look.wheels_radps = max(map(abs, message.wheel_speeds_radps))
         if message.brake_engaged and self._stops_pilot and self._out is None:
             self._let_pilot_go()
-        self.order.status(
+        self.confirm(
             in_force=message.brake_engaged or self._out is not None, stamp_s=header.stamp,
             reason="brake engaged" if message.brake_engaged else "brake not engaged")
 
@@ -133,8 +132,7 @@ class EmergencyStop(HeldRecovery):
         self._let_pilot_go()
 
     def stay_idle(self) -> None:
-        """End what an earlier incarnation may have ordered."""
-        super().stay_idle()
+        """End what a predecessor may have ordered; the brake that it left makes one activated."""
         self._let_pilot_go()
 
     def repeat(self) -> None:
@@ -202,7 +200,7 @@ class EmergencyStop(HeldRecovery):
         if out is None:
             return
         self._out = None
-        self._brake(True, self.order.why)
+        self.give(True, self.why)
         self.publish(topics.PILOT_ORDER, PilotOrder(True, PilotMode.STOP, clip(f"way out: {why}")))
         self._tell_operator(granted=False, why=why, is_out=out.is_out)
 
@@ -253,7 +251,7 @@ class EmergencyStop(HeldRecovery):
         elif not out.open and message.mode is PilotMode.TELEOPERATION \
                 and 0.0 < message.top_speed_mps <= TOP_SPEED_MPS:
             out.open = True
-            self._brake(True, self.order.why)
+            self.give(True, self.why)
         elif out.open and message.mode is not PilotMode.TELEOPERATION:
             self._close(f"the safety pilot is in mode {message.mode}")
 

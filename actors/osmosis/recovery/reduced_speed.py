@@ -35,6 +35,6 @@ class ReducedSpeed(PilotRecovery):
     def pilot_status(self, message: PilotStatus, header: Header) -> None:
         """See which bound the Safety Pilot keeps."""
         in_force = 0.0 < message.top_speed_mps <= self.top_speed_mps
-        self.order.status(in_force=in_force, stamp_s=header.stamp,
-                          reason=f"at most {message.top_speed_mps:g} m/s" if in_force
-                          else "the safety pilot does not bound the speed")
+        self.confirm(in_force=in_force, stamp_s=header.stamp,
+                     reason=f"at most {message.top_speed_mps:g} m/s" if in_force
+                     else "the safety pilot does not bound the speed")

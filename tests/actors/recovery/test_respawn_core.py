@@ -9,8 +9,8 @@ import pytest
 from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topics import HEARTBEAT
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import RecoveryCommand
-from rampart.actors.recovery.respawn import Ask, Respawn, RespawnCore
+from rampart.actors.ftm.messages import RecoveryCommand, RespawnRequest
+from rampart.actors.recovery.respawn import Respawn, RespawnCore
 from rampart.actors.runtime.run_context import RunContext
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import VirtualSystem
@@ -19,7 +19,11 @@ from tests import CELL
 
 
 def core(*nodes: str) -> RespawnCore:
-    return RespawnCore(nodes or ("a",), first_request=100, start_s=0.0)
+    return RespawnCore("RM", nodes or ("a",), first_request=100, start_s=0.0)
+
+
+def request(number: int, node: str, failed: int) -> RespawnRequest:
+    return RespawnRequest(number, node, failed, "RM")
 
 
 def seen(core: RespawnCore, node: str = "a", incarnation: int = 1, now_s: float = 1.0) -> None:
@@ -32,7 +36,7 @@ def test_a_dead_node_is_asked_for_with_the_incarnation_that_died():
     seen(rm, incarnation=3)
     rm.event("a", "crashed", 3, "", 1.05)
     assert rm.order(["a"], 1.06, renewed=False)
-    assert rm.take_requests() == [Ask(100, "a", 3)]
+    assert rm.take_requests() == [request(100, "a", 3)]
     assert rm.take_requests() == []
     assert rm.pending == ("a",)
 
@@ -41,7 +45,7 @@ def test_a_node_whose_heartbeat_is_overdue_is_named():
     rm = core()
     seen(rm, incarnation=3)
     rm.order(["a"], 1.4, renewed=False)
-    assert rm.take_requests() == [Ask(100, "a", 3)]
+    assert rm.take_requests() == [request(100, "a", 3)]
 
 
 def test_in_a_fast_system_a_heartbeat_is_overdue_before_the_watchdog_reports_it():
@@ -69,13 +73,13 @@ def test_a_node_heard_a_moment_ago_is_not_accused_its_predecessor_is():
     rm = core()
     seen(rm, incarnation=3)
     rm.order(["a"], 1.05, renewed=False)
-    assert rm.take_requests() == [Ask(100, "a", 2)]
+    assert rm.take_requests() == [request(100, "a", 2)]
 
 
 def test_a_node_never_heard_of_is_asked_for_without_a_name():
     rm = core()
     rm.order(["a"], 0.0, renewed=False)
-    assert rm.take_requests() == [Ask(100, "a", 0)]
+    assert rm.take_requests() == [request(100, "a", 0)]
 
 
 def test_the_same_order_again_asks_for_nothing_more():
@@ -157,7 +161,7 @@ def test_a_new_life_that_dies_is_asked_for_again():
     rm.event("a", "respawned", 4, "", 1.1)
     rm.take_requests()
     rm.event("a", "crashed", 4, "", 1.2)
-    assert rm.take_requests() == [Ask(101, "a", 4)]
+    assert rm.take_requests() == [request(101, "a", 4)]
 
 
 def test_a_new_life_that_is_not_heard_is_asked_for_again():
@@ -169,17 +173,17 @@ def test_a_new_life_that_is_not_heard_is_asked_for_again():
     rm.retry(2.0)
     assert rm.take_requests() == []
     rm.retry(2.1)
-    assert rm.take_requests() == [Ask(101, "a", 4)]
+    assert rm.take_requests() == [request(101, "a", 4)]
 
 
 def test_a_wedged_life_that_the_supervisor_takes_for_well_is_named_in_the_next_request():
     rm = core()
     rm.event("a", "adopted", 3, "", 0.0)  # not heard yet
     rm.order(["a"], 0.01, renewed=False)
-    assert rm.take_requests() == [Ask(100, "a", 2)]
+    assert rm.take_requests() == [request(100, "a", 2)]
     rm.event("a", "respawned", 3, "already", 0.02)
     rm.retry(1.1)
-    assert rm.take_requests() == [Ask(101, "a", 3)]
+    assert rm.take_requests() == [request(101, "a", 3)]
 
 
 def test_a_repeated_order_respawns_a_node_that_came_back_and_died_again_but_no_other():
@@ -193,7 +197,7 @@ def test_a_repeated_order_respawns_a_node_that_came_back_and_died_again_but_no_o
     assert not rm.order(["a", "b"], 1.15, renewed=True)
     rm.event("b", "crashed", 2, "", 1.2)
     assert rm.order(["a", "b"], 1.21, renewed=True)
-    assert rm.take_requests() == [Ask(102, "b", 2)]
+    assert rm.take_requests() == [request(102, "b", 2)]
 
 
 def test_what_was_given_up_is_tried_again_on_a_new_order_only():

@@ -1,4 +1,4 @@
-"""Recovery modules that a specification alone makes: `Hold`, `SwitchMode`, `Call`, `CallEach`."""
+"""Recovery modules that a specification alone makes: `Hold` and `Call`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.recovery.telling import Call, CallEach, Hold, SwitchMode
+from rampart.actors.recovery.telling import Call, Hold
 from rampart.actors.runtime.actor import Actor, Header, on
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.run_plan import RunPlan
@@ -139,7 +139,7 @@ def test_a_mode_is_reached_when_the_node_says_so_and_lost_when_it_no_longer_does
         await system.settle()
         assert case.orders[-1] == Valve(False)
 
-    play(SwitchMode, script, **CONFIRMED, back={"shut": False})
+    play(Hold, script, **CONFIRMED, back={"shut": False})
 
 
 def test_what_is_never_confirmed_fails_at_its_deadline():
@@ -169,6 +169,7 @@ def test_a_respawned_hold_takes_back_what_its_predecessor_left():
 
 
 ANSWER = {"answer": "tank/valve:shut", "equals": True}
+ONE = {"topic": "tank/order", "messages": [{"shut": True}], **ANSWER}
 
 
 def test_a_call_is_repeated_until_it_is_answered_and_then_never_again():
@@ -190,7 +191,7 @@ def test_a_call_is_repeated_until_it_is_answered_and_then_never_again():
         await system.settle()
         assert (len(case.orders), case.phase) == (4, "acting")
 
-    play(Call, script, **SHUT, **ANSWER)
+    play(Call, script, **ONE)
 
 
 STEPS = {"topic": "tank/order", "messages": [{"shut": True}, {"shut": False}, {"shut": True}],
@@ -209,7 +210,7 @@ def test_each_call_waits_for_the_answer_of_the_one_before():
         assert [order.shut for order in case.orders] == [True, False, True]
         assert case.phase == "done"
 
-    play(CallEach, script, **STEPS)
+    play(Call, script, **STEPS)
 
 
 def test_a_refused_call_is_a_failure_unless_it_may_be_refused():
@@ -226,7 +227,7 @@ def test_a_refused_call_is_a_failure_unless_it_may_be_refused():
         assert "number 2 of 3 on tank/order: tank/valve:shut is False" in (
             case.reports[-1].message.reason)
 
-    play(CallEach, script, **STEPS, that_may_fail=[0])
+    play(Call, script, **STEPS, repeat_s=0, that_may_fail=[0])
 
 
 def test_a_call_that_is_not_answered_fails_and_names_the_answer():
@@ -237,7 +238,7 @@ def test_a_call_that_is_not_answered_fails_and_names_the_answer():
         assert "tank/valve:shut is not True" in case.reports[-1].message.reason
         assert len(case.orders) == 1
 
-    play(Call, script, **SHUT, **ANSWER, repeat_s=0)
+    play(Call, script, **ONE, repeat_s=0)
 
 
 @pytest.mark.parametrize(("kind", "parameters", "words"), [
@@ -245,8 +246,7 @@ def test_a_call_that_is_not_answered_fails_and_names_the_answer():
     (Hold, {"topic": "a", "message": 3}, "message = 3"),
     (Hold, {**SHUT, "confirm": "a:b"}, "equals: missing"),
     (Hold, {**SHUT, "equals": 1}, "confirm"),
-    (SwitchMode, CONFIRMED, "back: missing"),
-    (Call, SHUT, "answer: missing"),
+    (Call, {"topic": "a", "messages": [{}]}, "answer: missing"),
 ])
 def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, words):
     with pytest.raises(ValueError, match=r".") as caught:

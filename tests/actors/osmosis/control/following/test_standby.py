@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rampart.actors.bus.envelope import Header
+from rampart.actors.ftm.messages import RespawnRequest
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
@@ -24,7 +25,7 @@ from rampart.actors.osmosis.control.pilot.command_pair import FORGET_S, CommandP
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import PilotMode
-from rampart.actors.recovery.respawn import Ask, RespawnCore, accused
+from rampart.actors.recovery.respawn import RespawnCore, accused
 
 PERIOD_S = 0.05
 
@@ -356,23 +357,23 @@ def test_a_loop_that_only_listens_adds_what_the_other_does_until_that_is_silent(
 
 
 def test_a_life_that_is_accused_by_its_number_is_respawned_though_it_is_well():
-    core = RespawnCore(("a",), first_request=100, start_s=0.0)
+    core = RespawnCore("RM", ("a",), first_request=100, start_s=0.0)
     core.beat("a", 3, 1.0, 1.0)
     assert core.order(["a#3"], 1.01, renewed=False)
-    assert core.take_requests() == [Ask(100, "a", 3)]
+    assert core.take_requests() == [RespawnRequest(100, "a", 3, "RM")]
     core.beat("a", 4, 1.1, 1.1)
     assert core.back == ("a",)
 
 
 def test_a_later_life_is_not_accused_by_the_number_of_an_earlier_one():
-    core = RespawnCore(("a",), first_request=100, start_s=0.0)
+    core = RespawnCore("RM", ("a",), first_request=100, start_s=0.0)
     core.beat("a", 4, 1.0, 1.0)
     core.order(["a#2"], 1.01, renewed=False)
-    assert core.take_requests() == [Ask(100, "a", 3)]
+    assert core.take_requests() == [RespawnRequest(100, "a", 3, "RM")]
 
 
 def test_a_stranger_is_named_without_its_life():
-    core = RespawnCore(("a",), first_request=100, start_s=0.0)
+    core = RespawnCore("RM", ("a",), first_request=100, start_s=0.0)
     core.order(["b#2"], 1.0, renewed=False)
     assert core.problem.startswith("b: not among")
 
