@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 
 from rampart.actors.detection.finding import Sustained
-from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.detection.module import DetectionModule
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import FieldName, FieldNames, Suspects
 from rampart.manager.spec.tables import NonNegative, Positive
@@ -56,7 +56,7 @@ def agreeing(values: Sequence[Any], within: float, *, angle: bool) -> list[int]:
 class _Comparing(DetectionModule):
     """Hears several fields, and compares those that are true at about the same time."""
 
-    class Parameters(Waiting, frozen=True, kw_only=True):
+    class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
         """How they are compared.
 
         Attributes:

@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 from rampart.actors.detection.finding import Finding
-from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import ControlTimeout, Suspects, TopicHeard
@@ -90,7 +90,7 @@ class FreshnessMonitor(Finding):
 class Freshness(DetectionModule):
     """Active while the newest content of a topic is too old."""
 
-    class Parameters(Waiting, frozen=True, kw_only=True):
+    class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
         """What is stale, and who is named then.
 
         Attributes:

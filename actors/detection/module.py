@@ -34,7 +34,7 @@ from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.machine.absence import Absence
 from rampart.actors.runtime.actor import Actor, Context, Header, every
 from rampart.actors.runtime.timer import Timer
-from rampart.manager.spec.tables import FAILOVER_S, NonNegative
+from rampart.manager.spec.tables import FAILOVER_S
 
 LATE_S = 0.02
 """A timer that is so late, simulated seconds, shows a lack of processor time."""
@@ -47,10 +47,6 @@ NEXT_EXCUSE_S = 1.0
 
 _SHORTEST_SLEEP_S = 1e-4
 """Rounding must not make a timer that is due now come again now, for ever."""
-
-
-class IllegalTransitionError(RuntimeError):
-    """A state machine was asked for a step that its table does not have."""
 
 
 class Monitor(Protocol):
@@ -82,17 +78,6 @@ class Monitor(Protocol):
 M = TypeVar("M", bound=Monitor)
 
 
-class Waiting(Actor.Parameters, frozen=True):
-    """Parameters of a module that waits for its first input.
-
-    Attributes:
-        startup_grace_s: how long that may take while the system starts; None: the spec's. A
-            respawned module joins a running system: for it the timeout itself is the grace.
-    """
-
-    startup_grace_s: NonNegative | None = None
-
-
 class DetectionModule(Actor):
     """Base of every detection module.
 
@@ -120,12 +105,12 @@ class DetectionModule(Actor):
         self._judges_from_s = 0.0  # before that the system is starting, see `Launcher.start`
 
     def grace_s(self, timeout_s: float) -> float:
-        """Return how long the first input may take, s."""
-        if not self.first_life:
-            return timeout_s
+        """Return how long the first input may take, s: the timeout, or more while a system starts.
+
+        A respawned module joins a running system: for it the timeout itself is the grace.
+        """
         startup_s = self.context.run.system.timing.startup_grace_s
-        said_s = getattr(self.parameters, "startup_grace_s", None)
-        return max(timeout_s, startup_s if said_s is None else said_s)
+        return max(timeout_s, startup_s) if self.first_life else timeout_s
 
     # -- the state machine ----------------------------------------------------------------------
 
@@ -141,21 +126,11 @@ class DetectionModule(Actor):
         self.state = DetectionState.ACTIVE
         self._tell(DetectionReport(self.state, reason, nodes, since_s))
 
-    def clear(self) -> None:
-        """Go from active to idle and report it.
-
-        Raises:
-            IllegalTransitionError: it is idle.
-        """
-        if self.state is DetectionState.IDLE:
-            raise IllegalTransitionError(f"{self.name}: no transition from idle to idle")
-        self.state = DetectionState.IDLE
-        self._tell(DetectionReport(self.state, "", (), self.clock.now()))
-
     def know_idle(self) -> None:
         """Say that the fault is known not to be there: go to idle, or stay. Report what is new."""
         if self.state is DetectionState.ACTIVE:
-            self.clear()
+            self.state = DetectionState.IDLE
+            self._tell(DetectionReport(self.state, "", (), self.clock.now()))
         elif not self._told:
             self._tell(self._report)
 
@@ -237,7 +212,8 @@ class DetectionModule(Actor):
         now_s = self.clock.now()
         if monitor.due_s <= now_s:
             self._note_move()
-            self._note_lateness(now_s - due_s)
+            if now_s - due_s > LATE_S:
+                self._read_mail_until(now_s + min(now_s - due_s, EXCUSE_S))
         if now_s < self._judges_from_s:
             self._sleep_until(self._judges_from_s)
         else:
@@ -257,10 +233,6 @@ class DetectionModule(Actor):
         """Whether its monitor has found what may only be missing because it was absent itself."""
         return self.state is DetectionState.IDLE and self._monitor is not None and (
             self._monitor.active and self._absence.excuses(self.clock.now()))
-
-    def _note_lateness(self, late_s: float) -> None:
-        if late_s > LATE_S:
-            self._read_mail_until(self.clock.now() + min(late_s, EXCUSE_S))
 
     def _note_move(self) -> None:
         if self._bus.moved():

@@ -16,7 +16,6 @@ the same; and if it is not heard itself for too long, the manager takes it for a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
 from typing import Annotated, Any
 
 import msgspec
@@ -26,7 +25,6 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
-from rampart.actors.machine.patience import Usage
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.parameters import NodeNames
 from rampart.manager.spec.budget import allowed_late_s
@@ -39,28 +37,6 @@ _LOOK_S = 0.1
 _SAMPLE_S = 0.5
 
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
-
-
-class RunQueue:
-    """Which processes wait for a processor. Pure; real seconds.
-
-    Args:
-        used: Returns what a process has used.
-        share: Of the time, from which on a process counts as waiting.
-    """
-
-    def __init__(self, used: Callable[[int], Usage], share: float) -> None:
-        self._used = used
-        self._share = share
-        self._at_s = -math.inf
-        self._waited_s: dict[int, float] = {}
-
-    def count(self, pids: Collection[int], now_s: float) -> int:
-        """Return how many have waited, since this was asked last, for so much of the time."""
-        passed_s, self._at_s = now_s - self._at_s, now_s
-        before, self._waited_s = self._waited_s, {pid: self._used(pid).waited_s for pid in pids}
-        return sum(pid in before and waited_s - before[pid] >= self._share * passed_s
-                   for pid, waited_s in self._waited_s.items())
 
 
 class Overload(DetectionModule):
@@ -97,7 +73,7 @@ class Overload(DetectionModule):
         self._many = max(LEAST, told.share * len(told.watch))
         self._late_until_s: dict[str, float] = {}
         self._pids: dict[str, int] = {}
-        self._queue = RunQueue(context.scheduled, told.wait_share)
+        self._waited_s: dict[int, float] = {}
         self._sampled_s = self._was_late_s = -math.inf
         self._may_wait = False
         self._knows_from_s = self.known_after_s(told.clear_s)
@@ -139,8 +115,13 @@ class Overload(DetectionModule):
         self.follow()
 
     def _still_wait(self, now_s: float) -> bool:
-        if now_s - self._sampled_s >= _SAMPLE_S:
-            self._sampled_s = now_s
-            waiting = self._queue.count(self._pids.values(), now_s / self.clock.rate)
+        passed_s = now_s - self._sampled_s
+        if passed_s >= _SAMPLE_S:
+            before, self._sampled_s = self._waited_s, now_s
+            self._waited_s = {
+                pid: self.context.scheduled(pid).waited_s for pid in self._pids.values()}
+            long_s = self.parameters.wait_share * passed_s / self.clock.rate
+            waiting = sum(pid in before and waited_s - before[pid] >= long_s
+                          for pid, waited_s in self._waited_s.items())
             self._may_wait = waiting >= self._many
         return self._may_wait and now_s - self._was_late_s < self.parameters.wait_s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Heartbeat
@@ -18,15 +18,6 @@ from rampart.manager.spec.tables import NonNegative, Positive
 
 PERIOD_S = 0.5
 _MB = 1e6
-
-
-class _Look(NamedTuple):
-    """A process, when it was looked at (seconds of this machine), and what it had used then."""
-
-    pid: int
-    incarnation: int
-    at_s: float
-    usage: ProcessCount
 
 
 class ProcessUsage(DetectionModule):
@@ -64,7 +55,7 @@ class ProcessUsage(DetectionModule):
         super().__init__(context)
         said = self.parameters
         self._now = now
-        self._looks: dict[str, _Look] = {}
+        self._looks: dict[str, tuple[tuple[int, int], float, ProcessCount]] = {}
         self._running: dict[str, tuple[int, int]] = {}
         self.monitor = self.judged_by(Sustained(
             said.for_s, said.clear_s, self.known_after_s(said.for_s + 2 * PERIOD_S)))
@@ -77,9 +68,8 @@ class ProcessUsage(DetectionModule):
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
         """Hear which process a node runs in."""
-        if header.incarnation >= self._running.get(header.source, (0, 0))[1]:
-            self._running[header.source] = (
-                self.context.local_pid(header.source, message.pid), header.incarnation)
+        self._running[header.source] = (
+            self.context.local_pid(header.source, message.pid), header.incarnation)
 
     @every(PERIOD_S)
     def look(self) -> None:
@@ -93,18 +83,17 @@ class ProcessUsage(DetectionModule):
         self.follow()
 
     def _problem(self, node: str, pid: int, incarnation: int) -> str:
-        usage, now_s = self.context.usage(pid), self._now()
-        before = self._looks.pop(node, None)
+        usage, now_s, said = self.context.usage(pid), self._now(), self.parameters
         if usage is None:
             return ""
-        self._looks[node] = _Look(pid, incarnation, now_s, usage)
-        said = self.parameters
+        look = (pid, incarnation), now_s, usage
+        process, before_s, before = self._looks.get(node, look)
+        self._looks[node] = look
         if said.memory_mb is not None and usage.memory_bytes > said.memory_mb * _MB:
             return f"{usage.memory_bytes / _MB:.0f} MB of memory, more than {said.memory_mb:g} MB"
-        if said.processor_share is None or before is None or now_s <= before.at_s or (
-                before.pid, before.incarnation) != (pid, incarnation):
+        if said.processor_share is None or process != look[0] or now_s <= before_s:
             return ""
-        share = (usage.cpu_s - before.usage.cpu_s) / (now_s - before.at_s)
+        share = (usage.cpu_s - before.cpu_s) / (now_s - before_s)
         if share > said.processor_share:
             return f"{share:.2f} of a core, more than {said.processor_share:g}"
         return ""

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import msgspec
 
 from rampart.actors.detection.finding import Sustained
-from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.detection.module import DetectionModule
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import Suspects, TopicHeard
 from rampart.manager.spec.tables import NonNegative, Positive
@@ -38,29 +38,16 @@ class RateMonitor(Sustained):
         self._least, self._most = at_least_hz * window_s, at_most_hz * window_s
         self._window_s = window_s
         self._from_s = start_s + max(grace_s, window_s)
+        self._is_first = True
         self._heard: deque[float] = deque(maxlen=_MOST)
 
     @property
     def due_s(self) -> float:
-        """When so many have left the window that the finding changes."""
-        if self.active and self._too_few:
-            return math.inf
-        times = [] if self.known else [self._from_s]
-        needed, allowed = math.ceil(self._least - 1e-9), self._most
-        count = len(self._heard)
-        if count < needed and not self.active:
-            times.append(self._from_s)
-        elif needed:
-            times.append(max(self._from_s, self._heard[-needed] + self._window_s))
-        if count > allowed + 1e-9:
-            times.append(self._heard[-int(allowed + 1e-9) - 1] + self._window_s)
-        elif self.active:
-            times.append(self._well.since_s + self._well.enough_s)
-        return min(times, default=math.inf)
-
-    @property
-    def _too_few(self) -> bool:
-        return len(self._heard) < self._least - 1e-9
+        """When a message leaves the window, the first one is full, or the rate is well for long."""
+        leaves_s = self._heard[0] + self._window_s if self._heard else math.inf
+        begins_s = self._from_s if self._is_first else math.inf
+        well_s = self._well.since_s + self._well.enough_s if self.active else math.inf
+        return min(leaves_s, begins_s, well_s)
 
     def heard(self, now_s: float) -> None:
         """Count a message."""
@@ -70,26 +57,28 @@ class RateMonitor(Sustained):
     def missed(self, now_s: float) -> None:
         """Count anew: messages may have come unheard."""
         self._heard.clear()
-        self._from_s = now_s + self._window_s
+        self._from_s, self._is_first = now_s + self._window_s, True
 
     def expire(self, now_s: float) -> None:
         """Forget what has left the window, and judge."""
         while self._heard and self._heard[0] <= now_s - self._window_s + 1e-9:
             self._heard.popleft()
+        if now_s >= self._from_s - 1e-9:
+            self._is_first = False
         count = len(self._heard)
         if count > self._most + 1e-9:
             self.note(f"{count} messages in {self._window_s:g} s, at most {self._most:g} are right",
                       now_s)
-        elif not self._too_few:
+        elif count >= self._least - 1e-9:
             self.note("", now_s)
-        elif now_s >= self._from_s - 1e-9:
+        elif not self._is_first:
             self.note(f"fewer than {self._least:g} messages in {self._window_s:g} s", now_s)
 
 
 class Rate(DetectionModule):
     """Active while messages of a topic come too seldom or too often, by their arrival."""
 
-    class Parameters(Waiting, frozen=True, kw_only=True):
+    class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
         """Which topic, and its rate.
 
         Attributes:

@@ -5,35 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import msgspec
-
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import FieldName, Suspects
 from rampart.manager.spec.tables import NonNegative
-
-
-class _Limits(msgspec.Struct, frozen=True):
-    """Between which a number is in order.
-
-    A number that has been out of them is in order again when it lies inside by `hysteresis`.
-    """
-
-    above: float | None
-    below: float | None
-    hysteresis: float
-
-    def problem(self, value: float, *, was_out: bool) -> str:
-        """Return what is wrong with a number, "" if nothing is."""
-        margin = self.hysteresis if was_out else 0.0
-        if not math.isfinite(value):
-            return f"{value} is no number"
-        if self.above is not None and value > self.above - margin:
-            return f"{value:g} is above {self.above:g}"
-        if self.below is not None and value < self.below + margin:
-            return f"{value:g} is below {self.below:g}"
-        return ""
 
 
 class Threshold(DetectionModule):
@@ -76,7 +52,6 @@ class Threshold(DetectionModule):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         said = self.parameters
-        self._limits = _Limits(said.above, said.below, said.hysteresis)
         self.monitor = self.judged_by(Sustained(
             said.for_s, said.clear_s, self.known_after_s(said.for_s + said.clear_s)))
         self._out = False
@@ -87,8 +62,20 @@ class Threshold(DetectionModule):
         if value is None:
             return
         number = abs(value) if self.parameters.absolute else value
-        why = self._limits.problem(number, was_out=self._out)
+        why = self._problem(number)
         self._out = bool(why)
         self.monitor.accused = self.accused(self.parameters.suspects, header)
         self.monitor.note(f"{self.parameters.value}: {why}" if why else "", self.clock.now())
         self.follow()
+
+    def _problem(self, number: float) -> str:
+        """Return what is wrong with a number, "" if nothing is."""
+        limits = self.parameters
+        margin = limits.hysteresis if self._out else 0.0
+        if not math.isfinite(number):
+            return f"{number} is no number"
+        if limits.above is not None and number > limits.above - margin:
+            return f"{number:g} is above {limits.above:g}"
+        if limits.below is not None and number < limits.below + margin:
+            return f"{number:g} is below {limits.below:g}"
+        return ""

@@ -8,8 +8,7 @@ from typing import Any
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.detection.disagreement import apart
-from rampart.actors.detection.finding import Finding
-from rampart.actors.detection.lasting import Lasting
+from rampart.actors.detection.finding import Finding, Lasting
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import FieldName, Suspects

@@ -17,13 +17,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from operator import attrgetter
 from typing import Any
 
 from rampart.actors.bus import messages as m
 from rampart.actors.bus import topics
 from rampart.actors.bus.topic import Members, Topic
-from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import FAILURES, NEW_PROCESSES, ProcessEvent
 from rampart.actors.ftm.plausible import is_possible
@@ -47,9 +46,6 @@ class _Watched:
     failure: str = ""
 
 
-_failure = attrgetter("failure")
-
-
 class WatchdogCore:
     """Active while one of the nodes has failed; `nodes` names those.
 
@@ -70,7 +66,7 @@ class WatchdogCore:
     @property
     def active(self) -> bool:
         """Whether a node has failed."""
-        return any(map(_failure, self._watched.values()))  # asked with every heartbeat
+        return any(one.failure for one in self._watched.values())
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -138,7 +134,7 @@ class WatchdogCore:
 class Watchdog(DetectionModule):
     """Active while one of the nodes it watches is dead, stopped or wedged."""
 
-    class Parameters(Waiting, frozen=True, kw_only=True):
+    class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
         """Whom it watches.
 
         Attributes:

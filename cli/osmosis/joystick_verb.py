@@ -12,7 +12,7 @@ from typing import Any
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
-from rampart.actors.detection.lasting import Lasting
+from rampart.actors.detection.finding import Lasting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import TELEOPERATION

@@ -321,7 +321,7 @@ def test_a_flapping_detection_module_does_not_thrash_the_recovery():
         for _ in range(40):
             flapper.activate("flap")
             await asyncio.sleep(0.3)
-            flapper.clear()
+            flapper.know_idle()
             await asyncio.sleep(0.7)
         releases = [d for d in system.recorder.decisions if not d.active]
         assert len(releases) <= 3

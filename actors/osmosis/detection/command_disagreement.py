@@ -16,8 +16,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from rampart.actors.detection.finding import Finding
-from rampart.actors.detection.lasting import Lasting
+from rampart.actors.detection.finding import Finding, Lasting
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.osmosis import messages as m

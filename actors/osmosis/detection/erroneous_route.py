@@ -18,8 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from rampart.actors.detection.finding import Finding
-from rampart.actors.detection.lasting import Lasting
+from rampart.actors.detection.finding import Finding, Lasting
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics

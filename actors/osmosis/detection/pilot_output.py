@@ -20,9 +20,8 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import chain, takewhile
 
-from rampart.actors.detection.finding import Finding
-from rampart.actors.detection.lasting import Lasting
-from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.detection.finding import Finding, Lasting
+from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -174,7 +173,7 @@ class PilotOutput(DetectionModule):
     process goes with it.
     """
 
-    class Parameters(Waiting, frozen=True):
+    class Parameters(DetectionModule.Parameters, frozen=True):
         """Whom it checks, and how strictly.
 
         Attributes:

@@ -268,11 +268,10 @@ def test_a_respawned_module_claims_nothing_before_it_knows(kind, parameters):
 
 
 def test_a_rate_is_reported():
-    found = reports(Rate, levels(*[1.0] * 10), 3.0, topic="tank/level", at_least_hz=5.0,
-                    startup_grace_s=0.0)
+    found = reports(Rate, levels(*[1.0] * 60), 8.0, topic="tank/level", at_least_hz=5.0)
     assert [(state, why) for _, state, why in found] == [
         ("idle", ""), ("active", "fewer than 5 messages in 1 s")]
-    assert found[1][0] == pytest.approx(1.6)  # the fifth from last came at 0.6
+    assert found[1][0] == pytest.approx(6.6)  # the fifth from last came at 5.6
 
 
 def test_two_gauges_that_disagree():

@@ -9,7 +9,7 @@ import pytest
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.detection.overload import Overload, RunQueue
+from rampart.actors.detection.overload import Overload
 from rampart.actors.machine.patience import Usage
 from rampart.manager.spec.budget import allowed_late_s
 from rampart.testing import Ear, VirtualSystem, run
@@ -91,15 +91,6 @@ def test_a_successor_says_nothing_before_it_knows():
     assert states([], until_s=0.9, incarnation=2) == []
     assert states([], until_s=2.0, incarnation=2) == [(1.0, "idle")]
     assert states([(0.5, "abc", 0.2)], until_s=0.9, incarnation=2) == [(0.5, "active")]
-
-
-def test_a_process_waits_that_has_spent_enough_of_the_time_in_the_run_queue():
-    waited_s = {1: 5.0, 2: 0.0}
-    queue = RunQueue(lambda pid: Usage("S", 0.0, waited_s[pid]), 0.1)
-    assert queue.count([1, 2], 10.0) == 0  # nothing to compare with
-    waited_s |= {1: 5.11, 2: 0.09, 3: 9.0}
-    assert queue.count([1, 2, 3], 11.0) == 1
-    assert queue.count([1, 2, 3], 12.0) == 0
 
 
 def test_by_default_late_is_half_the_slack_of_the_systems_shortest_timeout():

@@ -92,7 +92,7 @@ def test_what_plan_and_spec_say_is_given_to_the_actors_that_take_it():
      "detection DM7: parameters.timeout_s = 0.2: would raise false alarms; at least 0.420 s, 3 "
      "periods of heartbeat_period_s = 0.140 s, is right"),
     ("detections", "DM1", {"margim_m": 0.6},
-     "detection DM1: parameters.margim_m = 0.6: unknown parameter; known: startup_grace_s, margin"),
+     "detection DM1: parameters.margim_m = 0.6: unknown parameter; known: margin"),
     ("detections", "DM2", {"suspects": "osmosis_control"},
      "detection DM2: parameters.suspects = 'osmosis_control': expected a list of node names"),
     ("detections", "DM2", {"suspects": ["osmosis"]},
@@ -133,7 +133,7 @@ def test_what_an_actor_cannot_do_without_may_be_derived_but_not_left_out():
 
 @pytest.mark.parametrize(("old", "new", "words"), [
     ("margin_m = 0.6,", "margin_m = 0.6, hold = 1,",
-     "detection DM1: parameters.hold = 1: unknown parameter; known: startup_grace_s, margin_m"),
+     "detection DM1: parameters.hold = 1: unknown parameter; known: margin_m"),
     ("{ top_speed_mps = 0.6 }", '{ top_speed_mps = "x" }',
      "recovery RM8: parameters.top_speed_mps = 'x': expected a number > 0")])
 def test_a_look_at_a_spec_refuses_parameters_of_the_modules_that_ship(tmp_path, old, new, words):

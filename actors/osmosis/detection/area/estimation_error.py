@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from rampart.actors.detection.finding import Finding
-from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.position_vote import PositionVote
@@ -75,8 +75,6 @@ class EstimationMonitor(Finding):
 
 class EstimationError(DetectionModule):
     """DM8: see the module."""
-
-    Parameters = Waiting
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

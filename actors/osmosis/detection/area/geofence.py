@@ -17,8 +17,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from rampart.actors.detection.finding import Lasting
 from rampart.actors.detection.freshness import FreshnessMonitor
-from rampart.actors.detection.lasting import Lasting
 from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.osmosis.messages import GpsFix
 from rampart.actors.osmosis.readings import is_fix

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from rampart.actors.detection.freshness import FreshnessMonitor
-from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
@@ -24,7 +24,7 @@ GPS_PERIOD_S = 1.0 / topics.GPS.rate_hz
 class ProhibitedArea(DetectionModule):
     """Active while the robot would not stop before the prohibited area, or while GPS is silent."""
 
-    class Parameters(Waiting, frozen=True):
+    class Parameters(DetectionModule.Parameters, frozen=True):
         """When it warns.
 
         Attributes:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from rampart.actors.detection.module import DetectionModule, Waiting
+from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
@@ -77,7 +77,7 @@ class VotedPosition:
 class VotedArea(DetectionModule):
     """Active while the robot would not stop before the prohibited area, or its place is unknown."""
 
-    class Parameters(Waiting, frozen=True):
+    class Parameters(DetectionModule.Parameters, frozen=True):
         """When it warns.
 
         Attributes:
