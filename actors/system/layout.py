@@ -1,7 +1,16 @@
-"""Everything that follows from the plan of a run and its system: processes and their actors."""
+"""Everything that follows from the plan of a run and its system: processes and their actors.
+
+All that is checked of the actors together is checked here: whether what they receive can come, what
+they publish is theirs alone, and what they name is there.
+
+A node that waits for a topic under a mistyped key, or for messages of another type, works as well
+as any: it is only silent. So it is refused before a run, in one line.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -9,21 +18,17 @@ from typing import Any
 import msgspec
 
 from rampart.actors import ROLES, TAKES
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.fields import Field
+from rampart.actors.bus.topic import Members, Qos, Topic
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.runtime.actor import Actor
+from rampart.actors.recovery.respawn import Respawn
+from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor
 from rampart.actors.runtime.application import Application
-from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.parameters import Named, messages_said, read_parameters
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_document, on_host, tailor
-from rampart.actors.system.checks import (
-    check_connections,
-    check_heard,
-    check_repairs,
-    publishers_of,
-)
 from rampart.actors.system.hosts import Hosts
 from rampart.actors.system.members import (
     Member,
@@ -37,7 +42,7 @@ from rampart.actors.system.members import (
     load_member,
     published,
 )
-from rampart.actors.system.topics import choose_topics, stand_in_topics
+from rampart.actors.system.topics import find_topic, flaw, stand_in_topics
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 from rampart.manager.spec.specification import check_change, check_document
 from rampart.manager.spec.tables import Layers
@@ -92,7 +97,7 @@ class Layout:
         try:
             kind = application_class(spec)
             observer = load_class(kind.observer)
-            judge = judge_class(spec)
+            judge: Any = judge_class(spec)
             judged = judged_topics(spec, observer)
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
@@ -100,21 +105,32 @@ class Layout:
                  "dead_man": spec.layers.dead_man,
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
         # Without fault tolerance its actors are not started: what they publish is not missed, and
-        # what they hear is checked.
+        # what they receive is checked.
         whole = msgspec.structs.replace(spec, layers=Layers()).actors()
         everyone = self._complete((
             *self._guards(observer, judged),
             *(load_member(n, spec, file, world if n.kind is Kind.WORLD else {}) for n in whole)),
             file)
-        started = {*self.unit_of, *(m.name for m in everyone if m.kind is Kind.SUPERVISION)}
-        known = (*kind.topics, *stand_in_topics(spec))
-        chosen, topics = choose_topics(everyone, (*known, *judged), file)
-        self.members = {name: member for name, member in chosen.items() if name in started}
-        self.topics = topics
-        made = {topic.key for member in everyone
-                for topic in member.actor.own_topics(member.parameters)}
-        self._check(judge, chosen.values(), (*ftm_topics.ALL, *known, *(
-            topic for key, topic in topics.items() if key in made)), file)
+        judged_by = f"$.judge: {judge.__name__}" if judge else ""
+        connections = Connections(
+            everyone, (*ftm_topics.ALL, *kind.topics, *stand_in_topics(spec)),
+            judge.inputs() if judge else (), judged_by, file)
+        self.topics = connections.named
+        self.members = {name: member for name, member in connections.members.items()
+                        if name in self.unit_of or member.kind is Kind.SUPERVISION}
+        silent = [] if spec.layers.ftm else [topic.key for topic in ftm_topics.ALL]
+        connections.check(self.members.values(), silent)
+        check_repairs(self.members, spec, file)
+        if judge is None:
+            return
+        if kind.trial:
+            raise ValueError(f"{file}: $.judge: the application says by itself what a run was "
+                             "worth; leave it out")
+        given = {name: value for name, value in spec.judge.items() if name != "class"}
+        read_parameters(judge.Parameters, given, file, "$.judge")
+        for topic in judge.inputs():
+            if topic not in judge.optional_inputs and topic.key not in silent:
+                connections.check_published(f"{file}: {judged_by}", topic.key, None)
 
     def _guards(self, observer: type[Actor], judged: Collection[Topic[Any]]) -> Iterator[Member]:
         """Yield supervisors and observers of all hosts, the observer of the run among them."""
@@ -155,25 +171,220 @@ class Layout:
         return "pool" if all(name in self.members and self.members[name].spare == "pool"
                              for name in names) else "none"
 
-    def _check(self, judge: Any, everyone: Iterable[Member], known: Collection[Topic[Any]],
-               file: str) -> None:
-        """Check who hears and publishes what; raises as the constructor."""
-        silent = [] if self.spec.layers.ftm else [topic.key for topic in ftm_topics.ALL]
-        said = publishers_of(everyone)
-        declared = check_connections(list(self.members.values()), said, known, silent, file)
-        check_repairs(self.members, self.spec, file)
-        if judge is None:
+
+class Connections:
+    """All topics of a system, and who publishes them.
+
+    Args:
+        members: all actors of the system, also those that are not started now, and could be.
+        known: topics of engine and application, whose declarations count first.
+        judged: topics of the judge.
+        judge: what the judge is called in messages.
+        file: name of the spec, for messages.
+
+    Attributes:
+        members: the actors by name, with the topics that their parameters name.
+        named: those topics, by the keys in the parameters.
+
+    Raises:
+        ValueError: a topic makes no sense or is declared in two ways, or a parameter names a topic
+            or a field that there is not; the message names node, key or parameter, and value.
+    """
+
+    def __init__(self, members: Collection[Member], known: Iterable[Topic[Any]],
+                 judged: Iterable[Topic[Any]], judge: str, file: str) -> None:
+        self._file = file
+        self._topics: dict[str, tuple[Topic[Any], str]] = {}
+        for topic in known:
+            self._topics.setdefault(topic.key, (topic, "the application or the engine"))
+        for member in members:
+            for topic in (*member.actor.outputs, *BASE_OUTPUTS, *member.actor.inputs()):
+                self._declare(topic, member.where)
+        for topic in judged:
+            self._declare(topic, judge)
+        for member in members:
+            with self._checking(member):
+                for topic in member.actor.own_topics(member.parameters):
+                    self._topics.setdefault(topic.key, (topic, member.where))
+        self.named: dict[str, Topic[Any]] = {}
+        self.members = {member.name: self._with_named(member) for member in members}
+        self._publishers: dict[str, list[tuple[Member, Members]]] = {}
+        for member in self.members.values():
+            for key, names in published(member).items():
+                self._publishers.setdefault(key, []).append((member, names))
+
+    def check(self, started: Collection[Member], silent: Collection[str]) -> None:
+        """Check who receives and publishes what.
+
+        Args:
+            started: the actors that are started.
+            silent: keys on which no node has to publish now.
+
+        Raises:
+            ValueError: a topic is received and never published, or has two publishers where one is
+                meant; the message names nodes and key.
+        """
+        for member in started:
+            optional = {topic.key for topic in member.actor.optional_inputs}
+            for key, names in heard(member).items() if member.kind is not Kind.SUPERVISION else ():
+                if key not in optional and key not in silent:
+                    self.check_published(f"{self._file}: {member.where}:", key, names)
+        for member in started:
+            self._check_alone(member)
+        for key, publishers in self._publishers.items():
+            topic = self._topics[key][0]
+            if topic.several or topic.qos is Qos.COMMAND or topic in BASE_OUTPUTS:
+                continue
+            first: dict[str, Member] = {}
+            for member, names in publishers:
+                for name in (names or ()) if topic.is_family else ("",):
+                    other = first.setdefault(name, member)
+                    if other.name != member.name:
+                        raise ValueError(
+                            f"{self._file}: {member.where}: publishes {key!r}, as {other.where} "
+                            f"does; of a topic of qos {topic.qos.value} the latest message counts, "
+                            "so that one may (or several = True in the Topic)")
+
+    def check_published(self, who: str, key: str, names: Members) -> None:
+        """Check that what is received is published.
+
+        Args:
+            who: receives it, for the message.
+            key: of the topic.
+            names: of the members of a family, None for all.
+
+        Raises:
+            ValueError: no node publishes it.
+        """
+        topic, publishers = self._topics[key][0], self._publishers.get(key, [])
+        if topic.outside or (publishers and not topic.is_family):
             return
-        if application_class(self.spec).trial:
-            raise ValueError(f"{file}: $.judge: the application says by itself what a run was "
-                             "worth; leave it out")
-        given = {name: value for name, value in self.spec.judge.items() if name != "class"}
-        read_parameters(judge.Parameters, given, file, "$.judge")
-        for topic in judge.inputs():
-            who = f"$.judge: {judge.__name__}"
-            declared.add(topic, who)
-            if topic not in judge.optional_inputs and topic.key not in silent:
-                check_heard(f"{file}: {who}", topic, None, said)
+        missing = () if publishers and names is None else [
+            name for name in names or ("",)
+            if not any(there is None or name in there for _, there in publishers)]
+        if not missing:
+            return
+        wanted = key.replace("{name}", missing[0] or "{name}")
+        spelt = [key.replace("{name}", name) for key, those in self._publishers.items()
+                 for _, there in those for name in there or ("{name}",)]
+        near = difflib.get_close_matches(wanted, spelt, 1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ValueError(f"{who} hears {wanted!r}, which nothing publishes; {hint}What a node can "
+                         "do without is named in optional_inputs of its class")
+
+    def _declare(self, topic: Topic[Any], who: str) -> None:
+        first, other = self._topics.setdefault(topic.key, (topic, who))
+        if reason := flaw(topic):
+            raise ValueError(f"{self._file}: {who}: topic {topic.key!r}: {reason}")
+        if first is not topic and (first.type, first.qos) != (topic.type, topic.qos):
+            raise ValueError(
+                f"{self._file}: {who}: topic {topic.key!r} is {_form(topic)}, and {_form(first)} "
+                f"to {other}; declare it once, and import it")
+
+    def _with_named(self, member: Member) -> Member:
+        """Return a member with the topics that its parameters name."""
+        ways: dict[str, dict[str, Members]] = {"heard": {}, "published": {}}
+        for way, names in member.actor.named(member.parameters).items():
+            for one in names:
+                where = f"{self._file}: {member.name}: {one.row or member.table}{one.name}"
+                self.named[one.key] = topic = self._find(one.key, where)
+                if way == "heard" and topic.is_family and topic in member.actor.inputs():
+                    raise ValueError(f"{where}: {member.actor.__name__} hears {one.key!r} anyway")
+                _check_field(topic, one, where)
+                name = topic.member(one.key)
+                there = ways[way].get(topic.key, ())
+                ways[way][topic.key] = (*(there or ()), name) if name else None
+        with self._checking(member):
+            member.actor.check_topics(member.parameters, self.named)
+            for parameter, said in messages_said(member.parameters).items():
+                topic = self.named[said.topic]
+                try:
+                    msgspec.convert(said.fields, topic.type)
+                except ValueError as error:
+                    raise ValueError(
+                        f"parameters.{parameter}: topic {topic.key}: {error}") from None
+        return replace(member, hears=ways["heard"], publishes=ways["published"])
+
+    def _find(self, key: str, where: str) -> Topic[Any]:
+        known = {key: topic for key, (topic, _) in self._topics.items()}
+        topic = known.get(key) or find_topic(key, known.values())
+        if topic is None:
+            near = difflib.get_close_matches(key, known, 3)
+            hint = f"; the nearest: {', '.join(near)}" if near else ""
+            raise ValueError(f"{where}: no actor has a topic {key!r}{hint}")
+        return topic
+
+    def _check_alone(self, node: Member) -> None:
+        """Check that no other node publishes where one is to be alone, as an operator's joystick.
+
+        Also of a command: the robot is told to stand still once, when he lets go.
+        """
+        for alone_on, what in node.actor.alone_on(node.parameters).items():
+            for key, publishers in self._publishers.items():
+                topic = self._topics[key][0]
+                name = topic.member(alone_on)
+                for other, names in publishers if name is not None and not topic.several else ():
+                    if other.name != node.name and (names is None or name in names):
+                        raise ValueError(
+                            f"{self._file}: {node.name}: {what}: {other.where} "
+                            f"publishes {alone_on!r} as well, and may move what an operator let go "
+                            "of; a topic of the stick's own is right (or several = True in the "
+                            "Topic)")
+
+    @contextlib.contextmanager
+    def _checking(self, member: Member) -> Iterator[None]:
+        """Name file and node in what is wrong with its parameters."""
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(f"{self._file}: {member.name}: {error}") from None
+
+
+def check_repairs(members: Mapping[str, Member], spec: SystemSpec, file: str) -> None:
+    """Check that what a detection module names can be restarted by what answers to it.
+
+    Args:
+        members: all actors of a system, by name.
+        spec: the system.
+        file: name of the spec, for messages.
+
+    Raises:
+        ValueError: a module that restarts nodes answers to a detection module, and neither it nor
+            another one that answers has a node that this watches or suspects.
+    """
+    for mechanism in spec.mechanisms:
+        repairs = {name: members[name].parameters for name in mechanism.recoveries
+                   if name in members and issubclass(members[name].actor, Respawn)}
+        mendable = {node for said in repairs.values()
+                    if isinstance(said, Respawn.Parameters) for node in said.nodes}
+        for name in mechanism.detections if repairs else ():
+            if name not in members:
+                continue
+            for parameter in ("watch", "suspects"):
+                for node in getattr(members[name].parameters, parameter, ()):
+                    if node not in mendable:
+                        by = " or ".join(repairs)
+                        raise ValueError(
+                            f"{file}: detection {name}: parameters.{parameter}: {by} answers to "
+                            f"{mechanism.name} and does not restart {node}; expected "
+                            f"respawn = {next(iter(repairs))!r} in node {node}, or {node} in the "
+                            f"parameters.nodes of {by}")
+
+
+def _check_field(topic: Topic[Any], named: Named, where: str) -> None:
+    """Check the field of a topic that a parameter names."""
+    if named.field:
+        try:
+            kind = Field(topic.type, named.field).kind
+        except ValueError as error:
+            raise ValueError(f"{where}: topic {topic.key}: {error}") from None
+        if kind not in named.kinds:
+            raise ValueError(f"{where}: topic {topic.key}: {named.field} is a {kind}; a "
+                             f"{' or a '.join(named.kinds)} is right")
+
+
+def _form(topic: Topic[Any]) -> str:
+    return f"{topic.type.__module__}:{topic.type.__name__} of qos {topic.qos.value}"
 
 
 def _guard(name: str, kind: type[Actor], given: Mapping[str, Any]) -> Member:

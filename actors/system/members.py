@@ -82,7 +82,7 @@ def heard(member: Member) -> dict[str, Members]:
     actor = member.actor
     return _together({
         t.key: actor.names(t, member.name, member.parameters) if t.is_family else None
-        for t in topics_of(actor)[0]}, member.hears)
+        for t in actor.inputs() if t not in BASE_INPUTS}, member.hears)
 
 
 def _together(declared: dict[str, Members], chosen: Mapping[str, Members]) -> dict[str, Members]:
@@ -92,9 +92,9 @@ def _together(declared: dict[str, Members], chosen: Mapping[str, Members]) -> di
     return declared
 
 
-def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[Any], ...]]:
-    """Return (inputs, outputs) of an actor class without what every actor has."""
-    return tuple(t for t in actor.inputs() if t not in BASE_INPUTS), tuple(actor.outputs)
+def topics_of(actor: type[Actor]) -> tuple[Topic[Any], ...]:
+    """Return the inputs and outputs of an actor class without what every actor receives."""
+    return *(t for t in actor.inputs() if t not in BASE_INPUTS), *actor.outputs
 
 
 def load_member(node: NodeSpec, spec: SystemSpec, file: str,

@@ -1,25 +1,18 @@
-"""All topics of a system: the common ones, what its actors declare, and what parameters name."""
+"""The topics of a system: the common ones, and what its actors declare besides."""
 
 from __future__ import annotations
 
-import contextlib
-import difflib
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterable
+from functools import cache
 from typing import Any
 
+import msgspec
+from msgspec import inspect
+
 from rampart.actors import TAKES
-from rampart.actors.bus.topic import Members, Topic
+from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
-from rampart.actors.runtime.actor import BASE_OUTPUTS
-from rampart.actors.system.checks import check_named, check_said, flaw
-from rampart.actors.system.members import (
-    Member,
-    application_class,
-    load_class,
-    load_member,
-    topics_of,
-)
+from rampart.actors.system.members import application_class, load_class, load_member, topics_of
 from rampart.manager.spec.specification import SystemSpec
 
 _SHIPPED = "rampart."
@@ -35,17 +28,35 @@ def declared_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     return (*topics.ALL, *application_class(spec).topics)
 
 
-def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+def system_topics(spec: SystemSpec, *, shipped: bool = True) -> tuple[Topic[Any], ...]:
     """Return every topic of a system once: the declared ones, then what its actors have besides.
 
     The latter are in the order of the spec. A key that is declared keeps its contract.
+
+    Args:
+        spec: the system.
+        shipped: whether actors that ship are loaded, too.
 
     Raises:
         ValueError: the spec names an actor class that does not exist, or one of them declares a
             topic that makes no sense.
     """
-    known = declared_topics(spec)
-    return _with_made((*known, *_beyond(known, _actors(spec))), spec)
+    found = {topic.key: topic for topic in declared_topics(spec)}
+    paths = (*(node.actor for node in spec.nodes), *(row.actor for row in spec.detections),
+             *(row.actor for row in spec.recoveries), *(node.stand_in for node in spec.nodes))
+    for path in dict.fromkeys(paths):
+        if not path or (path.startswith(_SHIPPED) and not shipped):
+            continue
+        for topic in topics_of(load_class(path)):
+            if topic.key not in found and (reason := flaw(topic)):
+                raise ValueError(f"actor = {path!r}: topic {topic.key!r}: {reason}")
+            found.setdefault(topic.key, topic)
+    for node in spec.nodes if spec.ros2 else ():
+        if node.actor == TAKES["ros2"]:
+            member = load_member(node, spec, spec.name)
+            for topic in member.actor.own_topics(member.parameters):
+                found.setdefault(topic.key, topic)
+    return tuple(found.values())
 
 
 def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
@@ -57,47 +68,7 @@ def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     Raises:
         ValueError: as `system_topics`, of the actors that do not ship.
     """
-    known = declared_topics(spec)
-    own = _beyond(known, (path for path in _actors(spec) if not path.startswith(_SHIPPED)))
-    return _with_made((*known, *own), spec)[len(known):]
-
-
-def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
-    """Return the topic of a key below the root, one member's if it is a family, or None."""
-    return next((topic for topic in known if topic.member(key) is not None), None)
-
-
-def _actors(spec: SystemSpec) -> Iterator[str]:
-    """Return the paths of all actor classes of a system."""
-    tables = (spec.nodes, spec.detections, spec.recoveries)
-    return filter(None, [*(row.actor for table in tables for row in table),
-                         *(node.stand_in for node in spec.nodes)])
-
-
-def _with_made(known: tuple[Topic[Any], ...], spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return topics with those that there are because parameters say so, each key once."""
-    found = {topic.key: topic for topic in known}
-    for node in spec.nodes if spec.ros2 else ():
-        if node.actor == TAKES["ros2"]:
-            member = load_member(node, spec, spec.name)
-            for topic in member.actor.own_topics(member.parameters):
-                found.setdefault(topic.key, topic)
-    return tuple(found.values())
-
-
-def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[Any], ...]:
-    """Return what actors have that is not known, each key once."""
-    common = {topic.key for topic in known}
-    found: dict[str, Topic[Any]] = {}
-    for path in dict.fromkeys(paths):
-        inputs, outputs = topics_of(load_class(path))
-        for topic in (*inputs, *outputs):
-            if topic.key in common or topic.key in found:
-                continue
-            if reason := flaw(topic):
-                raise ValueError(f"actor = {path!r}: topic {topic.key!r}: {reason}")
-            found[topic.key] = topic
-    return tuple(found.values())
+    return system_topics(spec, shipped=False)[len(declared_topics(spec)):]
 
 
 def stand_in_topics(spec: SystemSpec) -> list[Topic[Any]]:
@@ -106,66 +77,47 @@ def stand_in_topics(spec: SystemSpec) -> list[Topic[Any]]:
     Raises:
         ValueError: there is no such class.
     """
-    classes = [load_class(node.stand_in, field="stand_in") for node in spec.nodes if node.stand_in]
-    return [topic for one in classes for part in topics_of(one) for topic in part]
+    return [topic for node in spec.nodes if node.stand_in
+            for topic in topics_of(load_class(node.stand_in, field="stand_in"))]
 
 
-def choose_topics(members: Collection[Member], known: Iterable[Topic[Any]], file: str
-                  ) -> tuple[dict[str, Member], dict[str, Topic[Any]]]:
-    """Return the members with the topics that their parameters name, and those topics by key.
-
-    Args:
-        members: all of a system.
-        known: topics besides those of their classes.
-        file: name of the spec, for messages.
-
-    Raises:
-        ValueError: no actor of the system has such a topic, no actor publishes what is to be heard,
-            or its messages have no such field; the message names node, parameter and value.
-    """
-    every: dict[str, Topic[Any]] = {topic.key: topic for topic in known}
-    for member in members:
-        for topic in (*member.actor.outputs, *BASE_OUTPUTS, *member.actor.inputs()):
-            every.setdefault(topic.key, topic)
-    for member in members:
-        with _of(member, file):
-            for topic in member.actor.own_topics(member.parameters):
-                every.setdefault(topic.key, topic)
-    found: dict[str, Topic[Any]] = {}
-    chosen: dict[str, Member] = {}
-    for member in members:
-        ways: dict[str, dict[str, Members]] = {"heard": {}, "published": {}}
-        for way, names in member.actor.named(member.parameters).items():
-            for one in names:
-                where = f"{file}: {member.name}: {one.row or member.table}{one.name}"
-                found[one.key] = topic = _topic(one.key, every, where)
-                if way == "heard" and topic.is_family and topic in member.actor.inputs():
-                    raise ValueError(f"{where}: {member.actor.__name__} hears {one.key!r} anyway")
-                check_named(topic, one, where)
-                name = topic.member(one.key)
-                there = ways[way].get(topic.key, ())
-                ways[way][topic.key] = (*(there or ()), name) if name else None
-        with _of(member, file):
-            member.actor.check_topics(member.parameters, found)
-            check_said(member.parameters, found)
-        chosen[member.name] = replace(member, hears=ways["heard"], publishes=ways["published"])
-    return chosen, found
+def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
+    """Return the topic of a key below the root, one member's if it is a family, or None."""
+    return next((topic for topic in known if topic.member(key) is not None), None)
 
 
-@contextlib.contextmanager
-def _of(member: Member, file: str) -> Iterator[None]:
-    """Name the node in what is wrong with its parameters."""
+def flaw(topic: Topic[Any]) -> str:
+    """Return what is wrong with a topic, or an empty text."""
+    if topic.key.count("{name}") > 1:
+        return "one {name} at most is right"
+    if not (isinstance(topic.type, type) and issubclass(topic.type, msgspec.Struct)):
+        return f"type = {topic.type!r}: must be derived from rampart.actors.bus.messages.Message"
+    return _unsendable(topic.type)
+
+
+@cache
+def _unsendable(message: type[msgspec.Struct]) -> str:
+    """Return which field of a message has a type that no message can have, "" if none has."""
     try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{file}: {member.name}: {error}") from None
-
-
-def _topic(key: str, known: Mapping[str, Topic[Any]], where: str) -> Topic[Any]:
-    topic = known.get(key) or next(
-        (t for t in known.values() if t.member(key) is not None), None)
-    if topic is None:
-        near = difflib.get_close_matches(key, known, 3)
-        hint = f"; the nearest: {', '.join(near)}" if near else ""
-        raise ValueError(f"{where}: no actor has a topic {key!r}{hint}")
-    return topic
+        waiting = [("", inspect.type_info(message))]
+    except (TypeError, NameError) as error:
+        return str(error)
+    seen: set[type] = set()
+    while waiting:
+        path, info = waiting.pop()
+        match info:
+            case inspect.CustomType(cls=kind):
+                return (f"field {path}: {kind.__module__}.{kind.__qualname__} cannot be sent; "
+                        "expected plain types, e.g. tuple[float, ...]")
+            case inspect.Metadata(type=inner):
+                waiting.append((path, inner))
+            case inspect.UnionType(types=several) | inspect.TupleType(item_types=several):
+                waiting += [(path, one) for one in several]
+            case inspect.DictType(key_type=key, value_type=value):
+                waiting += [(path, key), (path, value)]
+            case inspect.StructType(cls=kind, fields=fields) if kind not in seen:
+                seen.add(kind)
+                waiting += [(f"{path}.{f.name}".lstrip("."), f.type) for f in fields]
+            case inspect.CollectionType(item_type=item):
+                waiting.append((f"{path}[]", item))
+    return ""

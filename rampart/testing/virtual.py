@@ -112,13 +112,9 @@ class VirtualSystem:
         Raises:
             ValueError: the system is unsound, or an actor cannot be imported; one line says where.
         """
-        file = systems.find(str(system))
-        working_folder.admit(file.parent)
-        chosen = RunPlan(**{"system_file": str(file), "virtual": True, **plan})
-        spec = load_system(chosen)
-        context = load_run(chosen, spec)
-        return cls(context, Layout(chosen, spec, context.application),
-                   keeps_checkpoints=spec.layers.checkpoints)
+        run = _load(system, plan)
+        return cls(run, Layout(run.plan, run.system, run.application),
+                   keeps_checkpoints=run.system.layers.checkpoints)
 
     async def __aenter__(self) -> Self:
         await self.bus.open()
@@ -282,11 +278,15 @@ def virtual_run(system: str | Path, *faults: str, seconds: float | None = None,
     Raises:
         ValueError: the system or a fault is unsound; one line says where.
     """
-    file = systems.find(str(system))
-    working_folder.admit(file.parent)
-    chosen = RunPlan(**{"system_file": str(file), "virtual": True, **plan})
-    spec = load_system(chosen)
-    trial = trial_class(spec)(load_run(chosen, spec), seconds)
+    run = _load(system, plan)
+    trial = trial_class(run.system)(run, seconds)
     if not trial.patient and trial.limit_s is None:
         raise ValueError(f"{system}: has no [end]; say after how many seconds the run is over")
     return VirtualRun(trial, scenario=[parse_fault(text) for text in faults]).run()
+
+
+def _load(system: str | Path, plan: dict[str, Any]) -> RunContext:
+    file = systems.find(str(system))
+    working_folder.admit(file.parent)
+    chosen = RunPlan(**{"system_file": str(file), "virtual": True, **plan})
+    return load_run(chosen, load_system(chosen))
