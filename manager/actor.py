@@ -52,7 +52,7 @@ from rampart.manager.spec.adaptation import Action, Change, Document, adapt, des
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.specification import check_change
 
-MANAGER_STATE = StateFormat(Memory, version=1, objection=objection)
+MANAGER_STATE = StateFormat(Memory, version=2, objection=objection)
 
 DECISIONS_PER_INCARNATION = 10_000
 """Each incarnation numbers its decisions from a multiple of this."""
@@ -222,8 +222,7 @@ class FtmManager(Actor):
                         output.decision.rule, output.decision.recoveries, output.taken))
                 case ResetAnswered(granted=False):
                     self.report_diagnostic("reset refused", output.reason, output.recovery)
-        if (outputs or not _says_all_is_well(event) or self._shown is None
-                or not _is_calm(self._shown)) and self._status() != self._shown:
+        if self._status() != self._shown:
             self._show()
         if (self.arbiter_state.number, self.arbiter_state.latched) != self._remembered:
             self.remember()
@@ -272,22 +271,6 @@ def _with_other_topics(before: Layout, after: Layout) -> list[str]:
     """Return the actors that would hear or publish what they do not now."""
     return [name for name, new in after.members.items() for old in [before.members[name]]
             if (heard(new), published(new)) != (heard(old), published(old))]
-
-
-def _says_all_is_well(event: Input) -> bool:
-    """Whether a report, in a system in which all is well, changes nothing that could be shown.
-
-    Such reports are nearly all that the manager hears, and to look for a change costs as much as
-    to hear one.
-    """
-    match event:
-        case DetectionHeard(active=False) | RecoveryHeard(activated=False):
-            return True
-    return False
-
-
-def _is_calm(status: m.ManagerStatus) -> bool:
-    return not (status.active or status.silent or status.activated or status.latched)
 
 
 def forgive_absence(state: State, missed_s: float, now_s: float) -> State:

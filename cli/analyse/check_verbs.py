@@ -16,7 +16,7 @@ from rampart.cli.look import topic_catalogue as catalogue
 from rampart.cli.output import UsageError, print_json, print_table, say
 from rampart.cli.verbs import JSON, add_verb
 from rampart.manager.spec.schema import Kind, SystemSpec
-from rampart.manager.strategies.arrangement import arrange
+from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.escalation import succession
 from rampart.manager.strategies.registry import decide
 
@@ -171,7 +171,7 @@ def _consequences(spec: SystemSpec) -> Iterator[Consequence]:
     if not spec.mechanisms:
         return
     mechanisms, tree, order = spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order()
-    arrangement = arrange(mechanisms, tree, order)
+    arrangement = Arrangement(mechanisms, tree, order)
     for detection in spec.detections:
         name = detection.name
         listening = tuple(m.name for m in spec.mechanisms if name in m.detections)

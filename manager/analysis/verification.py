@@ -24,7 +24,7 @@ from rampart.manager.analysis.active_sets import (
 from rampart.manager.analysis.transitions import Transitions, Violations, explore
 from rampart.manager.spec.budget import patience_s
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.arrangement import Arrangement, arrange
+from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision
 from rampart.manager.strategies.escalation import escalate
 from rampart.manager.strategies.registry import STRATEGIES, find_strategy
@@ -104,7 +104,7 @@ def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
             f"{spec.name}: {len(spec.mechanisms)} mechanisms have {count} active sets; at most "
             f"{MAX_MECHANISMS} mechanisms can be verified exhaustively")
     names = tuple(strategies) or tuple(dict.fromkeys((spec.strategy, *STRATEGIES)))
-    arrangement = arrange(
+    arrangement = Arrangement(
         spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
     safety = spec.build_safety_order()
     explorer = _Explorer(arrangement, together)

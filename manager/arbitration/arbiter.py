@@ -28,7 +28,7 @@ states can be explored. The strategy decides *which* recovery; the arbiter sees 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from operator import attrgetter
 
 from msgspec.structs import replace
@@ -42,9 +42,6 @@ from rampart.manager.arbitration.arbiter_state import (
     ResetAsked,
     ShadowDiffered,
     State,
-    keep_latched,
-    reset_refusal,
-    with_late,
 )
 from rampart.manager.arbitration.detection_track import (
     DetectionHeard,
@@ -56,7 +53,7 @@ from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, R
 from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.budget import patience_s
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.arrangement import Arrangement, arrange
+from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import NOTHING_ACTIVE, Decision, Strategy
 from rampart.manager.strategies.escalation import escalate
 from rampart.manager.strategies.registry import Decider, find_strategy
@@ -64,6 +61,10 @@ from rampart.manager.strategies.registry import Decider, find_strategy
 LARGEST_NUMBER = 1 << 52
 """A decision number beyond it was never given, although it be reported or remembered. What may
 follow still fits into a message (`rampart.actors.bus.bounds.Count`)."""
+
+EXCUSE_S = 5.0
+"""So long before what excuses it was detected may a latch have come: an overload begins before it
+is noticed."""
 
 _is_at_rest = attrgetter("is_at_rest")
 
@@ -196,13 +197,21 @@ class Arbiter:
                             latched=self.mechanisms.contracts[event.recovery].latched)
         track = recovery_track.hear(track, event, now)
         if track.failure and not track.failed_for:
-            track = replace(track, failed_for=recovery_track.sakes(
-                self.mechanisms.users[event.recovery], state.decision.active))
+            track = replace(track, failed_for=self._sakes(track.name, state.decision.active))
         return self._with_recovery(replace(state, number=number), track)
 
     def _reset(self, state: State, event: ResetAsked) -> tuple[State, tuple[ResetAnswered]]:
-        refusal = reset_refusal(state, event.recovery, self._choose(state)[1])
-        if not refusal:
+        unlatched = self._choose(state)[1]
+        refusal = ""
+        if event.recovery not in self._recovery:
+            refusal = "there is no such recovery module"
+        elif not self._track(state, event.recovery).latched:
+            refusal = "it is not latched"
+        elif not state.oriented:
+            refusal = "not all modules have been heard yet"
+        elif event.recovery in unlatched.recoveries:
+            refusal = f"the cause persists: {', '.join(unlatched.active)} active"
+        else:
             state = self._with_recovery(state, replace(
                 self._track(state, event.recovery), latched=False, adopted=False))
         return state, (ResetAnswered(event.recovery, not refusal, refusal or (
@@ -215,12 +224,10 @@ class Arbiter:
             else detection_track.pass_time(t, self._rules_of(state, t.name), now)
             for t in state.detections)
         believed = {track.name: track for track in detections}
-        active = self._active(detections)
-        contracts, users = self.mechanisms.contracts, self.mechanisms.users
-        reported = said(detections)
-        recoveries = tuple(recovery_track.excuse(
-            recovery_track.judge(t, contracts[t.name], users[t.name], believed, active, now),
-            contracts[t.name], reported, believed) for t in state.recoveries)
+        active, reported = self._active(detections), said(detections)
+        recoveries = tuple(
+            self._excuse(self._judge(t, believed, active, now), believed, reported)
+            for t in state.recoveries)
         oriented = state.oriented or (
             all(t.ever_heard or t.silent for t in detections) and (
                 all(t.heard for t in recoveries)
@@ -228,7 +235,72 @@ class Arbiter:
         if oriented and not state.oriented:
             recoveries = tuple(replace(t, adopted=False) for t in recoveries)
         state = replace(state, detections=detections, recoveries=recoveries, oriented=oriented)
-        return with_late(state, active, self.arrangement, now) if self._patient else state
+        return self._with_late(state, active, now) if self._patient else state
+
+    def _sakes(self, recovery: str, active: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the active mechanisms for whose sake a recovery acts.
+
+        One that was chosen for another's sake, by block 4 or by escalation, acts for all.
+        """
+        users = self.mechanisms.users[recovery]
+        return tuple(name for name in active if name in users) or active
+
+    def _judge(self, track: RecoveryTrack, believed: Mapping[str, DetectionTrack],
+               active: tuple[str, ...], now: float) -> RecoveryTrack:
+        """Find a recovery to have failed, or forgive it."""
+        if track.failure:
+            forgiven = set(track.failed_for).isdisjoint(active)
+            return replace(track, failure="", failed_for=()) if forgiven else track
+        contract = self.mechanisms.contracts[track.name]
+        if now - track.ordered_s <= contract.deadline_s:
+            return track
+        if track.letting_go:  # one that does not answer for so long is dead, and holds nothing
+            return replace(track, letting_go=False)
+        if not track.wanted or not (active or track.draining):
+            return track  # latched or adopted: there is nothing to escalate for
+        failure = ""
+        if track.unfinished:
+            failure = f"not done within {contract.deadline_s:g} s"
+        elif contract.kind.repairs and not track.draining:
+            # What it was not told of yet, it cannot have repaired.
+            lasting = sorted(
+                name for name, rises in track.cause
+                if believed[name].asserted and believed[name].rises == rises
+                and set(believed[name].nodes) <= set(track.command.nodes))
+            if lasting:
+                failure = (f"done, but {', '.join(lasting)} still active after "
+                           f"{contract.deadline_s:g} s")
+        if not failure:
+            return track
+        return replace(track, failure=failure, failed_for=self._sakes(track.name, active))
+
+    def _excuse(self, track: RecoveryTrack, believed: Mapping[str, DetectionTrack],
+                reported: frozenset[str]) -> RecoveryTrack:
+        """Undo a latch that is excused, unless it came long before what excuses it."""
+        excusing = self.mechanisms.contracts[track.name].excused_by & reported
+        if track.latched and any(
+                track.latched_s >= believed[name].since_s - EXCUSE_S for name in excusing):
+            return replace(track, latched=False)
+        return track
+
+    def _with_late(self, state: State, active: tuple[str, ...], now: float) -> State:
+        """Note since when mechanisms have had their turn, and which of them are late.
+
+        One that has to wait for a deeper one does not lose its patience meanwhile, or it would be
+        late, and the next above in force, the moment the deeper one has succeeded. One whose
+        recovery is in force is not late; but a repair ends the error or it does not.
+        """
+        tree, mechanisms = self.arrangement.tree, self.mechanisms
+        before = dict(state.since)
+        in_time = [name for name in active if name not in state.late]
+        since = tuple((name, now if any(tree.is_above(name, deeper) for deeper in in_time)
+                       else before.get(name, now)) for name in active)
+        in_force = {track.name for track in state.recoveries
+                    if track.in_force and not mechanisms.contracts[track.name].kind.repairs}
+        return replace(state, since=since, late=frozenset(
+            name for name, since_s in since
+            if name in state.late or (now - since_s > mechanisms.by_name[name].patience_s
+                                      and not in_force.issuperset(mechanisms.recover[name]))))
 
     def _active(self, detections: tuple[DetectionTrack, ...]) -> tuple[str, ...]:
         active = self.mechanisms.detected_by(
@@ -242,10 +314,29 @@ class Arbiter:
         failures |= {t.name: t.failure for t in state.recoveries if t.failure}
         if failures:
             decision = escalate(decision, failures, self.arrangement)
+        return chosen, decision, self._keep_latched(state, decision)
+
+    def _keep_latched(self, state: State, decision: Decision) -> Decision:
+        """Return a decision in which the safest of the kept recoveries stays, or a safer one runs.
+
+        A latched recovery stays until an operator resets it. An adopted one was found activated by
+        an arbiter that had just started, and stays until all modules have been heard. Several stay
+        only if one drains under another.
+        """
         kept = [t for t in state.recoveries if t.latched or t.adopted]
-        return chosen, decision, keep_latched(
-            decision, kept, self.arrangement,
-            exclusive=self.decider.strategy.exclusive) if kept else decision
+        if not kept:
+            return decision
+        safest = min(kept, key=lambda track: self.order.number[track.name])
+        base = tuple(name for name in decision.recoveries if name == safest.name
+                     or self.order.is_above(name, safest.name)) or (safest.name,)
+        others = [name for name in decision.recoveries if name not in base]
+        beneath = () if self.decider.strategy.exclusive else tuple(
+            name for name in others if self.mechanisms.contracts[name].kind.repairs
+            and self.arrangement.can_join(name, base))
+        why = "is latched until reset" if safest.latched else \
+            "was found activated, and not all modules have been heard yet"
+        return replace(decision, recoveries=base + beneath, rejected=decision.rejected + tuple(
+            (name, f"{safest.name} {why}") for name in others if name not in beneath))
 
     def _unmet(self, state: State) -> dict[str, str]:
         """Return why recoveries are of no use now: a node that they need is reported failed."""
@@ -331,7 +422,9 @@ class Arbiter:
     def _activate(self, state: State, track: RecoveryTrack, now: float) -> RecoveryTrack:
         """Activate a recovery, order it again if need be, or let it wait for another to drain."""
         ordered_s = now
-        activated = recovery_track.latch(track, now) if self._latches(state, track) else track
+        activated = track
+        if not track.latched and self._latches(state, track):
+            activated = replace(track, latched=True, latched_s=now)
         if track.wanted:
             if not self._has_new_cause(state, track):
                 return replace(activated, draining=False)
@@ -390,7 +483,7 @@ def build_arbiter(spec: SystemSpec, *, first_start: bool = True) -> Arbiter:
     """
     timing = spec.timing
     silence_s = timing.detection_silence_timeout_s
-    arrangement = arrange(
+    arrangement = Arrangement(
         spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
     rules = DetectionRules(silence_s, timing.startup_grace_s if first_start else silence_s,
                            timing.release_hold_s, timing.release_hold_max_s)

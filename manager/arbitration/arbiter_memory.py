@@ -17,12 +17,14 @@ cause is still there.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import msgspec
 from msgspec.structs import replace
 
 from rampart.manager.arbitration.arbiter import LARGEST_NUMBER, Arbiter
 from rampart.manager.arbitration.arbiter_state import State
+from rampart.manager.arbitration.detection_track import DetectionTrack
 from rampart.manager.arbitration.recovery_track import LONG_AGO_S, Command, RecoveryTrack
 
 
@@ -30,12 +32,14 @@ class Latch(msgspec.Struct, frozen=True):
     """A recovery that stays until it is reset: what it was told last, and for which detections.
 
     A safer one may have taken its place for a while. `latched_s` is since when it stays; a latch of
-    unknown age is excused by nothing.
+    unknown age is excused by nothing. Not `latched` is one in force that would be latched, but for
+    what explains its cause.
     """
 
     command: Command
     cause: tuple[tuple[str, int], ...]
     latched_s: float = LONG_AGO_S
+    latched: bool = True
 
 
 class Memory(msgspec.Struct, frozen=True):
@@ -43,28 +47,24 @@ class Memory(msgspec.Struct, frozen=True):
 
     Attributes:
         number: of the last decision.
-        latches: the latched recoveries.
+        latches: the latched recoveries, and those that what explains their causes excuses.
         buckets: of detection modules that have flapped: name, content, and when that was true;
             see `rampart.manager.arbitration.detection_track`.
-        excused: recoveries in force that would be latched, but for what explains their causes.
     """
 
     number: int
     latches: tuple[Latch, ...] = ()
     buckets: tuple[tuple[str, float, float], ...] = ()
-    excused: tuple[Latch, ...] = ()
 
 
 def remember(state: State, arbiter: Arbiter) -> Memory:
     """Return what of a state must not be forgotten."""
     contracts = arbiter.mechanisms.contracts
-    kept = {t.name: Latch(t.command, tuple(sorted(t.cause)), t.latched_s) for t in state.recoveries}
-    latched = [t.name for t in state.recoveries if t.latched]
-    excused = [t.name for t in state.recoveries
-               if t.wanted and not t.latched and contracts[t.name].excused_by]
+    latches = (Latch(t.command, tuple(sorted(t.cause)), t.latched_s, t.latched)
+               for t in state.recoveries
+               if t.latched or (t.wanted and contracts[t.name].excused_by))
     buckets = ((t.name, t.bucket_s, t.bucket_at_s) for t in state.detections if t.bucket_s > 0)
-    return Memory(state.number, tuple(map(kept.__getitem__, latched)),
-                  tuple(buckets), tuple(map(kept.__getitem__, excused)))
+    return Memory(state.number, tuple(latches), tuple(buckets))
 
 
 def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
@@ -77,22 +77,13 @@ def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
         number: decisions are numbered from here on, or from the memory's number if that is higher.
     """
     state = arbiter.initial(now, max(number, memory.number))
-    latches = {latch.command.recovery: (latch, is_latched) for kept, is_latched in (
-        (memory.excused, False), (memory.latches, True)) for latch in kept}
-    buckets = {name: (bucket_s, at_s) for name, bucket_s, at_s in memory.buckets}
-    detections = list(state.detections)
-    for index, detection in enumerate(detections):
-        if detection.name in buckets:
-            bucket_s, at_s = buckets[detection.name]
-            detections[index] = replace(detection, bucket_s=bucket_s, bucket_at_s=min(at_s, now))
-    recoveries = list(state.recoveries)
-    for index, recovery in enumerate(recoveries):
-        if recovery.name in latches:
-            latch, is_latched = latches[recovery.name]
-            recoveries[index] = RecoveryTrack(
-                latch.command, ordered_s=now, cause=frozenset(latch.cause), adopted=not is_latched,
-                latched=is_latched, latched_s=min(latch.latched_s, now))
-    return replace(state, detections=tuple(detections), recoveries=tuple(recoveries))
+    detections = {t.name: t for t in state.detections}
+    kept = [replace(detections[name], bucket_s=bucket_s, bucket_at_s=min(at_s, now))
+            for name, bucket_s, at_s in memory.buckets if name in detections]
+    return _with_tracks(state, kept, [
+        RecoveryTrack(latch.command, ordered_s=now, cause=frozenset(latch.cause),
+                      adopted=not latch.latched, latched=latch.latched,
+                      latched_s=min(latch.latched_s, now)) for latch in memory.latches])
 
 
 def take_over(arbiter: Arbiter, state: State, now: float) -> State:
@@ -100,13 +91,19 @@ def take_over(arbiter: Arbiter, state: State, now: float) -> State:
 
     What is known of modules that there still are is kept; new ones are waited for.
     """
-    detections = {track.name: track for track in state.detections}
-    recoveries = {track.name: track for track in state.recoveries}
-    fresh = arbiter.initial(now, state.number)
+    fresh = _with_tracks(
+        arbiter.initial(now, state.number), state.detections, state.recoveries)
+    return replace(fresh, started_s=state.started_s, oriented=state.oriented)
+
+
+def _with_tracks(state: State, detections: Iterable[DetectionTrack],
+                 recoveries: Iterable[RecoveryTrack]) -> State:
+    """Return a state with other tracks for those of its modules that these are of."""
+    known = {track.name: track for track in detections}
+    commanded = {track.name: track for track in recoveries}
     return replace(
-        fresh, started_s=state.started_s, oriented=state.oriented,
-        detections=tuple(detections.get(t.name, t) for t in fresh.detections),
-        recoveries=tuple(recoveries.get(t.name, t) for t in fresh.recoveries))
+        state, detections=tuple(known.get(t.name, t) for t in state.detections),
+        recoveries=tuple(commanded.get(t.name, t) for t in state.recoveries))
 
 
 def objection(memory: Memory) -> str:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import msgspec
-from msgspec.structs import replace
 
 from rampart.manager.arbitration.detection_track import DetectionHeard, DetectionTrack
 from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, RecoveryTrack
-from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision
 
 
@@ -124,72 +120,3 @@ class State(msgspec.Struct, frozen=True):
     def latched(self) -> tuple[str, ...]:
         """Names of the recovery modules that stay until they are reset."""
         return tuple(track.name for track in self.recoveries if track.latched)
-
-
-def with_late(state: State, active: tuple[str, ...], arrangement: Arrangement, now: float) -> State:
-    """Note since when mechanisms have had their turn, and which of them are late.
-
-    One that has to wait for a deeper one does not lose its patience meanwhile, or it would be
-    late, and the next above in force, the moment the deeper one has succeeded. One whose recovery
-    is in force is not late; but a repair ends the error or it does not.
-    """
-    tree, mechanisms = arrangement.tree, arrangement.mechanisms
-    before = dict(state.since)
-    in_time = [name for name in active if name not in state.late]
-    since = tuple((name, now if any(tree.is_above(name, deeper) for deeper in in_time)
-                   else before.get(name, now)) for name in active)
-    in_force = {track.name for track in state.recoveries
-                if track.in_force and not mechanisms.contracts[track.name].kind.repairs}
-    return replace(state, since=since, late=frozenset(
-        name for name, since_s in since
-        if name in state.late or (now - since_s > mechanisms.by_name[name].patience_s
-                                  and not in_force.issuperset(mechanisms.recover[name]))))
-
-
-def reset_refusal(state: State, recovery: str, decision: Decision) -> str:
-    """Say why a recovery is not reset; "" if it may be.
-
-    Args:
-        state: Of the arbiter.
-        recovery: Name, as it was typed.
-        decision: What would run if nothing were latched.
-    """
-    if recovery not in state.latched:
-        known = recovery in state.desired
-        return "it is not latched" if known else "there is no such recovery module"
-    if not state.oriented:
-        return "not all modules have been heard yet"
-    if recovery in decision.recoveries:
-        return f"the cause persists: {', '.join(decision.active)} active"
-    return ""
-
-
-# -- recoveries that stay in force although nothing asks for them -------------------------------
-# A latched recovery stays until an operator resets it, and a reset is refused while its cause
-# persists. An adopted one was found activated by an arbiter that had just started, and stays until
-# all modules have been heard. Only a safer recovery takes the place of either.
-
-
-def keep_latched(decision: Decision, kept: Sequence[RecoveryTrack], arrangement: Arrangement, *,
-                 exclusive: bool) -> Decision:
-    """Return a decision in which the safest of the kept recoveries stays, or a safer one runs.
-
-    Args:
-        decision: Without regard to what is kept.
-        kept: Latched and adopted recoveries, at least one. Several are only if one drains under
-            another.
-        arrangement: Of the system.
-        exclusive: No repairs run beneath.
-    """
-    order, contracts = arrangement.order, arrangement.mechanisms.contracts
-    safest = min(kept, key=lambda track: order.number[track.name])
-    base = tuple(name for name in decision.recoveries
-                 if name == safest.name or order.is_above(name, safest.name)) or (safest.name,)
-    others = [name for name in decision.recoveries if name not in base]
-    beneath = () if exclusive else tuple(
-        name for name in others if contracts[name].kind.repairs
-        and arrangement.can_join(name, order.mask(base)))
-    why = "is latched until reset" if safest.latched else \
-        "was found activated, and not all modules have been heard yet"
-    return replace(decision, recoveries=base + beneath, rejected=decision.rejected + tuple(
-        (name, f"{safest.name} {why}") for name in others if name not in beneath))

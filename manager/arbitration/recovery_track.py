@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
-
 import msgspec
 from msgspec.structs import replace
 
-from rampart.manager.arbitration.detection_track import DetectionTrack
-from rampart.manager.model.mechanisms import Contract, RecoveryPhase
+from rampart.manager.model.mechanisms import RecoveryPhase
 
 LONG_AGO_S = -1e12
 """A time before all others; finite, for it is kept."""
@@ -128,79 +125,3 @@ def hear(track: RecoveryTrack, report: RecoveryHeard, now: float) -> RecoveryTra
         finished = track.phase is not RecoveryPhase.ACTING
         return replace(after, acknowledged=False, ordered_s=now if finished else track.ordered_s)
     return after
-
-
-def sakes(own: Set[str], active: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the active mechanisms for whose sake a recovery acts, given those that run it.
-
-    One that was chosen for another's sake, by block 4 or by escalation, acts for all.
-    """
-    return tuple(name for name in active if name in own) or active
-
-
-def judge(track: RecoveryTrack, contract: Contract, own: Set[str],  # noqa: PLR0917
-          believed: Mapping[str, DetectionTrack], active: tuple[str, ...], now: float
-          ) -> RecoveryTrack:
-    """Find a recovery to have failed, or forgive it.
-
-    Args:
-        track: Of the recovery.
-        contract: Its promises.
-        own: Mechanisms that run it.
-        believed: Belief about all detection modules.
-        active: Active mechanisms.
-        now: Time, seconds.
-    """
-    if track.failure:
-        forgiven = set(track.failed_for).isdisjoint(active)
-        return replace(track, failure="", failed_for=()) if forgiven else track
-    if now - track.ordered_s <= contract.deadline_s:
-        return track
-    if track.letting_go:  # one that does not answer for so long is dead, and holds nothing
-        return replace(track, letting_go=False)
-    if not track.wanted or not (active or track.draining):
-        return track  # latched or adopted: there is nothing to escalate for
-    failure = _failure(track, contract, believed)
-    return replace(track, failure=failure, failed_for=sakes(own, active)) if failure else track
-
-
-EXCUSE_S = 5.0
-"""So long before what excuses it was detected may a latch have come: an overload begins before it
-is noticed."""
-
-
-def latch(track: RecoveryTrack, now: float) -> RecoveryTrack:
-    """Have a recovery stay until it is reset, from now on if it does not already."""
-    return track if track.latched else replace(track, latched=True, latched_s=now)
-
-
-def excuse(track: RecoveryTrack, contract: Contract, reported: Set[str],
-           believed: Mapping[str, DetectionTrack]) -> RecoveryTrack:
-    """Undo a latch that is excused, unless it came long before what excuses it.
-
-    Args:
-        track: Of the recovery.
-        contract: Its promises.
-        reported: See `rampart.manager.arbitration.detection_track.said`.
-        believed: Belief about all detection modules.
-    """
-    if track.latched and any(track.latched_s >= believed[name].since_s - EXCUSE_S
-                             for name in contract.excused_by & reported):
-        return replace(track, latched=False)
-    return track
-
-
-def _failure(track: RecoveryTrack, contract: Contract, believed: Mapping[str, DetectionTrack]
-             ) -> str:
-    """Say why a recovery has failed whose deadline is over; "" if it has not."""
-    if track.unfinished:
-        return f"not done within {contract.deadline_s:g} s"
-    if contract.kind.repairs and not track.draining:
-        # What it was not told of yet, it cannot have repaired.
-        lasting = sorted(
-            name for name, rises in track.cause
-            if believed[name].asserted and believed[name].rises == rises
-            and set(believed[name].nodes) <= set(track.command.nodes))
-        if lasting:
-            return f"done, but {', '.join(lasting)} still active after {contract.deadline_s:g} s"
-    return ""

@@ -52,40 +52,27 @@ class GuardedRepair:
     def choose(self, active: tuple[str, ...], arrangement: Arrangement, late: Late  # noqa: ARG002
                ) -> Decision:
         """Decide by the four rules."""
-        mechanisms, order = arrangement.mechanisms, arrangement.order
-        ftms, rms = arrangement.masks(active)
+        mechanisms = arrangement.mechanisms
         if len(active) == 1:
             return Decision(active, 1, mechanisms.recover[active[0]], active)
-        rule, guards, sakes = self._guard(ftms, rms, arrangement)
-        taken = list(guards)
-        mask = order.mask(guards)
-        asks, waiting = arrangement.asks, rms & arrangement.repairs & ~mask
-        for name in active:
-            if asks[name] & waiting:
-                for recovery in mechanisms.recover[name]:
-                    if order.bit[recovery] & waiting and arrangement.can_join(recovery, mask):
-                        taken.append(recovery)
-                        mask |= order.bit[recovery]
-                waiting &= ~asks[name]
-        served = tuple(name for name in active if asks[name] & mask)
-        if not set(sakes) <= set(served):
-            served = mechanisms.sort((*sakes, *served))
-        return Decision(active, rule, tuple(taken), served)
+        demanded = arrangement.demanded(active)
+        rule, guards, sakes = self._guard(active, demanded, arrangement)
+        repairs = (name for name in demanded if mechanisms.contracts[name].kind.repairs)
+        taken = arrangement.compatible(repairs, beside=guards)
+        return Decision(active, rule, taken,
+                        mechanisms.sort((*sakes, *arrangement.asking(active, taken))))
 
-    def _guard(self, ftms: int, rms: int, arrangement: Arrangement
+    def _guard(self, active: tuple[str, ...], demanded: tuple[str, ...], arrangement: Arrangement
                ) -> tuple[int, tuple[str, ...], tuple[str, ...]]:
         """Return rule, guard, and the mechanism for whose sake it is, if it need not ask for it."""
         order, recover = arrangement.order, arrangement.mechanisms.recover
-        greatest = order.greatest_in(rms)
-        if greatest >= 0:
-            guard = order.names[greatest]
+        guard = order.greatest(demanded)
+        if guard is not None:
             return 2, (guard,), ()  # for the sake of those that ask for it, and they are active
-        dominant = arrangement.tree.names[arrangement.tree.lowest_common_in(ftms)]
-        above = (1 << len(order.names)) - 1
-        for name in order.members(rms):
-            above &= order.up_set[order.number[name]]
-        least = {name for name in order.members(above)
-                 if not order.below[order.number[name]] & above}
+        dominant = arrangement.tree.lowest_common_dominant(active)
+        above = [name for name in order.names
+                 if all(name == one or order.is_above(name, one) for one in demanded)]
+        least = {name for name in above if not any(order.is_above(name, one) for one in above)}
         if not least:
             return 4, recover[dominant], (dominant,)
         preferred = chain(recover[dominant], arrangement.mechanisms.recoveries)
@@ -97,9 +84,9 @@ class GuardedRepair:
             return msgspec.structs.replace(decision, path=decision.active)
         order, taken = arrangement.order, decision.recoveries
         candidates = arrangement.demanded(decision.active)
-        mask = order.mask(taken)
-        waiting = {name for name in candidates if arrangement.repairs & order.bit[name]
-                   and not arrangement.can_join(name, mask)}
+        contracts = arrangement.mechanisms.contracts
+        waiting = {name for name in candidates if contracts[name].kind.repairs
+                   and not arrangement.can_join(name, taken)}
         rejected = (
             (name, "waits, another recovery claims the same" if name in waiting else why)
             for name, why in turned_down(order, taken, candidates))

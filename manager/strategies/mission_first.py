@@ -44,26 +44,23 @@ class MissionFirst:
         tree, order, mechanisms = arrangement.tree, arrangement.order, arrangement.mechanisms
         if tree.root in active:
             return Decision(active, 3, mechanisms.recover[tree.root], (tree.root,))
-        climbed = bool(late) and not late.isdisjoint(active)
-        in_time = (tree.mask(n for n in active if n not in late) if climbed
-                   else arrangement.masks(active)[0])
+        climbed = not late.isdisjoint(active)
+        in_time = [name for name in active if name not in late]
         asking: dict[str, None] = {}
         for name in active:
-            if tree.below[tree.number[name]] & in_time:
+            if any(tree.is_above(name, deeper) for deeper in in_time):
                 continue  # the cause is being dealt with
             while name in late and tree.parents[name]:
                 name = str(tree.parents[name])  # noqa: PLW2901 climbing
             asking[name] = None
         # Of barriers in time none is above another already.
         highest = tree.maximal(asking) if climbed else asking
-        ranked = sorted(highest, key=arrangement.depth.__getitem__, reverse=True)
-        demanded = arrangement.demanded(ranked)
-        mask = order.mask(demanded)
-        ranked_recoveries = sorted(
-            demanded, key=lambda r: (order.up_set[order.number[r]] & mask).bit_count())
-        taken = arrangement.compatible(ranked_recoveries)
-        mask = order.mask(taken)
-        sakes = mechanisms.sort(n for n in highest if arrangement.asks[n] & mask)
+        deepest_first = sorted(
+            highest, key=lambda name: len(tree.chain(tree.root, name)), reverse=True)
+        demanded = arrangement.demanded(deepest_first)
+        taken = arrangement.compatible(sorted(
+            demanded, key=lambda name: sum(order.is_above(one, name) for one in demanded)))
+        sakes = mechanisms.sort(arrangement.asking(highest, taken))
         return Decision(active, 2 if climbed else 1, taken, sakes)
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:

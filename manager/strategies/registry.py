@@ -17,7 +17,7 @@ from types import MappingProxyType
 
 from rampart.manager.model.mechanisms import Mechanisms
 from rampart.manager.model.order import PartialOrder, Tree
-from rampart.manager.strategies.arrangement import Arrangement, arrange
+from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import NOTHING_ACTIVE, Decision, Late, Strategy
 from rampart.manager.strategies.guarded_repair import GuardedRepair
 from rampart.manager.strategies.mission_first import MissionFirst
@@ -59,14 +59,13 @@ def find_strategy(name: str) -> Strategy:
 
 
 class Decider:
-    """A strategy applied to an arrangement, which remembers its answers."""
+    """A strategy applied to an arrangement, which remembers what it chose."""
 
     def __init__(self, strategy: Strategy, arrangement: Arrangement) -> None:
         self.strategy = strategy
         self.arrangement = arrangement
         self._choose = lru_cache(MEMORY)(
             lambda active, late: strategy.choose(active, arrangement, late))
-        self._explain = lru_cache(MEMORY)(lambda decision: strategy.explain(decision, arrangement))
 
     def choose(self, active: tuple[str, ...], late: Late = frozenset()) -> Decision:
         """Decide without a certificate; `active` is in declared sequence."""
@@ -76,7 +75,9 @@ class Decider:
 
     def explain(self, decision: Decision) -> Decision:
         """Return a decision of `choose` with its certificate."""
-        return self._explain(decision) if decision.active else decision
+        if not decision.active:
+            return decision
+        return self.strategy.explain(decision, self.arrangement)
 
 
 def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,
@@ -87,11 +88,13 @@ def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,
         UnknownElementError: `active` names something that is no mechanism.
         UnknownStrategyError: No such strategy.
     """
-    decider = _decider(find_strategy(strategy), arrange(mechanisms, tree, order))
+    decider = _decider(strategy, mechanisms, tree, order)
     return decider.explain(decider.choose(mechanisms.sort(active)))
 
 
-_decider = lru_cache(maxsize=64)(Decider)
+@lru_cache(maxsize=16)
+def _decider(strategy: str, mechanisms: Mechanisms, tree: Tree, order: PartialOrder) -> Decider:
+    return Decider(find_strategy(strategy), Arrangement(mechanisms, tree, order))
 
 
 def named(name: str, titles: Mapping[str, str]) -> str:

@@ -40,21 +40,19 @@ class SafetyFirst:
                ) -> Decision:
         """Decide by the four blocks."""
         tree, recover = arrangement.tree, arrangement.mechanisms.recover
-        ftms, rms = arrangement.masks(active)
-        ftm = tree.greatest_in(ftms)
-        if ftm >= 0:
-            chosen = tree.names[ftm]
-            return Decision(active, 1 if len(active) == 1 else 2, recover[chosen], (chosen,))
+        dominant = tree.greatest(active)
+        if dominant is not None:
+            return Decision(active, 1 if len(active) == 1 else 2, recover[dominant], (dominant,))
         # Block 3 asks for a recovery that dominates all *others*, and mechanisms may share one:
         # FTM5 and FTM7 active is {RM4}, a set with no others, which RM4 therefore dominates.
         # Counting recoveries per mechanism instead (RM4 against RM4) would find no strict
         # dominance and fall through to block 4: an emergency stop for two crashes that one
         # respawn cures.
-        taken = _dominating(active, arrangement, rms)
+        taken = _dominating(active, arrangement)
         if taken:
             return Decision(active, 3, taken,
                             tuple(name for name in active if set(recover[name]) & set(taken)))
-        chosen = tree.names[tree.lowest_common_in(ftms)]
+        chosen = tree.lowest_common_dominant(active)
         return Decision(active, 4, recover[chosen], (chosen,))
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
@@ -78,18 +76,15 @@ class SafetyFirst:
             decision, path=chains(tree, chosen, names), rejected=no_block_2 + no_block_3)
 
 
-def _dominating(active: tuple[str, ...], arrangement: Arrangement, rms: int) -> tuple[str, ...]:
+def _dominating(active: tuple[str, ...], arrangement: Arrangement) -> tuple[str, ...]:
     """Return the recoveries of one active mechanism that dominate those of all others, or ()."""
-    order = arrangement.order
-    rm = order.greatest_in(rms)
-    if rm >= 0:
-        return (order.names[rm],)
-    if arrangement.compound:
-        for name in active:
-            way = arrangement.mechanisms.recover[name]
-            reach = order.mask(way)
-            for one in way:
-                reach |= order.below[order.number[one]]
-            if not rms & ~reach:
-                return way
+    order, demanded = arrangement.order, arrangement.demanded(active)
+    greatest = order.greatest(demanded)
+    if greatest is not None:
+        return (greatest,)
+    for name in active if arrangement.compound else ():
+        way = arrangement.mechanisms.recover[name]
+        if all(other in way or any(order.is_above(one, other) for one in way)
+               for other in demanded):
+            return way
     return ()

@@ -36,15 +36,12 @@ class Simultaneous:
         while True:
             if len(sakes) == 1:  # all its parts, even if one dominates another
                 return Decision(active, rule, recover[sakes[0]], sakes)
-            maximal = order.maximal_in(arrangement.masks(sakes)[1])
-            mask = order.mask(maximal)
-            clash = order.mask(n for n in maximal if not arrangement.can_join(n, mask))
+            maximal = order.maximal(arrangement.demanded(sakes))
+            clash = [name for name in maximal if not arrangement.can_join(name, maximal)]
             if not clash:
-                mechanisms = tuple(n for n in sakes if arrangement.asks[n] & mask)
-                return Decision(active, rule, maximal, mechanisms)
+                return Decision(active, rule, maximal, arrangement.asking(sakes, maximal))
             rule = 3
-            involved = tuple(name for name in sakes if arrangement.asks[name] & clash)
-            upper = tree.lowest_common_dominant(involved)
+            upper = tree.lowest_common_dominant(arrangement.asking(sakes, clash))
             sakes = arrangement.mechanisms.sort(
                 (upper, *(n for n in sakes if n != upper and not tree.is_above(upper, n))))
 
