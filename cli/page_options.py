@@ -25,7 +25,8 @@ from rampart.cli.verbs import flag, option, whole, word
 
 TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
 
-NAMES = ("hmi_port", "hmi_host", "hmi_token_file", "hmi_cert", "hmi_key", "hmi_unencrypted")
+NAMES = ("hmi_port", "hmi_host", "hmi_token_file", "hmi_cert", "hmi_key", "hmi_unencrypted",
+         "hmi_behind")
 
 _SOON_DAYS = 7.0
 """A certificate that ends within so many days is told."""
@@ -41,6 +42,8 @@ OPTIONS = (
          "of the certificate)", ""),
     flag("--hmi-unencrypted", "serve the page to other machines without a certificate: whoever "
          "hears that network may then read the token and everything else"),
+    word("--hmi-behind", "ORIGIN", "where a reverse proxy on this machine serves the page, as "
+         "https://robot.example; the page asks for a token", ""),
     word("--hmi-token-file", "FILE", "a file of yours, of mode 0600: a token, 16 characters or "
          "more, to keep it over several runs; or the names, roles and tokens that `rampart tokens` "
          f"keeps. Or set {TOKEN_VARIABLE} to a token (default: a random one; for yourself on this "
@@ -84,22 +87,23 @@ def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
         return PagePlan(0 if options.no_hmi else options.hmi_port)
     host: str = options.hmi_host
     token, listed = _tokens(options, own)
-    is_new = not (token or listed or is_loopback(host))
+    is_new = not (token or listed or (is_loopback(host) and not options.hmi_behind))
     if is_new:
         token = new_token()
     certificate = _certificate(options, note)
     try:
         Access(host, options.hmi_port, bool(token or listed), certificate is not None,
-               options.hmi_unencrypted)
+               options.hmi_unencrypted, behind=options.hmi_behind)
     except AccessError as error:
-        raise UsageError(f"--hmi-host {host}: {error}") from None
+        which = f"--hmi-behind {options.hmi_behind}" if options.hmi_behind else f"--hmi-host {host}"
+        raise UsageError(f"{which}: {error}") from None
     _check_address(host, options.hmi_port)
     return PagePlan(
         options.hmi_port, host, token, is_new, listed,
         cert=str(Path(options.hmi_cert).resolve()) if certificate else "",
         key=str(Path(options.hmi_key).resolve()) if certificate else "",
         unencrypted=options.hmi_unencrypted, secret=secrets.token_hex(32),
-        shown=_shown(host, certificate))
+        shown=_shown(host, certificate), behind=options.hmi_behind)
 
 
 def audited(page: PagePlan, file: Path) -> PagePlan:

@@ -265,7 +265,7 @@ class Hmi(Actor):
         secret = page.secret or secrets.token_hex(32)
         names = () if is_loopback(page.host) else (socket.gethostname(),)
         access = Access(page.host, self._port, asks, tls is not None, page.unencrypted,
-                        (*names, *(tls.says.names if tls else ())))
+                        (*names, *(tls.says.names if tls else ())), page.behind)
         audit = AuditLog(Path(page.audit_log) if page.audit_log else None, self.clock.now, complain,
                          asyncio.get_running_loop().time)
         operating = self._operating
@@ -273,7 +273,8 @@ class Hmi(Actor):
             access, Feed(self._state, self.clock.now, self._hello, self._look),
             Handlers(self.requests, operating.introduction, self._fulfil, operating.left,
                      self.refuses),
-            lambda port: Gate(register, secret, port, tls=tls is not None, owner=owner), audit,
+            lambda port: Gate(register, secret, port, owner=owner,
+                              tls=tls is not None or page.behind.startswith("https:")), audit,
             tls=tls, camera=self._camera, files=self.files, tell=complain)
 
     def _complain(self, why: str) -> None:

@@ -1,11 +1,11 @@
 """The web side of the page: static files and a WebSocket, on loopback unless asked otherwise.
 
 It runs on the actor's own event loop and costs nothing while no page is open
-(`rampart.actors.web.server`, where connections are also let in and seen out).
+(`rampart.actors.web.server`).
 
-Who is let in is decided in `rampart.actors.web.door` and what is behind it, how much one may say in
-`limits`, and what may be said in `requests`, which say the role that each needs: here it is held
-against that of whoever asks, and what came of it is written down.
+Who is let in is decided in `rampart.actors.web.door` and what is behind it, and what may be said in
+`requests`, which name the role that each needs: here it is held against that of whoever asks, and
+what came of it is written down.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from rampart.actors.operator.camera_eye import CameraError, CameraEye
 from rampart.actors.operator.feed import SEND_TIMEOUT_S, Feed, PageFeed
-from rampart.actors.operator.limits import MessageBudget, Verdict
 from rampart.actors.operator.requests import (
     RefusedError,
     Request,
@@ -40,7 +39,7 @@ from rampart.actors.web.access import SUBPROTOCOL, Access
 from rampart.actors.web.audit import AuditLog
 from rampart.actors.web.door import Door, address_of, login_routes, visitor_of
 from rampart.actors.web.gate import Gate
-from rampart.actors.web.server import WebServer, served
+from rampart.actors.web.server import WebServer
 from rampart.actors.web.tls import Tls
 from rampart.actors.web.visitors import Visitor
 from rampart.files.plain_text import one_line
@@ -166,11 +165,10 @@ class PageServer:
                   *login_routes(self._gate, audit), WebSocketRoute("/ws", self._page)]
         self._server = WebServer(
             Starlette(routes=routes, middleware=[Middleware(
-                Door, access=access, gate=self._gate, public=frozenset(public))]),
-            listening, refusal="" if asks else _REFUSAL, known=not asks,
-            tls=tls.context if tls else None,
-            not_plain=f"This page is encrypted: {access.url}", tell=tell,
-            ws_max_size=MAX_MESSAGE_BYTES)
+                Door, access=access, gate=self._gate, public=frozenset(public),
+                refusal="" if asks else _REFUSAL)]),
+            listening, tls=tls.serving() if tls else None, tell=tell,
+            proxy_headers=bool(access.behind), ws_max_size=MAX_MESSAGE_BYTES)
         self._server.start()
 
     @property
@@ -199,9 +197,8 @@ class PageServer:
         try:
             if self._camera is None:
                 raise CameraError("this system has no camera")
-            with served(request.scope):
-                return Response(await self._camera.picture(), media_type="image/jpeg",
-                                headers={"cache-control": "no-store"})
+            return Response(await self._camera.picture(), media_type="image/jpeg",
+                            headers={"cache-control": "no-store"})
         except CameraError as error:
             return PlainTextResponse(str(error), 503)
 
@@ -219,7 +216,7 @@ class PageServer:
         page = self._open[self._count] = _Page(self._count, visitor, address_of(socket_.scope))
         self._note(page, "open")
         try:
-            with served(socket_.scope), self._feed.page() as fed:
+            with self._feed.page() as fed:
                 await _send(socket_, self._introduction(visitor))
                 await _send(socket_, self._handlers.came(page.number))
                 await _until_one_ends(self._talk(socket_, fed, page), self._push(socket_, fed),
@@ -253,23 +250,10 @@ class PageServer:
             f"Needs the role {kind.role}: you are {visitor.name}, with the role {visitor.role}"))
 
     async def _talk(self, socket_: WebSocket, fed: PageFeed, page: _Page) -> None:
-        loop = asyncio.get_running_loop()
-        budget = MessageBudget(loop.time())
-        while True:
-            message = await socket_.receive()
-            if message["type"] == "websocket.disconnect":
-                return
-            verdict = budget.spend(loop.time())
+        while (message := await socket_.receive())["type"] != "websocket.disconnect":
             text = message.get("text") or message.get("bytes")
-            if verdict is Verdict.READ:
-                if not self._feed.heard(fed, text):
-                    await _send(socket_, self._answer(text, page))
-            elif verdict is Verdict.TELL:
-                await _send(socket_, {"type": "error", "text": "too many messages from this page; "
-                                      "those beyond the limit are not read"})
-            elif verdict is Verdict.CLOSE:
-                await _close(socket_, 1008, "flooding: far too many messages")
-                return
+            if not self._feed.heard(fed, text):
+                await _send(socket_, self._answer(text, page))
 
     async def _watch(self, socket_: WebSocket, page: _Page) -> None:
         """Close the page of a visitor whose token is withdrawn, or whose role is another now."""

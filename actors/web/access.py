@@ -85,6 +85,8 @@ class Access(msgspec.Struct, frozen=True):
         plain: whether it need not be, for other machines.
         names: other names under which the page may be asked for: of this machine, and of the
             page's certificate.
+        behind: origin under which a reverse proxy serves the page, as https://robot.example; ""
+            without one.
 
     Raises:
         AccessError: it would be open to the network without a token, or unencrypted.
@@ -96,8 +98,18 @@ class Access(msgspec.Struct, frozen=True):
     tls: bool = False
     plain: bool = False
     names: tuple[str, ...] = ()
+    behind: str = ""
 
     def __post_init__(self) -> None:
+        if self.behind:
+            parts = urlsplit(self.behind)
+            if parts.scheme not in {"http", "https"} or not parts.hostname or (
+                    f"{parts.scheme}://{parts.netloc}" != self.behind):
+                raise AccessError(f"page behind {self.behind}: expected an origin, as "
+                                  "https://robot.example")
+            if not self.asks:
+                raise AccessError(f"page behind {self.behind}: needs a token, since other machines "
+                                  "reach it")
         if is_loopback(self.host):
             return
         if not self.asks:
@@ -110,10 +122,12 @@ class Access(msgspec.Struct, frozen=True):
     @property
     def url(self) -> str:
         """Where to open the page."""
-        return page_url(self.host, self.port, tls=self.tls)
+        return f"{self.behind}/" if self.behind else page_url(self.host, self.port, tls=self.tls)
 
     def own_host(self, header: str | None) -> bool:
         """Tell whether a `Host` header means this page."""
+        if self.behind and header == urlsplit(self.behind).netloc:
+            return True
         try:
             parts = urlsplit(f"//{header}")
             return (header is not None and "@" not in header and (parts.port or 80) >= 0
@@ -123,7 +137,7 @@ class Access(msgspec.Struct, frozen=True):
 
     def own_origin(self, origin: str | None) -> bool:
         """Tell whether a page of this `Origin` is this page; programs send none."""
-        if origin is None:
+        if origin is None or (self.behind and origin == self.behind):
             return True
         scheme, port = ("https", 443) if self.tls else ("http", 80)
         try:

@@ -5,9 +5,8 @@ written at once and whole, and is then the kernel's. (A machine that loses its p
 last ones.) A line that a full disk cut in two stays readable as a line of its own. There is no
 token in it, nor what was shown in the place of one.
 
-Who has a role, or none, could fill a disk with what is refused. So everybody has so many lines at
-once and so many a second; what is beyond is counted, and the next line says how many there were. A
-file that is full says so in its last line. A line that cannot be written keeps nobody from acting:
+Of visitors without a token one line a second is kept, and the next one counts those between. A file
+that is full says so in its last line. A line that cannot be written keeps nobody from acting:
 an emergency stop must be releasable on a full disk; how many were lost is said when there is room.
 """
 
@@ -23,18 +22,13 @@ from typing import Any, Literal
 
 import msgspec
 
-from rampart.actors.bus.limits import Remembered
-from rampart.actors.web.guests import Bucket
-
-LINES_AT_ONCE = 200
-LINES_PER_S = 2.0
-"""Of one visitor; of all strangers together."""
+STRANGERS_S = 1.0
+"""Real seconds between two lines of visitors without a token."""
 
 MAX_BYTES = 4_000_000
 """Of a file; some ten thousand lines."""
 
 _LINE_BYTES = 4000
-_WRITERS = 64
 _SELF = "page"
 
 Outcome = Literal["accepted", "refused"]
@@ -54,7 +48,7 @@ class AuditLine(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=True):
         asked: what else the request said.
         outcome: accepted or refused.
         why: it was refused, or what was answered.
-        left_out: lines of the same visitor since the line before that were not written.
+        left_out: lines of visitors without a token since the line before that were not written.
     """
 
     utc: str
@@ -90,16 +84,21 @@ class AuditLog:
         self._trouble = ""
         self._lost = 0
         self._is_full = False
-        self._writers: Remembered[str, tuple[Bucket, int]] = Remembered(_WRITERS)
+        self._stranger_s = -STRANGERS_S
+        self._left_out = 0
 
     def write(self, what: str, *, who: str = "", address: str = "", role: str = "", page: int = 0,
               asked: dict[str, Any] | None = None, why: str = "", refused: bool = False) -> None:
         """Append a line; never raises."""
         if self._file is None:
             return
-        left_out = self._counted(who)
-        if left_out is None:
-            return
+        left_out = 0
+        if not who:
+            if self._real_s() < self._stranger_s + STRANGERS_S:
+                self._left_out += 1
+                return
+            self._stranger_s = self._real_s()
+            left_out, self._left_out = self._left_out, 0
         self._append(AuditLine(
             utc=datetime.now(UTC).isoformat(timespec="milliseconds"), t_s=round(self._now(), 3),
             who=who, address=address, role=role, page=page, what=what, asked=asked or {},
@@ -110,17 +109,6 @@ class AuditLog:
         if self._handle >= 0:
             os.close(self._handle)
             self._handle = -1
-
-    def _counted(self, writer: str) -> int | None:
-        """Return how many lines of somebody were left out before this one; None leaves it out."""
-        now_s = self._real_s()
-        bucket, left_out = self._writers.pop(
-            writer, (Bucket(LINES_AT_ONCE, LINES_PER_S, now_s), 0))
-        has_room = bucket.has(1, now_s)
-        if has_room:
-            bucket.take(1, now_s)
-        self._writers[writer] = (bucket, 0 if has_room else left_out + 1)
-        return left_out if has_room else None
 
     def _append(self, line: AuditLine) -> None:
         encoded = msgspec.json.encode(line) + b"\n"

@@ -1,10 +1,13 @@
 """The door of a page: who makes a request, and may it come in at all.
 
-Foreign hosts and origins are turned away before all else. The page's files are for everybody, they
+Other users of this machine, where no token is asked for, and foreign hosts and origins are turned
+away before all else. The page's files are for everybody, they
 are the same for all; so is the form where one logs in. Everything else is for visitors.
 """
 
 from __future__ import annotations
+
+import os
 
 import msgspec
 from starlette.requests import HTTPConnection, Request
@@ -15,7 +18,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from rampart.actors.web.access import Access
 from rampart.actors.web.audit import AuditLog
 from rampart.actors.web.gate import Gate
-from rampart.actors.web.server import is_known, source_of
+from rampart.actors.web.tcp_peer import plain_address, user_of_peer
 from rampart.actors.web.visitors import Visitor
 
 LOGIN = "/login"
@@ -52,10 +55,13 @@ class Door:
         access: which hosts and origins are this page's.
         gate: who is known.
         public: paths that are for everybody.
+        refusal: answer to other users of this machine; "" lets them in.
     """
 
-    def __init__(self, app: ASGIApp, access: Access, gate: Gate, public: frozenset[str]) -> None:
+    def __init__(self, app: ASGIApp, access: Access, gate: Gate, public: frozenset[str],
+                 refusal: str = "") -> None:
         self._app = app
+        self._refusal = refusal
         self._access = access
         self._gate = gate
         self._public = public | {LOGIN}
@@ -69,12 +75,14 @@ class Door:
         visitor = self._gate.visitor(connection.headers.get("authorization"),
                                      connection.headers.get("cookie"))
         scope["state"][_VISITOR] = visitor
-        if visitor is not None:
-            is_known(scope)
+        is_user = not self._refusal or _is_this_user(scope)
         if scope["type"] == "websocket":
-            if not (is_here and is_own):
+            if not (is_here and is_own and is_user):
                 await send({"type": "websocket.close", "code": 1008})  # before it was accepted: 403
                 return
+        elif not is_user:
+            await PlainTextResponse(self._refusal + "\n", 403)(scope, receive, send)
+            return
         elif not is_here:
             await PlainTextResponse("Invalid host header", 400)(scope, receive, send)
             return
@@ -87,6 +95,13 @@ class Door:
         await self._app(scope, receive, send)
 
 
+def _is_this_user(scope: Scope) -> bool:
+    """Whether a request on loopback comes from a process of the user who serves the page."""
+    client, server = scope["client"], scope["server"]
+    return bool(client and server) and plain_address(client[0]).is_loopback and (
+        user_of_peer(server, client) == os.getuid())
+
+
 def login_routes(gate: Gate, audit: AuditLog) -> list[Route]:
     """Return where one logs in and out; nowhere, where no token is asked for."""
 
@@ -95,11 +110,10 @@ def login_routes(gate: Gate, audit: AuditLog) -> list[Route]:
         token = await _token(request)
         if token is None:
             return PlainTextResponse(_LOG_IN, 400, _NO_STORE)
-        visitor, told = gate.log_in(token, source_of(request.scope))
+        visitor, told = gate.log_in(token)
         if visitor is None:
             audit.write("log in", address=address, refused=True, why=told)
             return PlainTextResponse(told, 403, _NO_STORE)
-        is_known(request.scope)
         audit.write("log in", who=visitor.name, role=visitor.role, address=address)
         return JSONResponse({"name": visitor.name, "role": visitor.role},
                             headers={"set-cookie": told, **_NO_STORE})

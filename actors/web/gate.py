@@ -5,9 +5,10 @@ types it into a form, a script sends it as `Authorization: Bearer TOKEN`. Whoeve
 cookie that the page's scripts cannot read, that no other site's page sends along, and that over
 TLS is sent over TLS alone.
 
-The cookie says who, since when, and a MAC of both and of the token's digest, with a key that the
-run has made for itself. So the node that serves the page keeps nothing: it may die, and its
-successor knows its visitors. With the token goes the cookie, and with the run all of them.
+The cookie is the visitor's name, signed with a time (itsdangerous) by a key that the run has made
+for itself, salted with the token's digest. So the node that serves the page keeps nothing: it may
+die, and its successor knows its visitors. With the token goes the cookie, and with the run all of
+them.
 
 Cookies know no ports: a browser sends them to every server of the same host. The key makes those of
 another run worthless here, not the other way round; on plain loopback a page of another user of the
@@ -16,23 +17,12 @@ machine, opened in the same browser, would be sent it.
 
 from __future__ import annotations
 
-import hashlib
-import hmac
-import time
-from collections.abc import Callable
+from itsdangerous import BadSignature, TimestampSigner
 
-from rampart.actors.bus.limits import Remembered
-from rampart.actors.web.guests import Bucket
 from rampart.actors.web.visitors import Register, Visitor
 
 LASTS_S = 12 * 3600
 """Real seconds after which a visitor has to log in again."""
-
-GUESSES_AT_ONCE = 10
-GUESSES_PER_S = 0.5
-"""Wrong tokens of one source; beyond, it waits."""
-
-_SOURCES = 256
 
 
 class Gate:
@@ -42,20 +32,17 @@ class Gate:
         register: of those who may come.
         secret: of the run: key of its cookies.
         port: of the page: part of the cookie's name.
-        tls: whether the page is encrypted.
+        tls: whether the page is encrypted on its way to the browser.
         owner: who everybody is where no token is asked for; None where one is.
-        clock: real seconds, the same for all processes of the machine.
     """
 
     def __init__(self, register: Register, secret: str, port: int, *, tls: bool,
-                 owner: Visitor | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+                 owner: Visitor | None = None) -> None:
         self._register = register
-        self._key = secret.encode()
+        self._key = secret
         self._tls = tls
         self._owner = owner
-        self._clock = clock
         self._cookie = f"{'__Host-' if tls else ''}rampart-{port}"
-        self._guesses: Remembered[str, Bucket] = Remembered(_SOURCES)
 
     @property
     def asks(self) -> bool:
@@ -69,31 +56,23 @@ class Gate:
         scheme, _, token = (authorization or "").partition(" ")
         if scheme.lower() == "bearer":
             return self._register.by_token(token.strip())
-        return self._by_cookie(cookies or "")
+        for part in (cookies or "").split(";"):
+            key, _, value = part.strip().partition("=")
+            if key == self._cookie and (visitor := self._signed(value)):
+                return visitor
+        return None
 
     def still(self, visitor: Visitor) -> bool:
         """Tell whether somebody who was let in may stay as who he was."""
         return visitor == self._owner or self._register.still(visitor)
 
-    def log_in(self, token: str, source: str) -> tuple[Visitor | None, str]:
-        """Return who shows a token, and a `Set-Cookie` for them; or None, and why not.
-
-        Args:
-            token: what was shown.
-            source: whom its mistakes are counted with.
-        """
-        now_s = self._clock()
-        guesses = self._guesses.pop(source, None) or Bucket(GUESSES_AT_ONCE, GUESSES_PER_S, now_s)
-        self._guesses[source] = guesses
-        if not guesses.has(1, now_s):
-            return None, "too many wrong tokens; wait some seconds"
+    def log_in(self, token: str) -> tuple[Visitor | None, str]:
+        """Return who shows a token, and a `Set-Cookie` for them; or None, and why not."""
         visitor = self._owner or self._register.by_token(token)
         if visitor is None:
-            guesses.take(1, now_s)
             return None, "that token opens nothing"
-        since = int(now_s)
-        value = f"{visitor.name}|{since}|{self._mac(visitor, since)}"
-        return visitor, self._set_cookie(value, LASTS_S)
+        return visitor, self._set_cookie(
+            self._signer(visitor).sign(visitor.name).decode(), LASTS_S)
 
     def log_out(self) -> str:
         """Return a `Set-Cookie` that takes the cookie away."""
@@ -103,23 +82,16 @@ class Gate:
         return (f"{self._cookie}={value}; Path=/; Max-Age={lasts_s}; HttpOnly; SameSite=Strict"
                 + ("; Secure" if self._tls else ""))
 
-    def _by_cookie(self, header: str) -> Visitor | None:
-        for part in header.split(";"):
-            key, _, value = part.strip().partition("=")
-            if key == self._cookie and (visitor := self._signed(value)):
-                return visitor
-        return None
-
     def _signed(self, value: str) -> Visitor | None:
-        name, _, rest = value.partition("|")
-        since, _, mac = rest.partition("|")
+        name = "".join(value.rsplit(".", 2)[:-2])
         visitor = self._register.visitors().get(name)
-        if visitor is None or not (since.isascii() and since.isdecimal() and len(since) < 16):
+        if visitor is None:
             return None
-        is_own = hmac.compare_digest(mac.encode(errors="replace"),
-                                     self._mac(visitor, int(since)).encode())
-        return visitor if is_own and 0 <= self._clock() - int(since) <= LASTS_S else None
+        try:
+            self._signer(visitor).unsign(value, max_age=LASTS_S)
+        except BadSignature:
+            return None
+        return visitor
 
-    def _mac(self, visitor: Visitor, since: int) -> str:
-        said = f"{visitor.name}|{visitor.digest}|{since}"
-        return hmac.new(self._key, said.encode(), hashlib.sha256).hexdigest()
+    def _signer(self, visitor: Visitor) -> TimestampSigner:
+        return TimestampSigner(self._key, salt=f"rampart {visitor.digest}")

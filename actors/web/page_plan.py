@@ -23,6 +23,7 @@ class PagePlan(msgspec.Struct, frozen=True):
         secret: key of its cookies; its node makes one for itself where there is none.
         shown: address or name under which it is shown; "" for the one it is served at.
         audit_log: file that keeps who did what there; "" for none.
+        behind: origin under which a reverse proxy serves it; "" without one.
     """
 
     port: int = 0
@@ -36,10 +37,13 @@ class PagePlan(msgspec.Struct, frozen=True):
     secret: str = ""
     shown: str = ""
     audit_log: str = ""
+    behind: str = ""
 
     @property
     def url(self) -> str:
         """Where the page is, "" if there is none; the token is no part of it."""
+        if self.behind:
+            return f"{self.behind}/"
         return page_url(self.shown or self.host, self.port, tls=bool(self.cert)
                         ) if self.port else ""
 

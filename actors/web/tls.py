@@ -165,6 +165,14 @@ class Tls:
         self._seen = self._look()
         self._context, self.says = load(certificate, key)
 
+    def serving(self) -> ssl.SSLContext:
+        """Return what a server encrypts with: each connection by the files as they are then."""
+        def chosen(connection: ssl.SSLObject | ssl.SSLSocket, *_: object) -> None:
+            connection.context = self.context()
+
+        self._context.sni_callback = chosen
+        return self._context
+
     def context(self) -> ssl.SSLContext:
         """Return what the next connection is encrypted with."""
         if (seen := self._look()) != self._seen:

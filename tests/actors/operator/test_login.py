@@ -11,7 +11,6 @@ import pytest
 import websockets
 
 from rampart.actors.web.audit import read_audit
-from rampart.actors.web.gate import GUESSES_AT_ONCE
 from rampart.actors.web.visitors import Role, issue, revoke
 from rampart.testing import eventually, free_port
 from tests.actors.operator.test_operating import RELEASED, TOKEN, Hand, ask, open_page
@@ -121,17 +120,13 @@ async def test_what_is_no_login_is_refused(world, tmp_path):
             assert evil.status_code == 403
             assert "set-cookie" not in evil.headers
             assert (await client.get(f"http://{at}/login")).status_code == 405
-            for i in range(GUESSES_AT_ONCE):
-                answer = await post(client, f"http://{at}", f"wrong-token-{i:010}")
-                assert (answer.status_code, answer.text) == (403, "that token opens nothing")
-            answer = await post(client, f"http://{at}", TOKEN)
-            assert answer.text == "too many wrong tokens; wait some seconds"
+            answer = await post(client, f"http://{at}", "wrong-token-0000000001")
+            assert (answer.status_code, answer.text) == (403, "that token opens nothing")
             assert client.cookies == {}
             assert (await client.get(f"http://{at}/camera.jpg", headers=BEARER)).status_code == 503
     lines = read_audit(log)
     assert {(line.what, line.who, line.address, line.outcome) for line in lines} == {
         ("log in", "", "127.0.0.1", "refused")}
-    assert len(lines) == GUESSES_AT_ONCE + 1
     assert "wrong-token" not in log.read_text()
     assert TOKEN not in log.read_text()
 
@@ -305,9 +300,8 @@ async def test_over_tls_one_logs_in_and_drives_with_a_cookie_for_tls_alone(world
                 await eventually(lambda: world.others.stick[-1].dead_man)
             await eventually(lambda: world.others.stick[-1] == RELEASED)
         async with httpx.AsyncClient() as client:
-            answer = await client.get(f"http://{at}/")
-            assert (answer.status_code, answer.text) == (
-                400, f"This page is encrypted: https://127.0.0.1:{hmi._server.port}/\n")
+            with pytest.raises(httpx.RemoteProtocolError):
+                await client.get(f"http://{at}/")
 
 
 async def test_an_expired_cookie_does_not_end_an_open_page_but_opens_no_other(world, monkeypatch):

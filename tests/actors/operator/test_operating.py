@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 
 import pytest
@@ -301,31 +300,3 @@ async def test_a_fault_that_nobody_takes_is_shown_to_have_no_effect(world):
             assert len({o.injection for o in world.others.injections}) == 1
 
 
-# ---- too much -----------------------------------------------------------------------------------
-
-
-@pytest.mark.usefixtures("patient")
-async def test_a_page_that_floods_is_told_and_closed_and_nobody_else_notices(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        async with open_page(at) as good, open_page(at, ping_interval=None) as bad:
-            driver = Hand(good)
-            await driver.take()
-            told = []
-
-            async def listen() -> None:
-                async for text in bad:
-                    told.append(json.loads(text))
-
-            listening = asyncio.create_task(listen())
-            with contextlib.suppress(websockets.ConnectionClosed):
-                for _ in range(100_000):
-                    await bad.send('{"type": "reset", "recovery": "RM1"}')
-            with pytest.raises(websockets.ConnectionClosedError, match="flooding"):
-                await listening
-            errors = [message["text"] for message in told if message["type"] == "error"]
-            assert sum("too many messages" in text for text in errors) == 1
-            await ask(good, type="stick", panel="Drive", held=False)
-            assert (await driver.hold())["grip"] in ("drives", "waits")
-            await eventually(lambda: hmi._server.pages == 1)
-    assert world.others.resets == []

@@ -15,7 +15,6 @@ from rampart.actors.bus.fields import Steered
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.operator.hmi import Hmi
-from rampart.actors.operator.limits import BURST
 from rampart.actors.operator.panels import Panel
 from rampart.actors.operator.stick import TICKET_S
 from rampart.actors.runtime.actor import Actor, Header, on
@@ -331,13 +330,11 @@ async def test_what_is_no_message_of_this_stick_moves_nothing(world):
                 assert "not understood" in (await hear(page, "error"))["text"]
             hand = Driver(page)
             await hand.take()
-            for _ in range(3 * BURST):
-                await page.send('{"type":"stick","panel":"Drive","held":true,"forward":-1e308}')
+            await page.send('{"type":"stick","panel":"Drive","held":true,"forward":-1e308}')
             told = await hear(page, "stick")
             assert (told["grip"], told["text"]) == (
                 "refused", "forward = -1e+308: must be between -1 and 1; the stick was taken from "
                 "you, let go first")
-            assert "too many messages" in (await hear(page, "error"))["text"]
             await rests(robot)
     assert {hand.forward for hand in robot.hands} <= {0.0, 0.25}
 

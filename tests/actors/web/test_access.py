@@ -105,3 +105,19 @@ def test_no_header_whatever_is_in_it_raises(text):
     for access in (HERE, EVERYWHERE, OVER_TLS):
         assert access.own_host(text) in (True, False)
         assert access.own_origin(text) in (True, False)
+
+
+def test_behind_a_proxy_its_origin_is_the_proxys_and_a_token_is_needed():
+    behind = Access("127.0.0.1", 8080, True, behind="https://robot.example")
+    assert behind.url == "https://robot.example/"
+    assert behind.own_host("robot.example")
+    assert behind.own_origin("https://robot.example")
+    for foreign in ("http://robot.example", "https://robot.example:8443", "https://evil.example"):
+        assert not behind.own_origin(foreign)
+    assert not behind.own_host("evil.example")
+    with pytest.raises(AccessError, match="needs a token"):
+        Access("127.0.0.1", 8080, behind="https://robot.example")
+    for wrong in ("robot.example", "https://robot.example/", "https://robot.example/ui", "ftp://a",
+                  "https://"):
+        with pytest.raises(AccessError, match="expected an origin"):
+            Access("127.0.0.1", 8080, True, behind=wrong)

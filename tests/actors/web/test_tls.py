@@ -14,15 +14,10 @@ from starlette.applications import Starlette
 from starlette.responses import PlainTextResponse
 from starlette.routing import Route
 
-from rampart.actors.web import guests as web_guests
-from rampart.actors.web import server as web_server
 from rampart.actors.web.server import WebServer
 from rampart.actors.web.tls import Certificate, Tls, TlsError, holds_key, load
 from rampart.testing import eventually
 from tests.actors.web.pems import PEMS, pair, pem
-
-NOT_PLAIN = "This page is encrypted: https://robot.local:8080/"
-
 
 # ---- the files ----------------------------------------------------------------------------------
 
@@ -119,13 +114,13 @@ async def served(tmp_path, **settings):
     listening = socket.create_server(("127.0.0.1", 0))
     port = listening.getsockname()[1]
     server = WebServer(Starlette(routes=[Route("/", front)]), listening,
-                       tls=Tls(*pair(tmp_path)).context, not_plain=NOT_PLAIN, **settings)
+                       tls=Tls(*pair(tmp_path)).serving(), **settings)
     server.start()
     try:
         yield server, port
     finally:
         server.stop()
-        await eventually(lambda: not server._arriving)
+        await eventually(lambda: not server._state.connections)
 
 
 def trusting(tmp_path) -> ssl.SSLContext:
@@ -152,36 +147,7 @@ async def test_a_page_is_served_over_tls_1_3(tmp_path):
             await ask(port, old)
         with pytest.raises(ssl.SSLCertVerificationError):
             await ask(port, ssl.create_default_context())
-        await eventually(lambda: len(server.reception) == 0)
-
-
-async def test_who_speaks_plain_http_is_told_where_the_page_is(tmp_path):
-    async with served(tmp_path) as (server, port):
-        answer = await ask(port, None)
-        assert answer.startswith(b"HTTP/1.1 400 Bad Request\r\n")
-        assert answer.endswith(NOT_PLAIN.encode() + b"\n")
-        await eventually(lambda: len(server.reception) == 0)
-
-
-@pytest.mark.parametrize("say", [b"", b"\x16\x03\x01", b"\x16\x03\x01\x02\x00\x01" + bytes(40)],
-                         ids=["nothing", "half a hello", "nonsense"])
-async def test_who_never_shakes_hands_is_closed_and_keeps_nobody_out(tmp_path, monkeypatch, say):
-    monkeypatch.setattr(web_guests, "PATIENCE_S", 0.4)
-    monkeypatch.setattr(web_server, "_SWEEP_S", 0.05)
-    loop = asyncio.get_running_loop()
-    async with served(tmp_path) as (server, port):
-        with contextlib.ExitStack() as held:
-            for _ in range(2 * web_guests.ROOM):
-                one = held.enter_context(socket.socket())
-                one.setblocking(False)
-                await loop.sock_connect(one, ("127.0.0.1", port))
-                with contextlib.suppress(OSError):
-                    await loop.sock_sendall(one, say)
-            assert (await ask(port, trusting(tmp_path))).endswith(b"here")
-            assert len(server.reception) <= web_guests.ROOM
-            await eventually(lambda: len(server.reception) == 0)
-            with contextlib.suppress(ConnectionError):
-                assert await asyncio.wait_for(loop.sock_recv(one, 10_000), 5) is not None
+        await eventually(lambda: not server._state.connections)
 
 
 def open_files() -> int:
@@ -196,7 +162,7 @@ async def test_a_client_that_vanishes_in_the_middle_leaves_nothing(tmp_path):
                 _, writer = await asyncio.open_connection("127.0.0.1", port)
                 writer.write(say)
                 writer.transport.abort()
-        await eventually(lambda: len(server.reception) == 0 and not server._arriving)
+        await eventually(lambda: not server._state.connections)
         await eventually(lambda: open_files() <= before)
 
 
