@@ -37,7 +37,7 @@ from rampart.actors.web.page_plan import PagePlan
 from rampart.cli.host import HostRun
 from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.page_options import audited
-from rampart.cli.run_options import ERROR_LOG, MAX_RATE, parse, plan_of, refuse
+from rampart.cli.run_options import ERROR_LOG, MAX_RATE, of_one_process, parse, plan_of, refuse
 from rampart.files import interrupts, streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec
@@ -48,6 +48,14 @@ from rampart.sim.runs.process_run import ProcessRun
 from rampart.sim.runs.rate_search import find_rate, first_rate, probe_run
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import in_words
+from rampart.sim.runs.resumption import (
+    AFTER_S,
+    Manifest,
+    RunFiles,
+    differences,
+    find,
+    manifest_of,
+)
 from rampart.sim.runs.trial import Trial, trial_class
 from rampart.sim.runs.virtual_run import LEAD_S, VirtualRun
 from rampart.sim.virtual.network import find_network
@@ -62,7 +70,8 @@ class Run:
     """One run from the parsed options to the exit code, on processes or in virtual time."""
 
     def __init__(self, options: argparse.Namespace, plan: RunPlan, spec: SystemSpec,
-                 reports: Path) -> None:
+                 reports: Path, *, arguments: Sequence[str] = (),
+                 resumed: tuple[RunFiles, Manifest] | None = None) -> None:
         self._options = options
         kind = trial_class(spec)
         if kind.patient and options.duration is not None:
@@ -87,6 +96,14 @@ class Run:
         self._kind, self._context = kind, replace(run, plan=plan)
         self._trial = self._made(plan, sys.stderr)
         self._plan = plan
+        self._files: RunFiles | None = None
+        if not options.virtual and spec.layers.checkpoints and not spec.hosts and kind.resumes:
+            self._files = resumed[0] if resumed else RunFiles(self._directory)
+        self._manifest = manifest_of(plan, arguments,
+                                     [path for _, path in application.documents()])
+        self._before = resumed[1] if resumed else None
+        if self._before is not None:
+            self._resume(self._before)
         self._scenario = [parse_fault(text) for text in options.fault]
         known = system_topics(spec) if self._scenario else ()
         for i, planned in enumerate(self._scenario):
@@ -104,14 +121,36 @@ class Run:
         with _kept(self._directory):
             if self._options.virtual:
                 return self._in_virtual_time()
-            root = Root(self._context)
-            code = root.run(lambda link: _in_child(lambda: self._watch(link)))
-            return self._not_watched(root) if code is None else code
+            files = self._files
+            if files is not None and not files.lock():
+                raise UsageError(f"--report {files.directory}: a run is under way that keeps its "
+                                 "checkpoints there")
+            try:
+                root = Root(self._context)
+                code = root.run(lambda link: _in_child(lambda: self._watch(link)))
+                if code == EXIT_USAGE:
+                    self._not_started()
+                return self._not_watched(root) if code is None else code
+            finally:
+                if files is not None:
+                    files.unlock()
 
     async def _watch(self, link: socket.socket) -> int:
         if self._options.rate == MAX_RATE:
             await self._find_rate()
-        return await self._on_processes(ProcessRun(self._trial, self._scenario, link))
+        if self._files is not None:
+            self._files.save(msgspec.structs.replace(self._manifest, rate=self._plan.rate))
+        keep = self._files.keep_memory if self._files else None
+        return await self._on_processes(ProcessRun(self._trial, self._scenario, link, keep))
+
+    def _not_started(self) -> None:
+        """Have a run that could not be started be resumed only if it was before."""
+        if self._files is not None:
+            with contextlib.suppress(OSError):
+                if self._before is None:
+                    self._files.drop()
+                else:
+                    self._files.save(self._before)
 
     def _not_watched(self, root: Root) -> int:
         """Conclude a run whose watching process has ended without a verdict."""
@@ -124,6 +163,35 @@ class Run:
         return self._conclude(msgspec.structs.replace(
             record, safety="not known", reasons=(*record.reasons, why)), why)
 
+    def _resume(self, before: Manifest) -> None:
+        """Go on where a run was cut off.
+
+        Raises:
+            UsageError: what is started is not that run.
+        """
+        files = self._files
+        if self._options.virtual:
+            raise UsageError("--resume: not in virtual time: the same --seed gives the same run")
+        if files is None:
+            raise UsageError(f"--resume: {self._context.system.name} keeps nothing to go on from; "
+                             "expected layers.checkpoints, one machine, and no judge of its own")
+        if why := differences(before, self._manifest):
+            raise UsageError(f"--resume {files.directory}: {why}")
+        begins_s, problems = files.recall(self._trial.recall)
+        for problem in problems:
+            _say(problem)
+        self._plan = msgspec.structs.replace(
+            self._plan, run_id=before.run_id, part=before.part + 1,
+            page=audited(self._plan.page, files.directory / f"audit-{before.run_id}.jsonl"),
+            begins_s=begins_s + AFTER_S * self._plan.rate if begins_s else 0.0)
+        self._manifest = msgspec.structs.replace(
+            self._manifest, run_id=before.run_id, part=self._plan.part)
+        self._context = replace(self._context, plan=self._plan)
+        self._trial = self._made(self._plan, sys.stderr)
+        files.recall(self._trial.recall)
+        _say(f"run {before.run_id} is resumed at {self._plan.begins_s:.1f} s, part "
+             f"{self._plan.part + 1}")
+
     def _made(self, plan: RunPlan, stream: TextIO | None) -> Trial:
         options, kind = self._options, self._kind
         return kind(replace(self._context, plan=plan),
@@ -133,8 +201,7 @@ class Run:
         """Take the rate with which this machine keeps up."""
         def trial(rate: float, run_id: str) -> Trial:
             plan = msgspec.structs.replace(
-                self._plan, rate=rate, run_id=run_id, checkpoints="", page=PagePlan(),
-                waits=False)
+                self._plan, rate=rate, run_id=run_id, checkpoints="", page=PagePlan(), waits=False)
             return self._made(plan, None)
 
         rate = await find_rate(partial(probe_run, trial), _say, first_rate())
@@ -185,6 +252,11 @@ class Run:
 
     def _conclude(self, record: RunRecord, failure: str = "", **more: Any) -> int:
         """Tell what came of the run; no disk and no reader that fails changes the verdict."""
+        if self._files is not None:
+            with contextlib.suppress(OSError):  # of a full disk the report tells
+                self._files.save(msgspec.structs.replace(
+                    self._manifest, ended=f"{record.mission or 'without a mission'}, "
+                    f"{record.safety or 'without a judge'}"))
         report = self._trial.report(record, self._directory)
         if self._trial.console:
             self._trial.console.conclusion(record, report.html)
@@ -321,12 +393,23 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
     PROGRAM.set(program)
     streams.secure()
     working_folder.admit()  # for actors of one's own, as in the processes of a run
+    resumed = None
     try:
         interrupts.end_at_once()
         try:
-            options, kind = parse(arguments, program)
+            given = sys.argv[1:] if arguments is None else arguments
+            which, lasting = of_one_process(given)
+            resumed = find(reports, which) if which is not None else None
+            if resumed is not None:
+                files, before = resumed
+                lasting = [*before.arguments, *lasting]
+                given = [*before.arguments, *given, "--report", str(files.directory)]
+            options, kind = parse(given, program)
+            if resumed is not None and options.rate == MAX_RATE:
+                options.rate = resumed[1].rate
             plan, spec = plan_of(options, kind, _say)
-            run = Run(options, plan, spec, reports) if not plan.host else None
+            run = None if plan.host else Run(options, plan, spec, reports, arguments=lasting,
+                                             resumed=resumed)
         finally:
             interrupts.raise_again()
         return run.run() if run else _on_another_host(options, plan, reports)
@@ -335,6 +418,9 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
         return EXIT_USAGE
     except KeyboardInterrupt:
         return EXIT_FAILED
+    finally:
+        if resumed is not None:
+            resumed[0].unlock()
 
 
 if __name__ == "__main__":

@@ -119,6 +119,10 @@ _OPTIONS = (
     word("--report", "DIR", f"where the report goes, checkpoints, and in {ERROR_LOG} the "
          "tracebacks of nodes that failed (default: reports/TIME-MISSION, without a mission "
          "reports/TIME-SYSTEM)"),
+    option("--resume", nargs="?", const="", metavar="RUN", help="go on with a run whose launcher "
+           "was killed, or whose machine lost its power: from its checkpoints, with its options; "
+           "RUN is the directory of its report or its id (default: the newest that did not end); "
+           "runs on the processes of one machine only, not with --virtual"),
     flag("--virtual", "run a mission in virtual time: all actors in this process, many times "
          "faster than real; the same --seed gives the same run, to the byte"),
     word("--network", "NAME", "with --virtual, what lies between the nodes: "
@@ -171,6 +175,26 @@ def parse(arguments: Sequence[str] | None, program: str
         raise UsageError(f"{unknown[0]}: no option of the launcher or of {spec.name}; --system "
                          f"{system} --help shows those there are")
     return options, kind
+
+
+def of_one_process(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Return which run is to be resumed, and the arguments that hold for all parts of a run.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        The run, "" for the newest one, None for none; and the rest, without what is of this process
+        alone: recording, faults, place of the report.
+    """
+    p = argparse.ArgumentParser(add_help=False)
+    p.add_argument("--resume", nargs="?", const="")
+    p.add_argument("--record")
+    p.add_argument("--overwrite", action="store_true")
+    p.add_argument("--report")
+    p.add_argument("--fault", action="append")
+    known, rest = p.parse_known_args(arguments)
+    return known.resume, rest
 
 
 def _system_file(system: str) -> Path:

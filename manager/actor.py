@@ -202,8 +202,8 @@ class FtmManager(Actor):
     def _step(self, event: Input) -> None:
         now_s = self.clock.now()
         self._absence.note(now_s)
-        # Before simulated time 0 the system is starting: silence means nothing yet.
-        is_excused = now_s <= 0 or self._absence.excuses(now_s)
+        # Before the run begins the system is starting: silence means nothing yet.
+        is_excused = now_s <= self.context.run.plan.begins_s or self._absence.excuses(now_s)
         missed_s = now_s - self._ran_s - (0.0 if is_excused else ABSENT_S)
         self._ran_s = now_s
         state = self.arbiter_state

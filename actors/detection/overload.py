@@ -86,11 +86,12 @@ class Overload(DetectionModule):
 
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
-        """Hear how late a node was; before simulated time 0 the system is starting."""
-        now_s = self.clock.now()
+        """Hear how late a node was; before the run begins the system is starting."""
+        now_s, begins_s = self.clock.now(), self.context.run.plan.begins_s
         self._pids[header.source] = self.context.local_pid(header.source, message.pid)
         late_s = max(message.late_s, self.came_s(header) - header.stamp)
-        if late_s > self._too_late_s and header.stamp > 0 and not self._absence.excuses(now_s):
+        if late_s > self._too_late_s and header.stamp > begins_s and not (
+                self._absence.excuses(now_s)):
             told = self.parameters
             self._late_until_s[header.source] = now_s + max(
                 told.within_s, min(late_s, told.clear_s))

@@ -91,7 +91,7 @@ class Actor(Declared):
         self._last_sent = self._injections.gate.last
         self._keeper = Keeper(
             context.checkpoints, lambda line: self.report_diagnostic("checkpoint", line, self.name),
-            context.clock.now, expected=context.incarnation > 1)
+            context.clock.now, expected=context.incarnation > 1 or context.run.plan.part > 0)
         self._dispatcher = Dispatcher(
             context.bus.bursts, self._overflowed, after_burst=context.bus.after_burst)
         self._timers = Timers(context.clock, self._dispatcher)

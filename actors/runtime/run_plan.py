@@ -57,6 +57,8 @@ class RunPlan(msgspec.Struct, frozen=True):
         options: of the system's application, in place of what the spec says.
         host: name of the machine that this is the plan of; "" on the first, and on the only one.
         incarnations: of the supervisor and the routers of this host begin above this number.
+        part: how often the run was resumed.
+        begins_s: simulated time at which this part of the run begins; before, it is starting.
     """
 
     run_id: str = "run"
@@ -81,6 +83,8 @@ class RunPlan(msgspec.Struct, frozen=True):
     options: dict[str, Any] = {}
     host: str = ""
     incarnations: int = 0
+    part: int = 0
+    begins_s: float = 0.0
 
     @property
     def supervisor(self) -> str:

@@ -119,7 +119,9 @@ class Launcher:
 
     def origin_s(self) -> float:
         """Return the reading of the monotonic clock at simulated time 0, all being loaded now."""
-        return time.monotonic() + min(max(STARTUP_S[0], _LOADS * self._load_s), STARTUP_S[1])
+        startup_s = STARTUP_S[1] if self.plan.part else min(
+            max(STARTUP_S[0], _LOADS * self._load_s), STARTUP_S[1])
+        return time.monotonic() + startup_s - self.plan.begins_s / self.plan.rate
 
     def failed(self, why: str) -> None:
         """Note that the run has to end, for a part of this process has failed."""

@@ -40,6 +40,10 @@ from rampart.manager.spec.schema import Kind
 WORLD_NICE = -10
 """Niceness of the simulated world, where that is permitted."""
 
+OF_A_PART = 10**9
+"""More incarnations of a node than one part of a run has: in a resumed run the next part's begin
+there, so that its states are newer."""
+
 EXIT_OK = 0
 EXIT_FAILED = 1
 EXIT_BUS = 3
@@ -108,7 +112,8 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
     plan = layout.plan
     if not (plan.checkpoints and layout.spec.layers.checkpoints):
         return NoCheckpoints()
-    return FileCheckpoints(Path(plan.checkpoints), name, plan.run_id, incarnation)
+    return FileCheckpoints(Path(plan.checkpoints), name, plan.run_id,
+                           plan.part * OF_A_PART + incarnation)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ on the way, each message with the stamp of its reading.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from heapq import heapreplace
 from typing import Annotated, Any, ClassVar
@@ -31,11 +32,14 @@ from rampart.manager.spec.tables import Positive
 from rampart.sim.osmosis.actuator_faults import FaultNews
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.sensors import LaserSpec
-from rampart.sim.osmosis.world import World
+from rampart.sim.osmosis.world import WORLD_STATE, World
 from rampart.sim.runs.physics import report_instability
 
 WAKE_UP_S = 0.02
 MAX_CATCH_UP_S = 1.0
+
+_KEEP_S = 0.1
+"""Simulated seconds between two states of the world that a resumed run goes on from."""
 
 _JOBS = (topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.UPPER_SCAN,
          topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES)
@@ -75,6 +79,7 @@ class Simulator(Actor):
         self._laser = LaserSpec(
             rays=self.parameters.laser_rays, range_max_m=self.parameters.laser_range_m)
         self._asked_s = self._skipped_s = 0.0
+        self._keep_at_s = -math.inf
         self._real_time_factor = 1.0
         self._brakes: Holders[bool] = Holders(
             None if context.run.system is NO_SYSTEM
@@ -84,10 +89,11 @@ class Simulator(Actor):
     def on_start(self) -> None:
         """Build the world at the present time."""
         now_s, parameters = self.clock.now(), self.parameters
+        kept = self.kept(WORLD_STATE) if self.context.run.plan.part else None
         self._world = world = World(
             self._airport, Osmosis.of(self.context).world, parameters.seed, parameters.obstacles,
             dead_man_timeout_s=parameters.dead_man_timeout_s if parameters.dead_man else None,
-            laser=self._laser, start_s=now_s, max_catch_up_s=MAX_CATCH_UP_S)
+            laser=self._laser, start_s=now_s, max_catch_up_s=MAX_CATCH_UP_S, kept=kept)
         self._asked_s = now_s
         readings: dict[Topic[Any], Callable[[], Any]] = {
             topics.IMU: world.imu, topics.ODOMETRY: world.odometry,
@@ -184,6 +190,9 @@ class Simulator(Actor):
     def tick(self) -> None:
         """Step the physics to now and publish what has become due."""
         self._advance()
+        if self.clock.now() >= self._keep_at_s and not self.context.run.plan.virtual:
+            self._keep_at_s = self.clock.now() + _KEEP_S
+            self.keep(WORLD_STATE, self._world.keep())
 
     def _advance(self) -> None:
         now_s = self.clock.now()

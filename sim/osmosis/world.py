@@ -6,8 +6,10 @@ same world runs in real time and, many times faster, on a virtual clock.
 
 from __future__ import annotations
 
+import contextlib
 import math
 
+import msgspec
 import mujoco
 import numpy as np
 import shapely
@@ -15,6 +17,7 @@ import shapely
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.world import WorldTruth
+from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.sim.osmosis import robot, sensors
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, motor_of
 from rampart.sim.osmosis.clearance import Clearance, Pose, footprint
@@ -39,6 +42,37 @@ LOCKED_DAMPING = 300.0
 """Wheel damping, N m s/rad, of a blocked wheel, braked or stuck: all that moves is the tyre."""
 
 
+class WorldKept(msgspec.Struct, frozen=True):
+    """What a resumed run finds of its world: the robot stands where it was, as after a power cut.
+
+    Attributes:
+        pose: x m, y m, yaw rad in `map`.
+        obstacles: present ones: name, x m, y m, radius m.
+        waiting: names of presets that have not appeared yet.
+        leaving: presets that go again, each with the time since the world began, s.
+        began_s: simulated time at which it began.
+        collisions: counted so far.
+        prohibited_s: time spent in the prohibited area so far.
+    """
+
+    pose: tuple[float, float, float]
+    obstacles: tuple[tuple[str, float, float, float], ...]
+    waiting: tuple[str, ...]
+    leaving: dict[str, float]
+    began_s: float
+    collisions: int
+    prohibited_s: float
+
+
+def _objection(kept: WorldKept) -> str:
+    numbers = [*kept.pose, kept.began_s, kept.prohibited_s, *kept.leaving.values(),
+               *(value for _, *place in kept.obstacles for value in place)]
+    return "" if all(map(math.isfinite, numbers)) else "a number is not finite"
+
+
+WORLD_STATE = StateFormat(WorldKept, version=1, objection=_objection)
+
+
 class World:
     """An airport with the robot in it.
 
@@ -52,6 +86,7 @@ class World:
         start_s: time at which the world begins.
         max_catch_up_s: the most that one `step_to` simulates. If the caller was held up longer,
             the world has stood still meanwhile instead of holding it up further.
+        kept: how a world was left that this one continues.
 
     Raises:
         WorldError: more obstacles asked for than the airport has presets.
@@ -60,7 +95,7 @@ class World:
     def __init__(self, airport: Airport, truth: WorldTruth | None = None, seed: int = 0,
                  obstacles: int = 0, *, dead_man_timeout_s: float | None = 0.4,
                  laser: sensors.LaserSpec | None = None, start_s: float = 0.0,
-                 max_catch_up_s: float = 1.0) -> None:
+                 max_catch_up_s: float = 1.0, kept: WorldKept | None = None) -> None:
         if not 0 <= obstacles <= len(airport.obstacles):
             raise WorldError(f"obstacles: {obstacles}: {airport.name} has presets for 0 to "
                              f"{len(airport.obstacles)}")
@@ -68,8 +103,11 @@ class World:
         self.time_s = start_s
         self.skipped_s = 0.0
         self._start_s = start_s
+        self._began_s = start_s
         self._max_catch_up_s = max_catch_up_s
         self._scene = Scene(airport)
+        if kept:
+            self._scene.place_robot(*kept.pose)
         self._model, self._data = self._scene.model, self._scene.data
         self._steps_per_tick = round(TICK_S / self._model.opt.timestep)
         self._ticks = 0
@@ -105,6 +143,8 @@ class World:
         self._examine_at_s = start_s
         self._waiting = list(airport.obstacles[:obstacles])
         self._leaving: dict[str, float] = {}
+        if kept:
+            self._restore(kept)
         self._bring_obstacles()
         self._examine()
 
@@ -278,7 +318,7 @@ class World:
 
     def _bring_obstacles(self) -> None:
         """Let presets appear and go by their time windows."""
-        elapsed_s = self.time_s - self._start_s
+        elapsed_s = self.time_s - self._began_s
         for name in [name for name, until in self._leaving.items() if elapsed_s >= until]:
             self.remove_obstacle(name)
         x_m, y_m, _ = self.pose
@@ -293,6 +333,22 @@ class World:
                 continue  # The robot stands there now: it appears once the place is clear.
             if preset.gone_after_s is not None:
                 self._leaving[preset.name] = elapsed_s + preset.gone_after_s
+
+    def _restore(self, kept: WorldKept) -> None:
+        self._began_s = kept.began_s
+        self._collisions, self._prohibited_s = kept.collisions, kept.prohibited_s
+        for obstacle in kept.obstacles:
+            with contextlib.suppress(WorldError):  # on the robot, which was moving
+                self.add_obstacle(*obstacle)
+        self._waiting = [preset for preset in self._waiting if preset.name in kept.waiting]
+        self._leaving.update(kept.leaving)
+
+    def keep(self) -> WorldKept:
+        """Return what a resumed run needs to go on in this world."""
+        return WorldKept(
+            self.pose, tuple((o.name, o.x_m, o.y_m, o.radius_m) for o in self.obstacles),
+            tuple(preset.name for preset in self._waiting), dict(self._leaving), self._began_s,
+            self._collisions, self._prohibited_s)
 
     # -- ground truth ---------------------------------------------------------------------------
 

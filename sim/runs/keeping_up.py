@@ -76,12 +76,15 @@ class KeepingUp:
         timing: Of the system.
         world: Names of the nodes that simulate the world.
         rate: Simulated seconds per second.
+        begins_s: Simulated time before which the system is starting.
     """
 
-    def __init__(self, timing: Timing, world: Collection[str], rate: float) -> None:
+    def __init__(self, timing: Timing, world: Collection[str], rate: float,
+                 begins_s: float = 0.0) -> None:
         self._allowed_s = allowed_late_s(timing)
         self._world = world
         self._rate = rate
+        self._begins_s = begins_s
         self._until_s = self._said_s = -math.inf
         self._window = (0.0, "", 0.0)
         self._worst = (0.0, "", 0.0)
@@ -90,7 +93,7 @@ class KeepingUp:
 
     def take(self, table: NodeTable, now_s: float) -> str:
         """Take a table of the nodes; return a line for people, "" if there is nothing to say."""
-        if now_s < 0:  # the system is starting
+        if now_s < self._begins_s:
             return ""
         late_s, node = max(((row.late_s, row.name) for row in table.nodes), default=(0.0, ""))
         world_s = max((row.late_s for row in table.nodes if row.name in self._world), default=0.0)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -25,6 +26,9 @@ from rampart.sim.runs.trial import Trial
 
 _LOOK_S = 0.05
 _STALL_S = 0.5
+
+_KEEP_S = 1.0
+"""Wall seconds between two memories of the record, if nothing happens."""
 
 _KEYS_S = 5.0
 """Wall seconds between two looks at the certificates."""
@@ -60,6 +64,7 @@ class ProcessRun:
         trial: What is run.
         scenario: What goes wrong, and when.
         link: Connection to the run's root; None to start one.
+        keep: Takes what a resumed run needs of the record; called in a thread. None for nothing.
 
     Attributes:
         interrupted: Setting it ends the run for this reason.
@@ -68,7 +73,8 @@ class ProcessRun:
     """
 
     def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = (),
-                 link: socket.socket | None = None) -> None:
+                 link: socket.socket | None = None,
+                 keep: Callable[[bytes], None] | None = None) -> None:
         self.launcher = (FirstLauncher(trial.run, trial.title, link) if trial.run.system.hosts
                          else Launcher(trial.run.plan, trial.title, link))
         self.launcher.on_interrupt = self.interrupt
@@ -77,6 +83,8 @@ class ProcessRun:
         self.unrecorded = ""
         self._trial = trial
         self._scenario = tuple(scenario)
+        self._keep = keep
+        self._kept_marks, self._keep_at_s = -1, 0.0
 
     def interrupt(self, by: str) -> None:
         """End the run, for the user wants that: by which signal."""
@@ -140,6 +148,7 @@ class ProcessRun:
                     self.unrecorded = problem
                     actors[0].report_diagnostic("recording", problem, recording)
                     trial.not_recorded(problem, clock.now())
+                await self._keep_memory(clock.now())
                 why = trial.ended(clock.now())
             if launcher.failure:  # before its observer is told to end
                 why = self.failure = launcher.failure
@@ -153,6 +162,18 @@ class ProcessRun:
             if trial.console:
                 trial.console.close()
         return trial.conclude(clock.now(), self.interrupted or why or "ended")
+
+    async def _keep_memory(self, now_s: float) -> None:
+        """Keep what a resumed run needs of the record, if that is due."""
+        marks, wall_s = self._trial.recorder.marks(), time.monotonic()
+        if self._keep is None or (marks == self._kept_marks and wall_s < self._keep_at_s):
+            return
+        self._kept_marks, self._keep_at_s = marks, wall_s + _KEEP_S
+        try:
+            await asyncio.to_thread(self._keep, self._trial.memory(now_s))
+        except OSError as error:
+            self._keep = None
+            self.launcher.guard.report(f"the run cannot be resumed any more: {error}")
 
     async def _watch_keys(self) -> None:
         """Tell of each certificate that expires: without it a process is only gone, then hung."""

@@ -154,6 +154,34 @@ class RunRecorder:
         if take is not None:
             take(message, header)
 
+    def marks(self) -> int:
+        """Return a number that grows with everything that no memory may lack for long."""
+        return len(self._events) + len(self._decisions)
+
+    def memory(self, now_s: float) -> bytes:
+        """Return what a resumed run needs of the record so far."""
+        return msgspec.msgpack.encode(self.record(now_s))
+
+    def recall(self, memory: bytes) -> RunRecord:
+        """Go on from the memory of the part before, and return the record of that part.
+
+        Raises:
+            msgspec.DecodeError: the bytes are not a memory.
+        """
+        record = msgspec.msgpack.decode(memory, type=RunRecord)
+        self.continues(record)
+        return record
+
+    def continues(self, before: RunRecord) -> None:
+        """Take up the record of the part before."""
+        self._events = [*before.events, EventLine(
+            before.duration_s, "fault", "the run was cut off; what it did until it was resumed "
+            "was not watched")]
+        self._intervals = list(before.intervals)
+        for number, decision in enumerate(before.decisions):
+            self._decisions[0, number] = decision  # incarnations of this part are above 0
+        self._restarts.update(before.restarts)
+
     def record(self, duration_s: float, **more: Any) -> RunRecord:
         """Return the record of the run so far; `more` are fields that others know."""
         return RunRecord(**self.fields(duration_s), **more)

@@ -62,6 +62,7 @@ class Trial:
         margins: how far from harm a run was: names, and how they are headed in a report.
         margin_unit: of all of them.
         exact_below: above it a margin may be a lower bound; None if all are exact.
+        resumes: whether what was seen in one part of a run is known in the next.
         pictures: class path of the `RunPictures` that a campaign's report shows; "" for none.
 
     Args:
@@ -86,6 +87,7 @@ class Trial:
     margins: ClassVar[Mapping[str, str]] = {}
     margin_unit: ClassVar[str] = "m"
     exact_below: ClassVar[float | None] = None
+    resumes: ClassVar[bool] = True
     pictures: ClassVar[str] = ""
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
@@ -100,11 +102,12 @@ class Trial:
         self.console = self.tells(stream) if stream else None
         self.recorder = RunRecorder(run.plan, self.strategy, run.system.titles)
         self.injects: Injector | None = None
+        self._outcomes_before: tuple[FaultOutcome, ...] = ()
         self._brought_back = 0
         self._worlds = frozenset(n.name for n in run.system.nodes if n.kind is Kind.WORLD)
         self._unjudged = ""
         self._keeping_up = None if run.plan.virtual else KeepingUp(
-            run.system.timing, sorted(self._worlds), run.plan.rate)
+            run.system.timing, sorted(self._worlds), run.plan.rate, run.plan.begins_s)
 
     def sinks(self, clock: Clock) -> list[Sink]:
         """Return what wants to hear the run's messages."""
@@ -154,7 +157,21 @@ class Trial:
 
     def outcomes(self) -> tuple[FaultOutcome, ...]:
         """Return what has become of the faults so far."""
-        return self.injects.outcomes() if self.injects else ()
+        return (*self._outcomes_before, *(self.injects.outcomes() if self.injects else ()))
+
+    def memory(self, now_s: float) -> bytes:
+        """Return what a resumed run needs of what was seen so far."""
+        return self.recorder.memory(now_s)
+
+    def recall(self, memory: bytes) -> float:
+        """Go on from the memory of the part before, and return when it was kept, simulated s.
+
+        Raises:
+            msgspec.DecodeError: the bytes are not a memory.
+        """
+        before = self.recorder.recall(memory)
+        self._outcomes_before = before.faults
+        return before.duration_s
 
     def brought_back(self, name: str, now_s: float) -> None:
         """Note that the launcher has brought an actor back."""
@@ -267,6 +284,7 @@ class JudgedTrial(Trial):
     """
 
     judges = True
+    resumes = False
     judge: ClassVar[type[Judge]]
 
     def __init__(self, run: RunContext, limit_s: float | None = None,

@@ -116,7 +116,8 @@ class OsmosisHmi(Hmi):
         now = self.clock.now()
         if told := self._submission.expire(now):
             self._state.log(now, "note", told)
-        if self._submission.pending is not None and system_is_up(self._table, now):
+        if self._submission.pending is not None and system_is_up(
+                self._table, now - self.context.run.plan.begins_s):
             self.publish(topics.MISSION_REQUEST, self._submission.pending)
         self._tell(self._orders.expire(now))
         if self._orders.pending is not None:

@@ -119,7 +119,8 @@ class MissionTrial(Trial):
         self.about = f"mission {self.name} ({self.goals} goals) on {known.airport.name}"
         self._end = RunEnd(
             _PATIENCE_S if limit_s is None else limit_s, run.plan.waits,
-            [node.name for node in run.system.nodes if node.kind is Kind.WORLD])
+            [node.name for node in run.system.nodes if node.kind is Kind.WORLD],
+            run.plan.begins_s)
         self.recorder = MissionRecorder(run.plan, self.strategy, known.airport, known.mission)
 
     def sinks(self, clock: Clock) -> list[Sink]:

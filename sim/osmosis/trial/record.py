@@ -128,6 +128,44 @@ class MissionRecorder(RunRecorder):
             topics.LIGHT_MEASURED.key: self._light, topics.OBSTACLES.key: self._obstacle_list,
             topics.PILOT_STATUS.key: self._pilot}
 
+    def marks(self) -> int:
+        """Return a number that grows with everything that no memory may lack for long."""
+        return (super().marks() + len(self.judge.visit_times_s) + self.judge.collisions
+                + len(self._reached) + len(self._lights))
+
+    def memory(self, now_s: float) -> bytes:
+        """Return what a resumed run needs of the record so far, and of what the judge saw."""
+        verdict: dict[str, Any] = {"mission": "fail", "safety": "not known"}
+        return msgspec.msgpack.encode(_Memory(
+            self.record(now_s, **verdict), tuple(self.judge.visit_times_s),
+            self.judge.first_unsafe_s, self._mode))
+
+    def recall(self, memory: bytes) -> MissionRecord:
+        """Go on from the memory of the part before, and return the record of that part.
+
+        Raises:
+            msgspec.DecodeError: the bytes are not a memory.
+        """
+        kept = msgspec.msgpack.decode(memory, type=_Memory)
+        before, judge = kept.record, self.judge
+        self.continues(before)
+        self._mode, judge.visit_times_s = kept.mode, list(kept.visit_times_s)
+        judge.first_unsafe_s, judge.narrowest_s = kept.first_unsafe_s, before.narrowest_s
+        judge.collisions, judge.prohibited_s = before.collisions, before.prohibited_s
+        judge.obstacle_m = _or_infinite(before.obstacle_clearance_m)
+        judge.prohibited_m = _or_infinite(before.prohibited_clearance_m)
+        self._track, self._believed = list(before.track), list(before.believed)
+        self._obstacles.update((seen.name, seen) for seen in before.obstacles)
+        self._lights.update((light.name, m.LightMeasurement(
+            light.name, light.intensity_cd, light.ratio, m.LightVerdict(light.verdict)))
+            for light in before.lights
+            if light.intensity_cd is not None and light.ratio is not None)
+        self._skipped = frozenset(i for i, step in enumerate(before.steps) if step.skipped)
+        done = [step for step in before.steps if step.skipped or step.reached_s is not None]
+        self._reached = tuple(before.duration_s if step.reached_s is None else step.reached_s
+                              for step in done)
+        return before
+
     def record(self, duration_s: float, **more: Any) -> MissionRecord:
         """Return the record of the run so far; `more` are at least the verdicts."""
         judge, drawing = self.judge, draw(self._airport)
@@ -187,6 +225,19 @@ class MissionRecorder(RunRecorder):
         known, seen = msgspec.structs.asdict(light), self._lights.get(light.name)
         return LightResult(**known) if seen is None else LightResult(
             **known, verdict=seen.verdict.value, intensity_cd=seen.intensity_cd, ratio=seen.ratio)
+
+
+class _Memory(msgspec.Struct, frozen=True):
+    """What a resumed run needs: the record, and what the judge saw and the record has not."""
+
+    record: MissionRecord
+    visit_times_s: tuple[float, ...]
+    first_unsafe_s: float | None
+    mode: str
+
+
+def _or_infinite(value: float | None) -> float:
+    return math.inf if value is None else value
 
 
 def _finite(value: float) -> float | None:

@@ -47,22 +47,28 @@ class RunEnd:
             a metre nearer to the goal, and no way round something that is on the way.
         waits: whether the mission comes when the operator wants it, however late.
         worlds: names of the nodes that simulate the world.
+        begins_s: when this part of the run begins.
     """
 
     patience_s: float
     waits: bool = False
     worlds: Collection[str] = ()
+    begins_s: float = 0.0
     _mission_id: str = ""
     _progress: tuple[int, int] = (-1, -1)
     _nearest_m: float = math.inf
     _ways: set[str] = field(default_factory=lambda: {""})
-    _progress_at_s: float = 0.0
+    _progress_at_s: float = -math.inf
     _over_at_s: float = math.inf
     _over: str = ""
     _lost_at_s: float = math.inf
     _truth_at_s: float = math.inf
     _moves: bool = False
     _is_gone: bool = False
+
+    def __post_init__(self) -> None:
+        """Count the patience from the beginning."""
+        self._progress_at_s = self.begins_s
 
     def take(self, message: Any, now_s: float) -> None:
         """Take what the observer hears; what says nothing of the end does not matter."""
@@ -133,8 +139,9 @@ class RunEnd:
             return (self._over if now_s - self._over_at_s >= SETTLE_S else ""), self._over_at_s
         if now_s - self._lost_at_s > LOST_AFTER_S:
             return "mission lost: the Mission Manager came back without it", self._lost_at_s
-        if not self._mission_id and not self.waits and now_s > ACCEPT_WITHIN_S:
-            return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s", ACCEPT_WITHIN_S
+        accepted_by_s = self.begins_s + ACCEPT_WITHIN_S
+        if not self._mission_id and not self.waits and now_s > accepted_by_s:
+            return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s", accepted_by_s
         stuck_s = self._progress_at_s + self.patience_s
         if (self._mission_id or not self.waits) and now_s > stuck_s:
             return f"no progress for {self.patience_s:.0f} s", stuck_s

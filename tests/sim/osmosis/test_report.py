@@ -270,3 +270,62 @@ def test_an_interrupted_write_leaves_the_old_report(tmp_path, monkeypatch):
 ])
 def test_times_are_written_as_minutes_and_seconds(seconds, text):
     assert clock(seconds) == text
+
+
+# ---- a run that is resumed ------------------------------------------------------------
+
+
+def told_of_the_beginning(story: Story) -> None:
+    goal = MISSION.goals[0]
+    goals = tuple(m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in MISSION.goals)
+    light = m.LightMeasurement("A01", 200.0, 1.0, m.LightVerdict.OK)
+    story.tell(1.0, topics.MISSION_STATUS, m.MissionStatus(
+        "1", "AB", m.MissionPhase.RUNNING, 0, goals, (), (light,), ""))
+    story.truth(10.0, goal.x_m - 5.0, goal.y_m, prohibited_clearance_m=0.4)
+    story.truth(12.0, goal.x_m, goal.y_m)
+    story.tell(12.5, topics.MISSION_STATUS, m.MissionStatus(
+        "1", "AB", m.MissionPhase.RUNNING, 1, goals, (12.0,), (light,), ""))
+    story.detect(13.0, "DM4", ACTIVE, "dead")
+    story.detect(14.0, "DM4", IDLE)
+    story.tell(14.0, ftm_topics.PROCESS_EVENT, fm.ProcessEvent(
+        "hmi", "respawned", 7, 2, "supervisor", ""))
+
+
+def test_the_record_of_a_resumed_run_covers_both_parts():
+    before, after = Story(), Story()
+    told_of_the_beginning(before)
+    found = after.recorder.recall(before.recorder.memory(20.0))
+    assert found.duration_s == 20.0
+    goal = MISSION.goals[1]
+    after.truth(40.0, goal.x_m, goal.y_m, collisions=0)
+    after.tell(40.0, ftm_topics.PROCESS_EVENT, fm.ProcessEvent(
+        "hmi", "respawned", 7, 2, "supervisor", ""))
+    run = after.end(60.0)
+    assert [step.reached_s for step in run.steps[:2]] == [12.5, None]
+    assert next(x.intensity_cd for x in run.lights if x.name == "A01") == 200.0
+    assert run.prohibited_clearance_m == 0.4
+    assert [t for t, *_ in run.track] == [10.0, 12.0, 40.0]
+    assert run.restarts == {"hmi": 2}
+    assert ("detection", "DM4", 13.0, 14.0) in bars(run)
+    assert any("cut off" in event.text for event in run.events)
+
+
+def test_the_judge_knows_what_it_saw_before_and_judges_the_cut_in_the_mode_of_before():
+    before, after = Story(), Story()
+    told_of_the_beginning(before)
+    after.recorder.recall(before.recorder.memory(20.0))
+    goal = MISSION.goals[1]
+    after.truth(30.0, goal.x_m, goal.y_m)  # the Mission Manager has not been heard again yet
+    assert len(after.recorder.judge.visit_times_s) == 2
+    unsafe = Story()
+    unsafe.truth(5.0, 0.0, 0.0, collisions=1)
+    later = Story()
+    later.recorder.recall(unsafe.recorder.memory(6.0))
+    later.truth(9.0, 0.0, 0.0, collisions=0)
+    verdict = later.recorder.judge.verdict()
+    assert (verdict.safe, verdict.unsafe_s) == (False, 5.0)
+
+
+def test_a_memory_of_another_kind_is_refused():
+    with pytest.raises(msgspec.DecodeError):
+        Story().recorder.recall(b"\x93\x01\x02\x03")

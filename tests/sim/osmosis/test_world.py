@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 import shapely
 
@@ -15,9 +16,10 @@ from rampart.actors.osmosis.airport.model import (
     StartPose,
     rectangle,
 )
+from rampart.actors.runtime.checkpoint import StateError
 from rampart.sim.osmosis.clearance import Clearance
 from rampart.sim.osmosis.scene import NOTHING_M, SPARE_OBSTACLES, WorldError
-from rampart.sim.osmosis.world import World
+from rampart.sim.osmosis.world import WORLD_STATE, World
 
 # A road 40 m long and 4 m wide, eastward; the robot starts in its west.
 ROAD = shapely.box(-2, -2, 38, 2)
@@ -291,3 +293,41 @@ def test_a_clearance_is_exact_when_small_and_else_a_lower_bound_with_few_exact_l
         else:
             assert found <= truly + 1e-9
     assert len(looks) < 250
+
+
+# ---- a run that is resumed ------------------------------------------------------------
+
+
+def test_a_world_goes_on_as_it_was_left():
+    presets = (ObstaclePreset("early", "cylinder", 20.0, 0.0, 0.4), ObstaclePreset(
+        "timed", "cylinder", 30.0, 1.0, 0.4, present_from_s=2.0, gone_after_s=10.0))
+    before = world(road(obstacles=presets), obstacles=2)
+    before.add_obstacle("placed", 10.0, 1.5, 0.3)
+    before.command(1.0, 0.0)
+    before.step_to(3.0)
+    kept = WORLD_STATE.decode(1, WORLD_STATE.encode(before.keep()))
+    after = world(road(obstacles=presets), obstacles=2, start_s=9.0, kept=kept)
+    assert after.pose == pytest.approx(before.pose)
+    assert {o.name for o in after.obstacles} == {"early", "timed", "placed"}
+    after.step_to(10.0)
+    assert after.pose[0] == pytest.approx(before.pose[0], abs=0.02)  # it stands
+    after.step_to(12.5)
+    assert {o.name for o in after.obstacles} == {"early", "placed"}
+    assert (after.truth().collisions, after.truth().prohibited_s) == (0, 0.0)
+
+
+def test_collisions_and_time_in_the_prohibited_area_go_on_counting():
+    sim = world()
+    sim.command(1.0, 0.0)
+    sim.add_obstacle("crate", 3.0, 0.0, 0.4)
+    sim.step_to(4.0)
+    assert sim.truth().collisions > 0
+    after = world(start_s=5.0, kept=sim.keep())
+    after.step_to(5.1)
+    assert after.truth().collisions >= sim.truth().collisions
+
+
+def test_a_kept_world_that_makes_no_sense_is_refused():
+    kept = msgspec.structs.replace(world().keep(), pose=(math.nan, 0.0, 0.0))
+    with pytest.raises(StateError, match="not finite"):
+        WORLD_STATE.decode(1, WORLD_STATE.encode(kept))

@@ -158,3 +158,14 @@ def test_a_world_whose_process_has_ended_is_not_waited_for():
     end.take(ProcessEvent("simulator", "crashed", 1, 1, "supervisor", ""), 2.0)
     assert end.world_gone(2.0 + WORLD_SILENT_S) == ""
     assert "the world is gone" in end.world_gone(2.1 + WORLD_SILENT_S)
+
+
+assert end.ended(2.0 + WORLD_SILENT_S) is None
+    assert "the world is gone" in (end.ended(2.1 + WORLD_SILENT_S) or "")
+
+
+def test_a_part_that_begins_late_has_the_patience_of_one_that_begins_at_zero():
+    end = RunEnd(60.0, begins_s=500.0)
+    assert end.ended(501.0) is None
+    assert end.ended(529.0) is None
+    assert "no mission was accepted" in str(end.ended(532.0))

@@ -69,6 +69,7 @@ class FusedLocalization(Actor):
         """Go on from what the predecessor found out about the positions."""
         if (kept := self.kept(LOCALIZATION_STATE)) is not None:
             self._kept_m = self._filter.owed_m = kept.owed_m
+        self.keep(LOCALIZATION_STATE, LocalizationKept(self._kept_m))
 
     @on(topics.BASE_STATUS)
     def status(self, message: BaseStatus, header: Header) -> None:

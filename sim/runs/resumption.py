@@ -1,0 +1,263 @@
+"""What lies beside the report of a run so that it can be resumed, and how it is found again.
+
+In the report's directory are a manifest (`run.json`: which run that is, how it was started, and
+digests of the files that it was made from), the nodes' checkpoints, and the newest two memories of
+the run's record. The directory is locked (flock(2)) by every process of the run: a run that is
+locked lives, whatever became of its launcher.
+
+A resumed run has the same run id and the next part number. Its simulated time goes on a little
+after the newest thing that was recorded, so that no state is from the future.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rampart.actors.runtime.run_plan import RunPlan
+from rampart.actors.supervision.launcher import STARTUP_S
+
+MANIFEST = "run.json"
+FORMAT = 1
+_LARGEST_BYTES = 64 << 20
+
+_MEMORY, _BEFORE = "record.memory", "record.memory.before"
+_PATIENCE_S = 3.0
+"""Real seconds in which the processes of a run end whose launcher was killed."""
+
+AFTER_S = 2.0 + STARTUP_S[1]
+"""Real seconds from the newest memory of the record to the beginning of the next part: one is kept
+each second, states may be newer, and the processes start before the part begins."""
+
+
+class ResumptionError(ValueError):
+    """A run cannot be resumed; the text is one line that names the run and why."""
+
+
+class Manifest(msgspec.Struct, frozen=True):
+    """Which run a directory has, and how it was started.
+
+    Attributes:
+        format: of this file.
+        run_id: name of the run.
+        part: how often it was resumed.
+        arguments: of the command line.
+        choices: what must be the same in a resumed run, by name.
+        rate: simulated seconds per second.
+        digests: SHA-256 of each file that it was made from, by path.
+        ended: how it ended; "" if it has not.
+    """
+
+    format: int
+    run_id: str
+    part: int
+    arguments: tuple[str, ...]
+    choices: dict[str, Any]
+    rate: float
+    digests: dict[str, str]
+    ended: str = ""
+
+
+def manifest_of(plan: RunPlan, arguments: Iterable[str], files: Iterable[Path]) -> Manifest:
+    """Return the manifest of a run that is about to start.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    paths = sorted({str(file.resolve()) for file in (Path(plan.system_file), *files)})
+    digests = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in paths}
+    choices = {name: getattr(plan, name)
+               for name in ("system_file", "strategy", "shadow", "ftm", "seed")}
+    return Manifest(FORMAT, plan.run_id, plan.part, tuple(arguments), {**choices, **plan.options},
+                    plan.rate, digests)
+
+
+def differences(before: Manifest, now: Manifest) -> str:
+    """Return in words what a resumed run has that is not as it was; "" if all is."""
+    for name in sorted(before.choices.keys() | now.choices.keys()):
+        was, is_now = before.choices.get(name), now.choices.get(name)
+        if msgspec.json.encode(was) != msgspec.json.encode(is_now):
+            return f"{name} is {is_now!r}, expected {was!r} as in the run"
+    for path, digest in before.digests.items():
+        if now.digests.get(path) != digest:
+            return f"{path} has changed since the run was started"
+    return ""
+
+
+class RunFiles:
+    """What a run keeps in the directory of its report.
+
+    Args:
+        directory: of the report.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self._lock = -1
+
+    def lock(self) -> bool:
+        """Lock the directory for this process and those that it forks; return if that succeeds.
+
+        Raises:
+            OSError: there is no such directory.
+        """
+        if self._lock < 0:
+            self._lock = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.unlock()
+            return False
+        return True
+
+    def unlock(self) -> None:
+        """Let go of the directory. Harmless when repeated."""
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+    def manifest(self) -> Manifest:
+        """Return the manifest.
+
+        Raises:
+            ResumptionError: there is none, or it is damaged.
+        """
+        file = self.directory / MANIFEST
+        try:
+            found = msgspec.json.decode(_content(file), type=Manifest)
+        except FileNotFoundError:
+            raise ResumptionError(f"{self.directory}: no run that can be resumed: no {MANIFEST} "
+                                  "in it") from None
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
+            raise ResumptionError(f"{file}: damaged: {error}") from None
+        if found.format != FORMAT:
+            raise ResumptionError(f"{file}: format: {found.format}, expected {FORMAT}")
+        return found
+
+    def save(self, manifest: Manifest) -> None:
+        """Keep the manifest.
+
+        Raises:
+            OSError: it cannot be kept.
+        """
+        _write(self.directory / MANIFEST, msgspec.json.format(msgspec.json.encode(manifest)))
+
+    def drop(self) -> None:
+        """Remove the manifest of a run that did not start."""
+        (self.directory / MANIFEST).unlink(missing_ok=True)
+
+    def keep_memory(self, memory: bytes) -> None:
+        """Keep the newest memory of the record, and the one before it.
+
+        Raises:
+            OSError: it cannot be kept.
+        """
+        file = self.directory / _MEMORY
+        with contextlib.suppress(FileNotFoundError):
+            file.replace(self.directory / _BEFORE)
+        _write(file, hashlib.sha256(memory).digest() + memory)
+
+    def recall(self, recall: Callable[[bytes], float]) -> tuple[float, list[str]]:
+        """Have the newest sound memory recalled.
+
+        Args:
+            recall: takes a memory, and returns when it was kept, simulated seconds.
+
+        Returns:
+            That time, 0 without a memory; and what was damaged, one line each.
+        """
+        problems: list[str] = []
+        for file in (self.directory / _MEMORY, self.directory / _BEFORE):
+            try:
+                data = _content(file)
+                if hashlib.sha256(data[32:]).digest() != data[:32]:
+                    raise msgspec.DecodeError("its checksum is wrong")
+                return recall(data[32:]), problems
+            except FileNotFoundError:
+                continue
+            except (OSError, msgspec.DecodeError) as error:
+                problems.append(f"{file}: damaged: {error}")
+        return 0.0, problems
+
+
+def find(reports: Path, which: str) -> tuple[RunFiles, Manifest]:
+    """Return the files of a run that can be resumed, locked, and its manifest.
+
+    Args:
+        reports: folder of the reports.
+        which: directory of a run's report, or its name in `reports`, or the run's id; "" for the
+            newest run that did not end.
+
+    Raises:
+        ResumptionError: there is none, or it has ended, lives, or is damaged.
+    """
+    directory = _newest(reports) if not which else _named(reports, which)
+    files = RunFiles(directory)
+    until_s = time.monotonic() + _PATIENCE_S
+    while not files.lock():
+        if time.monotonic() > until_s:
+            raise ResumptionError(f"{directory}: the run still lives")
+        time.sleep(0.05)
+    try:
+        manifest = files.manifest()
+        if manifest.ended:
+            raise ResumptionError(f"{directory}: the run has ended ({manifest.ended})")
+    except BaseException:
+        files.unlock()
+        raise
+    return files, manifest
+
+
+def _newest(reports: Path) -> Path:
+    found = sorted(reports.glob(f"*/{MANIFEST}"), key=lambda file: -file.lstat().st_mtime)
+    damaged = None
+    for file in found:
+        try:
+            if not RunFiles(file.parent).manifest().ended:
+                return file.parent
+        except ResumptionError as error:
+            damaged = damaged or error
+    raise damaged or ResumptionError(f"{reports}: no run that did not end")
+
+
+def _named(reports: Path, which: str) -> Path:
+    for directory in (Path(which), reports / which):
+        if directory.is_dir():
+            return directory
+    for file in reports.glob(f"*/{MANIFEST}"):
+        with contextlib.suppress(ResumptionError):
+            if RunFiles(file.parent).manifest().run_id == which:
+                return file.parent
+    raise ResumptionError(f"{which}: no such run; expected the directory of a report, its name in "
+                          f"{reports}, or a run's id")
+
+
+def _content(file: Path) -> bytes:
+    with file.open("rb") as opened:
+        data = opened.read(_LARGEST_BYTES + 1)
+    if len(data) > _LARGEST_BYTES:
+        raise OSError(0, f"more than {_LARGEST_BYTES} bytes")
+    return data
+
+
+def _write(file: Path, content: bytes) -> None:
+    """Replace a file, whole or not at all, and have the disk confirm it."""
+    beside = file.with_name(f"{file.name}~")
+    with beside.open("wb") as opened:
+        opened.write(content)
+        opened.flush()
+        os.fsync(opened.fileno())
+    beside.replace(file)
+    folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

@@ -1,0 +1,179 @@
+"""What a run keeps so that it can be resumed: found again, or refused in one line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from rampart.actors.runtime.run_plan import RunPlan
+from rampart.sim.runs.resumption import (
+    MANIFEST,
+    Manifest,
+    ResumptionError,
+    RunFiles,
+    differences,
+    find,
+    manifest_of,
+)
+
+
+@pytest.fixture
+def system(tmp_path) -> Path:
+    file = tmp_path / "system.toml"
+    file.write_text("name = 'x'")
+    return file
+
+
+def begun(reports: Path, name: str, system: Path, **changes) -> RunFiles:
+    """Keep what a run keeps when it starts, and let go of it as if it had been killed."""
+    directory = reports / name
+    directory.mkdir(parents=True)
+    files = RunFiles(directory)
+    plan = RunPlan(run_id=f"id-{name}", system_file=str(system), options={"mission": "AB"})
+    files.save(msgspec.structs.replace(manifest_of(plan, ["--rate", "2"], []), **changes))
+    return files
+
+
+def test_the_newest_run_that_did_not_end_is_found(tmp_path, system):
+    reports = tmp_path / "reports"
+    for number, (name, ended) in enumerate((("a", ""), ("b", ""), ("c", "success, safe"))):
+        file = begun(reports, name, system, ended=ended).directory / MANIFEST
+        os.utime(file, (1000 + number, 1000 + number))
+    files, manifest = find(reports, "")
+    assert files.directory == reports / "b"
+    assert manifest.arguments == ("--rate", "2")
+    files.unlock()
+
+
+@pytest.mark.parametrize("which", ["reports/a", "a", "id-a"])
+def test_a_run_is_found_by_directory_name_and_id(tmp_path, system, monkeypatch, which):
+    monkeypatch.chdir(tmp_path)
+    begun(tmp_path / "reports", "a", system)
+    files, manifest = find(Path("reports"), which)
+    assert manifest.run_id == "id-a"
+    files.unlock()
+
+
+def damaged(text: str):
+    return lambda files: (files.directory / MANIFEST).write_text(text)
+
+
+@pytest.mark.parametrize(("change", "which", "why"), [
+    (lambda files: (files.directory / MANIFEST).unlink(), "a", MANIFEST),
+    (damaged(""), "a", MANIFEST),
+    (damaged("{"), "", MANIFEST),
+    (damaged('{"format": 9}'), "a", MANIFEST),
+    (damaged('{"format": 1, "run_id": 7}'), "a", "run_id"),
+    (lambda files: files.save(msgspec.structs.replace(files.manifest(), format=99)), "a", "99"),
+    (lambda files: files.save(msgspec.structs.replace(files.manifest(), ended="fail, safe")), "a",
+     "has ended (fail, safe)"),
+    (lambda files: files.save(msgspec.structs.replace(files.manifest(), ended="fail, safe")), "",
+     "no run that did not end"),
+    (lambda _files: None, "b", "no such run"),
+])
+def test_what_cannot_be_resumed_is_refused_in_one_line(tmp_path, system, change, which, why):
+    change(begun(tmp_path / "reports", "a", system))
+    with pytest.raises(ResumptionError) as refused:
+        find(tmp_path / "reports", which)
+    assert why in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_without_reports_there_is_nothing_to_resume(tmp_path):
+    with pytest.raises(ResumptionError, match="no run that did not end"):
+        find(tmp_path / "reports", "")
+
+
+def test_any_cut_or_wrong_byte_of_a_manifest_is_one_line_or_harmless(tmp_path, system):
+    files = begun(tmp_path / "reports", "a", system)
+    whole = (files.directory / MANIFEST).read_bytes()
+    for at in range(0, len(whole), 3):
+        for data in (whole[:at], whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1:]):
+            (files.directory / MANIFEST).write_bytes(data)
+            told = ""
+            try:
+                find(tmp_path / "reports", "a")[0].unlock()
+            except ResumptionError as error:
+                told = str(error)
+            assert "\n" not in told
+
+
+def test_a_run_that_lives_is_not_resumed_though_its_launcher_is_gone(tmp_path, system):
+    """Any process of the run keeps the lock, for it was forked with it."""
+    files = begun(tmp_path / "reports", "a", system)
+    assert files.lock()
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"],
+                             pass_fds=[files._lock])
+    files.unlock()
+    with pytest.raises(ResumptionError, match="still lives"):
+        find(tmp_path / "reports", "a")
+    child.kill()
+    child.wait()
+    found, _ = find(tmp_path / "reports", "a")
+    found.unlock()
+
+
+def test_processes_that_are_just_ending_are_waited_for(tmp_path, system):
+    files = begun(tmp_path / "reports", "a", system)
+    assert files.lock()
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(0.5)"],
+                             pass_fds=[files._lock])
+    files.unlock()
+    begun_s = time.monotonic()
+    found, _ = find(tmp_path / "reports", "a")
+    assert time.monotonic() - begun_s > 0.1
+    found.unlock()
+    child.wait()
+
+
+def manifest(system: Path, **changes) -> Manifest:
+    plan = RunPlan(run_id="r", system_file=str(system), options={"mission": "AB"})
+    return manifest_of(msgspec.structs.replace(plan, **changes), [], [])
+
+
+def test_another_system_seed_or_mission_is_named_and_another_rate_is_none_of_these(system):
+    before = manifest(system)
+    assert differences(before, manifest(system, rate=4.0, run_id="s")) == ""
+    assert "seed is 2, expected 1" in differences(before, manifest(system, seed=2))
+    assert "mission is 'A', expected 'AB'" in differences(
+        before, manifest(system, options={"mission": "A"}))
+    assert "ftm" in differences(before, manifest(system, ftm=False))
+    system.write_text("name = 'y'")
+    assert f"{system} has changed" in differences(before, manifest(system))
+
+
+def test_of_two_memories_the_newest_sound_one_is_recalled(tmp_path):
+    files, recalled = RunFiles(tmp_path), list[bytes]()
+
+    def recall(memory: bytes) -> float:
+        recalled.append(memory)
+        return 7.0
+
+    assert files.recall(recall) == (0.0, [])
+    for memory in (b"first", b"second", b"third"):
+        files.keep_memory(memory)
+    assert files.recall(recall) == (7.0, [])
+    newest = tmp_path / "record.memory"
+    newest.write_bytes(newest.read_bytes()[:-1])
+    time_s, problems = files.recall(recall)
+    assert (time_s, len(problems)) == (7.0, 1)
+    assert recalled == [b"third", b"second"]
+    (tmp_path / "record.memory.before").write_bytes(b"")
+    time_s, problems = files.recall(recall)
+    assert (time_s, len(problems)) == (0.0, 2)
+
+
+def test_a_memory_that_is_none_of_this_run_s_record_is_damage(tmp_path):
+    files = RunFiles(tmp_path)
+    files.keep_memory(b"\xc1")
+
+    def recall(_memory: bytes) -> float:
+        raise msgspec.ValidationError("Expected `object`")
+
+    assert files.recall(recall)[0] == 0.0

@@ -1,0 +1,69 @@
+"""A run whose launcher is killed goes on where it was: on real processes."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import pytest
+
+from tests.whole.checkpoint_runs import write_near_mission
+from tests.whole.resumption_runs import first_part, one, resumed, started
+
+pytestmark = [pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(300)]
+
+PORT = 18440
+
+
+@pytest.mark.parametrize("seed", [
+    100, 101, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(60))])
+def test_a_run_that_is_cut_off_at_any_moment_ends_in_success_with_each_light_measured_once(
+        tmp_path, seed):
+    wrong, _ = one(tmp_path, seed, PORT)
+    assert wrong == []
+
+
+def test_what_is_not_that_run_or_lives_is_refused_and_nothing_is_lost(tmp_path):
+    mission = str(write_near_mission(tmp_path))
+    report = str(tmp_path / "report")
+    run = started(tmp_path, PORT, "--mission", mission, "--rate", "2", "--report", report)
+    try:
+        deadline_s = time.monotonic() + 60
+        while not (tmp_path / "report" / "checkpoints").is_dir():
+            assert time.monotonic() < deadline_s
+            time.sleep(0.1)
+        code, _, told = resumed(tmp_path, PORT + 1, report)
+        assert (code, told.count("\n")) == (2, 1)
+        assert "still lives" in told
+        again = started(tmp_path, PORT + 1, "--mission", mission, "--report", report)
+        _, told = again.communicate(timeout=60)
+        assert again.returncode == 2
+        assert f"--report {report}" in told
+    finally:
+        run.send_signal(signal.SIGKILL)
+        run.communicate()
+    for options, why in ((("--seed", "7"), "seed"), (("--mission", "A"), "mission"),
+                         (("--system", "paper"), "paper"), (("--virtual",), "virtual"),
+                         (("--obstacles", "1"), "obstacles"), (("--no-ftm",), "")):
+        other = started(tmp_path, PORT, "--resume", report, *options)
+        _, told = other.communicate(timeout=60)
+        assert (other.returncode, told.count("\n")) == (2, 1), told
+        assert why in told
+    code, result, told = resumed(tmp_path, PORT, report)
+    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), told
+    code, _, told = resumed(tmp_path, PORT, report)
+    assert (code, told.count("\n")) == (2, 1)
+    assert "has ended (success, safe)" in told
+
+
+def test_a_resumed_run_can_be_cut_off_and_resumed_again(tmp_path):
+    run = first_part(tmp_path, PORT)
+    report = str(tmp_path / "report")
+    for _ in range(2):
+        time.sleep(9)
+        run.send_signal(signal.SIGKILL)
+        run.communicate()
+        run = started(tmp_path, PORT, "--resume", report)
+    told = run.communicate(timeout=200)[1]
+    assert run.returncode == 0, told
+    assert "part 3" in told
