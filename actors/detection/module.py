@@ -102,7 +102,7 @@ class DetectionModule(Actor):
         self._alarm: Timer | None = None
         self._senders: dict[str, int] = Remembered(MANY)
         self._absence = Absence(self.clock.now(), self.clock.rate)
-        self._judges_from_s = 0.0  # before that the system is starting, see `Launcher.start`
+        self._judges_from_s = context.run.plan.begins_s  # before, the system is starting
 
     def grace_s(self, timeout_s: float) -> float:
         """Return how long the first input may take, s: the timeout, or more while a system starts.
