@@ -173,7 +173,7 @@ class ProcessRun:
             await asyncio.to_thread(self._keep, self._trial.memory(now_s))
         except OSError as error:
             self._keep = None
-            self.launcher.guard.report(f"the run cannot be resumed any more: {error}")
+            self.launcher.report(f"the run cannot be resumed any more: {error}")
 
     async def _watch_keys(self) -> None:
         """Tell of each certificate that expires: without it a process is only gone, then hung."""
