@@ -160,10 +160,6 @@ def test_a_world_whose_process_has_ended_is_not_waited_for():
     assert "the world is gone" in end.world_gone(2.1 + WORLD_SILENT_S)
 
 
-assert end.ended(2.0 + WORLD_SILENT_S) is None
-    assert "the world is gone" in (end.ended(2.1 + WORLD_SILENT_S) or "")
-
-
 def test_a_part_that_begins_late_has_the_patience_of_one_that_begins_at_zero():
     end = RunEnd(60.0, begins_s=500.0)
     assert end.ended(501.0) is None
