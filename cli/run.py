@@ -51,6 +51,7 @@ from rampart.sim.runs.report import in_words
 from rampart.sim.runs.resumption import (
     AFTER_S,
     Manifest,
+    ResumptionError,
     RunFiles,
     differences,
     find,
@@ -101,9 +102,8 @@ class Run:
             self._files = resumed[0] if resumed else RunFiles(self._directory)
         self._manifest = manifest_of(plan, arguments,
                                      [path for _, path in application.documents()])
-        self._before = resumed[1] if resumed else None
-        if self._before is not None:
-            self._resume(self._before)
+        if resumed:
+            self._resume(resumed[1])
         self._scenario = [parse_fault(text) for text in options.fault]
         known = system_topics(spec) if self._scenario else ()
         for i, planned in enumerate(self._scenario):
@@ -125,11 +125,13 @@ class Run:
             if files is not None and not files.lock():
                 raise UsageError(f"--report {files.directory}: a run is under way that keeps its "
                                  "checkpoints there")
+            saved = files.saved() if files is not None else None
             try:
                 root = Root(self._context)
                 code = root.run(lambda link: _in_child(lambda: self._watch(link)))
-                if code == EXIT_USAGE:
-                    self._not_started()
+                if code == EXIT_USAGE and files is not None:
+                    with contextlib.suppress(OSError):
+                        files.put_back(saved)
                 return self._not_watched(root) if code is None else code
             finally:
                 if files is not None:
@@ -138,19 +140,11 @@ class Run:
     async def _watch(self, link: socket.socket) -> int:
         if self._options.rate == MAX_RATE:
             await self._find_rate()
+        keep = None
         if self._files is not None:
             self._files.save(msgspec.structs.replace(self._manifest, rate=self._plan.rate))
-        keep = self._files.keep_memory if self._files else None
+            keep = partial(self._files.keep_memory, self._plan.run_id)
         return await self._on_processes(ProcessRun(self._trial, self._scenario, link, keep))
-
-    def _not_started(self) -> None:
-        """Have a run that could not be started be resumed only if it was before."""
-        if self._files is not None:
-            with contextlib.suppress(OSError):
-                if self._before is None:
-                    self._files.drop()
-                else:
-                    self._files.save(self._before)
 
     def _not_watched(self, root: Root) -> int:
         """Conclude a run whose watching process has ended without a verdict."""
@@ -177,7 +171,7 @@ class Run:
                              "expected layers.checkpoints, one machine, and no judge of its own")
         if why := differences(before, self._manifest):
             raise UsageError(f"--resume {files.directory}: {why}")
-        begins_s, problems = files.recall(self._trial.recall)
+        begins_s, problems = files.recall(before.run_id, self._trial.recall)
         for problem in problems:
             _say(problem)
         self._plan = msgspec.structs.replace(
@@ -188,7 +182,7 @@ class Run:
             self._manifest, run_id=before.run_id, part=self._plan.part)
         self._context = replace(self._context, plan=self._plan)
         self._trial = self._made(self._plan, sys.stderr)
-        files.recall(self._trial.recall)
+        files.recall(before.run_id, self._trial.recall)
         _say(f"run {before.run_id} is resumed at {self._plan.begins_s:.1f} s, part "
              f"{self._plan.part + 1}")
 
@@ -252,9 +246,9 @@ class Run:
 
     def _conclude(self, record: RunRecord, failure: str = "", **more: Any) -> int:
         """Tell what came of the run; no disk and no reader that fails changes the verdict."""
-        if self._files is not None:
-            with contextlib.suppress(OSError):  # of a full disk the report tells
-                self._files.save(msgspec.structs.replace(
+        if self._files is not None and not failure:  # else it was cut off, and can be resumed
+            with contextlib.suppress(ResumptionError, OSError):  # of a full disk the report tells
+                self._files.end(msgspec.structs.replace(
                     self._manifest, ended=f"{record.mission or 'without a mission'}, "
                     f"{record.safety or 'without a judge'}"))
         report = self._trial.report(record, self._directory)

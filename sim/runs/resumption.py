@@ -2,7 +2,7 @@
 
 In the report's directory are a manifest (`run.json`: which run that is, how it was started, and
 digests of the files that it was made from), the nodes' checkpoints, and the newest two memories of
-the run's record. The directory is locked (flock(2)) by every process of the run: a run that is
+the run's record, named after the run. The directory is locked (flock(2)) by every process of the run: a run that is
 locked lives, whatever became of its launcher.
 
 A resumed run has the same run id and the next part number. Its simulated time goes on a little
@@ -29,7 +29,6 @@ MANIFEST = "run.json"
 FORMAT = 1
 _LARGEST_BYTES = 64 << 20
 
-_MEMORY, _BEFORE = "record.memory", "record.memory.before"
 _PATIENCE_S = 3.0
 """Real seconds in which the processes of a run end whose launcher was killed."""
 
@@ -39,7 +38,7 @@ each second, states may be newer, and the processes start before the part begins
 
 
 class ResumptionError(ValueError):
-    """A run cannot be resumed; the text is one line that names the run and why."""
+    """A run cannot be resumed, now or later; the text is one line that names the run and why."""
 
 
 class Manifest(msgspec.Struct, frozen=True):
@@ -146,36 +145,66 @@ class RunFiles:
         """Keep the manifest.
 
         Raises:
-            OSError: it cannot be kept.
+            ResumptionError: it cannot be kept.
         """
-        _write(self.directory / MANIFEST, msgspec.json.format(msgspec.json.encode(manifest)))
+        file = self.directory / MANIFEST
+        try:
+            _write(file, msgspec.json.format(msgspec.json.encode(manifest)))
+        except OSError as error:
+            raise ResumptionError(f"{file}: cannot be written: {error.strerror}") from None
 
-    def drop(self) -> None:
-        """Remove the manifest of a run that did not start."""
-        (self.directory / MANIFEST).unlink(missing_ok=True)
+    def saved(self) -> bytes | None:
+        """Return the manifest as it is on the disk; None if there is none, or it is unreadable."""
+        try:
+            return _content(self.directory / MANIFEST)
+        except OSError:
+            return None
 
-    def keep_memory(self, memory: bytes) -> None:
-        """Keep the newest memory of the record, and the one before it.
+    def put_back(self, saved: bytes | None) -> None:
+        """Have the manifest be again as it was before a run that did not start.
 
         Raises:
             OSError: it cannot be kept.
         """
-        file = self.directory / _MEMORY
-        with contextlib.suppress(FileNotFoundError):
-            file.replace(self.directory / _BEFORE)
-        _write(file, hashlib.sha256(memory).digest() + memory)
+        if saved is None:
+            (self.directory / MANIFEST).unlink(missing_ok=True)
+        elif saved != self.saved():
+            _write(self.directory / MANIFEST, saved)
 
-    def recall(self, recall: Callable[[bytes], float]) -> tuple[float, list[str]]:
-        """Have the newest sound memory recalled.
+    def end(self, manifest: Manifest) -> None:
+        """Keep the manifest of a run that has ended, and its memories no longer.
+
+        Raises:
+            ResumptionError: it cannot be kept.
+            OSError: a memory cannot be removed.
+        """
+        self.save(manifest)
+        for file in self._memories(manifest.run_id):
+            file.unlink(missing_ok=True)
+
+    def keep_memory(self, run_id: str, memory: bytes) -> None:
+        """Keep the newest memory of a run's record, and the one before it.
+
+        Raises:
+            OSError: it cannot be kept.
+        """
+        newest, before = self._memories(run_id)
+        with contextlib.suppress(FileNotFoundError):
+            newest.replace(before)
+        _write(newest, hashlib.sha256(memory).digest() + memory)
+
+    def recall(self, run_id: str, recall: Callable[[bytes], float]) -> tuple[float, list[str]]:
+        """Have the newest sound memory of a run's record recalled.
 
         Args:
+            run_id: name of the run.
             recall: takes a memory, and returns when it was kept, simulated seconds.
 
         Returns:
             That time, 0 without a memory; and what was damaged, one line each.
         """
         problems: list[str] = []
-        for file in (self.directory / _MEMORY, self.directory / _BEFORE):
+        for file in self._memories(run_id):
             try:
                 data = _content(file)
                 if hashlib.sha256(data[32:]).digest() != data[:32]:
@@ -186,6 +215,11 @@ class RunFiles:
             except (OSError, msgspec.DecodeError) as error:
                 problems.append(f"{file}: damaged: {error}")
         return 0.0, problems
+
+    def _memories(self, run_id: str) -> tuple[Path, Path]:
+        """Return the files of the newest memory, and of the one before it."""
+        name = f"record-{run_id}.memory"
+        return self.directory / name, self.directory / f"{name}.before"
 
 
 def find(reports: Path, which: str) -> tuple[RunFiles, Manifest]:
@@ -251,11 +285,15 @@ def _content(file: Path) -> bytes:
 def _write(file: Path, content: bytes) -> None:
     """Replace a file, whole or not at all, and have the disk confirm it."""
     beside = file.with_name(f"{file.name}~")
-    with beside.open("wb") as opened:
-        opened.write(content)
-        opened.flush()
-        os.fsync(opened.fileno())
-    beside.replace(file)
+    try:
+        with beside.open("wb") as opened:
+            opened.write(content)
+            opened.flush()
+            os.fsync(opened.fileno())
+        beside.replace(file)
+    except OSError:
+        beside.unlink(missing_ok=True)
+        raise
     folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(folder)

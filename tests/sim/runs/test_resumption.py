@@ -119,17 +119,12 @@ def test_a_run_that_lives_is_not_resumed_though_its_launcher_is_gone(tmp_path, s
     found.unlock()
 
 
-def test_processes_that_are_just_ending_are_waited_for(tmp_path, system):
-    files = begun(tmp_path / "reports", "a", system)
-    assert files.lock()
-    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(0.5)"],
-                             pass_fds=[files._lock])
-    files.unlock()
-    begun_s = time.monotonic()
+def test_processes_that_are_just_ending_are_waited_for(tmp_path, system, monkeypatch):
+    living = begun(tmp_path / "reports", "a", system)
+    assert living.lock()
+    monkeypatch.setattr(time, "sleep", lambda _s: living.unlock())
     found, _ = find(tmp_path / "reports", "a")
-    assert time.monotonic() - begun_s > 0.1
     found.unlock()
-    child.wait()
 
 
 def manifest(system: Path, **changes) -> Manifest:
@@ -155,25 +150,51 @@ def test_of_two_memories_the_newest_sound_one_is_recalled(tmp_path):
         recalled.append(memory)
         return 7.0
 
-    assert files.recall(recall) == (0.0, [])
+    assert files.recall("r", recall) == (0.0, [])
     for memory in (b"first", b"second", b"third"):
-        files.keep_memory(memory)
-    assert files.recall(recall) == (7.0, [])
-    newest = tmp_path / "record.memory"
+        files.keep_memory("r", memory)
+    assert files.recall("r", recall) == (7.0, [])
+    before, newest = sorted(tmp_path.iterdir(), key=lambda file: file.read_bytes()[-5:])
     newest.write_bytes(newest.read_bytes()[:-1])
-    time_s, problems = files.recall(recall)
+    time_s, problems = files.recall("r", recall)
     assert (time_s, len(problems)) == (7.0, 1)
     assert recalled == [b"third", b"second"]
-    (tmp_path / "record.memory.before").write_bytes(b"")
-    time_s, problems = files.recall(recall)
+    before.write_bytes(b"")
+    time_s, problems = files.recall("r", recall)
     assert (time_s, len(problems)) == (0.0, 2)
+
+
+def test_a_memory_of_another_run_in_the_same_directory_is_not_recalled(tmp_path):
+    RunFiles(tmp_path).keep_memory("r", b"memory")
+    assert RunFiles(tmp_path).recall("s", lambda _memory: 7.0) == (0.0, [])
+
+
+def test_a_run_that_has_ended_leaves_no_memory_and_keeps_its_manifest(tmp_path, system):
+    files = RunFiles(tmp_path)
+    files.keep_memory("r", b"memory")
+    files.end(manifest(system))
+    assert files.recall("r", lambda _memory: 7.0) == (0.0, [])
+    assert files.manifest() == manifest(system)
+
+
+def test_a_run_that_did_not_start_leaves_the_one_before_it_as_it_was(tmp_path, system):
+    files = begun(tmp_path, "a", system)
+    for before in (files.manifest(), None):
+        saved = files.saved()
+        files.save(manifest(system))
+        files.put_back(saved)
+        if before is None:
+            assert not (files.directory / MANIFEST).exists()
+        else:
+            assert files.manifest() == before
+            (files.directory / MANIFEST).unlink()
 
 
 def test_a_memory_that_is_none_of_this_run_s_record_is_damage(tmp_path):
     files = RunFiles(tmp_path)
-    files.keep_memory(b"\xc1")
+    files.keep_memory("r", b"\xc1")
 
     def recall(_memory: bytes) -> float:
         raise msgspec.ValidationError("Expected `object`")
 
-    assert files.recall(recall)[0] == 0.0
+    assert files.recall("r", recall)[0] == 0.0
