@@ -208,6 +208,9 @@ def _clean_up_after(root: int, folder: str) -> None:
     """Start the thread that ends this process, and all of the run, when the root has ended.
 
     The kernel ends the root's other children; not what commands have forked, nor the folder.
+
+    Raises:
+        LaunchError: there may be no thread.
     """
     ended = os.pidfd_open(root)
 
@@ -218,4 +221,7 @@ def _clean_up_after(root: int, folder: str) -> None:
         end_run(root, folder)
         kill(os.getpid())
 
-    threading.Thread(target=wait, name="root", daemon=True).start()
+    try:
+        threading.Thread(target=wait, name="root", daemon=True).start()
+    except RuntimeError as error:
+        raise LaunchError(f"no process can be started: {error}") from None

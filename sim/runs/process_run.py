@@ -171,7 +171,7 @@ class ProcessRun:
         self._kept_marks, self._keep_at_s = marks, wall_s + _KEEP_S
         try:
             await asyncio.to_thread(self._keep, self._trial.memory(now_s))
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # no disk, no thread
             self._keep = None
             self.launcher.report(f"the run cannot be resumed any more: {error}")
 

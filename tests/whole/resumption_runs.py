@@ -37,10 +37,10 @@ def started(folder: Path, port: int, *options: str) -> subprocess.Popen[str]:
          *options], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def first_part(folder: Path, port: int) -> subprocess.Popen[str]:
-    """Start the first part of a run, with its report in `folder/report`."""
+def first_part(folder: Path, port: int, report: Path | None = None) -> subprocess.Popen[str]:
+    """Start the first part of a run, with its report in `folder/report` if nowhere else."""
     return started(folder, port, "--mission", str(write_short_mission(folder)), "--rate", str(RATE),
-                   "--report", str(folder / "report"))
+                   "--report", str(report or folder / "report"))
 
 
 def resumed(folder: Path, port: int, which: str) -> tuple[int, dict[str, Any], str]:

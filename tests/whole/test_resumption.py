@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
+from rampart.actors.supervision.launcher import TITLE
+from rampart.actors.supervision.process_title import find_processes
 from tests.whole.checkpoint_runs import write_near_mission
+from tests.whole.hunger import fill, small_disk
 from tests.whole.resumption_runs import first_part, one, resumed, started
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone, pytest.mark.timeout(300)]
 
-PORT = 18440
+PORT = 20140
 
 
 @pytest.mark.parametrize("seed", [
@@ -54,6 +59,39 @@ def test_what_is_not_that_run_or_lives_is_refused_and_nothing_is_lost(tmp_path):
     code, _, told = resumed(tmp_path, PORT, report)
     assert (code, told.count("\n")) == (2, 1)
     assert "has ended (success, safe)" in told
+
+
+def test_a_run_whose_watching_process_was_killed_can_be_resumed(tmp_path):
+    mission, report = str(write_near_mission(tmp_path)), str(tmp_path / "report")
+    run = started(tmp_path, PORT, "--mission", mission, "--rate", "2", "--report", report)
+    until_s = time.monotonic() + 60
+    while not (watching := [p.pid for p in find_processes(PORT) if p.names == (TITLE,)]) or not (
+            list(Path(report).glob("record-*"))):
+        assert time.monotonic() < until_s
+        time.sleep(0.1)
+    os.kill(watching[0], signal.SIGKILL)
+    told = run.communicate(timeout=60)[1]
+    assert run.returncode == 4, told
+    code, result, told = resumed(tmp_path, PORT, report)
+    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), told
+
+
+def test_with_a_full_disk_a_run_is_refused_in_one_line_and_the_one_before_it_can_be_resumed(
+        tmp_path):
+    with small_disk(tmp_path / "disk", 16) as disk:
+        run = first_part(tmp_path, PORT, disk / "report")
+        time.sleep(8)
+        run.send_signal(signal.SIGKILL)
+        run.communicate()
+        filler = fill(disk)
+        for again in (first_part(tmp_path, PORT, disk / "report"),
+                      started(tmp_path, PORT, "--resume", str(disk / "report"))):
+            told = again.communicate(timeout=60)[1]
+            assert again.returncode == 2
+            assert "run.json: cannot be written: No space left on device" in told
+        filler.unlink()
+        code, result, told = resumed(tmp_path, PORT, str(disk / "report"))
+        assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), told
 
 
 def test_a_resumed_run_can_be_cut_off_and_resumed_again(tmp_path):

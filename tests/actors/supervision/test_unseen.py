@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import io
+import os
 import resource
+import shutil
 import subprocess
 import sys
 
@@ -154,6 +156,21 @@ async def test_a_run_may_open_as_many_files_as_the_hard_limit_allows(tmp_path):
                 assert resource.prlimit(process.pid, resource.RLIMIT_NOFILE)[0] == before[1]
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+@pytest.mark.processes
+@pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"),
+                    reason="only root can be a user who may start no process")
+@pytest.mark.parametrize("processes", range(1, 4))
+def test_a_run_that_may_start_too_few_processes_is_refused_in_one_line(tmp_path, processes):
+    reads_all = ["--inh-caps=-all,+dac_override", "--ambient-caps=-all,+dac_override"]
+    result = subprocess.run(
+        ["setpriv", "--reuid=47112", "--regid=47112", "--clear-groups", *reads_all,
+         "prlimit", f"--nproc={processes}", sys.executable, str(ROOT / "launch.py"),
+         "--no-hmi", "--port", str(free_base_port()), "--report", str(tmp_path / "report")],
+        check=False, capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
+    assert not (tmp_path / "report").exists()
 
 
 @pytest.mark.processes
