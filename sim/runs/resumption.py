@@ -2,8 +2,8 @@
 
 In the report's directory are a manifest (`run.json`: which run that is, how it was started, and
 digests of the files that it was made from), the nodes' checkpoints, and the newest two memories of
-the run's record, named after the run. The directory is locked (flock(2)) by every process of the run: a run that is
-locked lives, whatever became of its launcher.
+the run's record, named after the run. The directory is locked (flock(2)) by every process of the
+run: a run that is locked lives, whatever became of its launcher.
 
 A resumed run has the same run id and the next part number. Its simulated time goes on a little
 after the newest thing that was recorded, so that no state is from the future.
