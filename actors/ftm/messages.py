@@ -220,7 +220,7 @@ class NodeTable(Message, frozen=True):
 
 
 class KeptState(Message, frozen=True):
-    """Which state of a node a host holds: the newest, by incarnation and generation; 0 for none.
+    """The newest state of a node that a host holds; incarnation and generation are 0 for none.
 
     `issued` is the highest incarnation of the node that host has issued. `final`: no process of the
     node is there, and this is the last that any has kept.
@@ -229,30 +229,18 @@ class KeptState(Message, frozen=True):
     node: Name
     incarnation: Incarnation
     generation: Count
+    version: Count
+    failures: Count
+    state: KeptBytes
     issued: Incarnation
     final: bool
 
 
-class StateCopy(Message, frozen=True):
-    """A state that a node has kept."""
-
-    node: Name
-    incarnation: Incarnation
-    generation: Count
-    version: Count
-    failures: Count
-    state: KeptBytes
-
-
 class Checkpoints(Message, frozen=True):
-    """What a host holds of the states of nodes that two hosts may run, and copies of some.
-
-    Copies are of what is newer than the other host says it holds.
-    """
+    """States that a host holds of nodes that two hosts may run: all, or those that changed."""
 
     run: Name
     kept: Many[KeptState]
-    copies: Many[StateCopy] = ()
 
 
 class RespawnRequest(Message, frozen=True):

@@ -38,8 +38,8 @@ NODES = Topic("supervisor/nodes", m.NodeTable, Qos.STATE, 2, "", "The supervisor
 HOST_NODES = Topic("supervisor/{name}/nodes", m.NodeTable, Qos.STATE, 2, "",
                    "What supervisor {name} runs, of a system of several hosts; for the others.")
 CHECKPOINTS = Topic("supervisor/{name}/checkpoints", m.Checkpoints, Qos.SENSOR, 2, "",
-                    "What the host of supervisor {name} holds of states that two hosts have, and "
-                    "what the other lacks of them; in a system of several, with checkpoints.")
+                    "What the host of supervisor {name} holds of states that two hosts have; in a "
+                    "system of several, with checkpoints.")
 RESPAWN = Topic("supervisor/respawn", m.RespawnRequest, Qos.COMMAND, 0, "",
                 "Ask for a node to be respawned.")
 SIGNAL = Topic("supervisor/signal", m.SignalOrder, Qos.COMMAND, 0, "",

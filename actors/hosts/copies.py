@@ -1,13 +1,12 @@
-"""Which states of nodes are to be sent to another host, and which of those sent are taken. Pure.
+"""Which states of nodes another host is sent, and which of those it sends are taken. Pure.
 
 A node that has its home on another host than the first may have to run on the first. So each of the
-two holds the newest state that it has kept. They give each other no orders: each repeats what it
-holds (`Checkpoints.kept`) and adds copies of what is newer than the other published last. What is
-lost, comes late, twice, or after another, changes nothing: the next message shows what is missing,
-and only what is newer is ever taken.
+two holds the newest state that it has kept. Each repeats what it holds (`Checkpoints`), and at once
+what has changed since it repeated all. Lost, late, double and disordered messages do no harm: the
+next one has the state again, and only what is newer is ever taken.
 
 *Newer* is decided by incarnation, then generation (`Record.age`). A host where the node runs takes
-no copy but of a higher incarnation than its own: what runs there is superseded then. A host that
+no state but of a higher incarnation than its own: what runs there is superseded then. A host that
 gives a node back marks which state is the last (`KeptState.final`), so that the other waits for it.
 """
 
@@ -15,15 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from rampart.actors.ftm.messages import LARGEST_STATE_BYTES, Checkpoints, KeptState, StateCopy
+from rampart.actors.ftm.messages import LARGEST_STATE_BYTES, Checkpoints, KeptState
 from rampart.actors.hosts.placement import FIRST
 from rampart.actors.runtime.checkpoint import Record
 
-AGAIN_S = 1.0
-"""Real seconds after which a copy is sent again that the other host does not hold yet."""
-
-_NONE = 0, 0
+_NONE = Record(0, 0, 0, 0, b"")
 
 
 @dataclass(slots=True)
@@ -34,38 +31,21 @@ class _State:
         other: Host that holds it as well.
         mine: The newest here.
         theirs: What the other published last; None if nothing yet, or before it was lost.
-        sent: Age of the copy that was sent last.
-        sent_s: When that was.
     """
 
     other: str
-    mine: Record | None = None
+    mine: Record = _NONE
     theirs: KeptState | None = None
-    sent: tuple[int, int] = _NONE
-    sent_s: float = 0.0
-
-    @property
-    def age(self) -> tuple[int, int]:
-        return self.mine.age if self.mine else _NONE
-
-    def missed(self, now_s: float) -> Record | None:
-        """Return the newest one if the other host lacks it, and it was not just sent."""
-        if self.mine is None or self.theirs is None or self.age <= _age(self.theirs):
-            return None
-        return None if self.sent == self.age and now_s - self.sent_s < AGAIN_S else self.mine
 
 
-@dataclass(frozen=True, slots=True)
-class Taken:
+class Taken(NamedTuple):
     """What comes of a message.
 
     Attributes:
-        wants_answer: Whether that host had published nothing since it was lost.
         records: To be kept here, each with its node.
         problems: What is wrong with it, each with the node that it is about.
     """
 
-    wants_answer: bool = False
     records: tuple[tuple[str, Record], ...] = ()
     problems: tuple[tuple[str, str], ...] = ()
 
@@ -90,6 +70,7 @@ class Copies:
         self._states = {node: _State(FIRST if own == home else home)
                         for node, home in home_of.items() if own in {home, FIRST}}
         self._unsettled = set(self._states)
+        self._changed: set[str] = set()
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -98,7 +79,8 @@ class Copies:
 
     def kept(self, node: str, record: Record | None) -> None:
         """Note the newest state of a node on this host's disk."""
-        self._states[node].mine = record
+        self._states[node].mine = record or _NONE
+        self._changed.add(node)
 
     def unsettle(self, nodes: Iterable[str]) -> None:
         """Note that a process of nodes is being ended here: it may keep something yet."""
@@ -109,57 +91,58 @@ class Copies:
         self._unsettled.discard(node)
 
     def lost(self, host: str) -> None:
-        """Note that a host is lost: what it said it holds may be past."""
+        """Note that a host is lost: what it published may be past."""
         for state in self._states.values():
             if state.other == host:
-                state.theirs, state.sent = None, _NONE
+                state.theirs = None
 
     def told(self, host: str, message: Checkpoints) -> Taken:
-        """Take what another host says; it is believed about nodes of which it holds the state.
+        """Take what another host holds; it is believed about nodes of which it holds the state.
 
         Args:
             host: Name of it.
-            message: What its supervisor said.
+            message: From its supervisor.
         """
         if message.run != self._run:
             return Taken(problems=((host, f"checkpoints of run {message.run!r}"),))
-        wants_answer = False
+        records, problems = list[tuple[str, Record]](), list[tuple[str, str]]()
         for kept in message.kept:
             state = self._states.get(kept.node)
-            if state is not None and state.other == host:
-                wants_answer = wants_answer or state.theirs is None
-                state.theirs = kept
-        records, problems = list[tuple[str, Record]](), list[tuple[str, str]]()
-        for copy in message.copies:
-            state = self._states.get(copy.node)
             if state is None and host == FIRST:
                 continue  # for another host
             if state is None or state.other != host:
-                problems.append((copy.node, f"a state from host {host or 'the first'}, which it "
+                problems.append((kept.node, f"a state from host {host or 'the first'}, which it "
                                  "may not keep"))
-            elif (_age(copy) > state.age
-                  and self._runs(copy.node) < copy.incarnation <= self._issued(copy.node)):
-                records.append((copy.node, Record(copy.incarnation, copy.generation, copy.version,
-                                                  copy.failures, copy.state)))
-        return Taken(wants_answer, tuple(records), tuple(problems))
+                continue
+            state.theirs = kept
+            if (_age(kept) > state.mine.age
+                    and self._runs(kept.node) < kept.incarnation <= self._issued(kept.node)):
+                records.append((kept.node, Record(kept.incarnation, kept.generation, kept.version,
+                                                  kept.failures, kept.state)))
+        return Taken(tuple(records), tuple(problems))
 
-    def message(self, now_s: float) -> Checkpoints:
-        """Return what is to be published: what is held here, and copies of what others lack.
+    def changes(self) -> Checkpoints:
+        """Return what has changed since all was repeated."""
+        return self._message(self._changed)
 
-        Args:
-            now_s: Now, real seconds; for what is not sent again at once.
-        """
-        kept = tuple(KeptState(node, *state.age, self._issued(node),
-                               not self._runs(node) and node not in self._unsettled)
-                     for node, state in self._states.items())
-        copies, bytes_left = list[StateCopy](), LARGEST_STATE_BYTES
-        for node, state in sorted(self._states.items(), key=lambda item: item[1].sent_s):
-            record = state.missed(now_s)
-            if record is not None and len(record.state) <= bytes_left:
-                copies.append(StateCopy(node, *record))
-                state.sent, state.sent_s = record.age, now_s
-                bytes_left -= len(record.state)
-        return Checkpoints(self._run, kept, tuple(copies))
+    def all(self) -> Checkpoints:
+        """Return all that is held here; what a message has no room for comes with the next."""
+        self._changed.clear()
+        return self._message(tuple(self._states))
+
+    def _message(self, nodes: Iterable[str]) -> Checkpoints:
+        kept, bytes_left = list[KeptState](), LARGEST_STATE_BYTES
+        for node in nodes:
+            record = self._states[node].mine
+            if len(record.state) > bytes_left:
+                continue
+            bytes_left -= len(record.state)
+            kept.append(KeptState(
+                node, *record, self._issued(node),
+                not self._runs(node) and node not in self._unsettled))
+        for one in kept:  # to the end: the next message begins with what was left out
+            self._states[one.node] = self._states.pop(one.node)
+        return Checkpoints(self._run, tuple(kept))
 
     def is_caught_up(self, nodes: Iterable[str], issued: Mapping[str, int]) -> bool:
         """Whether the last states that another host has kept of its nodes are here.
@@ -174,10 +157,10 @@ class Copies:
                 continue
             theirs = state.theirs
             if (theirs is None or not theirs.final or theirs.issued < issued.get(node, 0)
-                    or _age(theirs) > state.age):
+                    or _age(theirs) > state.mine.age):
                 return False
         return True
 
 
-def _age(state: KeptState | StateCopy) -> tuple[int, int]:
+def _age(state: KeptState) -> tuple[int, int]:
     return state.incarnation, state.generation

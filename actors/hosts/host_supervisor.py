@@ -6,7 +6,7 @@ incarnation was issued; nobody but a supervisor writes there what another host h
 first host's publishes the table of all.
 
 With checkpoints they also hold the newest state of each node that either of two hosts may run
-(`Copies`): what the other lacks they send, and a node that is given back starts when what it has
+(`Copies`), which they publish, and a node that is given back starts when what it has
 kept there has come.
 """
 
@@ -144,7 +144,7 @@ class HostSupervisor(Supervisor):
         super().on_start()
         if self._copies.nodes:
             self._files.start()
-            self._tell_states()
+            self.tell_states()
             for node in self._copies.nodes:
                 self._files.settle(node)
 
@@ -183,7 +183,7 @@ class HostSupervisor(Supervisor):
 
     @on(topics.CHECKPOINTS)
     def told_states(self, message: fm.Checkpoints, header: Header) -> None:
-        """Keep what another host holds and this one lacks, and note what that one lacks."""
+        """Keep what another host holds and this one lacks."""
         host = self._supervisors.get(header.source)
         if host is None or not self._copies.nodes:
             return
@@ -192,8 +192,6 @@ class HostSupervisor(Supervisor):
             self._state_problem(node, problem)
         for node, record in taken.records:
             self._files.take(node, record)
-        if taken.wants_answer:
-            self._tell_states()
 
     @on(topics.SIGNAL)
     def signal(self, order: fm.SignalOrder, _header: Header) -> None:
@@ -269,7 +267,7 @@ class HostSupervisor(Supervisor):
         self._copies.kept(node, record)
         if is_last and node not in self._ending:
             self._copies.settled(node)
-        self._tell_states()
+        self.publish(topics.CHECKPOINTS, self._copies.changes())
 
     def _state_problem(self, node: str, problem: str) -> None:
         self.report_diagnostic("checkpoint", problem, node)
@@ -299,12 +297,9 @@ class HostSupervisor(Supervisor):
 
     @every(0.5)
     def tell_states(self) -> None:
-        """Repeat what is held here, and what others lack of it."""
+        """Repeat what is held here."""
         if self._copies.nodes:
-            self._tell_states()
-
-    def _tell_states(self) -> None:
-        self.publish(topics.CHECKPOINTS, self._copies.message(self._now_s()))
+            self.publish(topics.CHECKPOINTS, self._copies.all())
 
     # -- what it says ---------------------------------------------------------------------------
 

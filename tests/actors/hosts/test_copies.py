@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from rampart.actors.bus.bounds import MANY, MAX_PAYLOAD_BYTES
 from rampart.actors.bus.envelope import Header, encode
-from rampart.actors.ftm.messages import LARGEST_STATE_BYTES, Checkpoints, KeptState, StateCopy
-from rampart.actors.hosts.copies import AGAIN_S, Copies, Taken
+from rampart.actors.ftm.messages import LARGEST_STATE_BYTES, Checkpoints, KeptState
+from rampart.actors.hosts.copies import Copies, Taken
 from rampart.actors.runtime.checkpoint import Record
 
 HOMES = {"camera": "ground", "hmi": "ground", "drill": "moon"}
@@ -41,8 +41,8 @@ class Host:
         self.disk[node] = record
         self.copies.kept(node, record)
 
-    def message(self, now_s: float = 0.0) -> Checkpoints:
-        return self.copies.message(now_s)
+    def message(self) -> Checkpoints:
+        return self.copies.all()
 
     def hear(self, other: str, message: Checkpoints) -> Taken:
         taken = self.copies.told(other, message)
@@ -63,11 +63,14 @@ def ground():
     return Host("ground", camera=1, hmi=1)
 
 
-def exchange(robot: Host, ground: Host, now_s: float = 0.0) -> None:
-    """Both say what they hold, and hear it."""
-    for _ in range(2):
-        ground.hear("", robot.message(now_s))
-        robot.hear("ground", ground.message(now_s))
+def held(node: str, record: Record, *, final: bool = False) -> KeptState:
+    return KeptState(node, *record, issued=10 * EPOCH, final=final)
+
+
+def exchange(robot: Host, ground: Host) -> None:
+    """Both publish what they hold, and receive it."""
+    ground.hear("", robot.message())
+    robot.hear("ground", ground.message())
 
 
 def test_the_first_host_shares_with_each_other_and_these_with_it_alone():
@@ -77,19 +80,20 @@ def test_the_first_host_shares_with_each_other_and_these_with_it_alone():
 
 
 def test_what_a_node_keeps_is_with_the_next_message_on_the_other_host(robot, ground):
-    robot.hear("ground", ground.message())
-    ground.hear("", robot.message())
     ground.keep("camera", state(1, 1))
-    robot.hear("ground", ground.message())
+    robot.hear("ground", ground.copies.changes())
     assert robot.disk == {"camera": state(1, 1)}
-    ground.hear("", robot.message())
-    assert ground.message(9.0).copies == ()
 
 
-def test_to_who_has_said_nothing_nothing_is_sent_but_what_is_held(ground):
+def test_changes_are_all_there_were_since_everything_was_repeated_for_a_reader_may_skip_some(
+        ground):
+    ground.message()
     ground.keep("camera", state(1, 1))
-    assert ground.message() == Checkpoints("r", (
-        KeptState("camera", 1, 1, 10 * EPOCH, False), KeptState("hmi", 0, 0, 10 * EPOCH, False)))
+    assert ground.copies.changes().kept == (held("camera", state(1, 1)),)
+    ground.keep("hmi", state(1, 1))
+    assert {kept.node for kept in ground.copies.changes().kept} == {"camera", "hmi"}
+    ground.message()
+    assert ground.copies.changes().kept == ()
 
 
 # ---- twice, late, never, wrong, from a stranger -------------------------------------------------
@@ -111,35 +115,28 @@ def test_one_that_comes_after_a_newer_one_changes_nothing(robot, ground):
     robot.hear("ground", ground.message())
     assert robot.hear("ground", late) == Taken()
     assert robot.disk["camera"] == state(1, 2)
-    exchange(robot, ground)  # the late one told of an older one held there, too
-    assert ground.message(9.0).copies == ()
 
 
 def test_what_is_lost_is_sent_again_and_only_the_newest(robot, ground):
-    exchange(robot, ground)
     for generation in range(1, 100):
         ground.keep("camera", state(1, generation))
         ground.message()  # and lost
-    [copy] = ground.message(9.0).copies
-    assert (copy.incarnation, copy.generation) == (1, 99)
+    robot.hear("ground", ground.message())
+    assert robot.disk == {"camera": state(1, 99)}
 
 
 def test_who_may_not_speak_for_a_node_s_state_is_refused_and_told(robot):
-    copy = StateCopy("camera", 1, 7, 1, 0, b"state")
-    robot.hear("moon", Checkpoints("r", (KeptState("camera", 9, 9, 9, True),), (copy,)))
-    pilot = msgspec.structs.replace(copy, node="pilot")
-    robot.hear("ground", Checkpoints("r", (), (pilot,)))
+    robot.hear("moon", Checkpoints("r", (held("camera", state(1, 7), final=True),)))
+    robot.hear("ground", Checkpoints("r", (held("pilot", state(1, 7)),)))
     assert robot.disk == {}
     assert robot.problems == [
         ("camera", "a state from host moon, which it may not keep"),
         ("pilot", "a state from host ground, which it may not keep")]
-    robot.keep("camera", state(1, 7))
-    assert not robot.message().copies  # what moon said of it was not believed either
+    assert not robot.copies.is_caught_up(["camera"], {})  # nor is it taken for the last one
 
 
 def test_what_the_first_host_sends_to_another_one_is_no_problem(ground):
-    copy = StateCopy("drill", 1, 7, 1, 0, b"state")
-    assert ground.hear("", Checkpoints("r", (), (copy,))) == Taken()
+    assert ground.hear("", Checkpoints("r", (held("drill", state(1, 7)),))) == Taken()
 
 
 def test_another_run_s_states_are_refused_and_told(robot, ground):
@@ -151,18 +148,16 @@ def test_another_run_s_states_are_refused_and_told(robot, ground):
 
 def test_an_incarnation_that_nobody_knows_to_be_issued_is_not_taken_yet(robot, ground):
     """Else one message with the highest number there is would shut out all real ones for ever."""
-    exchange(robot, ground)
     ground.keep("camera", state(2**53, 1))
     robot.hear("ground", ground.message())
     assert robot.disk == {}
     ground = Host("ground", camera=2)
-    ground.copies.told("", robot.message())
     ground.keep("camera", state(2, 1))
     robot.issued["camera"] = 1
     robot.hear("ground", ground.message())
     assert robot.disk == {}
     robot.issued["camera"] = 2  # the table of what runs there has come
-    robot.hear("ground", ground.message(AGAIN_S))
+    robot.hear("ground", ground.message())
     assert robot.disk == {"camera": state(2, 1)}
 
 
@@ -170,38 +165,23 @@ def test_an_incarnation_that_nobody_knows_to_be_issued_is_not_taken_yet(robot, g
 
 
 def test_the_largest_states_of_all_nodes_come_one_by_one_and_fit_into_a_message(robot, ground):
-    exchange(robot, ground)
     for node in ("camera", "hmi"):
         ground.keep(node, state(1, 1, b"x" * LARGEST_STATE_BYTES))
     for turn in range(2):
-        message = ground.message(float(turn))
+        message = ground.message()
         assert len(encode(Header("supervisor_ground", 1, 1, 0.0), message)) < MAX_PAYLOAD_BYTES
         robot.hear("ground", message)
         assert len(robot.disk) == turn + 1
-        ground.hear("", robot.message())
-
-
-def test_a_copy_is_not_sent_again_before_there_can_be_an_answer(robot, ground):
-    exchange(robot, ground)
-    ground.keep("camera", state(1, 1))
-    assert ground.message(10.0).copies
-    assert not ground.message(10.0 + AGAIN_S / 2).copies
-    assert ground.message(10.1 + AGAIN_S).copies
-    ground.keep("camera", state(1, 2))
-    assert ground.message(10.2 + AGAIN_S).copies
 
 
 def test_a_state_that_the_other_host_could_not_keep_is_given_to_it_again(robot, ground):
-    exchange(robot, ground)
     ground.keep("camera", state(1, 1))
-    taken = robot.copies.told("ground", ground.message(1.0))
-    assert taken.records  # and its disk is full
-    ground.hear("", robot.message())
-    assert ground.message(1.1 + AGAIN_S).copies
+    assert robot.copies.told("ground", ground.message()).records  # and its disk is full
+    assert robot.hear("ground", ground.message()).records
 
 
-def test_what_is_held_of_as_many_nodes_as_there_may_be_leaves_room_for_a_copy():
-    kept = KeptState("a_name_of_twenty_chr", 2**53, 2**53, 2**53, True)
+def test_what_is_held_of_as_many_nodes_as_there_may_be_leaves_room_for_a_state():
+    kept = KeptState("a_name_of_twenty_chr", *state(2**53, 2**53, b""), 2**53, True)
     size = len(encode(Header("s", 1, 1, 0.0), Checkpoints("r", (kept,) * (MANY // 2))))
     assert size < MAX_PAYLOAD_BYTES - 3 * LARGEST_STATE_BYTES
 
@@ -249,8 +229,8 @@ def test_a_node_that_is_given_back_waits_for_the_last_state_that_was_kept(robot,
     robot.keep("camera", state(EPOCH + 1, 12))
     robot.copies.settled("camera")
     last = robot.message()
-    ground.hear("", msgspec.structs.replace(last, copies=()))
-    assert not ground.copies.is_caught_up(["camera"], told)  # the last state has not come
+    ground.copies.told("", last)
+    assert not ground.copies.is_caught_up(["camera"], told)  # the last state is not on the disk
     ground.hear("", last)
     assert ground.disk["camera"] == state(EPOCH + 1, 12)
     assert ground.copies.is_caught_up(["camera"], told)
@@ -278,13 +258,6 @@ def test_a_host_with_an_empty_disk_gets_what_the_other_holds(robot):
     assert fresh.copies.is_caught_up(["camera"], {})
 
 
-def test_the_first_word_since_a_loss_is_answered_at_once(robot, ground):
-    assert robot.hear("ground", ground.message()).wants_answer
-    assert not robot.hear("ground", ground.message()).wants_answer
-    robot.copies.lost("ground")
-    assert robot.hear("ground", ground.message()).wants_answer
-
-
 EVENTS = st.lists(st.one_of(
     st.tuples(st.just("keep"), st.sampled_from(["camera", "hmi"])),
     st.tuples(st.sampled_from(["robot says", "ground says"]), st.integers(0, 3)),
@@ -298,7 +271,7 @@ def test_however_messages_are_lost_late_double_and_disordered_in_the_end_both_ho
         events):
     robot, ground = Host(""), Host("ground", camera=1, hmi=1)
     under_way: list[tuple[Host, str, Checkpoints]] = []
-    epoch, generation, now_s = 0, 0, 0.0
+    epoch, generation = 0, 0
     for what, which in events:
         if what == "keep":
             generation += 1
@@ -308,8 +281,7 @@ def test_however_messages_are_lost_late_double_and_disordered_in_the_end_both_ho
                 where.keep(which, state(incarnation, generation, b"%d" % generation))
         elif what.endswith("says"):
             says, hears = (robot, ground) if what == "robot says" else (ground, robot)
-            now_s += 0.7
-            under_way.append((hears, says.name, says.message(now_s)))
+            under_way.append((hears, says.name, says.copies.changes() if which else says.message()))
         elif what in {"hear", "again"} and under_way:
             hears, name, message = under_way[which % len(under_way)]
             hears.hear(name, message)
@@ -324,8 +296,7 @@ def test_however_messages_are_lost_late_double_and_disordered_in_the_end_both_ho
                         default=None) for node in ("camera", "hmi")}
     robot.runs.clear()
     ground.runs.clear()
-    for turn in range(3):
-        exchange(robot, ground, 100.0 + 2 * turn)
+    exchange(robot, ground)
     for node, age in newest.items():
         assert age is None or robot.disk[node].age == ground.disk[node].age == age
     assert not robot.problems and not ground.problems  # noqa: PT018

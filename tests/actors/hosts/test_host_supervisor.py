@@ -16,7 +16,7 @@ from rampart.actors.bus.envelope import decode, pack
 from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import Checkpoints, StateCopy
+from rampart.actors.ftm.messages import Checkpoints, KeptState
 from rampart.actors.machine.unix_peer import process_id
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint import Record
@@ -381,7 +381,7 @@ def test_a_host_that_is_started_anew_with_an_empty_disk_goes_on_from_what_the_fi
                 run_folder.issue(made.ground.folder, [name], EPOCH + 1)
             await asyncio.sleep(0.26)  # out of step with what is repeated
             made.is_cut = False
-            await asyncio.sleep(0.1 + 4 * DELAY_S + 0.01)  # a heartbeat, who holds what, a copy
+            await asyncio.sleep(0.1 + 4 * DELAY_S + 0.01)  # a heartbeat, and what the first holds
             assert made.ground.disk == {"camera": record(EPOCH + 1, 3)}
             await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
             assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 3)
@@ -390,7 +390,7 @@ def test_a_host_that_is_started_anew_with_an_empty_disk_goes_on_from_what_the_fi
 
 
 def forged(incarnation: int = 1) -> Checkpoints:
-    return Checkpoints("r", (), (StateCopy("camera", *record(incarnation, 99)),))
+    return Checkpoints("r", (KeptState("camera", *record(incarnation, 99), issued=9, final=True),))
 
 
 @pytest.mark.parametrize("source", ["stranger#1", "camera#1", "supervisor_ground#0"])
