@@ -333,11 +333,11 @@ class Hmi(Actor):
 
     @on(ftm_topics.PROCESS_EVENT)
     def _process_event(self, message: fm.ProcessEvent, header: Header) -> None:
-        self._state.process_event(message, header.stamp)
+        self._state.event(message, header)
 
     @on(bus_topics.DIAGNOSTIC)
     def _diagnostic(self, message: bm.Diagnostic, header: Header) -> None:
-        self._state.diagnostic(message, header.stamp)
+        self._state.event(message, header)
         self._operating.diagnostic(message)
 
     @on(ftm_topics.ADAPTATION)

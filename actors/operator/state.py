@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus import messages as bm
+from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm.narrator import Line, Narrator
 from rampart.actors.operator.bounds import SHOWN, Bounds
 from rampart.actors.operator.picture import Picture
 from rampart.files.plain_text import one_line
-from rampart.manager.strategies.registry import decision_in_words, named
+from rampart.manager.strategies.registry import decision_in_words
 
 STALE_S = 1.5
 """A state that was not heard for so long is shown as stale (simulated seconds)."""
@@ -79,7 +81,6 @@ class HmiState:
 
     Attributes:
         picture: what pages are shown.
-        titles: of modules, mechanisms and recoveries.
     """
 
     def __init__(self) -> None:
@@ -89,7 +90,7 @@ class HmiState:
         self._patience_s: dict[str, float] = {}
         self._traces: dict[str, Trace] = {}
         self._detections: dict[str, fm.DetectionView] = {}
-        self.titles: Mapping[str, str] = {}
+        self._narrator = Narrator()
         self._outcomes = 0
         picture.section("system", bounds=_SYSTEM)
         picture.section("order", {"number": 0, "text": ""})
@@ -129,6 +130,15 @@ class HmiState:
             self._aged.append(name)
             self.picture.section(name, show=show)
 
+    @property
+    def titles(self) -> Mapping[str, str]:
+        """Titles of modules, mechanisms and recoveries."""
+        return self._narrator.titles
+
+    @titles.setter
+    def titles(self, titles: Mapping[str, str]) -> None:
+        self._narrator.titles = titles
+
     # -- hearing --------------------------------------------------------------------------------
 
     def keep(self, what: str, message: Any, now_s: float) -> None:
@@ -142,16 +152,12 @@ class HmiState:
 
     def manager(self, status: fm.ManagerStatus, now_s: float) -> None:
         """Keep the manager's view, and log which detections have come and gone."""
-        before = self._detections
         self._detections = {view.name: view for view in status.detections[:SHOWN.items]}
         self._heard_s["manager"] = now_s
         self.picture.put("manager", Heard(status))
         self._show_detections(False)
         for name, view in self._detections.items():
-            if view.active != (name in before and before[name].active):
-                what = named(name, self.titles)
-                text = f"{what}: {view.reason}" if view.active else f"{what} is idle again"
-                self.log(now_s, "fault" if view.active else "clear", text)
+            self._tell(self._narrator.detection(name, view.active, view.reason), now_s)
 
     def decision(self, record: fm.DecisionRecord, now_s: float) -> None:
         """Add a decision of the manager to the decision log."""
@@ -160,29 +166,23 @@ class HmiState:
             "t": round(now_s, 2), "number": r.decision, "active": r.active, "block": r.rule,
             "strategy": r.strategy, "recoveries": r.recoveries, "path": r.path,
             "words": decision_in_words(r.active, r.rule, r.recoveries, r.strategy,
-                                       self.titles),
+                                       self._narrator.titles),
             "rule": f"{r.rule} of {r.strategy}",
             "rejected": [f"{name}: {why}" for name, why in r.rejected]})
 
-    def process_event(self, event: fm.ProcessEvent, now_s: float) -> None:
-        """Log what happened to a process; that all start at the start is no news."""
-        if not event.news:
-            return
-        by = f" by {event.by}" if event.event == "respawned" and event.by else ""
-        detail = f": {event.detail}" if event.detail else ""
-        self.log(now_s, event.news, f"{event.node} {event.event}{by}{detail}")
+    def event(self, message: fm.ProcessEvent | bm.Diagnostic, header: Header) -> None:
+        """Log what happened to a process, or an error report of a node."""
+        self._tell(self._narrator.describe(message, header), header.stamp)
+
+    def _tell(self, lines: Iterable[Line], now_s: float) -> None:
+        for line in lines:
+            self.log(now_s, line.level, line.text)
 
     def announce(self, text: str, now_s: float, about: str = "") -> None:
         """Log what became of something the operator asked for, and keep it to be shown."""
         self._outcomes += 1
         self.picture.put("order", {"number": self._outcomes, "text": text})
         self.log(now_s, "note", f"{about}{text}")
-
-    def diagnostic(self, report: bm.Diagnostic, now_s: float) -> None:
-        """Log an error report of a node."""
-        times = f" ({report.count} times)" if report.count > 1 else ""
-        self.log(now_s, "note",
-                 f"{report.node}: {report.context}: {report.reason} [{report.offender}]{times}")
 
     def log(self, now_s: float, kind: str, text: str) -> None:
         """Add a line to the event log; `kind` is fault, clear or note."""

@@ -20,16 +20,23 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.narrator import Level, Narrator
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.registry import decision_in_words
 
 View = tuple[str, fg.Record]
 """Channel and what is to be seen on it."""
 
-Shown = list[View]
+LEVELS: Mapping[Level, fg.LogLevel] = {
+    "fault": fg.LogLevel.WARNING, "clear": fg.LogLevel.INFO, "note": fg.LogLevel.ERROR}
+"""A note is an error report of a node."""
+
+_TOLD = (ftm_topics.DECISION, ftm_topics.PROCESS_EVENT, bus_topics.DIAGNOSTIC, ftm_topics.DETECTION,
+         ftm_topics.MANAGER_STATUS, bus_topics.INJECT, bus_topics.INJECTION_REPORT)
+_ONCE = (fm.ProcessEvent, bm.Diagnostic)
+"""Events, of which a recording of several hosts may have copies."""
 
 Translator = Callable[[str, Header, Any, int], list[View]]
 """Makes views of key, header and body of a message, and the time of the recording."""
@@ -54,12 +61,9 @@ class Views:
     def __init__(self, application: Application | None = None,
                  system: SystemSpec = NO_SYSTEM) -> None:
         del application
-        self._titles = system.titles
+        self._narrator = Narrator(system.titles)
         self._seen: dict[str, Any] = Remembered(MANY)
-        self.translators: dict[Topic[Any], Translator] = {
-            ftm_topics.DECISION: self._decision, ftm_topics.PROCESS_EVENT: self._process,
-            bus_topics.DIAGNOSTIC: self._diagnostic, ftm_topics.DETECTION: self._detection,
-            bus_topics.INJECTION_REPORT: self._injection}
+        self.translators: dict[Topic[Any], Translator] = dict.fromkeys(_TOLD, self._log)
 
     def start(self, at_ns: int) -> list[View]:
         """Return what does not depend on any message."""
@@ -81,46 +85,13 @@ class Views:
 
     # -- the log --------------------------------------------------------------------------------
 
-    def _decision(self, key: str, header: Header, body: fm.DecisionRecord, at_ns: int) -> Shown:
-        words = decision_in_words(body.active, body.rule, body.recoveries, body.strategy,
-                                  self._titles)
-        level = fg.LogLevel.WARNING if body.active else fg.LogLevel.INFO
-        return self._event(key, header, at_ns, level, f"decision {body.decision}: {words}")
-
-    def _process(self, key: str, header: Header, body: fm.ProcessEvent, at_ns: int) -> list[View]:
-        if not body.news:
+    def _log(self, key: str, header: Header, body: Any, at_ns: int) -> list[View]:
+        """Return the lines for a message, once for all its copies."""
+        if isinstance(body, _ONCE) and not self.is_new(
+                key, (header.source, header.incarnation, header.sequence)):
             return []
-        level = fg.LogLevel.INFO if body.news == "clear" else fg.LogLevel.WARNING
-        by = f" by {body.by}" if body.by else ""
-        detail = f": {body.detail}" if body.detail else ""
-        return self._event(key, header, at_ns, level, f"{body.node} {body.event}{by}{detail}")
-
-    def _diagnostic(self, key: str, header: Header, body: bm.Diagnostic, at_ns: int) -> list[View]:
-        return self._event(key, header, at_ns, fg.LogLevel.ERROR,
-                           f"{body.context}: {body.reason} [{body.offender}]")
-
-    def _detection(self, key: str, header: Header, body: fm.DetectionReport, at_ns: int) -> Shown:
-        was = self._seen.get(key)
-        if not self.is_new(key, body.state) or (
-                was is None and body.state is fm.DetectionState.IDLE):
-            return []
-        active = body.state is fm.DetectionState.ACTIVE
-        return [line(at_ns, fg.LogLevel.WARNING if active else fg.LogLevel.INFO, header.source,
-                      f"detects: {body.reason}" if active else "is idle again")]
-
-    def _injection(self, key: str, header: Header, body: bm.InjectionReport, at_ns: int) -> Shown:
-        if not self.is_new(f"{key} {body.injection}", (body.affected > 0, body.finished)):
-            return []
-        what = "is over" if body.finished else "is in force"
-        why = f": {body.reason}" if body.reason else ""
-        return [line(at_ns, fg.LogLevel.WARNING, header.source,
-                      f"injection {body.injection} {what}, {body.affected} affected{why}")]
-
-    def _event(self, key: str, header: Header, at_ns: int, level: fg.LogLevel, text: str) -> Shown:
-        """Return a line for a message that counts, once for all its copies."""
-        if not self.is_new(key, (header.source, header.incarnation, header.sequence)):
-            return []
-        return [line(at_ns, level, header.source, text)]
+        return [line(at_ns, LEVELS[told.level], header.source, told.text)
+                for told in self._narrator.describe(body, header)]
 
     def is_new(self, what: str, value: Any) -> bool:
         """Take note of what was last said of something; tell whether it is another thing."""

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
-from rampart.actors.bus.bounds import MANY
-from rampart.actors.bus.limits import RateLimit, Remembered
+from rampart.actors.bus.limits import RateLimit
 from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm.narrator import Narrator
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan
 from rampart.files.plain_text import one_line, printable
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.registry import named
 from rampart.sim.runs.record import RunRecord
 
 REPORTS_PER_S = 10
@@ -53,19 +51,17 @@ class Console:
         self._stream = stream
         self._clock = clock
         self._is_limited = True
-        self._titles: Mapping[str, str] = {}
+        self._narrator = Narrator()
         self._reports = RateLimit(REPORTS_PER_S)
         self._others = RateLimit(LINES_PER_S)
         self._live = stream.isatty()
         self._live_text = ""
-        self._detections: dict[str, fm.DetectionState] = Remembered(MANY)
-        self._silent: tuple[str, ...] = ()
         self._last_live_s = 0.0
 
     def banner(self, what: str, plan: RunPlan, spec: SystemSpec, *, virtual: bool = False) -> None:
         """Say what is about to run, and in real time how to disturb it."""
         self._is_limited = not virtual
-        self._titles = spec.titles
+        self._narrator.titles = spec.titles
         mode = spec.strategy if plan.ftm else "no fault tolerance"
         time_is = f"virtual time, seed {plan.seed}" if virtual else f"rate {plan.rate:g}"
         self.say(f"Rampart: {what}, {mode}, {time_is}")
@@ -87,31 +83,9 @@ class Console:
         now_s = self._clock()
         if count := self._reports.left_out(now_s) + self._others.left_out(now_s):
             self.say(f"[{at:7.2f} s] {count} more lines were left out")
-        if isinstance(message, fm.ProcessEvent):
-            if message.news and message.event != "adopted":
-                detail = f" ({message.detail})" if message.detail else ""
-                which = f"incarnation {message.incarnation}"
-                self.line(at, f"{message.node} {message.event}, {which}{detail}")
-        elif isinstance(message, fm.DetectionReport):
-            self._take_detection(message, header)
-        elif isinstance(message, fm.ManagerStatus):
-            self._take_silence(message.silent, at)
-        elif isinstance(message, fm.DecisionRecord):
-            what = " and ".join(map(self._named, message.recoveries)) or "nothing to recover"
-            word = "block" if message.strategy == "safety-first" else "rule"  # figure 7's word
-            block = f", {word} {message.rule}" if message.rule else ""
-            active = ", ".join(map(self._named, message.active))
-            self.line(at, f"decision {message.decision}: {what}{block}"
-                      + (f" for {active}" if active else ""))
-        elif isinstance(message, fm.ShadowRecord):
-            self.line(at, f"  in shadow {message.strategy} would run "
-                          f"{' and '.join(map(self._named, message.recoveries)) or 'nothing'}")
-        elif isinstance(message, Diagnostic):
-            self.line(at, f"{message.node}: {message.context}: {message.reason} "
-                      f"[{message.offender}]", self._reports)
-
-    def _named(self, name: str) -> str:
-        return named(name, self._titles)
+        limit = self._reports if isinstance(message, Diagnostic) else self._others
+        for line in self._narrator.describe(message, header):
+            self.line(at, line.text, limit)
 
     def line(self, at_s: float, text: str, limit: RateLimit | None = None) -> None:
         """Write one line with its simulated time, unless there are too many of its kind."""
@@ -135,20 +109,6 @@ class Console:
             return []
         safety = "safety not known" if record.safety == "not known" else record.safety
         return [f"{record.mission}, {safety}, {record.duration_s:.1f} s simulated."]
-
-    def _take_detection(self, report: fm.DetectionReport, header: Header) -> None:
-        before = self._detections.get(header.source, fm.DetectionState.IDLE)
-        self._detections[header.source] = report.state
-        if report.state is not before:
-            what = report.reason if report.state is fm.DetectionState.ACTIVE else "clear"
-            self.line(header.stamp, f"{self._named(header.source)}: {what}")
-
-    def _take_silence(self, silent: tuple[str, ...], at: float) -> None:
-        for name in (n for n in silent if n not in self._silent):
-            self.line(at, f"{self._named(name)} silent: it counts as active")
-        for name in (n for n in self._silent if n not in silent):
-            self.line(at, f"{self._named(name)}: no longer silent")
-        self._silent = silent
 
     def show_live(self, text: str, at_s: float) -> None:
         """Show a line in place of the last one, four times a simulated second, on a terminal."""

@@ -15,6 +15,7 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.narrator import Narrator
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.web.audit import AuditLine
@@ -30,7 +31,8 @@ Safety = Literal["safe", "unsafe", "not known"]
 
 _CRASHES = ("crashed", "stopped", "wedged", "given up")
 _RECOVERED = ("respawned", "resumed", "adopted")
-_OF_HOSTS = ("unreachable", "back")
+_ELSEWHERE = (fm.DecisionRecord, fm.ShadowRecord, bm.Diagnostic)
+"""Decisions have a list of their own; error reports are in the log of the run."""
 
 
 class Interval(msgspec.Struct, frozen=True):
@@ -130,6 +132,7 @@ class RunRecorder:
         self._plan = plan
         self._strategy = strategy
         self._titles = titles
+        self._narrator = Narrator(titles)
         self._left_out = 0
         self._events: list[EventLine] = []
         self._intervals: list[Interval] = []
@@ -153,6 +156,9 @@ class RunRecorder:
         take = self._take.get(topic.key)
         if take is not None:
             take(message, header)
+        if not isinstance(message, _ELSEWHERE):
+            for line in self._narrator.describe(message, header):
+                self._note(header.stamp, line.level, line.text)
 
     def marks(self) -> int:
         """Return a number that grows with everything that no memory may lack for long."""
@@ -205,11 +211,8 @@ class RunRecorder:
             "failing": tuple(name for name, failing in self._failing.items() if failing)}
 
     def _detection(self, report: fm.DetectionReport, header: Header) -> None:
-        active = report.state is fm.DetectionState.ACTIVE
-        name = header.source
-        if self.turn("detection", name, active, header.stamp, report.reason):
-            text = f"{name} detects: {report.reason}" if active else f"{name} is idle again"
-            self._note(header.stamp, "fault" if active else "clear", text)
+        self.turn("detection", header.source, report.state is fm.DetectionState.ACTIVE,
+                  header.stamp, report.reason)
 
     def _manager(self, status: fm.ManagerStatus, header: Header) -> None:
         for name in status.activated:
@@ -235,16 +238,10 @@ class RunRecorder:
     def _process_event(self, event: fm.ProcessEvent, header: Header) -> None:
         if not event.news:
             return
-        detail = f": {event.detail}" if event.detail else ""
         if event.event in _CRASHES:
             self.turn("down", event.node, True, header.stamp, event.event)
-            self._note(header.stamp, "fault", f"{event.node} {event.event}{detail}")
         elif event.event in _RECOVERED:
             self.turn("down", event.node, False, header.stamp)
-            by = f" by {event.by}" if event.by else ""
-            self._note(header.stamp, "clear", f"{event.node} {event.event}{by}")
-        elif event.event in _OF_HOSTS:
-            self._note(header.stamp, event.news, f"{event.node} {event.event}{detail}")
         if event.event == "given up":
             self._given_up[event.node] = None
         elif event.event in _RECOVERED:
@@ -275,13 +272,7 @@ class RunRecorder:
 
     def _injection_report(self, report: bm.InjectionReport, header: Header) -> None:
         what = self._injections.get(report.injection, report.injection)
-        if self.turn("injection", report.injection, not report.finished, header.stamp, what):
-            where = f"{what} at {report.node}"
-            if report.finished:
-                self._note(header.stamp, "clear",
-                           f"injection over: {where}, {report.affected} messages changed")
-            else:
-                self._note(header.stamp, "fault", f"fault injected: {where}")
+        self.turn("injection", report.injection, not report.finished, header.stamp, what)
 
     # -- for recorders of a robot ---------------------------------------------------------------
 

@@ -159,7 +159,6 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
     monkeypatch.setattr(rampart.sim.osmosis.trial.record, "KEPT", 500)
     monkeypatch.setattr(rampart.sim.runs.record, "KEPT", 500)
     monkeypatch.setattr(rampart.sim.osmosis.trial.record, "TRACK_KEPT", 500)
-    monkeypatch.setattr(rampart.sim.runs.console, "MANY", 500)
     monkeypatch.setattr(rampart.sim.osmosis.trial.mission_trial, "MOST", 500)
     of = system("osmosis")
     run = MissionTrial(of.run, 60.0, io.StringIO())

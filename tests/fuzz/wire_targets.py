@@ -139,7 +139,7 @@ def page_headers(data: bytes) -> None:
         access.own_origin(text)
     _GATE.visitor(text, None)
     _GATE.visitor(None, text)
-    _GATE.log_in(text, text)
+    _GATE.log_in(text)
 
 
 @target("page-tokens", refuses=(VisitorError,), kind="text", words=("look", "drive", "#", "\n"),

@@ -121,7 +121,8 @@ class MissionTrial(Trial):
             _PATIENCE_S if limit_s is None else limit_s, run.plan.waits,
             [node.name for node in run.system.nodes if node.kind is Kind.WORLD],
             run.plan.begins_s)
-        self.recorder = MissionRecorder(run.plan, self.strategy, known.airport, known.mission)
+        self.recorder = MissionRecorder(run.plan, self.strategy, known.airport, known.mission,
+                                        run.system.titles)
 
     def sinks(self, clock: Clock) -> list[Sink]:
         """Return what wants to hear the run's messages."""

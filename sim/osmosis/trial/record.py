@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal
 
 import msgspec
@@ -104,13 +105,15 @@ class MissionRecorder(RunRecorder):
         strategy: of the manager; empty without FTMs.
         airport: where it takes place.
         mission: to be driven.
+        titles: of mechanisms and recoveries.
 
     Attributes:
         judge: of the mission.
     """
 
-    def __init__(self, plan: RunPlan, strategy: str, airport: Airport, mission: Mission) -> None:
-        super().__init__(plan, strategy)
+    def __init__(self, plan: RunPlan, strategy: str, airport: Airport, mission: Mission,
+                 titles: Mapping[str, str] = MappingProxyType({})) -> None:
+        super().__init__(plan, strategy, titles)
         self._airport = airport
         self._mission = mission
         self.judge = Judge(mission.goals)

@@ -5,6 +5,7 @@ import math
 
 import msgspec
 
+from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.state import STALE_S
 from rampart.actors.osmosis import messages as m
@@ -55,14 +56,15 @@ def test_a_detection_is_logged_when_it_begins_and_when_it_ends():
         view = fm.DetectionView("DM2", which, "stale" if which else "", ())
         state.manager(fm.ManagerStatus((), (), (), (), "safety-first", 0, (view,)), float(at_s))
     assert [(e["t"], e["kind"], e["text"]) for e in shown(state)["events"]] == [
-        (2.0, "fault", "DM2: stale"), (4.0, "clear", "DM2 is idle again")]
+        (2.0, "fault", "DM2: stale"), (4.0, "clear", "DM2: clear")]
 
 
 def test_that_all_nodes_start_at_the_start_is_no_news_but_a_crash_is():
     state = OsmosisState()
     for event in ("started", "running", "crashed", "respawned"):
-        state.process_event(fm.ProcessEvent("hmi", event, 1, 1, "RM4", ""), 1.0)
-    assert [e["text"] for e in shown(state)["events"]] == ["hmi crashed", "hmi respawned by RM4"]
+        state.event(fm.ProcessEvent("hmi", event, 1, 1, "RM4", ""), Header("hmi", 1, 1, 1.0))
+    assert [e["text"] for e in shown(state)["events"]] == [
+        "hmi crashed, incarnation 1", "hmi respawned by RM4, incarnation 1"]
 
 
 def test_lights_come_from_the_status_and_from_passing_and_a_new_mission_forgets_them():

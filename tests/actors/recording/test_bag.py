@@ -223,10 +223,11 @@ def test_the_log_tells_decisions_detections_and_processes_once_each():
     told = [line.message for number, state in enumerate(states) for _, line in views.of(
         ftm_topics.DETECTION, "DM1", Header("DM1", 1, number, 0.0),
         fm.DetectionReport(state, "fence", (), 0.0), 0)]
-    assert told == ["detects: fence", "is idle again"]
+    assert told == ["DM1: fence", "DM1: clear"]
     died = fm.ProcessEvent("hmi", "crashed", 1, 1, "", "killed by SIGKILL")
     [(_, line)] = views.of(ftm_topics.PROCESS_EVENT, "e", header, died, 0)
-    assert (line.level, line.message) == (fg.LogLevel.WARNING, "hmi crashed: killed by SIGKILL")
+    assert (line.level, line.message) == (
+        fg.LogLevel.WARNING, "hmi crashed, incarnation 1: killed by SIGKILL")
 
 
 def test_every_view_is_of_the_type_that_its_channel_announces(tmp_path):

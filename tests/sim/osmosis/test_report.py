@@ -121,7 +121,8 @@ def test_a_crash_is_a_bar_from_the_event_to_the_respawn_and_a_restart():
     run = story.end()
     assert bars(run) == [("down", "hmi", 10.0, 10.5)]
     assert run.restarts == {"hmi": 1}
-    assert [e.text for e in run.events] == ["hmi crashed: SIGKILL", "hmi respawned by RM4"]
+    assert [e.text for e in run.events] == [
+        "hmi crashed, incarnation 1: SIGKILL", "hmi respawned by RM4, incarnation 2"]
 
 
 def test_repeated_states_make_one_bar_and_one_that_never_ends_lasts_to_the_end():

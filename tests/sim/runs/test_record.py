@@ -34,7 +34,8 @@ def test_a_node_whose_return_was_not_heard_is_up_when_the_table_shows_it():
     show(recorder, 6.0, NodeState.RUNNING)
     record = recorder.record(250.0)
     assert record.intervals == (Interval("down", "pump", 5.0, 5.5, "wedged"),)
-    assert [event.text for event in record.events] == ["pump wedged", "pump runs again"]
+    assert [event.text for event in record.events] == [
+        "pump wedged, incarnation 2", "pump runs again"]
 
 
 @pytest.mark.parametrize(("at_s", "state"), [
