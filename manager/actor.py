@@ -6,10 +6,10 @@ returns: between a detection and its recovery no timer is waited for. Timers onl
 in force, show that the manager runs, and let the arbiter notice silence.
 
 One that was killed finds out what is in force from the recovery modules themselves, and adopts it;
-until it knows, it releases nothing. What they cannot tell it has from its checkpoint
+until it knows, it releases nothing. What they do not know it has from its checkpoint
 (`rampart.manager.arbitration.arbiter_memory`). That is kept *after* the commands are on their way,
-unlike elsewhere: an emergency stop does not wait for a disk, and what a command says its module
-knows as well.
+unlike elsewhere: an emergency stop does not wait for a disk, and its module knows the command
+as well.
 """
 
 from __future__ import annotations
@@ -38,8 +38,10 @@ from rampart.manager.arbitration.arbiter_memory import (
     take_over,
 )
 from rampart.manager.arbitration.arbiter_state import (
+    Command,
     DecisionMade,
     Input,
+    RecoveryHeard,
     ResetAnswered,
     ResetAsked,
     ShadowDiffered,
@@ -47,7 +49,6 @@ from rampart.manager.arbitration.arbiter_state import (
     Tick,
 )
 from rampart.manager.arbitration.detection_track import DetectionHeard, overdue
-from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard
 from rampart.manager.spec.adaptation import Action, Change, Document, adapt, describe
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.specification import check_change
@@ -59,7 +60,7 @@ DECISIONS_PER_INCARNATION = 10_000
 
 
 class FtmManager(Actor):
-    """Hears all detection and recovery modules, commands the recovery modules."""
+    """Receives the reports of all modules, commands the recovery modules."""
 
     outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.SHADOW, topics.RESPAWN,
                topics.MANAGER_STATUS, topics.ADAPTATION, topics.ADAPTED_SYSTEM)
@@ -92,7 +93,7 @@ class FtmManager(Actor):
         return tuple(topic.at(module.name) for module in modules)
 
     def on_start(self) -> None:
-        """Say at once that the manager runs, and what it has latched."""
+        """Publish at once that the manager runs, and what it has latched."""
         memory = self.kept(MANAGER_STATE)
         if memory is not None:
             self.arbiter_state = recall(
@@ -106,25 +107,25 @@ class FtmManager(Actor):
         self._remembered = self.arbiter_state.number, self.arbiter_state.latched
         self.keep(MANAGER_STATE, remember(self.arbiter_state, self._arbiter))
 
-    # -- what it hears --------------------------------------------------------------------------
+    # -- what it receives -----------------------------------------------------------------------
 
     @on(topics.DETECTION)
     def detection(self, message: m.DetectionReport, header: Header) -> None:
-        """Hear a detection module."""
+        """Take in the report of a detection module."""
         self._step(DetectionHeard(
             header.source, message.state is m.DetectionState.ACTIVE, message.reason,
             message.nodes, message.since_s, header.stamp, header.incarnation))
 
     @on(topics.RECOVERY)
     def recovery(self, message: m.RecoveryReport, header: Header) -> None:
-        """Hear a recovery module."""
+        """Take in the report of a recovery module."""
         self._step(RecoveryHeard(
             header.source, message.state is m.RecoveryState.ACTIVATED, message.phase,
             message.decision, message.reason))
 
     @on(topics.RESET)
     def reset(self, message: m.Reset, _header: Header) -> None:
-        """Hear the operator release a latched recovery; strangers are let go by who obeys them."""
+        """Reset a latched recovery for the operator; who obeys unknown holders resets those."""
         if any(recovery.name == message.recovery for recovery in self._system.recoveries):
             self._step(ResetAsked(message.recovery, message.by))
 
@@ -268,7 +269,7 @@ class FtmManager(Actor):
 
 
 def _with_other_topics(before: Layout, after: Layout) -> list[str]:
-    """Return the actors that would hear or publish what they do not now."""
+    """Return the actors that would receive or publish other topics than now."""
     return [name for name, new in after.members.items() for old in [before.members[name]]
             if (heard(new), published(new)) != (heard(old), published(old))]
 

@@ -30,12 +30,12 @@ from rampart.actors.runtime.timer import Timer as Timer
 from rampart.manager.analysis.verification import verify as verify
 from rampart.manager.arbitration.arbiter import Arbiter as Arbiter
 from rampart.manager.arbitration.arbiter import build_arbiter as build_arbiter
+from rampart.manager.arbitration.arbiter_state import Command as Command
 from rampart.manager.arbitration.arbiter_state import DecisionMade as DecisionMade
 from rampart.manager.arbitration.arbiter_state import DetectionHeard as DetectionHeard
 from rampart.manager.arbitration.arbiter_state import RecoveryHeard as RecoveryHeard
 from rampart.manager.arbitration.arbiter_state import ResetAsked as ResetAsked
 from rampart.manager.arbitration.arbiter_state import Tick as Tick
-from rampart.manager.arbitration.recovery_track import Command as Command
 from rampart.manager.spec.schema import SystemSpec as SystemSpec
 from rampart.manager.spec.specification import parse_specification as parse_specification
 from rampart.manager.spec.tables import NonNegative as NonNegative

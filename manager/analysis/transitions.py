@@ -33,14 +33,16 @@ import msgspec
 from msgspec.structs import replace
 
 from rampart.manager.arbitration.arbiter import Arbiter
-from rampart.manager.arbitration.arbiter_state import ResetAsked, State, Tick
-from rampart.manager.arbitration.detection_track import DetectionRules, DetectionTrack
-from rampart.manager.arbitration.recovery_track import (
+from rampart.manager.arbitration.arbiter_state import (
     LONG_AGO_S,
     Command,
     RecoveryHeard,
     RecoveryTrack,
+    ResetAsked,
+    State,
+    Tick,
 )
+from rampart.manager.arbitration.detection_track import DetectionRules, DetectionTrack
 from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryPhase
 from rampart.manager.model.order import PartialOrder, Tree
 from rampart.manager.strategies.arrangement import Arrangement

@@ -29,15 +29,17 @@ states can be explored. The strategy decides *which* recovery; the arbiter sees 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from operator import attrgetter
 
 from msgspec.structs import replace
 
-from rampart.manager.arbitration import detection_track, recovery_track
+from rampart.manager.arbitration import detection_track
 from rampart.manager.arbitration.arbiter_state import (
+    Command,
     DecisionMade,
     Input,
     Output,
+    RecoveryHeard,
+    RecoveryTrack,
     ResetAnswered,
     ResetAsked,
     ShadowDiffered,
@@ -49,7 +51,6 @@ from rampart.manager.arbitration.detection_track import (
     DetectionTrack,
     said,
 )
-from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, RecoveryTrack
 from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.budget import patience_s
 from rampart.manager.spec.schema import SystemSpec
@@ -66,7 +67,6 @@ EXCUSE_S = 5.0
 """So long before what excuses it was detected may a latch have come: an overload begins before it
 is noticed."""
 
-_is_at_rest = attrgetter("is_at_rest")
 
 
 class Arbiter:
@@ -152,10 +152,7 @@ class Arbiter:
             return state, answers
         late_before = state.late
         state = self._pass_time(state, now)
-        state, outputs = self._settle(state, now)
-        if state.late != late_before and not any(isinstance(o, DecisionMade) for o in outputs):
-            # Nothing new was decided, but a patient shadow may have climbed.
-            outputs += self._ask_shadow(state, self._choose(state)[0])
+        state, outputs = self._settle(state, now, late_before)
         if isinstance(event, RecoveryHeard) and not event.activated \
                 and event.recovery in self._recovery:
             track = self._track(state, event.recovery)
@@ -171,11 +168,10 @@ class Arbiter:
         """
         if not state.oriented or state.decision is not NOTHING_ACTIVE or state.since or state.late:
             return False
-        timeout_s = self.rules.silence_timeout_s
-        for detection in state.detections:
-            if not detection.is_calm(now, timeout_s):
-                return False
-        return all(map(_is_at_rest, state.recoveries))
+        oldest_s = now - self.rules.silence_timeout_s
+        return not (any(t.active or t.heard_s < oldest_s for t in state.detections)
+                    or any(t.command.activate or t.letting_go or t.latched or t.adopted or t.failure
+                           for t in state.recoveries))
 
     def _track(self, state: State, recovery: str) -> RecoveryTrack:
         return state.recoveries[self._recovery[recovery]]
@@ -189,13 +185,13 @@ class Arbiter:
         track = self._track(state, event.recovery)
         number = state.number
         if event.activated and not state.oriented and not track.wanted and not track.heard:
-            if event.decision <= LARGEST_NUMBER:  # or it is no number that was ever given
+            if event.decision <= LARGEST_NUMBER:  # a larger one was never given
                 number = max(number, event.decision)
             command = Command(event.recovery, True, event.decision,
                               reason="adopted, it was found activated")
             track = replace(track, ordered_s=now, adopted=True, command=command,
                             latched=self.mechanisms.contracts[event.recovery].latched)
-        track = recovery_track.hear(track, event, now)
+        track = track.heard_from(event, now)
         if track.failure and not track.failed_for:
             track = replace(track, failed_for=self._sakes(track.name, state.decision.active))
         return self._with_recovery(replace(state, number=number), track)
@@ -218,11 +214,8 @@ class Arbiter:
             f"reset by {event.by}" if event.by else "reset")),)
 
     def _pass_time(self, state: State, now: float) -> State:
-        timeout_s = self.rules.silence_timeout_s
-        detections = tuple(
-            t if t.is_calm(now, timeout_s)
-            else detection_track.pass_time(t, self._rules_of(state, t.name), now)
-            for t in state.detections)
+        detections = tuple(detection_track.pass_time(t, self._rules_of(state, t.name), now)
+                           for t in state.detections)
         believed = {track.name: track for track in detections}
         active, reported = self._active(detections), said(detections)
         recoveries = tuple(
@@ -345,7 +338,8 @@ class Arbiter:
                 for name in sorted(self._needy)
                 for node in sorted(self.mechanisms.contracts[name].needs & failed.keys())[:1]}
 
-    def _settle(self, state: State, now: float) -> tuple[State, tuple[Output, ...]]:
+    def _settle(self, state: State, now: float, late_before: frozenset[str]
+                ) -> tuple[State, tuple[Output, ...]]:
         """Decide, then command: release what is not chosen, activate what is."""
         strategys, _, decision = self._choose(state)
         chosen = decision.recoveries
@@ -369,6 +363,7 @@ class Arbiter:
         if fresh:
             detected_s = max((t.since_s for t in state.detections if t.active), default=now)
             outputs.append(DecisionMade(state.number, decision, detected_s, strategys))
+        if fresh or state.late != late_before:  # a patient shadow may have climbed alone
             outputs.extend(self._ask_shadow(state, strategys))
         return state, tuple(outputs)
 

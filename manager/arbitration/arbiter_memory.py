@@ -1,6 +1,6 @@
 """What of the arbiter's state must survive the FTM Manager's death, and how it is taken up again.
 
-Little: an arbiter that starts hears from the modules what is detected and what is in force, adopts
+Little: an arbiter that starts learns from the modules what is detected and what is in force, adopts
 it, and releases nothing before it has heard them all. Four things only the arbiter knows:
 
 * *Latches.* Whether an operator has reset an emergency stop is the arbiter's knowledge. If it dies
@@ -10,7 +10,7 @@ it, and releases nothing before it has heard them all. Four things only the arbi
 * *How much a detection module has flapped*, by which its all-clear is believed sooner or later.
 * *The number of the last decision*, so that none is given twice.
 
-What a memory says that is wrong can only stop the robot: it can latch, and release nothing whose
+A wrong memory can only stop the robot: it can latch, and release nothing whose
 cause is still there.
 """
 
@@ -23,9 +23,8 @@ import msgspec
 from msgspec.structs import replace
 
 from rampart.manager.arbitration.arbiter import LARGEST_NUMBER, Arbiter
-from rampart.manager.arbitration.arbiter_state import State
+from rampart.manager.arbitration.arbiter_state import LONG_AGO_S, Command, RecoveryTrack, State
 from rampart.manager.arbitration.detection_track import DetectionTrack
-from rampart.manager.arbitration.recovery_track import LONG_AGO_S, Command, RecoveryTrack
 
 
 class Latch(msgspec.Struct, frozen=True):

@@ -2,10 +2,10 @@
 
 Belief differs from the last report in two ways.
 
-*Silence counts as active.* A module that has died cannot say so, hence one of which there is no
+*Silence counts as active.* A dead module cannot report its death, hence one of which there is no
 report younger than `silence_timeout_s` is taken for active, whatever the reason: also while it is
 being respawned, which takes a fraction of the timeout, and one that crashes again and again is not
-excused for ever. Age is that of the report, not of its arrival: what repeats old news is silent.
+excused for good. Age is that of the report, not of its arrival: a repeated old report is silence.
 
 *One that runs and is not heard is replaced* once, well before its silence counts (`overdue`): its
 way out may be broken where its heartbeat's is not. Not while others are late as well: then it is
@@ -18,7 +18,7 @@ takes `release_hold_max_s` per portion. Therefore
 
 * flaps closer together than `release_hold_max_s` pour in faster than leaks out; the hold grows
   past the gaps between them, and the flapping is seen as one long activity: no thrashing;
-* flaps further apart do not build up, and a release per `release_hold_max_s` is no thrashing;
+* flaps further apart do not build up, and a release per `release_hold_max_s` is not thrashing;
 * the bucket is no larger than `release_hold_max_s`, so that long after the last flap the recovery
   is released for certain: no starvation either.
 
@@ -104,10 +104,6 @@ class DetectionTrack(msgspec.Struct, frozen=True):
     def asserted(self) -> bool:
         """Whether it is active by its own word or by its silence, rather than only held."""
         return self.reported or self.silent
-
-    def is_calm(self, now: float, silence_timeout_s: float) -> bool:
-        """Whether it is inactive and has been heard of late: to let time pass changes nothing."""
-        return not self.active and now - self.heard_s <= silence_timeout_s
 
 
 MANY_SHARE = 1 / 3

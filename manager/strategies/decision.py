@@ -1,8 +1,8 @@
 """A decision and its certificate.
 
-A decision says which recoveries are to run. Its certificate says why, so that a reader, or a proof
-checker, need not trust the program: which rule of the strategy applied, the chains of dominance
-that make it apply, and every alternative that was turned down, with the reason.
+A decision names the recoveries to run. Its certificate gives the reasons, so that a reader, or a
+proof checker, need not trust the program: which rule of the strategy applied, the chains of
+dominance that make it apply, and every alternative that was turned down, with the reason.
 
 Deciding and giving reasons are two steps, because a robot should brake first and explain after.
 """
@@ -57,7 +57,7 @@ class Strategy(Protocol):
     exclusive: bool
     """Whether one recovery runs at a time, as the paper has it, even where two could."""
     rules: dict[int, str]
-    """What each rule says, as the end of a sentence that begins with "because"."""
+    """What each rule means, as the end of a sentence that begins with "because"."""
 
     def __hash__(self) -> int:
         """Strategies are told apart by identity."""

@@ -1,9 +1,9 @@
-"""Repair under guard: as safe as every active mechanism asks for, and no stop for ever.
+"""Repair under guard: as safe as every active mechanism asks for, and no stop without end.
 
 Our own strategy. The paper's safety-first has two costs, both found by `rampart verify`:
 
 * It runs one recovery. With a dead control node and its consequence, a stale command, FTM2
-  dominates FTM4, RM2 stops the robot, RM3 is never started, and the robot stands there for ever.
+  dominates FTM4, RM2 stops the robot, RM3 is never started, and the robot stands there permanently.
 * Where neither tree nor order decides (block 4) it climbs the tree, often to the emergency stop,
   although a less drastic recovery would be safer than all that are asked for. Two node crashes at
   once, FTM4 and FTM7, end in RM1. And it is not monotone: with FTM6 active *as well*, it is RM5.

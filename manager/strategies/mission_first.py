@@ -45,10 +45,10 @@ class MissionFirst:
         if tree.root in active:
             return Decision(active, 3, mechanisms.recover[tree.root], (tree.root,))
         climbed = not late.isdisjoint(active)
-        in_time = [name for name in active if name not in late]
+        in_time = tree.mask(name for name in active if name not in late)
         asking: dict[str, None] = {}
         for name in active:
-            if any(tree.is_above(name, deeper) for deeper in in_time):
+            if tree.below[tree.number[name]] & in_time:
                 continue  # the cause is being dealt with
             while name in late and tree.parents[name]:
                 name = str(tree.parents[name])  # noqa: PLW2901 climbing
@@ -56,10 +56,11 @@ class MissionFirst:
         # Of barriers in time none is above another already.
         highest = tree.maximal(asking) if climbed else asking
         deepest_first = sorted(
-            highest, key=lambda name: len(tree.chain(tree.root, name)), reverse=True)
+            highest, key=lambda name: tree.up_set[tree.number[name]].bit_count(), reverse=True)
         demanded = arrangement.demanded(deepest_first)
+        mask = order.mask(demanded)
         taken = arrangement.compatible(sorted(
-            demanded, key=lambda name: sum(order.is_above(one, name) for one in demanded)))
+            demanded, key=lambda name: (order.up_set[order.number[name]] & mask).bit_count()))
         sakes = mechanisms.sort(arrangement.asking(highest, taken))
         return Decision(active, 2 if climbed else 1, taken, sakes)
 

@@ -85,7 +85,7 @@ def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,
     """Decide by the strategy of that name, with the certificate.
 
     Raises:
-        UnknownElementError: `active` names something that is no mechanism.
+        UnknownElementError: `active` names an unknown mechanism.
         UnknownStrategyError: No such strategy.
     """
     decider = _decider(strategy, mechanisms, tree, order)

@@ -8,9 +8,15 @@ import msgspec
 
 from rampart import systems
 from rampart.manager.arbitration.arbiter import build_arbiter
-from rampart.manager.arbitration.arbiter_state import DecisionMade, ResetAnswered, ResetAsked, Tick
+from rampart.manager.arbitration.arbiter_state import (
+    Command,
+    DecisionMade,
+    RecoveryHeard,
+    ResetAnswered,
+    ResetAsked,
+    Tick,
+)
 from rampart.manager.arbitration.detection_track import DetectionHeard
-from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard
 from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.specification import SystemSpec, parse_specification
 

@@ -30,9 +30,8 @@ from rampart.actors.runtime.checkpoint import Loaded, MemoryCheckpoints, Record,
 from rampart.actors.runtime.checkpoint_file import files_of, read
 from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_memory import Latch, Memory, objection, recall, remember
-from rampart.manager.arbitration.arbiter_state import ResetAsked, Tick
+from rampart.manager.arbitration.arbiter_state import Command, RecoveryHeard, ResetAsked, Tick
 from rampart.manager.arbitration.detection_track import DetectionHeard
-from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard
 from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import RealRun

@@ -5,8 +5,7 @@ import pytest
 
 from rampart.manager.actor import forgive_absence
 from rampart.manager.arbitration.arbiter_memory import Memory, recall, remember
-from rampart.manager.arbitration.arbiter_state import State, Tick
-from rampart.manager.arbitration.recovery_track import Command
+from rampart.manager.arbitration.arbiter_state import Command, State, Tick
 from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 from rampart.manager.spec.schema import SystemSpec
 from tests.manager.bench import DMS, Bench, commands, edited

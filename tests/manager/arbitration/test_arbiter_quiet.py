@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rampart.manager.arbitration.arbiter import Arbiter, build_arbiter
-from rampart.manager.arbitration.arbiter_state import ResetAsked, Tick
+from rampart.manager.arbitration.arbiter_state import RecoveryHeard, ResetAsked, Tick
 from rampart.manager.arbitration.detection_track import DetectionHeard
-from rampart.manager.arbitration.recovery_track import RecoveryHeard
 from rampart.manager.model.mechanisms import RecoveryPhase
 from tests.manager.bench import DMS, RMS, paper
 

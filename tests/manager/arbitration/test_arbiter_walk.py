@@ -3,8 +3,7 @@
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from rampart.manager.arbitration.arbiter_state import DecisionMade
-from rampart.manager.arbitration.recovery_track import Command
+from rampart.manager.arbitration.arbiter_state import Command, DecisionMade
 from rampart.manager.model.mechanisms import RecoveryPhase
 from tests.manager.bench import DMS, RMS, Bench, paper
 
