@@ -32,10 +32,10 @@ def apart(one: Any, other: Any, *, angle: bool) -> float:
     Args:
         one: a number, a text or a truth value.
         other: of the same kind.
-        angle: whether they are angles, rad, of which the shorter way round counts.
+        angle: whether they are angles, rad, of which the shorter way counts.
 
     Returns:
-        The distance; of what is no number, 0 if they are equal, else infinity.
+        The distance; of a text or a truth value 0 if they are equal, else infinity.
     """
     if isinstance(one, str | bool) or isinstance(other, str | bool):
         return 0.0 if one == other else math.inf
@@ -54,7 +54,7 @@ def agreeing(values: Sequence[Any], within: float, *, angle: bool) -> list[int]:
 
 
 class _Comparing(DetectionModule):
-    """Hears several fields, and compares those that are true at about the same time."""
+    """Receives several fields, and compares values of about the same time."""
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
         """How they are compared.
@@ -120,8 +120,8 @@ class Disagreement(_Comparing):
         """Which fields, and how far they may be apart.
 
         Attributes:
-            one: of what, as "topic:field".
-            other: likewise.
+            one: the one, as "topic:field".
+            other: the other.
             more_than: greatest distance that is in order.
         """
 
@@ -153,7 +153,7 @@ class Vote(_Comparing):
         """Which fields, and how many of them have to be alike.
 
         Attributes:
-            values: of what, as "topic:field" each.
+            values: as "topic:field" each.
             agree: how many.
             within: greatest distance of those that are alike.
         """

@@ -24,7 +24,7 @@ class Lasting:
         return now_s - self.since_s >= self.enough_s - 1e-9
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Begin again."""
         self.since_s = math.inf
 
 
@@ -37,7 +37,7 @@ class Finding:
     Attributes:
         reason: why it is active; "" while it is idle.
         nodes: the accused.
-        known: whether enough was heard, or missed, to say either.
+        known: whether enough was received, or missed, to decide.
     """
 
     def __init__(self, known_after_s: float = -math.inf) -> None:
@@ -69,8 +69,9 @@ class Finding:
 class Sustained(Finding):
     """Active when something has been wrong for `for_s`, until all has been well for `clear_s`.
 
-    What was noted last stands until something else is: a source that says something wrong and then
-    nothing makes it active, one that says something right and then nothing does not make it idle.
+    What was noted last stands until something else is: a source that publishes something wrong and
+    then nothing makes it active, a source that publishes something right and then nothing does not
+    make it idle.
 
     Args:
         for_s: how long it has to be wrong, simulated seconds.
@@ -111,7 +112,7 @@ class Sustained(Finding):
             self.note(self._why, now_s)
 
     def doubt(self) -> None:
-        """Take note that nothing can be said now: what lasted until now begins anew."""
+        """Take note that nothing is known now: what lasted until now begins again."""
         self._why = ""
         self._wrong.forget()
         self._well.forget()

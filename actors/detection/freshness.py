@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rampart.actors.detection.finding import Finding
+from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm.plausible import is_possible
 from rampart.actors.runtime.actor import Context, Header
@@ -18,11 +18,14 @@ from rampart.actors.runtime.parameters import ControlTimeout, Suspects, TopicHea
 from rampart.manager.spec.tables import NonNegative
 
 
-class FreshnessMonitor(Finding):
+class FreshnessMonitor(Sustained):
     """Active while the newest content is older than the timeout.
 
     It becomes idle again with a sample that comes after content has been fresh for `hold_s`
     without interruption. So neither a single sample nor a source that stutters makes it flap.
+
+    Content that is old already shows no more than that something is wrong: idle may not be claimed
+    after it, and `expire` makes the monitor active.
 
     Args:
         subject: what is monitored, for the reason: "command".
@@ -30,29 +33,22 @@ class FreshnessMonitor(Finding):
         hold_s: how long it must have been fresh again, s.
         start_s: now.
         grace_s: how long the first sample may take, s.
-        known: whether idle may be claimed before anything was heard.
-
-    Attributes:
-        nodes: whom to suspect; up to the owner.
-        known: whether anything fresh was heard, or missed. Content that is old already says no
-            more than that something is wrong: idle may not be claimed, and `expire` makes it
-            active.
+        known: whether idle may be claimed before anything was received.
     """
 
     def __init__(self, subject: str, timeout_s: float, hold_s: float, start_s: float,
                  grace_s: float, *, known: bool = True) -> None:
-        super().__init__(-math.inf if known else math.inf)
-        self.subject = subject
-        self.timeout_s = timeout_s
-        self.hold_s = hold_s
+        super().__init__(0.0, hold_s)
+        self.known = known
+        self._subject, self._timeout_s = subject, timeout_s
         self._newest_s = -math.inf
         self._stale_s = start_s + grace_s
-        self._fresh_since_s: float | None = None
 
     @property
     def due_s(self) -> float:
         """When time alone changes the finding."""
-        return math.inf if self.active and self._fresh_since_s is None else self._stale_s
+        is_over = self.active and self._well.since_s == math.inf
+        return math.inf if is_over else self._stale_s
 
     def heard(self, stamp_s: float, now_s: float) -> None:
         """Take note of a sample.
@@ -65,26 +61,15 @@ class FreshnessMonitor(Finding):
         if not is_possible(stamp_s, now_s) or not stamp_s > self._newest_s:
             return
         self._newest_s = min(stamp_s, now_s)
-        self._stale_s = self._newest_s + self.timeout_s
-        if now_s >= self._stale_s:
-            return
-        self.known = True
-        if not self.active:
-            return
-        if self._fresh_since_s is None:
-            self._fresh_since_s = now_s
-        elif now_s >= self._fresh_since_s + self.hold_s - 1e-9:
-            self.reason = ""
-            self._fresh_since_s = None
+        self._stale_s = self._newest_s + self._timeout_s
+        if now_s < self._stale_s:
+            self.note("", now_s)
 
     def expire(self, now_s: float) -> None:
         """Conclude from the time that has passed."""
         if now_s >= self._stale_s:
-            self._fresh_since_s = None
-            self.known = True
-            if not self.active:
-                self.reason = f"{self.subject} not updated for {self.timeout_s:g} s" \
-                    if self._newest_s > -math.inf else f"{self.subject} never heard"
+            self.note(f"{self._subject} not updated for {self._timeout_s:g} s"
+                      if self._newest_s > -math.inf else f"{self._subject} never heard", now_s)
 
 
 class Freshness(DetectionModule):
@@ -116,13 +101,11 @@ class Freshness(DetectionModule):
         self.monitor = self.judged_by(FreshnessMonitor(
             said.subject or said.topic, said.timeout_s, said.hold_s, self.clock.now(),
             self.grace_s(said.timeout_s), known=self.first_life))
-        self.monitor.nodes = said.suspects
+        self.monitor.accused = said.suspects
         self.hear_topic(said.topic, self.heard)
 
     def heard(self, _message: Any, header: Header) -> None:
         """Take note of a sample."""
-        monitor = self.monitor
-        monitor.heard(header.stamp, self.clock.now())
-        if self.parameters.suspects and not monitor.active:
-            monitor.nodes = self.accused(self.parameters.suspects, header)
+        self.monitor.heard(header.stamp, self.clock.now())
+        self.monitor.accused = self.accused(self.parameters.suspects, header)
         self.follow()

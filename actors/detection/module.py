@@ -2,13 +2,13 @@
 
 A detection module is a pure monitor (what it heard, and by when it must have heard more) and an
 actor round it. The actor hands events to the monitor, wakes it when its next deadline is due,
-and says on `detection/NAME` what the monitor found: at once when it changes, and at 5 Hz.
+and publishes on `detection/NAME` what the monitor found: at once when it changes, and at 5 Hz.
 
-What is not heard is no fault of those who say it, if the module could not have heard it:
+A missing message is not its sender's fault if the module could not have received it:
 
 * A timer that is late shows that the module, too, waits for a processor. It reads its mail for as
   long as it was late, and then judges.
-* When its router dies a module hears nothing from anybody, and so blames nobody, until the bus has
+* When its router dies a module receives nothing, and blames no node until the bus has
   gone over to the other one (`FAILOVER_S`).
 
 Neither counts again within a second. Two more subtleties, about a module that was away for longer:
@@ -43,10 +43,10 @@ EXCUSE_S = 0.1
 """How long one that was late reads its mail before it judges: a period of the slowest input."""
 
 NEXT_EXCUSE_S = 1.0
-"""Not sooner does another absence count: a module that is always late is not excused for ever."""
+"""Not sooner does another absence count: a module that is always late is not always excused."""
 
 _SHORTEST_SLEEP_S = 1e-4
-"""Rounding must not make a timer that is due now come again now, for ever."""
+"""Rounding must not make a timer that is due now come again now, without end."""
 
 
 class Monitor(Protocol):
@@ -56,7 +56,7 @@ class Monitor(Protocol):
         active: whether the fault is there.
         reason: why; constant while nothing changes.
         nodes: the failed nodes, where nodes are the subject.
-        known: False until the monitor has heard enough to say either.
+        known: False until the monitor has received enough to decide.
         due_s: when `expire` is to be called next; infinite if only an event can change anything.
     """
 
@@ -82,8 +82,8 @@ class DetectionModule(Actor):
     """Base of every detection module.
 
     A subclass either calls `activate` and `know_idle` itself, or has a `Monitor` (`judged_by`),
-    hands it what it hears, and calls `follow` after each event. One that calls them itself calls
-    `know_idle` whenever what it hears proves that the fault is not there, idle or not: from its
+    hands it each event, and calls `follow` afterwards. A module that calls them itself calls
+    `know_idle` whenever an event proves that the fault is not there, idle or not: from its
     second incarnation on it is silent, and counts as active, until it has called one of the two.
     """
 
@@ -199,7 +199,7 @@ class DetectionModule(Actor):
             now_s = self.clock.now()
             self._wake_s = max(due_s, now_s + _SHORTEST_SLEEP_S)  # it may be over already
             if self._alarm is not None:
-                self._alarm.cancel()  # or it would wake, sleep again, and so wake for ever
+                self._alarm.cancel()  # or it would wake and sleep again without end
             self._alarm = self.call_later(self._wake_s - now_s, self._woken)
 
     def _woken(self) -> None:
@@ -221,7 +221,7 @@ class DetectionModule(Actor):
             self.follow()
 
     def missed(self) -> None:
-        """React to having been stopped: of what was said meanwhile only the newest is there."""
+        """React to having been stopped: of the messages since then only the newest are there."""
 
     def note_absence(self) -> None:
         """Note that it runs, and whether it did not for a while; before what counts is judged."""

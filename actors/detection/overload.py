@@ -1,16 +1,16 @@
 """`Overload`: the machine has no processor time left for the system, one cause of many symptoms.
 
-Each heartbeat says how late the loop of its node was, and its stamp how long it was under way: what
-carries it needs processor time as well. One node that is late may have a fault of its own; where
+Each heartbeat carries how late the loop of its node was, and its stamp shows how long it was under
+way: the bus needs processor time as well. One node that is late may have a fault of its own; where
 many are late at once it is what they have in common: the machine. The kernel's figure for that
-(`/proc/pressure/cpu`) says as well that programs wait for a processor, but not which: it is high
+(`/proc/pressure/cpu`) shows as well that programs wait for a processor, but not which: it is high
 whenever anything else uses the machine, also when that takes nothing from the robot.
 
-An overload comes in waves. So it is not over while the nodes still wait for a processor, by what
-the kernel has counted for each (`/proc/PID/schedstat`), unless none was late for a good while.
+An overload comes in waves. So it is not over while the nodes still wait for a processor, as the
+kernel counts for each (`/proc/PID/schedstat`), unless none was late for a good while.
 
-This module is as short of processor time as those that it watches. What it hears is late, but says
-the same; and if it is not heard itself for too long, the manager takes it for active.
+This module is as short of processor time as those that it watches. Its input is late, but the
+same; and if its own reports are missing for too long, the manager takes it for active.
 """
 
 from __future__ import annotations
@@ -81,12 +81,12 @@ class Overload(DetectionModule):
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
-        """Hear the heartbeats of the watched nodes."""
+        """Subscribe to the heartbeats of the watched nodes."""
         return parameters.watch
 
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
-        """Hear how late a node was; before the run begins the system is starting."""
+        """Note how late a node was; before the run begins the system is starting."""
         now_s, begins_s = self.clock.now(), self.context.run.plan.begins_s
         self._pids[header.source] = self.context.local_pid(header.source, message.pid)
         late_s = max(message.late_s, self.came_s(header) - header.stamp)

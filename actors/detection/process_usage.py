@@ -62,12 +62,12 @@ class ProcessUsage(DetectionModule):
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
-        """Hear the heartbeats of the watched nodes, which say the number of their process."""
+        """Subscribe to the heartbeats of the watched nodes, which carry their process ids."""
         return parameters.watch
 
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
-        """Hear which process a node runs in."""
+        """Note which process a node runs in."""
         self._running[header.source] = (
             self.context.local_pid(header.source, message.pid), header.incarnation)
 

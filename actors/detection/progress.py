@@ -36,7 +36,7 @@ class ProgressMonitor(Finding):
     Args:
         what: is followed, for the reason.
         steps: all there are.
-        busy_at_most_s: how much longer a step may take that says it is busy.
+        busy_at_most_s: how much longer a step may take that reports to be busy.
         known_after_s: when idle may be claimed without anything heard; -inf for at once.
     """
 
@@ -89,7 +89,7 @@ class ProgressMonitor(Finding):
         self._has_missed = True
 
     def busy(self, until_s: float) -> None:
-        """Take note that the step says it is busy until then; what is no time counts as not."""
+        """Take note that the step is busy until then; a time that is not finite counts as never."""
         self._busy_until_s = until_s if math.isfinite(until_s) else -math.inf
 
     def expire(self, now_s: float) -> None:
@@ -110,10 +110,10 @@ class Progress(DetectionModule):
         """Which task, and its steps.
 
         Attributes:
-            value: where it says at which step it is, as "topic:field".
+            value: the step at which it is, as "topic:field".
             steps: all there are: `at` with `within_s` and `to`, see `Step`.
-            busy_until: where it says until when it is busy and must not be hurried, in simulated
-                seconds, as "topic:field"; "" if it never says so.
+            busy_until: until when it is busy and must not be hurried, in simulated seconds, as
+                "topic:field"; "" if it does not report that.
             busy_at_most_s: by how much that may exceed `within_s`, s.
             suspects: names of nodes to be respawned when it is active; none by default.
         """
@@ -125,7 +125,7 @@ class Progress(DetectionModule):
         suspects: Suspects = ()
 
         def __post_init__(self) -> None:
-            """Refuse steps that say nothing, or lead to none."""
+            """Refuse steps that contradict each other, or lead nowhere."""
             known = [step.at for step in self.steps]
             for step in self.steps:
                 if known.count(step.at) > 1:
@@ -134,7 +134,7 @@ class Progress(DetectionModule):
                     raise ValueError(f"steps: within_s of {step.at!r} must be above 0")
                 for at in step.to or ():
                     if at not in known:
-                        raise ValueError(f"steps: {step.at!r} leads to {at!r}, which is no step")
+                        raise ValueError(f"steps: {step.at!r} leads to {at!r}, which is not a step")
 
     parameters: Parameters
 

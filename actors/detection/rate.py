@@ -55,7 +55,7 @@ class RateMonitor(Sustained):
         self.expire(now_s)
 
     def missed(self, now_s: float) -> None:
-        """Count anew: messages may have come unheard."""
+        """Begin to count again: messages may have been missed."""
         self._heard.clear()
         self._from_s, self._is_first = now_s + self._window_s, True
 
@@ -118,7 +118,7 @@ class Rate(DetectionModule):
         self.hear_topic(said.topic, self.heard)
 
     def missed(self) -> None:
-        """Count anew."""
+        """Begin to count again."""
         self.monitor.missed(self.clock.now())
 
     def heard(self, _message: Any, header: Header) -> None:

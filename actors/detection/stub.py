@@ -30,7 +30,7 @@ class StubDetection(DetectionModule):
         margin_m: Positive | None = None
 
     def on_start(self) -> None:
-        """As a later incarnation, say at once that it was told nothing yet."""
+        """As a later incarnation, report at once that it has no order yet."""
         if not self.first_life:
             self.know_idle()
 

@@ -19,7 +19,7 @@ class Threshold(DetectionModule):
         """Which number, and its limits.
 
         Attributes:
-            value: of what, as "topic:field".
+            value: the number, as "topic:field".
             above: active when the number is greater.
             below: active when it is smaller; with both: when it is outside.
             absolute: whether its sign does not matter.

@@ -8,7 +8,7 @@ from typing import Any
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.detection.disagreement import apart
-from rampart.actors.detection.finding import Finding, Lasting
+from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import FieldName, Suspects
@@ -17,10 +17,10 @@ from rampart.manager.spec.tables import NonNegative, Positive
 _NOTHING = object()
 
 
-class UnchangedMonitor(Finding):
-    """Active from a message that says what has been said for `for_s`, until that changes again.
+class UnchangedMonitor(Sustained):
+    """Active from a message with the value of the last `for_s`, until that changes again.
 
-    It is judged when a message comes: who says nothing more is not unchanged but silent. A new
+    It is judged when a message comes: a sender that stops is not unchanged but silent. A new
     process of the sender is given `for_s` of its own.
 
     Args:
@@ -37,34 +37,29 @@ class UnchangedMonitor(Finding):
 
     def __init__(self, what: str, for_s: float, clear_s: float = 0.0, *, within: float = 0.0,
                  may_last: tuple[Any, ...] = (), known_after_s: float = -math.inf) -> None:
-        super().__init__(known_after_s)
+        super().__init__(0.0, clear_s, known_after_s)
         self._what, self._for_s = what, for_s
         self._within, self._may_last = within, may_last
-        self._changing = Lasting(clear_s)
         self._value: Any = _NOTHING
         self._since_s = math.inf
-        self.accused: tuple[str, ...] = ()
 
-    def heard(self, value: Any, now_s: float, *, anew: bool = False) -> None:
+    def heard(self, value: Any, now_s: float, *, renewed: bool = False) -> None:
         """Take note of a value.
 
         Args:
             value: a number, a text or a truth value.
             now_s: now.
-            anew: whether another process of its sender said the one before.
+            renewed: whether another process of its sender published the value before.
         """
         if value in self._may_last or not self._is_the_same(value):
             if self._value is not _NOTHING or value in self._may_last:
-                self.known = True
-                if self._changing.note(True, now_s):
-                    self.clear()
+                self.note("", now_s)
             self._value, self._since_s = value, now_s
-        elif anew:
+        elif renewed:
             self._since_s = now_s
         elif now_s - self._since_s >= self._for_s - 1e-9:
-            self.known = True
-            self._changing.forget()
-            self.reason, self.nodes = f"{self._what} is {self._value} all the time", self.accused
+            self.note(f"{self._what} is {self._value} all the time", now_s)
+            self.nodes = self.accused
         self._known_after_s = now_s + self._for_s  # of one value and then silence nothing follows
 
     def _is_the_same(self, value: Any) -> bool:
@@ -82,7 +77,7 @@ class Unchanged(DetectionModule):
         """Which field, and for how long.
 
         Attributes:
-            value: of what, as "topic:field".
+            value: the field, as "topic:field".
             for_s: how long it has to be the same, s; some periods of its topic.
             clear_s: how long it has to go on changing before the module is idle again, s.
             within: how far two numbers may be apart and still count as the same.
@@ -115,5 +110,5 @@ class Unchanged(DetectionModule):
         self.monitor.accused = self.accused(self.parameters.suspects, header)
         before = self._heard_of.get(header.source, header.incarnation)
         self._heard_of[header.source] = header.incarnation
-        self.monitor.heard(value, self.clock.now(), anew=before != header.incarnation)
+        self.monitor.heard(value, self.clock.now(), renewed=before != header.incarnation)
         self.follow()

@@ -3,7 +3,7 @@
 Two ways, which have nothing in common. The supervisor of the node's host sees what the kernel knows
 and publishes it: the process has ended, is stopped, or is silent although it could run. And the
 module receives the heartbeats itself: without one for twice the timeout the node has failed,
-whatever the supervisor says, and also when there is none. Twice, because the supervisor has the
+whatever the supervisor publishes, and also while it is dead. Twice, because the supervisor has the
 patience for a node that only waits for a processor (`rampart.actors.machine.patience`).
 
 Processes of a node are told apart by their incarnation. The end of one may be reported when the

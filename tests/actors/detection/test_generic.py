@@ -94,7 +94,7 @@ def followed(monitor: ProgressMonitor):
 
 def said_to(monitor: UnchangedMonitor):
     def handle(event: str, now_s: float) -> None:
-        monitor.heard(event.lower(), now_s, anew=event.isupper())
+        monitor.heard(event.lower(), now_s, renewed=event.isupper())
 
     return handle
 
@@ -363,7 +363,7 @@ def test_of_two_that_disagree_each_is_named_by_the_incarnation_that_was_heard():
     (Vote, {"values": ["a:b", "c:d"], "agree": 3}, "agree = 3: there are 2 values only"),
     (Progress, {"value": "a:b", "steps": [{"at": "x"}, {"at": "x"}]}, "'x' stands twice"),
     (Progress, {"value": "a:b", "steps": [{"at": "x", "to": ["z"]}, {"at": "y"}]},
-     "'x' leads to 'z', which is no step"),
+     "'x' leads to 'z', which is not a step"),
     (ProcessUsage, {"watch": ["a"]}, "memory_mb: missing"),
 ])
 def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, words):
