@@ -1,1 +1,1 @@
-"""The contract of fault tolerance: what detection, recovery, manager and supervision say."""
+"""The contract of fault tolerance: topics and messages of modules, manager and supervision."""

@@ -1,8 +1,8 @@
 """What is in force as long as there is a holder: the brake, a bound on the pilot.
 
-A holder that is no recovery module of the system is obeyed all the same: a brake on its word costs
+A holder that is not a recovery module of the system is obeyed all the same: its brake costs
 a mission, one that is not applied may cost more. But no recovery of the system will ever let go for
-it, so it is named as unknown, for somebody to see, and an operator can let go in its place
+it, so it is named as unknown, and an operator can let go in its place
 (`rampart reset NAME`). Of unknown holders so many are told apart; all above them are one, `OTHERS`.
 Pure.
 """
@@ -52,7 +52,7 @@ class Holders(Generic[V], dict[str, V]):
             self[OTHERS] = self._crowded
 
     def let_go(self, name: str) -> None:
-        """Have a holder let go; one that holds nothing may say so as well."""
+        """Have a holder let go; a holder that holds nothing changes nothing."""
         if name != OTHERS:
             self.pop(name, None)
 

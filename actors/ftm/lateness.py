@@ -1,4 +1,4 @@
-"""How late the loops of the nodes were, as their heartbeats say."""
+"""How late the loops of the nodes were, by their heartbeats."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Lateness:
         self._before: dict[str, float] = {}
 
     def note(self, node: str, late_s: float) -> None:
-        """Note what a heartbeat says."""
+        """Note a heartbeat."""
         if late_s > self._now.get(node, 0.0):
             self._now[node] = late_s
 

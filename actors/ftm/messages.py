@@ -1,7 +1,7 @@
-"""The contract of fault tolerance: what detection, recovery, manager and supervision say.
+"""The contract of fault tolerance: messages of detection, recovery, manager and supervision.
 
 One struct for each message, SI units; times are simulated seconds. Header data (source,
-incarnation, sequence, stamp) is not in these structs: the bus puts it round them
+incarnation, sequence, stamp) is not in these structs: the bus adds it
 (`rampart.actors.bus.envelope`). Every field is bounded by the types of `rampart.actors.bus.bounds`:
 a payload beyond the bounds never reaches an actor.
 """

@@ -1,6 +1,6 @@
 """Which stamps and readings are possible at all: what is not must do no harm, now or later.
 
-A stamp from the future would shut out all honest ones after it and stay fresh for ever. A number
+A stamp from the future would shut out all honest ones after it and stay fresh permanently. A number
 beyond all measure would overflow in a square, or stay in a sum for good. The checked and
 those who check them share these lines, as they share the envelope that refuses such stamps first.
 """

@@ -1,13 +1,13 @@
 """What all recovery modules have in common: states, obedience, reports.
 
-A recovery module does what the FTM Manager last told it, and says on `recovery/NAME/state` how
+A recovery module obeys the FTM Manager's last command, and publishes on `recovery/NAME/state` how
 far it is: at once when that changes, and five times a second.
 
 * *The same command again is one command.* The manager repeats what it wants; only a new decision
   number is a new order, given because the cause has come back.
 * *Never cut off half-way.* A release that arrives while the module is acting is obeyed as soon as
   the action is finished, has reached its degraded mode, or has failed.
-* *A respawned module starts idle.* The manager, who hears that, commands it again.
+* *A respawned module starts idle.* The manager sees that, and commands it again.
 
 Everything happens in the handler of the command itself, first the action, then the report:
 nothing between a decision and its effect waits for a timer.
@@ -42,10 +42,10 @@ failure.
 """
 
 DEFAULT_DEADLINE_S = 2.0
-"""From command to done, if no spec says."""
+"""From command to done, without a contract."""
 
 LATE_S = 0.1
-"""A deadline noticed this much late says that the module itself did not run."""
+"""A deadline noticed this much late shows that the module itself did not run."""
 
 _EPSILON_S = 1e-6
 
@@ -59,7 +59,7 @@ class IllegalTransitionError(RuntimeError):
 class RecoveryModule(Actor):
     """Base of every recovery module.
 
-    A subclass says what it does: `act` on each order, `let_go` when released. It calls
+    A subclass defines what it does: `act` on each order, `let_go` when released. It calls
     `succeed`, `degrade` or `fail` when it knows how the action went. The deadline is the one in
     the contract that the system spec gives for this module.
     """
@@ -83,7 +83,7 @@ class RecoveryModule(Actor):
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
-        """Hear the commands to itself."""
+        """Subscribe to its own commands."""
         return (name,) if topic is topics.RECOVERY_COMMAND else None
 
     @property
@@ -92,10 +92,10 @@ class RecoveryModule(Actor):
         return self.phase is not RecoveryPhase.IDLE
 
     def on_start(self) -> None:
-        """Say at once that it is there."""
+        """Report at once that it is there."""
         self._tell()
 
-    # -- what a subclass says -------------------------------------------------------------------
+    # -- what a subclass defines ----------------------------------------------------------------
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Take the action.
@@ -113,7 +113,7 @@ class RecoveryModule(Actor):
         """React to a release that finds it idle."""
 
     def unfinished(self) -> str:
-        """What is still to be done, for the report of a missed deadline; "" for no more words."""
+        """What is still to be done, for the report of a missed deadline."""
         return ""
 
     def repeat(self) -> None:

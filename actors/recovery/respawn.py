@@ -13,14 +13,15 @@ so that asking twice, or asking about a node that is back already, kills no proc
   supervisor, which holds the process's pidfd and knows better, respawns it or answers that it is
   there. This happens when this module was itself respawned and is commanded again, and when a
   stopped process was continued just in time.
-* A node that is well by all signs may be wrong all the same: a module that has compared what it
-  says names the incarnation, `NAME#INCARNATION`, and that one is accused, a later one is not.
+* A node that is well by all signs may be wrong all the same: a module that has compared its
+  messages names the incarnation, `NAME#INCARNATION`. That one is accused, a later one is not.
 * A new process that dies, or is not heard within a while, has failed as well: the next request
   names it. The supervisor counts, and gives up when there are too many.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
@@ -66,7 +67,7 @@ class _Node:
 
     heard_s: float
     incarnation: int = 0
-    gone_s: float | None = None
+    gone_s: float = -math.inf
     stage: Stage = Stage.NONE
     request: int = 0
     failed_incarnation: int = 0
@@ -113,11 +114,10 @@ class RespawnCore:
         self._strangers = tuple(name for name, _ in named if name not in self._nodes)
         for name, wrong in named:
             node = self._nodes.get(name)
-            if node is None:
-                continue
-            if node.stage is Stage.NONE or (node.stage is Stage.FAILED and renewed) or (
-                    node.stage is Stage.BACK
-                    and (self._has_failed(node, now_s) or wrong >= node.incarnation > 0)):
+            if node is not None and (
+                    node.stage is Stage.NONE or (node.stage is Stage.FAILED and renewed) or (
+                        node.stage is Stage.BACK and (
+                            self._has_failed(node, now_s) or wrong >= node.incarnation > 0))):
                 self._ask(name, node, now_s, wrong)
         return len(self._requests) > requests
 
@@ -140,12 +140,9 @@ class RespawnCore:
         node = self._nodes.get(name)
         if node is None or incarnation < node.incarnation:
             return
-        if incarnation == node.incarnation and node.gone_s is not None \
-                and stamp_s <= node.gone_s:
+        if incarnation == node.incarnation and stamp_s <= node.gone_s:
             return  # sent before it died, and under way since
-        node.incarnation = incarnation
-        node.gone_s = None
-        node.heard_s = now_s
+        node.incarnation, node.heard_s, node.gone_s = incarnation, now_s, -math.inf
         # A heartbeat that was under way when the order came proves nothing.
         if node.stage in (Stage.ASKED, Stage.STARTED, Stage.FAILED) \
                 and incarnation > node.failed_incarnation and stamp_s >= node.asked_s:
@@ -157,8 +154,8 @@ class RespawnCore:
         if node is None:
             return
         if incarnation > node.incarnation:
-            node.incarnation = incarnation
-            node.heard_s, node.gone_s = now_s, None  # not heard yet, but not overdue either
+            # Not heard yet, but not overdue either.
+            node.incarnation, node.heard_s, node.gone_s = incarnation, now_s, -math.inf
         if event in _LOST and incarnation == node.incarnation:
             node.gone_s = now_s
             if incarnation > node.failed_incarnation and node.stage in _WAITING:
@@ -172,7 +169,7 @@ class RespawnCore:
             node.problem = f"{name}: {event}{f', {detail}' if detail else ''}"
 
     def retry(self, now_s: float) -> None:
-        """Repeat requests that are unanswered; ask anew for a new process that is not heard."""
+        """Repeat unanswered requests; ask again for a new process without a heartbeat."""
         for name, node in self._nodes.items():
             if node.stage is Stage.ASKED:
                 self._request(name, node)
@@ -204,7 +201,7 @@ class RespawnCore:
         return "; ".join(problems)
 
     def _has_failed(self, node: _Node, now_s: float) -> bool:
-        return node.gone_s is not None or now_s - node.heard_s >= self._overdue_s
+        return node.gone_s > -math.inf or now_s - node.heard_s >= self._overdue_s
 
     def _ask(self, name: str, node: _Node, now_s: float, wrong: int = 0) -> None:
         failed = node.incarnation if self._has_failed(node, now_s) else node.incarnation - 1
@@ -244,7 +241,7 @@ class Respawn(RecoveryModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        # Whoever is silent for long enough to be reported is overdue here as well.
+        # A node that is silent for long enough to be reported is overdue here as well.
         overdue_s = min(_OVERDUE_S, _OVERDUE * context.run.system.timing.heartbeat_timeout_s)
         self._core = RespawnCore(
             self.name, self.parameters.nodes,
@@ -253,7 +250,7 @@ class Respawn(RecoveryModule):
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:
-        """Hear the heartbeats of its nodes."""
+        """Subscribe to the heartbeats of its nodes."""
         if topic is bus_topics.HEARTBEAT:
             return parameters.nodes
         return super().names(topic, name, parameters)
@@ -281,13 +278,13 @@ class Respawn(RecoveryModule):
 
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, _message: Heartbeat, header: Header) -> None:
-        """Hear that a node works."""
+        """Note that a node works."""
         self._core.beat(header.source, header.incarnation, header.stamp, self.came_s(header))
         self._settle()
 
     @on(topics.PROCESS_EVENT)
     def process_event(self, message: ProcessEvent, _header: Header) -> None:
-        """Hear what the supervisor did."""
+        """Note what the supervisor did."""
         self._core.event(message.node, message.event, message.incarnation, message.detail,
                          self.clock.now())
         self._settle()

@@ -12,7 +12,7 @@ from rampart.manager.spec.tables import NonNegative
 
 
 class StubRecovery(RecoveryModule):
-    """Acts for a while, and then reports what its parameters say."""
+    """Acts for a while, and then ends as its parameters specify."""
 
     class Parameters(RecoveryModule.Parameters, frozen=True):
         """What it does.

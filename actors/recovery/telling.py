@@ -169,7 +169,7 @@ class Call(_Telling):
             self._next()
 
     def let_go(self) -> None:
-        """Begin anew with the next order; nothing is to be taken back."""
+        """Begin again with the next order; nothing is to be taken back."""
         self._at = -1
 
     def unfinished(self) -> str:

@@ -73,7 +73,7 @@ class Hosts:
         return self._specs[host].address if self.several else ""
 
     def heard_by(self, host: str, nodes: Iterable[str]) -> tuple[str, ...]:
-        """Return whose heartbeats the supervisor of a host hears.
+        """Return the nodes whose heartbeats the supervisor of a host receives.
 
         Of its own routers and nodes, on the first host of all nodes, for it may have to run them,
         and of the guards of the others.

@@ -71,12 +71,12 @@ class Layout:
     Args:
         plan: of the run.
         spec: the system, as the plan leaves it.
-        application: of the run; without one, what it tells the world is missing.
+        application: of the run; without one, its parameters of the world are missing.
 
     Raises:
         ValueError: an actor class named in the spec does not exist, cannot be imported, belongs
-            into another table, or does not take its parameters; one hears what nobody publishes, or
-            publishes what another one does; the judge is none, or hears nothing.
+            into another table, or does not take its parameters; an actor receives what no
+            node publishes, or publishes what another one does; the judge is not a judge.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec,
@@ -437,7 +437,7 @@ def published_keys(spec: SystemSpec, layout: Layout | None = None) -> tuple[str,
     Raises:
         ValueError: the spec names an actor class that does not exist.
     """
-    global _last  # noqa: PLW0603 one entry, by identity: a spec is no key of a dictionary
+    global _last  # noqa: PLW0603 one entry, by identity: a spec cannot be a key of a dictionary
     if _last[0] is not spec:
         _last = spec, _published_keys(layout or Layout(RunPlan(system_file=spec.name), spec))
     return _last[1]
@@ -455,7 +455,7 @@ def _published_keys(layout: Layout) -> tuple[str, ...]:
     found: dict[str, None] = {}
     for member in members:
         for key, names in published(member).items():
-            # A node that may publish any member of a family publishes those that somebody hears.
+            # A node that may publish any member of a family publishes those that are received.
             chosen = wanted.get(key, {}) if names is None else names
             spelt = [key.replace("{name}", n) for n in chosen] if "{name}" in key else [key]
             found.update(dict.fromkeys(spelt))

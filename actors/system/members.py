@@ -1,4 +1,4 @@
-"""The actors of a system: their classes, loaded by name, and what each publishes and hears."""
+"""The actors of a system: their classes, loaded by name, and what each publishes and receives."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def published(member: Member) -> dict[str, Members]:
 def heard(member: Member) -> dict[str, Members]:
     """Return topic key → names of the family members heard (None: all, or not a family).
 
-    Without what every actor hears.
+    Without what every actor receives.
     """
     actor = member.actor
     return _together({
@@ -102,8 +102,8 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
     """Load the class of an actor, and read its parameters as that declares them.
 
     Args:
-        node: what the spec says of it.
-        spec: the system; to a module that respawns it says which nodes.
+        node: its row of the spec.
+        spec: the system; it names the nodes of a module that respawns.
         file: name of the spec, for messages.
         derived: parameters that it is given besides, if it takes them.
 
@@ -241,7 +241,7 @@ def judge_class(spec: SystemSpec) -> type[Handlers] | None:
 
 
 def judged_topics(spec: SystemSpec, observer: type[Handlers]) -> list[Topic[Any]]:
-    """Return the topics that the judge hears and the observer would not.
+    """Return the topics that the judge receives and the observer would not.
 
     Raises:
         ValueError: there is no such judge.

@@ -1,4 +1,4 @@
-"""Numbers that nobody has: TCP ports, and the base ports that tell runs apart."""
+"""Free numbers: TCP ports, and the base ports that tell runs apart."""
 
 from __future__ import annotations
 

@@ -27,8 +27,8 @@ class RealRun:
     At its end the run is ended, and no process of it may be left.
 
     Args:
-        directory: existing folder for what the run tells and reports; it is run there, so modules
-            of one's own may lie there.
+        directory: existing folder for output and report; the run's working directory, so custom
+            modules may lie there.
         system: path, or name of one that ships.
         arguments: more of the command line.
         hmi: whether it serves the operator's page.
@@ -71,7 +71,7 @@ class RealRun:
         return self._stderr.read_text()
 
     def story_from(self, byte: int) -> str:
-        """Return what it has told after so many bytes; a mission of many hits tells much."""
+        """Return what it has told after so many bytes; a long story is read once."""
         with self._stderr.open("rb") as told:
             told.seek(byte)
             return told.read().decode(errors="replace")
@@ -97,7 +97,7 @@ class RealRun:
 
     @property
     def info(self) -> RunInfo:
-        """What the run says of itself to tools; waits until it is up."""
+        """What the run publishes of itself to tools; waits until it is up."""
         self.wait_until(lambda: any(r.base_port == self.port for r in find_runs()), 30,
                         "the run did not come up")
         return next(r for r in find_runs() if r.base_port == self.port)
@@ -137,7 +137,7 @@ class RealRun:
         """Wait for the end and return exit code and result.
 
         Raises:
-            AssertionError: it tells no result.
+            AssertionError: it prints no result.
             subprocess.TimeoutExpired: it does not end within `timeout_s`.
         """
         code = self.process.wait(timeout_s)

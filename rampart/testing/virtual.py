@@ -57,7 +57,7 @@ async def turns(count: int = 60) -> None:
 
 
 class Heard(NamedTuple, Generic[M]):
-    """A message as a tester hears it: when (simulated seconds), on which key, from whom, what."""
+    """A message as a tester receives it: when (simulated seconds), on which key, from whom."""
 
     time_s: float
     key: str
@@ -66,10 +66,10 @@ class Heard(NamedTuple, Generic[M]):
 
 
 class VirtualSystem:
-    """Actors on one virtual bus, and a tester who starts, kills, hears, speaks and injects faults.
+    """Actors on one virtual bus, and a tester who starts, kills and disturbs them.
 
-    An asynchronous context manager within `run`. Who still lives at its end is killed; what an
-    actor raised that ended by itself, and was not killed or stopped since, is raised there.
+    An asynchronous context manager within `run`. Actors that live at its end are killed; an error
+    by which an actor ended, that was not killed or stopped since, is raised there.
 
     Args:
         context: what all actors have in common; by default no system and no application.
@@ -103,7 +103,7 @@ class VirtualSystem:
 
     @classmethod
     def load(cls, system: str | Path, **plan: Any) -> VirtualSystem:
-        """Return the system of a file, or of the name of one that ships; nobody is started yet.
+        """Return the system of a file, or of the name of a shipped one; no node is started yet.
 
         Args:
             system: path or name.
@@ -162,7 +162,7 @@ class VirtualSystem:
         return actor
 
     def start_node(self, name: str, *others: Any, **parameters: Any) -> Actor:
-        """Start a node as the file of the system says, with some parameters changed.
+        """Start a node as the file of the system specifies, with some parameters changed.
 
         Raises:
             LookupError: the system has no node of this name, or no file.
@@ -170,7 +170,7 @@ class VirtualSystem:
         if self.layout is None or name not in self.layout.members:
             raise LookupError(f"no node {name!r} in the file of this system")
         member = self.layout.members[name]
-        # What a file must not say may be the default all the same.
+        # A value that a file must not contain may be the default all the same.
         given = {field.name: value for field in msgspec.structs.fields(member.parameters)
                  if (value := getattr(member.parameters, field.name)) != field.default}
         return self.start(name, member.actor, *others, **{**given, **parameters})
@@ -232,8 +232,8 @@ class VirtualSystem:
 
         Args:
             topic: a family of topics needs a member, by default the source.
-            message: what is said.
-            source: who is said to say it.
+            message: what is published.
+            source: name of the node that publishes.
             member: name in the key of a family.
             incarnation: of the source.
             stamp_s: simulated seconds; by default now.
