@@ -33,11 +33,10 @@ from rampart.actors.supervision.root import Root
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import load_application
 from rampart.actors.system.topics import system_topics
-from rampart.actors.web.page_plan import PagePlan
 from rampart.cli.host import HostRun
 from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.page_options import audited
-from rampart.cli.run_options import ERROR_LOG, MAX_RATE, of_one_process, parse, plan_of, refuse
+from rampart.cli.run_options import ERROR_LOG, of_one_process, parse, plan_of, refuse
 from rampart.files import interrupts, streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec
@@ -45,7 +44,6 @@ from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import action_of, parse_fault
 from rampart.sim.runs.process_run import ProcessRun
-from rampart.sim.runs.rate_search import find_rate, first_rate, probe_run
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import in_words
 from rampart.sim.runs.resumption import (
@@ -138,8 +136,6 @@ class Run:
                     files.unlock()
 
     async def _watch(self, link: socket.socket) -> int:
-        if self._options.rate == MAX_RATE:
-            await self._find_rate()
         keep = None
         if self._files is not None:
             self._files.save(msgspec.structs.replace(self._manifest, rate=self._plan.rate))
@@ -190,18 +186,6 @@ class Run:
         options, kind = self._options, self._kind
         return kind(replace(self._context, plan=plan),
                     options.patience if kind.patient else options.duration, stream)
-
-    async def _find_rate(self) -> None:
-        """Take the rate with which this machine keeps up."""
-        def trial(rate: float, run_id: str) -> Trial:
-            plan = msgspec.structs.replace(
-                self._plan, rate=rate, run_id=run_id, checkpoints="", page=PagePlan(), waits=False)
-            return self._made(plan, None)
-
-        rate = await find_rate(partial(probe_run, trial), _say, first_rate())
-        _say(f"--rate max: {rate:g} is taken")
-        self._plan = msgspec.structs.replace(self._plan, rate=rate)
-        self._trial = self._made(self._plan, sys.stderr)
 
     async def _on_processes(self, run: ProcessRun) -> int:
         with _recorded(self._options, self._plan, self._trial.run.system) as recorder:
@@ -399,8 +383,6 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
                 lasting = [*before.arguments, *lasting]
                 given = [*before.arguments, *given, "--report", str(files.directory)]
             options, kind = parse(given, program)
-            if resumed is not None and options.rate == MAX_RATE:
-                options.rate = resumed[1].rate
             plan, spec = plan_of(options, kind, _say)
             run = None if plan.host else Run(options, plan, spec, reports, arguments=lasting,
                                              resumed=resumed)

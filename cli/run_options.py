@@ -52,24 +52,16 @@ from rampart.files import working_folder
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.faults.faults import faults_of
-from rampart.sim.runs.rate_search import LEAST, MOST
 from rampart.sim.virtual.network import NETWORKS
 
 ERROR_LOG = "errors.log"
 HMI = "rampart.actors.operator.hmi:Hmi"
 
-MAX_RATE = "max"
+LEAST_RATE, MOST_RATE = 0.1, 20
+"""Simulated seconds per second that can be asked for."""
 
 SOON = dt.timedelta(days=1)
 """Who starts a run is told of a certificate that expires sooner."""
-
-
-def _rate(text: str) -> float | str:
-    try:
-        return MAX_RATE if text == MAX_RATE else float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: a number from {LEAST:g} to {MOST:g} is right, or {MAX_RATE}") from None
 
 
 _EXAMPLES = (
@@ -93,9 +85,7 @@ _OPTIONS = (
          "says so (default: the system's)", ""),
     flag("--no-ftm", "run the paper's unprotected baseline: last command kept, no dead man, no "
          "respawn"),
-    option("--rate", type=_rate, metavar="R", default=1.0, help="simulated seconds per second, or "
-           f"{MAX_RATE}: as many as this machine keeps up with, which short runs find out before "
-           "(default: 1)"),
+    number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
     whole("--seed", "N", "for sensor noise (default: 1)", 1),
     flag("--no-hmi", "no operator's page (its node still runs)"),
     *page_options.OPTIONS,
@@ -226,7 +216,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
     token = page_options.own_token(options)
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port,
-        rate=1.0 if options.rate == MAX_RATE else options.rate,
+        rate=options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
         shadow=options.shadow, waits=options.wait, virtual=options.virtual, host=host)
@@ -308,11 +298,7 @@ def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    if options.rate != MAX_RATE:
-        between("--rate", options.rate, LEAST, MOST)
-    elif options.virtual:
-        raise UsageError(f"--rate {MAX_RATE}: only on real processes; virtual time has no rate, it "
-                         "is always as fast as it can be")
+    between("--rate", options.rate, LEAST_RATE, MOST_RATE)
     positive("--duration", options.duration, below=1e9)
     positive("--patience", options.patience)
     if options.record:

@@ -3,15 +3,13 @@
 A stored result stands for a run only as long as all of it is the same. So the digest is part of
 the job, and with it of the key under which the result is found again. It covers the specification
 as it was read, the application's files, files that specification and options name, the code of the
-system's own modules with what they import of their own, and the engine.
+packages of the system's own classes, and the engine.
 """
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import importlib.util
-import sysconfig
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from importlib.metadata import version
@@ -94,47 +92,15 @@ def _named(value: Any, beside: Path) -> Iterator[Path]:
 
 
 def _sources(modules: Iterable[str]) -> set[Path]:
-    """Return the files of modules of the user's own, and of those that they import likewise."""
-    left = sorted(modules)
-    own = {name.partition(".")[0] for name in left}
-    seen: set[str] = set()
+    """Return the code of modules of the user's own: their packages, or the files beside them."""
     found: set[Path] = set()
-    while left:
-        name = left.pop()
-        if name in seen or name.partition(".")[0] == "rampart":
-            continue
-        seen.add(name)
-        file = _file_of(name)
-        if file is None or (name.partition(".")[0] not in own and _is_installed(file)):
-            continue
-        found.add(file)
-        package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-        left += [*_imports(file, package), *([name.rpartition(".")[0]] if "." in name else [])]
-    return found
-
-
-def _file_of(module: str) -> Path | None:
-    try:
-        spec = importlib.util.find_spec(module)
-    except (ImportError, ValueError, AttributeError):
-        return None  # `from package import name`, where the name is no module
-    file = Path(spec.origin) if spec is not None and spec.origin else None
-    return file.resolve() if file is not None and file.suffix == ".py" else None
-
-
-def _is_installed(file: Path) -> bool:
-    """Tell whether a file is of the standard library or another package."""
-    return any(file.is_relative_to(Path(path).resolve())
-               for name, path in sysconfig.get_paths().items() if name in {
-                   "stdlib", "platstdlib", "purelib", "platlib"})
-
-
-def _imports(file: Path, package: str) -> Iterator[str]:
-    """Yield the names of what a module imports, those that are none included."""
-    for node in ast.walk(ast.parse(file.read_bytes())):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
-            yield base
-            yield from (f"{base}.{alias.name}" for alias in node.names)
+    for top in {name.partition(".")[0] for name in modules} - {"rampart"}:
+        spec = importlib.util.find_spec(top)
+        if spec is not None and spec.origin:
+            file = Path(spec.origin)
+            found |= set(file.parent.rglob("*.py") if spec.submodule_search_locations else
+                         file.parent.glob("*.py"))
+        elif spec is not None:
+            found |= {path for folder in spec.submodule_search_locations or ()
+                      for path in Path(folder).rglob("*.py")}
+    return {path.resolve() for path in found}

@@ -80,22 +80,6 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         return ", ".join(fault.text() for fault in self.faults) or "no fault"
 
 
-def job_of(stored: dict[str, Any]) -> Job:
-    """Return a job as it was kept in a campaign's store or in a counterexample's file.
-
-    In version 0.6 the options of the application were fields of the job.
-
-    Raises:
-        msgspec.ValidationError: it is none.
-    """
-    options = {name: stored[name] for name in stored if name not in Job.__struct_fields__}
-    if not options:
-        return msgspec.convert(stored, Job)
-    return msgspec.convert(
-        {name: value for name, value in stored.items() if name not in options}
-        | {"options": {name: value for name, value in options.items() if value}}, Job)
-
-
 class DecisionTaken(msgspec.Struct, frozen=True, array_like=True):
     """A decision of the manager: when, for whom, what."""
 

@@ -6,12 +6,12 @@ import contextlib
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
 from rampart.files.plain_text import shown
-from rampart.sim.campaign.job import Job, RunResult, job_of, trial_of_system
+from rampart.sim.campaign.job import Job, RunResult
 
 FILE_NAME = "runs.sqlite"
 
@@ -21,7 +21,7 @@ create table if not exists runs (
     key text primary key, job blob not null, result blob not null,
     finished_at text not null default current_timestamp);
 """
-_FORMAT, _FORMAT_06 = "2", "1"
+_FORMAT = "2"
 
 MAX_VALUE_BYTES = 16 << 20
 """Of a job or a result; those of the paper's campaign have some kilobytes."""
@@ -45,11 +45,10 @@ class Store:
     method raises `StoreError` when the file cannot be read or written.
 
     Args:
-        directory: Of the campaign; it is made if need be. A store of version 0.6 is read as it is;
-            its runs are not taken for those of today's jobs, whose keys are others.
+        directory: Of the campaign; it is made if need be.
 
     Raises:
-        StoreError: There is a file that is no store, or one of a later version.
+        StoreError: There is a file that is no store, or one of another version.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -75,8 +74,7 @@ class Store:
             raise StoreError(f"{self.path}: no store of campaign results: {error}") from None
         if foreign is not None:  # what it computes nobody bounds
             raise StoreError(f"{self.path}: no store of campaign results: it has a view or trigger")
-        self._format = found
-        if found not in {_FORMAT, _FORMAT_06}:
+        if found != _FORMAT:
             raise StoreError(f"{self.path}: format {shown(found)}, this program reads {_FORMAT}; "
                              "choose another --out")
 
@@ -96,9 +94,6 @@ class Store:
             StoreError: it cannot be written.
         """
         with self._using(), self._database:
-            if self._format != _FORMAT:  # from now on version 0.6 cannot read it
-                self._database.execute("update about set value = ? where name = 'format'",
-                                       (_FORMAT,))
             self._database.execute(
                 "insert or ignore into runs (key, job, result) values (?, ?, ?)",
                 (job.key, msgspec.msgpack.encode(job), msgspec.msgpack.encode(result)))
@@ -145,8 +140,5 @@ _NO_RUN = (ValueError, TypeError, LookupError, RecursionError, OSError)
 
 
 def _run(job: bytes, result: bytes) -> Run:
-    made = job_of(msgspec.msgpack.decode(job, type=dict[str, Any]))
-    values = msgspec.msgpack.decode(result, type=dict[str, Any])
-    if "margins" not in values:  # of version 0.6
-        values = trial_of_system(made.system).upgraded(values)
-    return Run(made, msgspec.convert(values, RunResult))
+    return Run(msgspec.msgpack.decode(job, type=Job),
+               msgspec.msgpack.decode(result, type=RunResult))

@@ -260,11 +260,6 @@ class Trial:
         del spec, searched
         return None
 
-    @classmethod
-    def upgraded(cls, result: dict[str, Any]) -> dict[str, Any]:
-        """Return a result that a campaign of version 0.6 stored, with the fields of today."""
-        return result
-
     def report(self, record: RunRecord, directory: Path) -> Written:
         """Write as much of a report as can be written."""
         return try_report(record, lambda run: render(run, self.title, self._margins(run)),

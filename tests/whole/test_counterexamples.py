@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from rampart.sim.campaign.job import job_of, run_job
+from rampart.sim.campaign.job import Job, run_job
 
-FOUND = {file.stem: job_of(msgspec.toml.decode(file.read_bytes()))
+FOUND = {file.stem: msgspec.toml.decode(file.read_bytes(), type=Job)
          for file in sorted((Path(__file__).parent / "counterexamples").glob("*.toml"))}
 
 

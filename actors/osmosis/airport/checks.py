@@ -9,7 +9,6 @@ import numpy as np
 import shapely
 
 from rampart.actors.osmosis.airport.errors import Problem
-from rampart.actors.osmosis.airport.limits import MAX_GOALS_BY_EDGES, sides
 from rampart.actors.osmosis.airport.model import GRAPH_REACH_M, Airport, Mission, repeated
 
 MIN_EDGE_CLEARANCE_M = 0.5
@@ -25,7 +24,6 @@ def problems(airport: Airport) -> Iterator[Problem]:
     yield from _ground(airport)
     yield from _lights(airport)
     yield from _obstacles(airport)
-    yield from _search(sum(len(m.goals) for m in airport.missions.values()), "missions", airport)
     for mission in airport.missions.values():
         yield from mission_problems(mission, airport)
 
@@ -42,12 +40,6 @@ def _graph(airport: Airport) -> Iterator[Problem]:
     for pair in repeated(frozenset(edge) for edge in airport.edges if edge[0] != edge[1]):
         yield Problem("edges", " to ".join(sorted(pair)), "edge given twice; once is enough",
                       tolerable=True)
-
-
-def _search(goals: int, where: str, airport: Airport) -> Iterator[Problem]:
-    if goals * len(airport.edges) > MAX_GOALS_BY_EDGES:
-        yield Problem(where, f"{goals} goals on {len(airport.edges)} edges",
-                      f"their product must be at most {MAX_GOALS_BY_EDGES}")
 
 
 def _ground(airport: Airport) -> Iterator[Problem]:
@@ -78,7 +70,10 @@ def _edges(airport: Airport, inside: set[str]) -> Iterator[Problem]:
         np.reshape([(airport.nodes[a], airport.nodes[b]) for _, a, b in edges], (-1, 2, 2)))
     paved = shapely.covers(airport.allowed, lines)
     rings = shapely.get_rings(shapely.get_parts(airport.allowed))
-    _, clear_m = shapely.STRtree(sides(rings)).query_nearest(
+    corners = [shapely.get_coordinates(ring) for ring in rings]
+    sides = shapely.linestrings(np.concatenate(
+        [np.stack([ring[:-1], ring[1:]], axis=1) for ring in corners]))
+    _, clear_m = shapely.STRtree(sides).query_nearest(
         lines, all_matches=False, return_distance=True)
     for (i, a, b), is_paved, distance_m in zip(edges, paved, clear_m, strict=True):
         if not is_paved:
@@ -130,7 +125,6 @@ def mission_problems(mission: Mission, airport: Airport) -> Iterator[Problem]:
     where = f"missions.{mission.name}"
     if not mission.goals:
         yield Problem(where, "empty", "a mission needs at least one goal")
-    yield from _search(len(mission.goals), where, airport)
     off = _off_pavement(airport, [(goal.x_m, goal.y_m) for goal in mission.goals])
     for i, goal in enumerate(mission.goals):
         at = f"({goal.x_m:g}, {goal.y_m:g})"

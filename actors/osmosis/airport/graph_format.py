@@ -22,7 +22,6 @@ from shapely.geometry import MultiPoint, MultiPolygon
 
 from rampart.actors.osmosis.airport import limits, model
 from rampart.actors.osmosis.airport.errors import AirportError, readable
-from rampart.actors.osmosis.airport.limits import check_count
 from rampart.actors.osmosis.airport.mask import MaskScale, allowed_area
 from rampart.actors.osmosis.airport.model import Airport, Mission, Point
 from rampart.files.plain_text import shown
@@ -57,7 +56,6 @@ def read_airport(graph: Path, scale: MaskScale | None = None) -> Airport:
     (x_m, y_m), (to_x, to_y) = nodes[first], nodes[second]
     missions: dict[str, Mission] = {}
     files = sorted(graph.parent.glob("*.miss"))
-    check_count(str(graph.parent), "*.miss", len(files), limits.MAX_COUNTS["missions"])
     for path in files:
         mission = read_mission(path)
         if mission.name in missions:
@@ -94,8 +92,6 @@ def read_graph(path: Path) -> tuple[dict[str, Point], tuple[tuple[str, str], ...
     if not isinstance(table, dict) or not all(
             isinstance(table.get(key), list) for key in ("nodes", "edges")):
         raise AirportError(f"{path}: file: {shown(table)}: needs the lists nodes and edges")
-    for key in ("nodes", "edges"):
-        check_count(str(path), key, len(table[key]), limits.MAX_COUNTS[key])
     nodes: dict[str, Point] = {}
     for i, entry in enumerate(table["nodes"]):
         name, at = _node(entry, f"{path}: nodes[{i}]")
@@ -126,7 +122,6 @@ def read_mission(path: Path) -> Mission:
     for number, line in enumerate(_text(path).splitlines(), start=1):
         if line.strip():
             goals.append(_goal(line, f"{path}: line {number}"))
-            check_count(str(path), "goals", len(goals), limits.MAX_GOALS)
     if not goals:
         raise AirportError(f"{path}: goals: empty: give lines such as x=20,y=-57,taxi=1")
     return Mission(path.stem.removeprefix("MISSION_"), tuple(goals))

@@ -15,7 +15,6 @@ from shapely.validation import explain_validity
 
 from rampart.actors.osmosis.airport import limits, model
 from rampart.actors.osmosis.airport.errors import AirportError, Problem, readable
-from rampart.actors.osmosis.airport.limits import check_count, check_nearness
 from rampart.actors.osmosis.airport.model import Name, Point, Record
 from rampart.actors.osmosis.airport.world import WorldTruth
 from rampart.files import toml
@@ -82,7 +81,9 @@ def read_airport(path: Path) -> tuple[model.Airport, WorldTruth]:
         AirportError: unreadable, not TOML, a wrong field, or a shape that is none.
     """
     file, name = _convert(path, _File), str(path)
-    _count(file, name)
+    lights = sum(max(row.count or 0, len(row.positions or ())) for row in file.row)
+    if lights > limits.MAX_LIGHTS:
+        raise _error(name, "row", f"{lights} lights", f"at most {limits.MAX_LIGHTS} in all rows")
     surfaces = _surfaces(file.surface, name)
     prohibited = [_polygon(area.polygon, f"prohibited[{i}].polygon", name)
                   for i, area in enumerate(file.prohibited)]
@@ -97,18 +98,13 @@ def read_airport(path: Path) -> tuple[model.Airport, WorldTruth]:
     # A building stands on no pavement the robot may use, wherever it stands.
     solid = [building.polygon for building in file.building]
     pavement = [part.polygon for part in surfaces]
-    check_nearness(name, "surface, prohibited and building", [*pavement, *prohibited, *solid], 0.0,
-                   limits.MAX_CROSSINGS)
     allowed = shapely.unary_union(pavement)
-    if file.fillet_radius_m > 0:
-        check_nearness(name, "fillet_radius_m", [allowed], 2 * file.fillet_radius_m,
-                       limits.MAX_NEAR_IN_FILLET)
     allowed = model.rounded(allowed, file.fillet_radius_m)
     allowed = allowed.difference(shapely.unary_union([*prohibited, *solid]))
-    lights = tuple(light for i, row in enumerate(file.row) for light in _lights(row, i, name))
+    placed = tuple(light for i, row in enumerate(file.row) for light in _lights(row, i, name))
     missions = {key: model.Mission(key, mission.goals) for key, mission in file.missions.items()}
     airport = model.Airport(file.name, file.nodes, file.edges, allowed, file.start, surfaces,
-                            file.building, lights, missions, file.obstacle)
+                            file.building, placed, missions, file.obstacle)
     return airport, _truth(file.world, airport, name)
 
 
@@ -119,7 +115,6 @@ def read_mission(path: Path) -> model.Mission:
         AirportError: as `read_airport`.
     """
     mission: model.Mission = _convert(path, model.Mission)
-    check_count(str(path), "goals", len(mission.goals), limits.MAX_GOALS)
     return mission
 
 
@@ -190,21 +185,8 @@ def _check_numbers(value: Any, path: str, file: str) -> None:
             _check_numbers(part, f"{path}[{i}]", file)
 
 
-def _count(file: _File, name: str) -> None:
-    """Refuse more of anything than there may be, before anything is built of it."""
-    for table, most in limits.MAX_COUNTS.items():
-        check_count(name, table, len(getattr(file, table)), most)
-    check_count(name, "goals of all missions",
-                sum(len(mission.goals) for mission in file.missions.values()), limits.MAX_GOALS)
-    check_count(name, "lights of all rows", sum(
-        max(row.count or 0, len(row.positions or ())) for row in file.row), limits.MAX_LIGHTS)
-    points = [*(part.polygon or part.centre_line or () for part in file.surface),
-              *(area.polygon for area in file.prohibited)]
-    check_count(name, "points of all outlines", sum(map(len, points)), limits.MAX_POINTS)
-
-
 def _surfaces(parts: list[_Surface], file: str) -> tuple[model.Surface, ...]:
-    near, surfaces = 0, []
+    surfaces = []
     for i, part in enumerate(parts):
         where, half_m = f"surface[{i}]", part.half_width_m
         if (part.polygon is None) == (part.centre_line is None):
@@ -218,8 +200,6 @@ def _surfaces(parts: list[_Surface], file: str) -> tuple[model.Surface, ...]:
             raise _error(file, f"{where}.half_width_m", half_m, "must be positive")
         else:
             line = LineString(part.centre_line)
-            near += check_nearness(file, f"{where}.centre_line", [line], 2 * half_m,
-                                   limits.MAX_NEAR_IN_STRIPS - near)
             shape = line.buffer(half_m, cap_style="flat" if part.kind == "runway" else "round")
         surfaces.append(model.Surface(part.name, part.kind, shape))
     return tuple(surfaces)

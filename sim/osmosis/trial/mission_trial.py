@@ -18,7 +18,7 @@ from rampart.actors.runtime.run_context import RunContext
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
-from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder, severity
+from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
 from rampart.sim.osmosis.trial.report import headline, render
 from rampart.sim.osmosis.trial.run_end import RunEnd
 from rampart.sim.runs.console import Console
@@ -160,13 +160,6 @@ class MissionTrial(Trial):
         """Return moments within every mission of the shipped airport; a search goes further."""
         del spec
         return 2.0, 150.0 if searched else 120.0
-
-    @classmethod
-    def upgraded(cls, result: dict[str, Any]) -> dict[str, Any]:
-        """Return a result with its clearances as margins, collisions and trespass as severity."""
-        margins = {name: result.pop(name) for name in cls.margins}
-        bad = severity(result.pop("prohibited_s"), result.pop("collisions"))
-        return {**result, "margins": margins, "severity": bad}
 
     def report(self, record: RunRecord, directory: Path) -> Written:
         """Write as much of the inspection report as can be written."""
