@@ -274,7 +274,7 @@ class HostSupervisor(Supervisor):
 
     def _settle(self, process: HeldProcess) -> None:
         """Have the states of a process that was handed over looked at when it has ended."""
-        if not process.handle.gone():
+        if process.asks or not process.handle.gone():
             self.call_later(_ENDING_S * self.clock.rate, partial(self._settle, process))
             return
         process.let_go()

@@ -14,10 +14,9 @@ import signal
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.bus import Bus, BusError
@@ -68,16 +67,12 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
     clock = clock_of(layout.plan, loop.time)
     bus = bus or _bus_of(layout, name)
 
-    def renewed(incarnation: int) -> None:
-        set_title(layout.plan.base_port, layout.plan.launcher_pid, (name,), incarnation)
-        issue(layout.plan.folder, (name,), incarnation, process_id(os.getpid()))
-
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s,
-        renewed=renewed, failed=failed,
+        renewed=partial(_take_place, layout, (name,)), failed=failed,
         is_here=partial(is_here, layout.plan.folder),
         members=frozenset((*layout.members, *layout.routers)), topics=layout.topics,
         command_age_s=layout.hosts.command_age_s))
@@ -116,20 +111,14 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
                            plan.part * OF_A_PART + incarnation)
 
 
-@dataclass(frozen=True)
-class Role:
-    """Who a process is to be.
-
-    Attributes:
-        names: of the actors.
-        incarnation: of the process.
-        born: called when it has its title, before it does anything that others see; it may not
-            return, if the process is not wanted any more.
-    """
+class Role(NamedTuple):
+    """Which actors a process runs, and its incarnation."""
 
     names: tuple[str, ...]
     incarnation: int
-    born: Callable[[], None] = lambda: None
+
+    def __str__(self) -> str:
+        return f"{'+'.join(self.names)} #{self.incarnation}"
 
 
 async def live(layout: Layout, role: Role, run: RunContext, bus: ZenohBus | None = None) -> int:
@@ -142,16 +131,14 @@ async def live(layout: Layout, role: Role, run: RunContext, bus: ZenohBus | None
         bus: open already, if there is one.
     """
     told: list[Exception] = []
-    who = f"{'+'.join(role.names)} #{role.incarnation}"
 
     def tell(error: Exception) -> None:  # at once: what replaces this process may kill it
         told.append(error)
-        complain(f"{who} failed: {type(error).__name__}: {error}")
-        _log_traceback(layout.plan.error_log, who, error)
+        complain(f"{role} failed: {type(error).__name__}: {error}")
+        _log_traceback(layout.plan.error_log, str(role), error)
 
     try:
-        set_title(layout.plan.base_port, layout.plan.launcher_pid, role.names, role.incarnation)
-        role.born()
+        _take_place(layout, *role)
         if any(node.kind is Kind.WORLD for node in layout.spec.nodes if node.name in role.names):
             go_first()
         signal.signal(signal.SIGUSR2, wedge)
@@ -167,11 +154,16 @@ async def live(layout: Layout, role: Role, run: RunContext, bus: ZenohBus | None
     return EXIT_OK
 
 
+def _take_place(layout: Layout, names: tuple[str, ...], incarnation: int) -> None:
+    """Have others know this process as that of its nodes."""
+    set_title(layout.plan.base_port, layout.plan.launcher_pid, names, incarnation)
+    issue(layout.plan.folder, names, incarnation, process_id(os.getpid()))
+
+
 async def _run_actors(layout: Layout, role: Role, run: RunContext,
                       failed: Callable[[Exception], None], bus: ZenohBus | None) -> None:
     loop = asyncio.get_running_loop()
-    tell_of_callbacks(
-        loop, lambda line: complain(f"{'+'.join(role.names)} #{role.incarnation}: {line}"))
+    tell_of_callbacks(loop, lambda line: complain(f"{role}: {line}"))
     buses = {name: _bus_of(layout, name, bus if name == role.names[0] else None)
              for name in role.names}
     actors = [make_actor(layout, name, role.incarnation, run, loop, failed=failed, bus=one)

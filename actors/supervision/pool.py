@@ -4,16 +4,12 @@ The root forks them ahead of time, and each opens its session on the bus. That i
 a new process takes. In a run with keys the session is the node's, by whose key it is opened; such a
 process has Zenoh loaded only.
 
-A process of the pool that is stopped is ended at once. One that hangs does not take its request
-within `_TAKE_S`: it is killed, and the next process gets the request when it is gone. So no request
-leads to two processes.
+A process of the pool that is stopped is ended at once.
 """
 
 from __future__ import annotations
 
 import asyncio
-import os
-import select
 import selectors
 import socket
 import time
@@ -22,7 +18,6 @@ from collections.abc import Awaitable, Callable
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
-from rampart.actors.machine.unix_peer import process_state
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.requests import REQUEST_BYTES
@@ -33,10 +28,7 @@ _PAUSE_S = 0.25
 _PAUSE_MAX_S = 8.0
 """... this, if the one before ended by itself."""
 
-_TAKE_S, _GONE_S = 0.01, 0.05
-"""Within which a process takes a request, and is gone when it was killed."""
-
-_READY, _TAKEN = b"ready", b"taken"
+_READY = b"ready"
 
 
 class Pool:
@@ -58,27 +50,18 @@ class Pool:
         self._pause_s = _PAUSE_S
         self._since_s = time.monotonic()
 
-    def take(self, request: bytes, answer: socket.socket) -> int:
-        """Give a request to a process of the pool and return its number; 0 if none is ready.
-
-        Raises:
-            OSError: one may have the request or not; it is to be made again.
-        """
+    def take(self, request: bytes) -> int:
+        """Give a request to a process of the pool and return its number; 0 if none is ready."""
         self._since_s = time.monotonic()
         while self._ready:
             pid = self._ready[0]
-            connection = self._waiting[pid]
             try:
-                if process_state(pid) not in "TtXZ":
-                    socket.send_fds(connection, [request], [answer.fileno()])
-                    if _is_readable(connection.fileno(), _TAKE_S) and connection.recv(1):
-                        self._forget(pid)
-                        return pid
+                self._waiting[pid].send(request)
             except OSError:  # it has just ended
-                pass
-            self.remove(pid)
-            if not _has_ended(pid):
-                raise TimeoutError("a process of the pool does not end")
+                self.remove(pid)
+            else:
+                self._forget(pid)
+                return pid
         return 0
 
     def look(self) -> float | None:
@@ -138,27 +121,8 @@ class Pool:
         self._pause_s = min(2 * self._pause_s, _PAUSE_MAX_S)
 
 
-def _has_ended(pid: int) -> bool:
-    """Wait for the end of a process that was killed; False if that takes too long."""
-    try:
-        ended = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return True
-    try:
-        return _is_readable(ended, _GONE_S)
-    finally:
-        os.close(ended)
-
-
-def _is_readable(descriptor: int, within_s: float) -> bool:
-    poll = select.poll()
-    poll.register(descriptor, select.POLLIN)
-    return bool(poll.poll(1000 * within_s))
-
-
-Become = Callable[[bytes, socket.socket, ZenohBus | None], Awaitable[int]]
-"""Given a request, the socket for the answer, and the open bus, if there is one: runs that process
-and returns its exit code."""
+Become = Callable[[bytes, ZenohBus | None], Awaitable[int]]
+"""Given a request, and the open bus, if there is one: runs that process; returns its exit code."""
 
 
 async def wait(control: socket.socket, plan: RunPlan, become: Become) -> int:
@@ -179,17 +143,13 @@ async def wait(control: socket.socket, plan: RunPlan, become: Become) -> int:
     try:
         control.send(_READY)
         await readable.wait()
-        request, descriptors, _, _ = socket.recv_fds(control, REQUEST_BYTES, 1)
-        if descriptors:
-            control.send(_TAKEN)
+        request = control.recv(REQUEST_BYTES)
     except OSError:
         return 0
     finally:
         loop.remove_reader(control)
         control.close()
-    if not descriptors:
-        return 0
-    return await become(request, socket.socket(fileno=descriptors[0]), bus)
+    return await become(request, bus) if request else 0
 
 
 async def _session(plan: RunPlan) -> ZenohBus | None:

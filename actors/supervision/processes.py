@@ -24,29 +24,15 @@ from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.machine.patience import AT_LEISURE, Usage, usage
 from rampart.actors.machine.unix_peer import process_state
 from rampart.actors.supervision.process_title import RunProcess, find_processes, kill
-from rampart.actors.supervision.requests import REQUEST_BYTES, ForkRequest, Reply
+from rampart.actors.supervision.requests import REQUEST_BYTES, WORD, ForkRequest, Reply
 
-__all__ = ["ForkError", "ForkPendingError", "OsProcesses", "ProcessHandle", "Processes",
-           "RunProcess"]
+__all__ = ["OsProcesses", "ProcessHandle", "Processes", "RunProcess"]
 
 WORD_S = 0.25
 """Wall seconds between two words to the root, and between two looks whether that is stopped."""
 
-WAIT_S = 0.05
-"""A fork takes a millisecond or two. So long its caller stands still for it, if it waits for no
-other one."""
-
-PATIENCE_S, PATIENCE_MAX_S = 0.25, 8.0
-"""A request that is not answered is made again; each time later, for on a machine that is busy
-enough the new process cannot answer sooner either."""
-
-
-class ForkError(Exception):
-    """No process could be started; the text is one line."""
-
-
-class ForkPendingError(ForkError):
-    """A process was asked for and has not answered yet."""
+Answer = Callable[[int, str], None]
+"""Called with the pid of a new process, or with 0 and why there is none, in one line."""
 
 
 class ProcessHandle:
@@ -93,18 +79,12 @@ class Processes(Protocol):
     def living(self) -> Sequence[RunProcess]:
         """Return those that are there."""
 
-    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
-        """Start a process for the named actors and return its pid.
+    def fork(self, names: tuple[str, ...], incarnation: int, answer: Answer) -> None:
+        """Start a process for the named actors; `answer` is called once, now or later.
 
         Raises:
-            ForkPendingError: It is under way; to be called again with the same names and
-                incarnation.
-            ForkError: It was not possible; likewise.
-            OSError: Likewise, for want of memory or descriptors.
+            OSError: No request can be made now.
         """
-
-    def withdraw(self, names: tuple[str, ...]) -> None:
-        """End a process that `fork` was called for and that is under way."""
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Take hold of a process; `ended` is called on the event loop when it ends.
@@ -176,40 +156,6 @@ class OsHandle(ProcessHandle):
             self.pidfd = -1
 
 
-class _Asked:
-    """A request to the root, until the new process has answered it or it is withdrawn."""
-
-    def __init__(self, root: socket.socket, request: ForkRequest) -> None:
-        self.incarnation = request.incarnation
-        self.since_s = time.monotonic()
-        self._answer, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            try:
-                socket.send_fds(root, [msgspec.json.encode(request)], [theirs.fileno()])
-            except OSError:
-                self._answer.close()
-                raise
-
-    def reply(self, wait_s: float) -> Reply | None:
-        """Return the answer, or None if there is none after so many seconds."""
-        poll = select.poll()
-        poll.register(self._answer, select.POLLIN)
-        return self._read() if poll.poll(wait_s * 1000) else None
-
-    def withdraw(self) -> Reply:
-        """Take the request back; return the answer if that came first."""
-        self._answer.shutdown(socket.SHUT_RD)
-        return self._read()
-
-    def _read(self) -> Reply:
-        with self._answer:
-            try:
-                data = self._answer.recv(REQUEST_BYTES)
-            except OSError:
-                data = b""
-        return msgspec.json.decode(data, type=Reply) if data else Reply(error="no answer")
-
-
 class OsProcesses:
     """Processes of this machine, which the root of the run forks. To be made on a running loop.
 
@@ -218,56 +164,49 @@ class OsProcesses:
         port: Base port of the run.
         launcher: Process id of the root.
         root: Descriptor of the connection to it.
+        call_soon: Has the supervisor do something, which it is told in words, after what it does.
     """
 
     has_routers = True
 
-    def __init__(self, folder: str, port: int, launcher: int, root: int) -> None:
+    def __init__(self, folder: str, port: int, launcher: int, root: int,
+                 call_soon: Callable[[str, Callable[[], None]], None]) -> None:
         self.folder = folder
         self._port = port
         self._launcher = launcher
         self._root = socket.socket(fileno=root)
         self._root.setblocking(False)
-        self._asked: dict[tuple[str, ...], _Asked] = {}
-        self._patience_s = PATIENCE_S
+        self._call_soon = call_soon
+        self._asked: dict[ForkRequest, Answer] = {}
         self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self._root, self._answered)
         self._word()
 
     def _word(self) -> None:
         """Show the root that this loop turns, and continue it if it was stopped."""
         with contextlib.suppress(OSError):
-            self._root.send(b" ")
+            self._root.send(WORD)
         if process_state(self._launcher) == "T":
             kill(self._launcher, signal.SIGCONT)
         self._next_word = self._loop.call_later(WORD_S, self._word)
 
-    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
-        """Start a process and return its pid, as `Processes`."""
-        asked = self._asked.get(names)
-        if asked is not None and asked.incarnation != incarnation:  # its place is another's now
-            self.withdraw(names)
-            asked = None
-        wait_s = 0.0 if self._asked else WAIT_S
-        if asked is None:
-            asked = self._asked[names] = _Asked(self._root, ForkRequest(names[0], incarnation))
-        reply = asked.reply(wait_s)
-        if reply is not None:
-            self._patience_s = PATIENCE_S
-        elif time.monotonic() - asked.since_s > self._patience_s:
-            reply = asked.withdraw()
-            self._patience_s = min(2 * self._patience_s, PATIENCE_MAX_S)
-        else:
-            raise ForkPendingError("no answer yet")
-        del self._asked[names]
-        if not reply.pid:
-            raise ForkError(reply.error)
-        return reply.pid
+    def fork(self, names: tuple[str, ...], incarnation: int, answer: Answer) -> None:
+        """Ask the root for a process, as `Processes`. The root answers each request once."""
+        request = ForkRequest(names[0], incarnation)
+        self._root.send(msgspec.json.encode(request))
+        self._asked[request] = answer
 
-    def withdraw(self, names: tuple[str, ...]) -> None:
-        """End what is under way for these actors."""
-        asked = self._asked.pop(names, None)
-        if asked is not None and (pid := asked.withdraw().pid):
-            kill(pid)
+    def _answered(self) -> None:
+        try:
+            data = self._root.recv(REQUEST_BYTES)
+        except OSError:
+            data = b""
+        if not data:  # the root has ended, and so does the run
+            self._loop.remove_reader(self._root)
+            return
+        reply = msgspec.json.decode(data, type=Reply)
+        answer = self._asked.pop(reply.request)
+        self._call_soon(f"{reply.request}", lambda: answer(reply.pid, reply.error))
 
     def adapt(self, adapted: AdaptedSystem) -> None:
         """Have every process that is forked from now on know a changed system.
@@ -303,6 +242,5 @@ class OsProcesses:
     def close(self) -> None:
         """Let go of everything."""
         self._next_word.cancel()
-        for names in list(self._asked):
-            self.withdraw(names)
+        self._loop.remove_reader(self._root)
         self._root.close()

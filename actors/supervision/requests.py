@@ -1,8 +1,8 @@
 """What the root is asked, and what it answers.
 
-Two kinds of processes ask it. The supervisor sends a `ForkRequest`, one datagram each, with a
-socket on which the new process answers (`Reply`); any datagram also shows that the supervisor's
-loop turns. The process that watches the run sends `FromRun` and receives `FromRoot`, as lines of
+Two kinds of processes ask it. The supervisor sends a `ForkRequest`, one datagram each, and gets one
+`Reply` for it; any datagram also shows that the supervisor's loop turns. The process that watches
+the run sends `FromRun` and receives `FromRoot`, as lines of
 JSON: so no document is too large.
 """
 
@@ -13,7 +13,10 @@ import msgspec
 from rampart.actors.runtime.run_plan import RunPlan
 
 REQUEST_BYTES = 4096
-"""Longest `ForkRequest`: the name of a process and a number."""
+"""Longest `ForkRequest` or `Reply`: the name of a process, a number, a line."""
+
+WORD = b" "
+"""The supervisor sends it when it has nothing to ask for."""
 
 
 class LaunchError(Exception):
@@ -28,8 +31,9 @@ class ForkRequest(msgspec.Struct, frozen=True):
 
 
 class Reply(msgspec.Struct, frozen=True):
-    """The new process by its number, or why there is none."""
+    """The new process that was asked for, by its number, or why there is none."""
 
+    request: ForkRequest
     pid: int = 0
     error: str = ""
 

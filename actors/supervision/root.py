@@ -11,9 +11,9 @@ no thread and no session (neither survives a fork), and waits in one selector lo
 * its children's ends, and signals;
 * tools that look for the run.
 
-**No incarnation has two processes.** A request is answered by the new process itself, and that runs
-only if its answer was accepted. The supervisor withdraws a request by shutting its end of the
-socket; the kernel decides which of the two was first.
+**No node has two processes.** The root answers each request once, and starts no process for nodes
+that have one: it kills that one and refuses. The requests of a supervisor that has ended are not
+carried out.
 
 **Nothing is orphaned.** Every process of the run is a child of the root, and asks the kernel to be
 killed with it (prctl(2), PR_SET_PDEATHSIG), stopped ones included. Only the watching process is
@@ -53,7 +53,6 @@ from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.machine import turns
 from rampart.actors.machine.absence import Absence
 from rampart.actors.machine.patience import Patience, usage
-from rampart.actors.machine.unix_peer import process_id
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_system
 from rampart.actors.supervision import requests
@@ -151,6 +150,8 @@ class Root:
         self._watch_pid = 0
         self._has_ended = False
         self._children: dict[int, tuple[str, ...]] = {}
+        self._issued: dict[str, int] = {}
+        self._supervisor_link: socket.socket | None = None
         self._pool: Pool | None = None
         self._held: list[socket.socket] = []
         self._supervisor = Guarded()
@@ -270,6 +271,7 @@ class Root:
                     self.death = signal.Signals(os.WTERMSIG(status)).name
             elif pid == self._supervisor.pid:
                 self._supervisor.pid = 0
+                self._unlink_supervisor()
             elif not self._supervisor.turns and self.plan.routers.keys() & set(names):
                 with contextlib.suppress(OSError):  # tried again with the next supervisor
                     self._start_routers()  # who looks after them has no bus to start on
@@ -483,7 +485,7 @@ class Root:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with theirs:
-                pid = self._fork((self.plan.supervisor,), guarded.incarnation + 1, link=theirs)
+                pid = self._fork((self.plan.supervisor,), guarded.incarnation + 1, theirs)
         except OSError:
             ours.close()
             raise
@@ -491,7 +493,15 @@ class Root:
         guarded.incarnation += 1
         guarded.looked_s = time.monotonic()
         guarded.patience.answered()
-        self._selector.register(ours, selectors.EVENT_READ, lambda: self._hear_supervisor(ours))
+        self._supervisor_link = ours
+        self._selector.register(ours, selectors.EVENT_READ, self._hear_supervisor)
+
+    def _unlink_supervisor(self) -> None:
+        """Hear no more of a supervisor that has ended, nor carry out what it has asked for."""
+        if self._supervisor_link is not None:
+            self._selector.unregister(self._supervisor_link)
+            self._supervisor_link.close()
+            self._supervisor_link = None
 
     def _start_routers(self) -> None:
         """Start both routers if there is none: without one a supervisor cannot start."""
@@ -501,35 +511,47 @@ class Root:
         for name in self.plan.routers:
             self._fork((name,), issued.get(name, self.plan.incarnations) + 1)
 
-    def _hear_supervisor(self, link: socket.socket) -> None:
+    def _hear_supervisor(self) -> None:
+        link = self._supervisor_link
+        if link is None:  # it has ended since the selector saw this
+            return
         try:
-            data, descriptors, _, _ = socket.recv_fds(link, requests.REQUEST_BYTES, 1)
+            data = link.recv(requests.REQUEST_BYTES)
         except OSError:
-            data, descriptors = b"", []
-        if not data:  # this one has ended
-            self._selector.unregister(link)
-            link.close()
+            data = b""
+        if not data:
+            self._unlink_supervisor()
             return
         self._supervisor.turns = True
         self._supervisor.patience.answered()
-        if not descriptors:
+        if data == requests.WORD:
             return
-        with socket.socket(fileno=descriptors[0]) as answer:
-            try:
-                self._carry_out(data, answer)
-            except Exception as error:  # it serves the next request all the same
-                _reply(answer, Reply(error=one_line(f"{type(error).__name__}: {error}")))
-
-    def _carry_out(self, data: bytes, answer: socket.socket) -> None:
-        self._follow_changes()
         request = msgspec.json.decode(data, type=ForkRequest)
+        try:
+            reply = Reply(request, self._carry_out(request))
+        except Exception as error:  # it serves the next request all the same
+            reply = Reply(request, error=one_line(f"{type(error).__name__}: {error}"))
+        with contextlib.suppress(OSError):  # it has ended
+            link.send(msgspec.json.encode(reply), socket.MSG_DONTWAIT)
+
+    def _carry_out(self, request: ForkRequest) -> int:
+        self._follow_changes()
         names = self._names_of(request.name)
+        self._reap()
+        if before := [pid for pid, other in self._children.items() if other == names]:
+            kill(before[0])
+            raise ValueError(f"process {before[0]} of it has to end first")
         assert self._pool is not None  # noqa: S101 for the type checker
-        pooled = self._loaded.spare_of(names) != "none" and self._pool.take(data, answer)
-        if pooled:
-            self._children[pooled] = names
-        else:
-            self._fork(names, request.incarnation, answer=answer)
+        pooled = self._loaded.spare_of(names) != "none" and self._pool.take(
+            msgspec.json.encode(request))
+        if not pooled:
+            return self._fork(names, request.incarnation)
+        self._note(pooled, names, request.incarnation)
+        return pooled
+
+    def _note(self, pid: int, names: tuple[str, ...], incarnation: int) -> None:
+        self._children[pid] = names
+        self._issued.update(dict.fromkeys(names, incarnation))
 
     def _names_of(self, name: str) -> tuple[str, ...]:
         layout = self._loaded
@@ -561,14 +583,13 @@ class Root:
             stream.flush()  # else the child has what is buffered as well
         return os.fork()
 
-    def _fork(self, names: tuple[str, ...], incarnation: int, *,
-              answer: socket.socket | None = None, link: socket.socket | None = None) -> int:
+    def _fork(self, names: tuple[str, ...], incarnation: int, link: socket.socket | None = None
+              ) -> int:
         """Fork a process of the run and return its number.
 
         Args:
             names: of its actors.
             incarnation: of it.
-            answer: on which it answers the request for it; None if the root itself wants it.
             link: to the root, if it is the supervisor.
 
         Raises:
@@ -577,9 +598,8 @@ class Root:
         pid = self._forked()
         if pid == 0:
             self._in_child(lambda: asyncio.run(live(
-                self._loaded, self._role(names, incarnation, answer), self._known(link))),
-                answer, link)
-        self._children[pid] = names
+                self._loaded, Role(names, incarnation), self._known(link))), link)
+        self._note(pid, names, incarnation)
         return pid
 
     def _fork_pooled(self, control: socket.socket) -> int:
@@ -590,9 +610,9 @@ class Root:
         return pid
 
     def _be_pooled(self, control: socket.socket) -> Callable[[], int]:
-        async def become(data: bytes, answer: socket.socket, bus: ZenohBus | None) -> int:
+        async def become(data: bytes, bus: ZenohBus | None) -> int:
             request = msgspec.json.decode(data, type=ForkRequest)
-            role = self._role(self._names_of(request.name), request.incarnation, answer)
+            role = Role(self._names_of(request.name), request.incarnation)
             return await live(self._loaded, role, self._known(None), bus)
 
         def be_pooled() -> int:
@@ -601,28 +621,14 @@ class Root:
 
         return be_pooled
 
-    def _role(self, names: tuple[str, ...], incarnation: int, answer: socket.socket | None
-              ) -> Role:
-        folder = self.plan.folder
-
-        def born() -> None:
-            if answer is not None:
-                if not _reply(answer, Reply(os.getpid())):
-                    os._exit(0)  # it was withdrawn: another process may have its place
-                answer.close()
-            register = run_folder.register_of(folder)
-            if max(register(name) or 0 for name in names) >= incarnation:
-                os._exit(0)  # asked for too late: a later one had its place, or has
-            run_folder.issue(folder, names, incarnation, process_id(os.getpid()))
-
-        return Role(names, incarnation, born)
-
     def _known(self, link: socket.socket | None) -> RunContext:
         assert self._run is not None  # noqa: S101 for the type checker
         if link is None:
             return self._run
-        return replace(self._run, root=link.fileno(),
-                       known_incarnations=run_folder.issued(self.plan.folder))
+        known = run_folder.issued(self.plan.folder)
+        for name, incarnation in self._issued.items():  # one may not have begun yet
+            known[name] = max(known.get(name, 0), incarnation)
+        return replace(self._run, root=link.fileno(), known_incarnations=known)
 
     def _in_child(self, be: Callable[[], int], *kept: socket.socket | None) -> NoReturn:
         """Be a process of the run, in a fork."""
@@ -655,14 +661,6 @@ class Root:
             os.close(one) if isinstance(one, int) else one.close()  # type: ignore[attr-defined]
         os.close(wakes)
         self._selector.close()
-
-
-def _reply(answer: socket.socket, reply: Reply) -> bool:
-    try:
-        answer.send(msgspec.json.encode(reply))
-    except OSError:
-        return False
-    return True
 
 
 def _raise_descriptors(processes: int) -> None:

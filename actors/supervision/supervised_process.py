@@ -80,7 +80,7 @@ class Event(Enum):
     FORKED = auto()
     """Another process was forked."""
     ADOPTED = auto()
-    """A process was found that was not known."""
+    """A process was found when the supervisor began."""
     ADAPTED = auto()
     """It is to run by other parameters from now on."""
 
@@ -92,8 +92,6 @@ class Action(Enum):
     """Publish the transition's word."""
     PUBLISH = auto()
     """Publish the table of all nodes."""
-    SEARCH = auto()
-    """Adopt a process that is not held, if there is one."""
     RECOVER = auto()
     """Ask for a restart, if it is the supervisor's to ask."""
     KILL = auto()
@@ -130,10 +128,7 @@ _ROWS: tuple[tuple[Iterable[State], Event, Transition], ...] = (
     ((_S.STOPPED, _S.WEDGED), _E.HEARD, Transition(_S.RUNNING, "resumed", _SAID)),
     ((_S.STARTING, _S.RUNNING), _E.SILENT, Transition(_S.WEDGED, "wedged", _LOST)),
     ((_S.RUNNING,), _E.SILENT_STOPPED, Transition(_S.STOPPED, "stopped", _LOST)),
-    # One that was never heard: another process, not held, may have its socket.
-    ((_S.STARTING,), _E.ENDED, Transition(
-        _S.CRASHED, "crashed", (_A.TELL, _A.SEARCH, _A.PUBLISH, _A.RECOVER))),
-    ((_S.RUNNING, _S.STOPPED, _S.WEDGED), _E.ENDED, Transition(_S.CRASHED, "crashed", _LOST)),
+    (_PRESENT, _E.ENDED, Transition(_S.CRASHED, "crashed", _LOST)),
     ((_S.CRASHED,), _E.START, Transition(_S.RESTARTING, "", (_A.FORK,))),
     ((*_PRESENT, _S.CRASHED), _E.RESTART, Transition(
         _S.RESTARTING, "", (_A.KILL, _A.FORK_WHEN_GONE))),
@@ -141,7 +136,7 @@ _ROWS: tuple[tuple[Iterable[State], Event, Transition], ...] = (
     ((*_PRESENT, _S.CRASHED), _E.TOO_OFTEN, Transition(_S.GIVEN_UP, "given up", _OVER)),
     ((_S.RESTARTING,), _E.STARTED, Transition(_S.STARTING, "started", _NEW)),
     (_WAITING, _E.FORKED, Transition(_S.STARTING, "respawned", _NEW)),
-    (State, _E.ADOPTED, Transition(_S.RUNNING, "adopted", (_A.TELL, _A.HOLD))),
+    ((_S.CRASHED,), _E.ADOPTED, Transition(_S.RUNNING, "adopted", (_A.TELL, _A.HOLD))),
     ((_S.GIVEN_UP,), _E.ADAPTED, Transition(_S.CRASHED)))
 
 TRANSITIONS = {(state, event): then for states, event, then in _ROWS for state in states}
@@ -248,6 +243,7 @@ class SupervisedProcess:
         incarnation: Of the present process.
         highest: The highest incarnation that there was.
         requested_by: The module that asked for it, until it was heard.
+        asks: Whether a process was asked for and there is no answer yet.
         stays: Whether it is there and starts its program again, which has ended.
         delay_s: How long to wait before the fork that was granted last.
         heard_s: When each of its nodes was last heard, and the manager's status.
@@ -262,10 +258,10 @@ class SupervisedProcess:
     incarnation: int = 0
     highest: int = 0
     requested_by: str = ""
+    asks: bool = False
     stays: bool = False
     delay_s: float = 0.0
     started_s: float = 0.0
-    searched_s: float = -math.inf
     heard_s: dict[str, float] = field(default_factory=dict)
     lives: Lives = field(default_factory=Lives)
 

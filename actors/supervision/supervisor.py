@@ -22,6 +22,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 from msgspec.structs import replace
@@ -40,9 +41,8 @@ from rampart.actors.machine.patience import Patience
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.held_process import HeldProcess
+from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.processes import (
-    ForkError,
-    ForkPendingError,
     OsProcesses,
     Processes,
     ProcessHandle,
@@ -73,10 +73,8 @@ _LATE_S = 0.02
 _ROUTERS_S = 0.03
 """Wall seconds between two looks whether a router is stopped."""
 
-_SEARCH_S, _GONE_S = 0.05, 0.002
-"""Wall seconds between two looks into /proc for one node, and at whether a killed one is gone."""
-
-_RETRY_S, _ASK_AGAIN_S = 0.05, 0.01
+_GONE_S, _RETRY_S = 0.002, 0.05
+"""Wall seconds between two looks whether a killed process is gone, and between two attempts."""
 
 
 class Supervisor(Actor):
@@ -96,7 +94,8 @@ class Supervisor(Actor):
         self._plan, self._spec = run.plan, run.system
         self._layout = Layout(self._plan, self._spec)
         self._machine: Processes = processes or OsProcesses(
-            self._plan.folder, self._plan.base_port, self._plan.launcher_pid, run.root)
+            self._plan.folder, self._plan.base_port, self._plan.launcher_pid, run.root,
+            self.call_soon)
         self._routers = self._layout.routers if self._machine.has_routers else {}
         self._processes = {
             name: self._held(unit) for name, unit in {**self._routers, **self._layout.here}.items()}
@@ -153,7 +152,6 @@ class Supervisor(Actor):
         """End a unit and keep it no more; return its process, which may not have ended yet."""
         process = self._processes.pop(unit, None)
         if process is not None:
-            self._machine.withdraw(process.names)
             process.forget_step()
             process.kill()
             self._tell(process, "handed over", self.name)
@@ -211,14 +209,10 @@ class Supervisor(Actor):
 
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
-        """Note that a node's loop turns; adopt a process that was not known, if the kernel does."""
+        """Note that a node's loop turns."""
         process = self._process_of(header.source)
         if process is None:
             return
-        if header.incarnation > process.incarnation or (
-                header.incarnation == process.incarnation and process.pid != message.pid
-                and process.is_dead):
-            self._look_for(process)
         if process.waits or (
                 header.incarnation, message.pid) != (process.incarnation, process.pid):
             return  # said before it was killed, or by another one
@@ -380,9 +374,6 @@ class Supervisor(Actor):
                     self._tell(process, step.word, by, detail)
                 case Action.PUBLISH:
                     self.publish_table()
-                case Action.SEARCH:
-                    process.searched_s = -math.inf
-                    self._look_for(process)
                 case Action.RECOVER:
                     self._recover(process)
                 case Action.KILL:
@@ -418,32 +409,34 @@ class Supervisor(Actor):
         self._fork(process, by)
 
     def _fork(self, process: HeldProcess, by: str) -> None:
+        if process.asks:  # the answer is under way
+            return
         incarnation = process.highest + 1
-        try:
-            pid = process.pid if process.stays else self._machine.fork(process.names, incarnation)
-        except (ForkError, OSError) as error:
-            is_busy = isinstance(error, ForkPendingError)
-            if not is_busy:
-                self.report_diagnostic("fork", str(error), process.unit.name)
-            self._fork_in(process, _ASK_AGAIN_S if is_busy else _RETRY_S,
-                          lambda: self._fork(process, by))
+        answer = partial(self._forked, process, by, incarnation)
+        if process.stays:
+            answer(process.pid, "")
             return
-        event = Event.FORKED if process.highest else Event.STARTED
-        process.take(pid, incarnation)
-        process.started_s = self._loop.time()
-        attempt = process.policy.attempts
-        self._on(process, event, by, f"attempt {attempt} since it was given up" if attempt else "")
+        process.asks = True
+        try:
+            self._machine.fork(process.names, incarnation, answer)
+        except OSError as error:
+            answer(0, str(error))
 
-    def _look_for(self, process: HeldProcess) -> None:
-        """Adopt what runs and was not known, as the kernel knows it: a message may name any pid."""
-        now = self._loop.time()
-        if process.stays or now - process.searched_s < _SEARCH_S:
-            return
-        process.searched_s = now
-        try:
-            self._adopt_living(process, self._machine.living())
-        except OSError as error:  # no descriptor left to look with
-            self.report_diagnostic("search", str(error), process.unit.name)
+    def _forked(self, process: HeldProcess, by: str, incarnation: int, pid: int, error: str
+                ) -> None:
+        process.asks = False
+        if pid and not (process.waits and self._is_kept(process)):
+            kill(pid)
+        elif pid:
+            event = Event.FORKED if process.highest else Event.STARTED
+            process.take(pid, incarnation)
+            process.started_s = self._loop.time()
+            attempt = process.policy.attempts
+            self._on(process, event, by,
+                     f"attempt {attempt} since it was given up" if attempt else "")
+        elif process.waits and self._is_kept(process):
+            self.report_diagnostic("fork", error, process.unit.name)
+            self._fork_in(process, _RETRY_S, lambda: self._fork(process, by))
 
     def _adopt_living(self, process: HeldProcess, living: Sequence[RunProcess]) -> bool:
         """Adopt the highest incarnation that is there and end the others; False without any."""

@@ -26,7 +26,7 @@ from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import SUPERVISOR
-from rampart.actors.supervision.processes import ForkError, ProcessHandle, RunProcess
+from rampart.actors.supervision.processes import Answer, ProcessHandle, RunProcess
 from rampart.actors.supervision.root import PERIOD_S, SUPERVISOR_PATIENCE_S
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.supervisor import Supervisor
@@ -150,7 +150,7 @@ class VirtualMachine:
     def _start_supervisor(self) -> None:
         self._supervisor += 1
         self._run = replace(self._run, known_incarnations=dict(self._known))
-        self.fork((SUPERVISOR,), self._supervisor)
+        self.fork((SUPERVISOR,), self._supervisor, lambda _pid, _error: None)
         self._supervisor_heard_s = self._loop.time()
 
     def _bring_supervisor_back(self) -> None:
@@ -196,19 +196,16 @@ class VirtualMachine:
         """Return the processes that are there, the supervisor's own included."""
         return [RunProcess(p.pid, 0, 0, p.names, p.incarnation) for p in self._processes.values()]
 
-    def withdraw(self, names: tuple[str, ...]) -> None:
-        """Nothing to do: nothing is ever under way."""
-
-    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
+    def fork(self, names: tuple[str, ...], incarnation: int, answer: Answer) -> None:
         """Start a process; its first word comes after the measured time."""
         if self._down:
-            raise ForkError("the machine is down")
+            raise ProcessLookupError("the machine is down")
         pid = next(self._pids)
         process = self._processes[pid] = VirtualProcess(pid, names, incarnation)
         for name in names:
             self._known[name] = max(self._known.get(name, 0), incarnation)
         self._loop.call_later(self._start_s(), self._begin, process)
-        return pid
+        answer(pid, "")
 
     def hold(self, pid: int, ended: Callable[[], None]) -> _Handle:
         """Take hold of a process."""

@@ -23,8 +23,8 @@ from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.supervision import supervisor
 from rampart.actors.supervision.node_process import make_actor
-from rampart.actors.supervision.processes import ForkPendingError
 from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run
@@ -259,22 +259,24 @@ def test_one_that_is_being_forked_when_its_home_is_back_gives_way(tmp_path, monk
     """The root may be slow; what it forks yet must not have the number of what the home forks."""
     async def scenario() -> None:
         async with world(tmp_path) as made:
-            fork, asked, withdrawn = made.robot.fork, [], []
+            fork, asked = made.robot.fork, []
 
-            def slow(names, incarnation):
-                if "camera" in names:
-                    asked.append(incarnation)
-                    raise ForkPendingError("no answer yet")
-                return fork(names, incarnation)
+            def slow(names, incarnation, answer):
+                if "camera" in names and not asked:
+                    asked.append((names, incarnation, answer))
+                else:
+                    fork(names, incarnation, answer)
 
             monkeypatch.setattr(made.robot, "fork", slow)
-            monkeypatch.setattr(made.robot, "withdraw", withdrawn.append)
             made.is_cut = True
             await eventually(lambda: asked)
             made.is_cut = False
             await eventually(lambda: made.ground.runs("camera") > 1)
-            assert made.ground.runs("camera") > max(asked)
-            assert ("camera",) in withdrawn
+            assert made.ground.runs("camera") > asked[0][1]
+            ended: list[int] = []
+            monkeypatch.setattr(supervisor, "kill", ended.append)
+            asked[0][2](77, "")
+            assert ended == [77]
 
     run(scenario)
 

@@ -22,8 +22,6 @@ from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.runtime.run_plan import load_document
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.supervision.process_title import TITLE_BYTES, find_processes
-from rampart.actors.supervision.processes import ForkError, ForkPendingError, OsProcesses
-from rampart.actors.supervision.requests import ForkRequest, Reply
 from rampart.actors.system.layout import Layout
 from rampart.cli.run_options import parse, plan_of
 from rampart.testing import eventually
@@ -99,90 +97,20 @@ async def test_a_stopped_root_is_continued(tmp_path):
 # -- requests --------------------------------------------------------------------------------------
 
 
-@contextlib.asynccontextmanager
-async def asking():
-    """Yield what asks, and the root's end of its connection."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with theirs:
-        machine = OsProcesses("", 1, os.getpid(), ours.detach())
-        try:
-            yield machine, theirs
-        finally:
-            machine.close()
-
-
-def received(root: socket.socket) -> tuple[ForkRequest, socket.socket]:
-    while True:
-        data, descriptors, _, _ = socket.recv_fds(root, 4096, 1)
-        if descriptors:
-            return msgspec.json.decode(data, type=ForkRequest), socket.socket(
-                fileno=descriptors[0])
-
-
-def answer(on: socket.socket, pid: int) -> None:
-    with on:
-        on.send(msgspec.json.encode(Reply(pid)))
-
-
-async def test_a_request_that_is_not_answered_yet_is_not_made_twice():
-    async with asking() as (machine, root):
-        with pytest.raises(ForkPendingError):
-            machine.fork(("DM1",), 2)
-        request, on = received(root)
-        assert request == ForkRequest("DM1", 2)
-        with pytest.raises(ForkPendingError):
-            machine.fork(("DM1",), 2)
-        answer(on, 77)
-        assert machine.fork(("DM1",), 2) == 77
-
-
-async def test_the_answer_to_a_withdrawn_request_is_not_accepted():
-    async with asking() as (machine, root):
-        with pytest.raises(ForkPendingError):
-            machine.fork(("DM1",), 2)
-        _, on = received(root)
-        machine.withdraw(("DM1",))
-        with pytest.raises(BrokenPipeError):
-            answer(on, 77)
-
-
-async def test_what_answered_before_its_request_was_withdrawn_is_killed():
-    async with asking() as (machine, root):
-        with pytest.raises(ForkPendingError):
-            machine.fork(("DM1",), 2)
-        victim = subprocess.Popen(["sleep", "60"])
-        answer(received(root)[1], victim.pid)
-        machine.withdraw(("DM1",))
-        assert victim.wait(5) == -signal.SIGKILL
-
-
-async def test_a_request_whose_process_died_is_refused_and_the_next_one_made():
-    async with asking() as (machine, root):
-        with pytest.raises(ForkPendingError):
-            machine.fork(("DM1",), 2)
-        received(root)[1].close()
-        with pytest.raises(ForkError, match="no answer"):
-            machine.fork(("DM1",), 2)
-        with pytest.raises(ForkPendingError):
-            machine.fork(("DM1",), 2)
-        request, on = received(root)
-        assert request == ForkRequest("DM1", 2)
-        on.close()
-
-
-async def test_another_incarnation_takes_the_place_of_the_one_that_was_asked_for():
-    async with asking() as (machine, root):
-        with pytest.raises(ForkPendingError):
-            machine.fork(("DM1",), 2)
-        first = received(root)[1]
-        with pytest.raises(ForkPendingError):
-            machine.fork(("DM1",), 3)
-        second, on = received(root)
-        assert second.incarnation == 3
-        with pytest.raises(BrokenPipeError):
-            answer(first, 76)
-        answer(on, 77)
-        assert machine.fork(("DM1",), 3) == 77
+@pytest.mark.processes
+async def test_a_supervisor_that_dies_with_requests_under_way_leaves_one_process_of_each_node(
+        tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        for life in range(2, 6):
+            for name in ("DM1", "DM2", "DM3"):
+                os.kill(witness.pid(name), signal.SIGKILL)
+            await asyncio.sleep(0.002 * life)
+            os.kill(process(port, "supervisor"), signal.SIGKILL)
+            await eventually(lambda n=life: witness.state("supervisor") == ("running", n) and all(
+                row.state.value == "running" for row in witness.table.nodes), 10)
+            there = [name for p in find_processes(port) for name in p.names if name != "pool"]
+            assert len(there) == len(set(there))
 
 
 # -- the pool --------------------------------------------------------------------------------------

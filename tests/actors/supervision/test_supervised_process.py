@@ -19,42 +19,6 @@ from rampart.actors.system.layout import Unit
 from rampart.manager.spec.schema import Kind, NodeSpec
 from rampart.manager.spec.tables import Supervision
 
-TABLE = """
-starting   heard          running    running   tell publish
-stopped    heard          running    resumed   tell publish
-wedged     heard          running    resumed   tell publish
-starting   silent         wedged     wedged    tell publish recover
-running    silent         wedged     wedged    tell publish recover
-running    silent_stopped stopped    stopped   tell publish recover
-starting   ended          crashed    crashed   tell search publish recover
-running    ended          crashed    crashed   tell publish recover
-stopped    ended          crashed    crashed   tell publish recover
-wedged     ended          crashed    crashed   tell publish recover
-crashed    start          restarting -         fork
-starting   restart        restarting -         kill fork_when_gone
-running    restart        restarting -         kill fork_when_gone
-stopped    restart        restarting -         kill fork_when_gone
-wedged     restart        restarting -         kill fork_when_gone
-crashed    restart        restarting -         kill fork_when_gone
-given_up   restart        given_up   given_up  tell
-starting   too_often      given_up   given_up  kill tell publish fork_when_gone
-running    too_often      given_up   given_up  kill tell publish fork_when_gone
-stopped    too_often      given_up   given_up  kill tell publish fork_when_gone
-wedged     too_often      given_up   given_up  kill tell publish fork_when_gone
-crashed    too_often      given_up   given_up  kill tell publish fork_when_gone
-restarting started        starting   started   tell publish hold
-restarting forked         starting   respawned tell publish hold
-given_up   forked         starting   respawned tell publish hold
-starting   adopted        running    adopted   tell hold
-running    adopted        running    adopted   tell hold
-stopped    adopted        running    adopted   tell hold
-wedged     adopted        running    adopted   tell hold
-crashed    adopted        running    adopted   tell hold
-restarting adopted        running    adopted   tell hold
-given_up   adopted        running    adopted   tell hold
-given_up   adapted        crashed    -
-"""
-
 
 def process(state: State = State.CRASHED, **limits: float) -> SupervisedProcess:
     unit = Unit("a", (NodeSpec("a", Kind.CONTROL, "m:A"), NodeSpec("b", Kind.CONTROL, "m:B")))
@@ -62,17 +26,6 @@ def process(state: State = State.CRASHED, **limits: float) -> SupervisedProcess:
     if state is not State.RESTARTING:
         made.shown = NodeState(state.value)
     return made
-
-
-def test_the_table_of_transitions():
-    written = {}
-    for line in TABLE.split("\n")[1:-1]:
-        state, event, after, word, *actions = line.split()
-        written[State[state.upper()], Event[event.upper()]] = (
-            State[after.upper()], word.replace("-", "").replace("_", " "), actions)
-    assert written == {
-        key: (step.state, step.word, [action.name.lower() for action in step.actions])
-        for key, step in TRANSITIONS.items()}
 
 
 @pytest.mark.parametrize("event", Event)

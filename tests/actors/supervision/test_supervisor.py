@@ -23,7 +23,7 @@ from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan, load_document, load_system
-from rampart.actors.supervision.processes import ForkError, RunProcess
+from rampart.actors.supervision.processes import Answer, RunProcess
 from rampart.actors.supervision.supervised_process import MOST_EXCUSED_S
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.actors.system.layout import Layout
@@ -83,23 +83,20 @@ class Machine:
         self.processes: dict[int, Process] = {}
         self.forks: list[tuple[str, int]] = []
         self.issued: dict[str, int] = {}
-        self.fork_error: Exception | None = None
+        self.fork_error: Exception | str | None = None
+        self.is_slow = False
+        self.waiting: list[Callable[[], None]] = []
         self.hold_error: Exception | None = None
-        self.look_error: Exception | None = None
         self.ended: list[str] = []
         self.starving: set[str] = set()
         self.starves_from_s = 0.0
         self.turning = False
         self.questions = 0
-        self.searches = 0
 
     def usage(self, process: Process) -> Usage:
         ran_s = 1.0 + (asyncio.get_running_loop().time() / 100 if self.turning else 0.0)
         return Usage("S", ran_s, max(0.0, asyncio.get_running_loop().time() - self.starves_from_s)
                      if process.names[0] in self.starving else 0.0)
-
-    def withdraw(self, names: tuple[str, ...]) -> None:
-        """Nothing is ever under way."""
 
     def add(self, names: tuple[str, ...], incarnation: int, *, bound: bool = False) -> Process:
         self.issued |= dict.fromkeys(names, incarnation)
@@ -125,17 +122,20 @@ class Machine:
             ended()
 
     def living(self) -> list[RunProcess]:
-        self.searches += 1
-        if self.look_error:
-            raise self.look_error
         return [RunProcess(p.pid, 0, 0, p.names, p.incarnation)
                 for p in self.processes.values() if not p.killed]
 
-    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
+    def fork(self, names: tuple[str, ...], incarnation: int, answer: Answer) -> None:
+        if self.is_slow:
+            self.waiting.append(lambda: self.fork(names, incarnation, answer))
+            return
+        if isinstance(self.fork_error, str):
+            answer(0, self.fork_error)
+            return
         if self.fork_error:
             raise self.fork_error
         self.forks.append((names[0], incarnation))
-        return self.add(names, incarnation).pid
+        answer(self.add(names, incarnation).pid, "")
 
     def hold(self, pid: int, ended: Callable[[], None]) -> Handle:
         if self.hold_error:
@@ -240,7 +240,6 @@ async def running(supervision: Supervision = USUAL,
     beats = asyncio.create_task(world.beats())
     await eventually(world.all_run)
     world.machine.forks.clear()
-    world.machine.searches = 0
     try:
         yield world
     finally:
@@ -476,30 +475,10 @@ def test_the_end_of_a_process_that_is_being_replaced_anyway_is_no_crash():
     run(scenario)
 
 
-def test_a_process_that_was_replaced_is_not_held_in_the_place_of_its_successor():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.hold_error = no_descriptor()
-            world.kill("DM1")
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-            (old,) = world.machine.of("DM1")
-            world.machine.hold_error = None
-            successor = world.machine.add(old.names, 5, bound=True)
-            world.beat(successor)
-            await asyncio.sleep(0.1)
-            world.machine.kill(old)
-            world.respawn("DM1", 5)
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 6))
-            assert successor.gone
-            assert world.machine.forks == [("DM1", 2), ("DM1", 6)]
-
-    run(scenario)
-
-
 def test_what_a_process_said_before_it_was_killed_does_not_make_it_run():
     async def scenario() -> None:
         async with running() as world:
-            world.machine.fork_error = ForkError("none")
+            world.machine.fork_error = "none"
             (victim,) = world.machine.of("DM1")
             world.silent.add(victim.pid)
             await eventually(lambda: victim.killed)
@@ -529,7 +508,7 @@ def test_a_fork_that_fails_for_want_of_descriptors_is_tried_again():
 def test_a_living_process_is_replaced_once_however_long_nobody_can_fork(outage_s):
     async def scenario() -> None:
         async with running() as world:
-            world.machine.fork_error = ForkError("none")
+            world.machine.fork_error = "none"
             for _ in range(3):  # it is asked for again while nobody answers
                 world.respawn("safety_pilot", 1)
                 await asyncio.sleep(0.01)
@@ -543,6 +522,25 @@ def test_a_living_process_is_replaced_once_however_long_nobody_can_fork(outage_s
     run(scenario)
 
 
+def test_nothing_is_asked_for_again_before_it_is_answered():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.is_slow = True
+            world.kill("DM1")
+            world.kill("osmosis_control")
+            for _ in range(5):
+                world.respawn("osmosis_control", 1)
+                await asyncio.sleep(1.0)
+            world.machine.is_slow = False
+            assert len(world.machine.waiting) == 2
+            for answer in world.machine.waiting:
+                answer()
+            await eventually(world.all_run)
+            assert sorted(world.machine.forks) == [("DM1", 2), ("osmosis_control", 2)]
+
+    run(scenario)
+
+
 @pytest.mark.parametrize("outage_s", [0.2, 0.24])  # whichever of two chains would go on first
 def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(outage_s):
     async def scenario() -> None:
@@ -550,7 +548,7 @@ def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(outage_
             document = load_document(PLAN)
             row = next(r for r in document["detection"] if r["name"] == "DM2")
             row["parameters"] = {**row.get("parameters", {}), "hold_s": 0.9}
-            world.machine.fork_error = ForkError("none")
+            world.machine.fork_error = "none"
             world.kill("DM2")
             await asyncio.sleep(0.02)
             world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
@@ -580,92 +578,6 @@ def test_a_heartbeat_that_names_a_process_of_somebody_elses_has_nobody_adopted_o
             assert not stranger.killed
             assert world.row("DM1")[0] == "running"
             assert world.row("DM1")[2] not in {stranger.pid, own.pid}
-
-    run(scenario)
-
-
-def test_a_life_that_is_adopted_while_it_is_replaced_is_not_forked_again():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.fork_error = ForkError("its answer was lost")
-            names = world.kill("DM2").names
-            await asyncio.sleep(0.02)
-            orphan = world.machine.add(names, 2)
-            await eventually(lambda: world.row("DM2") == ("running", 2, orphan.pid))
-            world.machine.fork_error = None
-            await asyncio.sleep(1.0)
-            assert world.machine.forks == []
-            assert world.row("DM2") == ("running", 2, orphan.pid)
-
-    run(scenario)
-
-
-@pytest.mark.parametrize("name", ["DM2", "osmosis_control"])
-@pytest.mark.parametrize("phase_s", [0.0, 0.03, 0.06, 0.09])
-def test_a_life_without_its_port_leads_to_the_one_that_nobody_holds(name, phase_s):
-    async def scenario() -> None:
-        async with running() as world:
-            fork, orphans = world.machine.fork, []
-
-            def twice(names: tuple[str, ...], incarnation: int) -> int:
-                if not orphans:  # a process that has died before it answered
-                    orphans.append(world.machine.add(names, incarnation))
-                return fork(names, incarnation)
-
-            world.machine.fork = twice
-            await asyncio.sleep(phase_s)  # the orphan is heard before or after the other ends
-            world.kill(name)
-            await asyncio.sleep(0.02)
-            world.respawn(name, 1)  # owned by RM3, or respawned by then
-            await asyncio.sleep(1.0)
-            assert world.row(name) == ("running", 2, orphans[0].pid)
-            assert world.machine.of(name) == orphans
-            assert world.machine.forks == [(name, 2)]
-            world.kill(name)  # it is held like any other
-            await asyncio.sleep(0.02)
-            world.respawn(name, 2)
-            await eventually(lambda: world.row(name)[:2] == ("running", 3))
-
-    run(scenario)
-
-
-def test_an_incarnation_that_was_given_is_never_given_again():
-    async def scenario() -> None:
-        async with running() as world:
-            names = world.machine.of("DM2")[0].names
-            world.kill("DM2")
-            await eventually(lambda: world.row("DM2")[:2] == ("running", 2))
-            world.kill("DM2")
-            orphan = world.machine.add(names, 2, bound=True)
-            await eventually(lambda: world.row("DM2") == ("running", 2, orphan.pid))
-            world.kill("DM2")
-            await eventually(lambda: world.row("DM2")[:2] == ("running", 4))
-            assert world.machine.forks == [("DM2", 2), ("DM2", 3), ("DM2", 4)]
-
-    run(scenario)
-
-
-def test_a_search_for_which_no_descriptor_is_left_ends_nothing():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.look_error = no_descriptor()
-            world.kill("DM2")
-            await eventually(lambda: world.row("DM2")[0] == "starting")
-            world.kill("DM2")
-            await eventually(lambda: world.row("DM2")[:2] == ("running", 3))
-            assert world.machine.searches == 1
-            assert not world.task.done()
-
-    run(scenario)
-
-
-def test_an_ordinary_respawn_searches_for_nobody():
-    async def scenario() -> None:
-        async with running() as world:
-            for life in (2, 3, 4):
-                world.kill("DM2")
-                await eventually(lambda n=life: world.row("DM2")[:2] == ("running", n))
-            assert world.machine.searches == 0
 
     run(scenario)
 
