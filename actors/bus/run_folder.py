@@ -28,7 +28,6 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from rampart.actors.bus.board import FileBoard
-from rampart.actors.machine.unix_peer import ProcessId
 
 ROUTERS = ("router_a", "router_b")
 """Names of the sockets of the two routers."""
@@ -95,14 +94,14 @@ def socket_path(folder: str, name: str) -> str:
 
 
 def issue(folder: str, names: Iterable[str], incarnation: int,
-          process: ProcessId | None = None) -> None:
+          pid: int = 0) -> None:
     """Make a number known as the incarnation of these nodes, before their process is heard.
 
     Args:
         folder: of the run.
         names: of the nodes.
         incarnation: of their process.
-        process: which that is; None if it is on another machine.
+        pid: of their process; 0 if it is on another machine.
 
     Raises:
         OSError: the folder is gone, or full; or a name is none of a file.
@@ -112,7 +111,7 @@ def issue(folder: str, names: Iterable[str], incarnation: int,
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL), name)
         fresh = Path(folder, _ISSUED, f"{name}~{os.getpid()}~")  # several may issue at once
         fresh.unlink(missing_ok=True)  # left by a process that died here
-        fresh.symlink_to(" ".join(map(str, (incarnation, *(process or ())))))
+        fresh.symlink_to(f"{incarnation} {pid}" if pid else f"{incarnation}")
         fresh.replace(fresh.with_name(name))
 
 
@@ -193,13 +192,13 @@ def register_of(folder: str) -> Register:
 def is_here(folder: str, name: str) -> bool:
     """Whether the incarnation of a node that was issued last is a process of this machine."""
     found = _look_up(folder, name)
-    return found is not None and len(found) >= 1 + len(ProcessId._fields)
+    return found is not None and len(found) > 1
 
 
 def is_elsewhere(folder: str, name: str) -> bool:
     """Whether the incarnation of a node that was issued last is on another machine."""
     found = _look_up(folder, name)
-    return found is not None and len(found) < 1 + len(ProcessId._fields)
+    return found is not None and len(found) == 1
 
 
 def board_of(folder: str) -> FileBoard:

@@ -13,7 +13,8 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterable
-from pathlib import Path
+
+from rampart.actors.machine.unix_peer import stat_fields
 
 END_S = 2.0
 """Wall seconds in which what was killed has to be gone; what is not waits for a disk."""
@@ -26,12 +27,11 @@ def _living() -> dict[int, tuple[int, int]]:
 
 
 def _parent_and_session(pid: int) -> tuple[int, int] | None:
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_bytes()
-    except OSError:
+    stat = stat_fields(pid)
+    if not stat or stat[0] in b"ZX":
         return None
-    state, parent, _group, session = stat.rpartition(b")")[2].split()[:4]
-    return None if state in b"ZX" else (int(parent), int(session))
+    _state, parent, _group, session = stat[:4]
+    return int(parent), int(session)
 
 
 def _below(living: dict[int, tuple[int, int]], tops: Iterable[int]) -> set[int]:

@@ -25,7 +25,6 @@ from pathlib import Path
 
 from rampart.actors.foreign.descendants import descendants, kill_all
 from rampart.actors.foreign.output_log import OutputLog
-from rampart.actors.machine import turns
 from rampart.actors.machine.unix_peer import process_state
 from rampart.manager.spec.nodes import ChildLimits
 
@@ -69,12 +68,11 @@ class ProgramProcess:
         _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
         output, printed = os.pipe()
         try:
-            with turns.usual():
-                process = subprocess.Popen(  # noqa: S603 what the system names
-                    arguments, executable=program, cwd=folder, env=environment,
-                    stdin=subprocess.DEVNULL, stdout=printed, stderr=printed, pass_fds=inherited,
-                    start_new_session=True,
-                    preexec_fn=_preparation(limits))  # noqa: PLW1509 it takes no lock
+            process = subprocess.Popen(  # noqa: S603 what the system names
+                arguments, executable=program, cwd=folder, env=environment,
+                stdin=subprocess.DEVNULL, stdout=printed, stderr=printed, pass_fds=inherited,
+                start_new_session=True,
+                preexec_fn=_preparation(limits))  # noqa: PLW1509 it takes no lock
         except BaseException:
             os.close(output)
             raise

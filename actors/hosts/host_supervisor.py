@@ -34,7 +34,6 @@ from rampart.actors.hosts.state_files import StateFiles
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.run_plan import SUPERVISOR, on_host
-from rampart.actors.supervision.held_process import HeldProcess
 from rampart.actors.supervision.kill_node import (
     SIGNALS,
     SignalError,
@@ -43,6 +42,7 @@ from rampart.actors.supervision.kill_node import (
 )
 from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.processes import Processes
+from rampart.actors.supervision.supervised_process import SupervisedProcess
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.manager.spec.schema import Kind
 
@@ -272,7 +272,7 @@ class HostSupervisor(Supervisor):
     def _state_problem(self, node: str, problem: str) -> None:
         self.report_diagnostic("checkpoint", problem, node)
 
-    def _settle(self, process: HeldProcess) -> None:
+    def _settle(self, process: SupervisedProcess) -> None:
         """Have the states of a process that was handed over looked at when it has ended."""
         if process.asks or not process.handle.gone():
             self.call_later(_ENDING_S * self.clock.rate, partial(self._settle, process))

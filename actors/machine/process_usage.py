@@ -11,7 +11,8 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
+
+from rampart.actors.machine.unix_peer import stat_fields
 
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -51,26 +52,13 @@ class ProcessUsage:
     age_s: float
 
 
-def parse_stat(text: str) -> ProcessCount | None:
-    """Return what a line of `/proc/PID/stat` says, None if it is none.
-
-    The name in parentheses may itself hold spaces and parentheses, so it is cut off from behind.
-    """
-    fields = text.rpartition(")")[2].split()
-    try:
-        user, system, start, pages = (int(fields[i]) for i in (11, 12, 19, 21))
-        return ProcessCount(
-            (user + system) / _TICKS_PER_S, pages * _PAGE_BYTES, start / _TICKS_PER_S)
-    except (IndexError, ValueError, OverflowError):
-        return None
-
-
 def read_count(pid: int) -> ProcessCount | None:
     """Return the kernel's counts for a process, None if there is no such process."""
-    try:
-        return parse_stat(Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace"))
-    except OSError:
+    stat = stat_fields(pid)
+    if not stat:
         return None
+    user, system, start, pages = (int(stat[i]) for i in (11, 12, 19, 21))
+    return ProcessCount((user + system) / _TICKS_PER_S, pages * _PAGE_BYTES, start / _TICKS_PER_S)
 
 
 class UsageMeter:

@@ -5,12 +5,9 @@ from __future__ import annotations
 import os
 import socket
 import struct
-from typing import NamedTuple
 
 _CREDENTIALS = struct.Struct("3i")
 _STAT_BYTES = 4096
-_STATE, _STARTED = 0, 19
-"""Fields of /proc/PID/stat, counted from the one after the name."""
 
 
 def peer(connection: socket.socket) -> tuple[int, int]:
@@ -44,36 +41,13 @@ def receive_signed(connection: socket.socket, size: int) -> tuple[bytes, int]:
     return data, 0
 
 
-class ProcessId(NamedTuple):
-    """A process of this machine, which no later one can be taken for.
-
-    Attributes:
-        pid: its number.
-        started: when it was started, in clock ticks of the kernel (proc(5)).
-    """
-
-    pid: int
-    started: int
-
-
 def process_state(pid: int) -> str:
     """Return the state letter of /proc/PID/stat, or "X" if there is no such process."""
-    stat = _stat(pid)
-    return stat[_STATE].decode() if stat else "X"
+    stat = stat_fields(pid)
+    return stat[0].decode() if stat else "X"
 
 
-def process_id(pid: int) -> ProcessId | None:
-    """Return which process has this number now; None if there is none."""
-    stat = _stat(pid)
-    return ProcessId(pid, int(stat[_STARTED])) if stat else None
-
-
-def is_alive(process: ProcessId) -> bool:
-    """Whether a process is there and has not ended; a zombie has."""
-    return process_id(process.pid) == process and process_state(process.pid) not in "ZX"
-
-
-def _stat(pid: int) -> list[bytes]:
+def stat_fields(pid: int) -> list[bytes]:
     """Return the fields of /proc/PID/stat after the name; none if there is no such process."""
     try:  # a third of what pathlib takes; of the routers it is asked 66 times a second
         stat = os.open(f"/proc/{pid}/stat", os.O_RDONLY | os.O_CLOEXEC)

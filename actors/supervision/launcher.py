@@ -24,7 +24,7 @@ from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.supervision import requests
-from rampart.actors.supervision.process_title import TITLE_BYTES, end_run, kill, set_title
+from rampart.actors.supervision.process_title import end_run, kill, set_title
 from rampart.actors.supervision.requests import LaunchError
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 from rampart.files import working_folder
@@ -167,7 +167,7 @@ class Launcher:
                 [sys.executable, "-P", "-m", "rampart.actors.supervision.root",
                  str(theirs.fileno())],
                 stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()], process_group=0,
-                env={**working_folder.environment(), "RAMPART_ROOM_FOR_TITLES": "." * TITLE_BYTES})
+                env=working_folder.environment())
         return ours
 
     async def _read(self, reader: asyncio.StreamReader) -> None:

@@ -24,7 +24,6 @@ from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import ROUTERS, board_of, is_here, issue, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
-from rampart.actors.machine.unix_peer import process_id
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
@@ -157,7 +156,7 @@ async def live(layout: Layout, role: Role, run: RunContext, bus: ZenohBus | None
 def _take_place(layout: Layout, names: tuple[str, ...], incarnation: int) -> None:
     """Have others know this process as that of its nodes."""
     set_title(layout.plan.base_port, layout.plan.launcher_pid, names, incarnation)
-    issue(layout.plan.folder, names, incarnation, process_id(os.getpid()))
+    issue(layout.plan.folder, names, incarnation, os.getpid())
 
 
 async def _run_actors(layout: Layout, role: Role, run: RunContext,

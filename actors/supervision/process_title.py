@@ -22,9 +22,6 @@ from rampart.actors.machine.unix_peer import process_state
 
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 
-TITLE_BYTES = 512
-"""A title may be so long: by one that is cut off no process is found."""
-
 # It finds the room for titles from the environment's first variable, the first time it is called:
 # now, as long as none has been replaced.
 setproctitle.getproctitle()
@@ -45,13 +42,6 @@ def set_title(port: int, launcher: int, names: tuple[str, ...], incarnation: int
     """Name the calling process."""
     setproctitle.setproctitle(f"rampart[{port}/{launcher}] {'+'.join(names)} #{incarnation}")
     setproctitle.setthreadtitle("+".join(names)[:15])
-
-
-def title_room() -> int:
-    """Return how long a title of this process may be: as its arguments and environment were."""
-    stat = Path("/proc/self/stat").read_text(encoding="utf-8", errors="replace")
-    arguments, _, _, end = map(int, stat.rpartition(")")[2].split()[45:49])
-    return end - arguments
 
 
 def parse_title(pid: int, title: str) -> RunProcess | None:

@@ -50,20 +50,15 @@ from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.foreign.descendants import kill_orphans
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.machine import turns
 from rampart.actors.machine.absence import Absence
 from rampart.actors.machine.patience import Patience, usage
+from rampart.actors.machine.unix_peer import stat_fields
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_system
 from rampart.actors.supervision import requests
 from rampart.actors.supervision.node_process import Role, live
 from rampart.actors.supervision.pool import Pool, wait
-from rampart.actors.supervision.process_title import (
-    TITLE_BYTES,
-    kill,
-    set_title,
-    title_room,
-)
+from rampart.actors.supervision.process_title import kill, set_title
 from rampart.actors.supervision.requests import ForkRequest, LaunchError, Reply
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.system.layout import Layout, adapted_system, load_run, published_keys
@@ -86,7 +81,6 @@ LAST_PORT = 32_000
 EXIT_INTERRUPTED = 1
 
 _STOP_S, _KILLED_S = 1.2, 1.0
-_ROOM = "RAMPART_ROOM_FOR_TITLES"
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 
 # A router holds a socket for each process of a run, and the supervisor a descriptor. With too few
@@ -168,9 +162,6 @@ class Root:
         Raises:
             LaunchError: no process can be forked.
         """
-        if title_room() < TITLE_BYTES and _ROOM not in os.environ:
-            os.execve(  # noqa: S606 this program once more, with room
-                sys.executable, sys.orig_argv, {**os.environ, _ROOM: "." * TITLE_BYTES})
         ours, theirs = socket.socketpair()
         verdict, said = os.pipe()
         self._take_signals()
@@ -381,7 +372,6 @@ class Root:
         layout = self._layout
         if layout is None or not self.plan.folder:
             raise LaunchError("nothing is loaded")
-        turns.short()
         self._take_plan(origin_s=origin_s)
         self._supervisor.policy = RestartPolicy(layout.spec.supervision)
         self._supervisor.incarnation = self.plan.incarnations
@@ -685,8 +675,7 @@ def needed_descriptors(processes: int) -> int:
 
 def _age_s() -> float:
     """Return for how long this process has existed, real seconds (proc(5), field 22 of stat)."""
-    stat = Path("/proc/self/stat").read_text(encoding="utf-8", errors="replace")
-    begun_s = int(stat.rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
+    begun_s = int(stat_fields(os.getpid())[19]) / os.sysconf("SC_CLK_TCK")
     return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - begun_s)
 
 

@@ -1,7 +1,7 @@
 """A process under supervision: its states, what moves it between them, what is then to be done.
 
-`TRANSITIONS` is the whole of it; what is not in the table changes nothing. Pure: time is an
-argument, and the actions are carried out by `rampart.actors.supervision.supervisor`.
+`TRANSITIONS` is the whole of it; what is not in the table changes nothing. Time is an argument, and
+the actions are carried out by `rampart.actors.supervision.supervisor`.
 
 How often it may be restarted is OTP's restart intensity, with backoff; the numbers are those of
 `[supervision]` in the system spec. Up to half of `intensity` restarts within `period_s` happen at
@@ -17,13 +17,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import NamedTuple
 
-from rampart.actors.ftm.messages import NodeState
+from rampart.actors.bus.run_folder import restarts_of
+from rampart.actors.ftm.messages import NodeInfo, NodeState
 from rampart.actors.machine.patience import Patience, Usage
+from rampart.actors.runtime.timer import Timer
+from rampart.actors.supervision.processes import ProcessHandle
 from rampart.actors.system.layout import Unit
 from rampart.manager.spec.tables import Supervision
 
@@ -247,6 +250,8 @@ class SupervisedProcess:
         stays: Whether it is there and starts its program again, which has ended.
         delay_s: How long to wait before the fork that was granted last.
         heard_s: When each of its nodes was last heard, and the manager's status.
+        handle: On the process that is there.
+        next_step: Towards its fork, while that is under way; there is never more than one.
     """
 
     unit: Unit
@@ -264,6 +269,8 @@ class SupervisedProcess:
     started_s: float = 0.0
     heard_s: dict[str, float] = field(default_factory=dict)
     lives: Lives = field(default_factory=Lives)
+    handle: ProcessHandle = field(default_factory=ProcessHandle)
+    next_step: Timer | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -305,10 +312,35 @@ class SupervisedProcess:
         return Event.TOO_OFTEN, f"{why}, the next attempt is in {self.delay_s:.0f} s"
 
     def take(self, pid: int, incarnation: int) -> None:
-        """Note that another process is the present one."""
+        """Note that another process is the present one, and let go of the one before."""
+        self.forget_step()
+        self.let_go()
         self.pid, self.incarnation, self.heard_s, self.stays = pid, incarnation, {}, False
         self.lives.forked()
         self.highest = max(self.highest, incarnation)
+
+    def let_go(self) -> None:
+        """Hold nothing."""
+        self.handle.close()
+        self.handle = ProcessHandle()
+
+    def kill(self) -> None:
+        """End it at once, and do not report that; not if only its program has to be replaced."""
+        if not self.stays:
+            self.handle.ignore()
+            self.handle.kill()
+
+    def forget_step(self) -> None:
+        """Have the next step towards a fork not taken."""
+        if self.next_step is not None:
+            self.next_step.cancel()
+
+    def rows(self, late_s: Callable[[str], float], now_s: float) -> Iterator[NodeInfo]:
+        """Return the rows of its nodes in the table of all; `late_s` says how late one was."""
+        failing = self.lives.failing(now_s)
+        for node in self.unit.nodes:
+            yield NodeInfo(node.name, node.kind.value, self.pid, self.shown, self.incarnation,
+                           restarts_of(self.incarnation), late_s(node.name), failing=failing)
 
     def is_late(self, now_s: float, timeout_s: float) -> bool:
         """Whether a heartbeat of it is missing."""

@@ -40,7 +40,6 @@ from rampart.actors.machine.absence import Absence
 from rampart.actors.machine.patience import Patience
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.run_plan import SUPERVISOR
-from rampart.actors.supervision.held_process import HeldProcess
 from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.processes import (
     OsProcesses,
@@ -56,6 +55,7 @@ from rampart.actors.supervision.supervised_process import (
     Event,
     RestartPolicy,
     State,
+    SupervisedProcess,
 )
 from rampart.actors.system.layout import Layout, Unit, adapted_system
 from rampart.manager.spec.adaptation import changed_actors
@@ -116,14 +116,14 @@ class Supervisor(Actor):
         """Receive what becomes of programs if there is any."""
         return topic is not topics.PROCESS_EVENT or any(node.command for node in self._spec.nodes)
 
-    def _held(self, unit: Unit) -> HeldProcess:
+    def _held(self, unit: Unit) -> SupervisedProcess:
         known = self.context.run.known_incarnations
         highest = max((known.get(node.name, 0) for node in unit.nodes), default=0)
-        return HeldProcess(unit, RestartPolicy(self._spec.supervision),
+        return SupervisedProcess(unit, RestartPolicy(self._spec.supervision),
                            Patience(2 * _CHECK_S / self._plan.rate),
                            incarnation=highest, highest=highest)
 
-    def _process_of(self, node: str) -> HeldProcess | None:
+    def _process_of(self, node: str) -> SupervisedProcess | None:
         return self._processes.get(
             node if node in self._routers else self._layout.unit_of.get(node, ""))
 
@@ -148,7 +148,7 @@ class Supervisor(Actor):
         process.incarnation = process.highest = above
         self._on(process, Event.START)
 
-    def hand_over(self, unit: str) -> HeldProcess | None:
+    def hand_over(self, unit: str) -> SupervisedProcess | None:
         """End a unit and keep it no more; return its process, which may not have ended yet."""
         process = self._processes.pop(unit, None)
         if process is not None:
@@ -167,7 +167,7 @@ class Supervisor(Actor):
         process = self._process_of(node)
         return process.highest if process else 0
 
-    def _is_kept(self, process: HeldProcess) -> bool:
+    def _is_kept(self, process: SupervisedProcess) -> bool:
         return self._processes.get(process.unit.name) is process
 
     # -- start and stop -------------------------------------------------------------------------
@@ -337,7 +337,7 @@ class Supervisor(Actor):
         self.publish_table()
         self._lateness.turn()
 
-    def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
+    def _ended(self, process: SupervisedProcess, pid: int, detail: str = "") -> None:
         self._end_programs(process)
         # Else it was replaced, or is kept no more, since the news came to the mailbox.
         if process.pid == pid and self._is_kept(process):
@@ -345,12 +345,12 @@ class Supervisor(Actor):
             process.stays = False
             self._on(process, Event.ENDED, detail=detail)
 
-    def _end_programs(self, process: HeldProcess) -> None:
+    def _end_programs(self, process: SupervisedProcess) -> None:
         """End what the program of a command has left, whose process has ended."""
         if any(node.command for node in process.unit.nodes):
             kill_orphans(self._plan.launcher_pid)
 
-    def _owns(self, process: HeldProcess) -> bool:
+    def _owns(self, process: SupervisedProcess) -> bool:
         """Whether the supervisor itself brings the process back."""
         return process.unit.name in self._routers or (
             self._spec.layers.supervisor_respawn
@@ -359,7 +359,7 @@ class Supervisor(Actor):
 
     # -- acting ---------------------------------------------------------------------------------
 
-    def _on(self, process: HeldProcess, event: Event, by: str = "", detail: str = "") -> None:
+    def _on(self, process: SupervisedProcess, event: Event, by: str = "", detail: str = "") -> None:
         """Take a process's transition, and do what follows from it."""
         step, by = process.step(event), by or self.name
         if step is None:
@@ -386,18 +386,19 @@ class Supervisor(Actor):
                 case Action.HOLD:
                     self._hold(process, process.pid)
 
-    def _recover(self, process: HeldProcess) -> None:
+    def _recover(self, process: SupervisedProcess) -> None:
         if self._owns(process) or process.policy.attempts or process.requested_by:
             self._restart(process, process.requested_by or self.name)
 
-    def _restart(self, process: HeldProcess, by: str) -> None:
+    def _restart(self, process: SupervisedProcess, by: str) -> None:
         event, why_not = process.ask(self._loop.time())
         self._on(process, event, by, why_not)
 
-    def _fork_in(self, process: HeldProcess, delay_s: float, step: Callable[[], None]) -> None:
+    def _fork_in(self, process: SupervisedProcess, delay_s: float, step: Callable[[], None]
+                 ) -> None:
         process.next_step = self.call_later(delay_s * self.clock.rate, step)
 
-    def _fork_when_gone(self, process: HeldProcess, by: str, delay_s: float = 0.0) -> None:
+    def _fork_when_gone(self, process: SupervisedProcess, by: str, delay_s: float = 0.0) -> None:
         # The socket is free only when the old process is gone: a few more milliseconds.
         if delay_s > 0 or not (process.stays or process.handle.gone()):
             self._fork_in(process, max(delay_s, _GONE_S),
@@ -408,7 +409,7 @@ class Supervisor(Actor):
         process.policy.restarted(self._loop.time())
         self._fork(process, by)
 
-    def _fork(self, process: HeldProcess, by: str) -> None:
+    def _fork(self, process: SupervisedProcess, by: str) -> None:
         if process.asks:  # the answer is under way
             return
         incarnation = process.highest + 1
@@ -422,7 +423,7 @@ class Supervisor(Actor):
         except OSError as error:
             answer(0, str(error))
 
-    def _forked(self, process: HeldProcess, by: str, incarnation: int, pid: int, error: str
+    def _forked(self, process: SupervisedProcess, by: str, incarnation: int, pid: int, error: str
                 ) -> None:
         process.asks = False
         if pid and not (process.waits and self._is_kept(process)):
@@ -438,7 +439,7 @@ class Supervisor(Actor):
             self.report_diagnostic("fork", error, process.unit.name)
             self._fork_in(process, _RETRY_S, lambda: self._fork(process, by))
 
-    def _adopt_living(self, process: HeldProcess, living: Sequence[RunProcess]) -> bool:
+    def _adopt_living(self, process: SupervisedProcess, living: Sequence[RunProcess]) -> bool:
         """Adopt the highest incarnation that is there and end the others; False without any."""
         found = sorted((p for p in living if p.names == process.names),
                        key=lambda p: -p.incarnation)
@@ -453,7 +454,7 @@ class Supervisor(Actor):
             self._on(process, Event.ADOPTED)
         return bool(found)
 
-    def _hold(self, process: HeldProcess, pid: int) -> None:
+    def _hold(self, process: SupervisedProcess, pid: int) -> None:
         if process.pid != pid:  # it was replaced while this waited
             return
         process.let_go()
@@ -472,7 +473,7 @@ class Supervisor(Actor):
 
     # -- what it says ---------------------------------------------------------------------------
 
-    def _tell(self, process: HeldProcess, event: str, by: str, detail: str = "") -> None:
+    def _tell(self, process: SupervisedProcess, event: str, by: str, detail: str = "") -> None:
         for node in process.unit.nodes:
             self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
                 node.name, event, process.pid, process.incarnation, by, clip(detail)))

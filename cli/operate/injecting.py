@@ -15,7 +15,7 @@ from rampart.actors.bus.run_info import NoRunError, find_run
 from rampart.actors.runtime.fault_watch import FaultWatch, Order
 from rampart.actors.supervision.kill_node import SignalError
 from rampart.cli.look.topic_catalogue import check_member
-from rampart.cli.operate.kill_elsewhere import signal_anywhere
+from rampart.cli.operate.kill_node import signal_anywhere
 from rampart.cli.output import NoEffectError, UsageError, positive, print_json, refusing, say
 from rampart.cli.session import Session, connect, pause
 

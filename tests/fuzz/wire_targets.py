@@ -9,7 +9,6 @@ import msgspec
 from rampart.actors.bus.envelope import UNREADABLE, ArrivalGuard, Header, encode
 from rampart.actors.bus.recorder_connection import frame, parse_frame
 from rampart.actors.bus.run_info import RunInfo, read_info
-from rampart.actors.machine.process_usage import parse_stat
 from rampart.actors.operator.requests import RequestError, RequestReader
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
@@ -79,12 +78,6 @@ def tap_frame(data: bytes) -> None:
         samples=lambda: [b"rampart[7400/123] osmosis_control #1", b"rampart[7400/1] a+b #42 x"])
 def process_title(data: bytes) -> None:
     parse_title(1, data.rstrip(b"\0").decode(errors="replace"))
-
-
-@target("proc-stat", refuses=(), kind="text", samples=lambda: [
-        b"1 (a b) S 1 1 1 0 -1 4194560 1 2 3 4 5 6 7 8 20 0 1 0 99 1000 250 18446744073709551615"])
-def proc_stat(data: bytes) -> None:
-    parse_stat(data.decode(errors="replace"))
 
 
 @target("run-info", refuses=UNREADABLE, kind="json",

@@ -34,7 +34,7 @@ def net():
 def listed(net: Network, name: str, run: RealRun) -> tuple[dict[str, str], str]:
     """Return each node that `kill-node --list` lists, with its host, and what it tells."""
     done = subprocess.run(
-        net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_elsewhere",
+        net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_node",
                     "--list", "--json", "--port", str(run.port)),
         capture_output=True, text=True, check=True, timeout=30)
     return {row["name"]: row["host"] for row in json.loads(done.stdout)}, done.stderr

@@ -27,7 +27,7 @@ def keys(tmp_path):
 
 
 def kill(run, *words):
-    done = subprocess.run([sys.executable, "-P", "-m", "rampart.actors.supervision.kill_node",
+    done = subprocess.run([sys.executable, "-P", "-m", "rampart.cli.operate.kill_node",
                            *words, "--port", str(run.port)], capture_output=True, text=True,
                           timeout=30, check=False)
     assert done.returncode == 0, done.stderr

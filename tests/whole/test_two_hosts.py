@@ -66,7 +66,7 @@ def with_keys(folder: Path, spec: Path) -> dict[str, tuple[str, ...]]:
 
 def kill_node(net: Network, name: str, run: RealRun, node: str):
     """Kill a node from a host."""
-    command = net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_elsewhere",
+    command = net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_node",
                           node, "--port", str(run.port))
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from rampart.actors.bus import run_folder
-from rampart.actors.machine.unix_peer import process_id
 
 _MAKE = """
 import os, sys
@@ -62,7 +61,7 @@ def test_what_was_issued_last_is_known():
 
 
 def test_it_is_known_which_process_an_incarnation_is(sockets):
-    own = process_id(os.getpid())
+    own = os.getpid()
     run_folder.issue(sockets, ["DM1"], 3, own)
     assert run_folder.register_of(sockets)("DM1") == 3
     assert run_folder.issued(sockets) == {"DM1": 3}

@@ -17,7 +17,6 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import Checkpoints, KeptState
-from rampart.actors.machine.unix_peer import process_id
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.clock import Clock
@@ -108,7 +107,7 @@ class Host(Machine):
         return self.files
 
     def add(self, names, incarnation, *, bound=False):
-        run_folder.issue(self.folder, names, incarnation, process_id(os.getpid()))
+        run_folder.issue(self.folder, names, incarnation, os.getpid())
         for name in names:
             self.loaded[name, incarnation] = self.disk.get(name)
         return super().add(names, incarnation, bound=bound)
@@ -453,7 +452,7 @@ def test_a_module_takes_no_number_of_another_machine_for_a_process_of_its_own(tm
         watchdog = make_actor(Layout(plan, spec), "DM5", 1, RunContext(plan, spec),
                               asyncio.get_running_loop())
         run_folder.issue(sockets, ["hmi"], 1)
-        run_folder.issue(sockets, ["DM4"], 1, process_id(os.getpid()))
+        run_folder.issue(sockets, ["DM4"], 1, os.getpid())
         assert watchdog.context.local_pid("hmi", 4711) == -1
         assert watchdog.context.local_pid("DM4", 4711) == 4711
 

@@ -5,30 +5,24 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 
 import psutil
 import pytest
 
-from rampart.actors.machine.process_usage import (
-    ProcessCount,
-    UsageMeter,
-    parse_stat,
-    read_count,
-)
-
-TICKS = os.sysconf("SC_CLK_TCK")
-LINE = ("12 (a) b) S 1 12 12 0 -1 4194304 100 0 0 0 {user} {system} 0 0 20 0 3 0 {start} 1000000 "
-        "250 18446744073709551615 1 1 0 0 0 0 0 0 0 0 0 0 17 0 0 0 0 0 0")
+from rampart.actors.machine.process_usage import ProcessCount, UsageMeter, read_count
 
 
-def test_a_name_with_parentheses_and_spaces_does_not_shift_the_fields():
-    count = parse_stat(LINE.format(user=2 * TICKS, system=TICKS, start=50 * TICKS))
-    assert count == ProcessCount(3.0, 250 * os.sysconf("SC_PAGE_SIZE"), 50.0)
-
-
-@pytest.mark.parametrize("text", ["", "12 (a) S 1", "12 (a) " + "x " * 50])
-def test_a_line_that_is_none_is_no_process(text):
-    assert parse_stat(text) is None
+def test_a_name_with_parentheses_and_spaces_does_not_shift_the_fields(tmp_path):
+    program = tmp_path / "a) S (b"
+    program.symlink_to("/bin/sleep")
+    with subprocess.Popen([program, "60"]) as process:
+        try:
+            count = read_count(process.pid)
+            assert count is not None
+            assert 0 <= time.clock_gettime(time.CLOCK_BOOTTIME) - count.started_s < 60
+        finally:
+            process.kill()
 
 
 def test_this_process_is_as_psutil_sees_it():

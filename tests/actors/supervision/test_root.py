@@ -21,7 +21,7 @@ from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.runtime.run_plan import load_document
 from rampart.actors.supervision.launcher import Launcher, LaunchError
-from rampart.actors.supervision.process_title import TITLE_BYTES, find_processes
+from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
 from rampart.cli.run_options import parse, plan_of
 from rampart.testing import eventually
@@ -302,15 +302,3 @@ async def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(tmp_path, at_s):
     before = err.startswith("Fatal Python error")  # the interpreter's own words, at its start
     assert before or "Traceback" not in err
     assert find_processes(port) == []
-
-
-@pytest.mark.processes
-async def test_a_root_with_little_room_for_titles_makes_some(tmp_path):
-    root, port = started(tmp_path, PATH=os.environ["PATH"])
-    with root:
-        await eventually(lambda: len(find_processes(port)) >= 26, 20)
-        long = [p for p in find_processes(port) if p.names == ("mission_manager",)]
-        room = Path(f"/proc/{long[0].pid}/stat").read_text().rpartition(")")[2].split()
-        assert int(room[48]) - int(room[45]) >= TITLE_BYTES
-        root.send_signal(signal.SIGTERM)
-        await asyncio.to_thread(root.communicate, timeout=10)

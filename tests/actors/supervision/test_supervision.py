@@ -25,11 +25,11 @@ from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import load_system
 from rampart.actors.supervision import node_process
-from rampart.actors.supervision.kill_node import main as kill_node
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.system.layout import Layout
+from rampart.cli.operate import kill_node
 from rampart.manager.spec.tables import Supervision
 from rampart.testing import eventually
 from tests.stub_actors import launched, stub_plan, write_stub_system
@@ -306,14 +306,14 @@ async def test_an_unsound_spec_is_one_line(tmp_path):
 async def test_kill_node_signals_one_node_and_names_what_it_does_not_know(tmp_path, capsys):
     async with running(tmp_path) as (launcher, witness):
         port = str(launcher.plan.base_port)
-        assert kill_node(["DM1", "--port", port]) == 0
+        assert await asyncio.to_thread(kill_node.main, ["DM1", "--port", port]) == 0
         await eventually(lambda: witness.state("DM1") == ("running", 2))
         for arguments, words in (
                 (["DM99", "--port", port], "unknown node 'DM99'"),
                 (["DM1", "--signal", "HUG", "--port", port], "unknown signal"),
                 (["DM1", "--port", "1"], "no run found on port 1"),
                 (["--port", port], "no node given")):
-            assert kill_node(arguments) == 2
+            assert await asyncio.to_thread(kill_node.main, arguments) == 2
             error = capsys.readouterr().err
             assert words in error
             assert error.count("\n") == 1

@@ -13,11 +13,9 @@ import pytest
 from rampart.actors.bus import run_info
 from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable
-from rampart.actors.supervision import kill_node
-from rampart.actors.supervision.kill_node import Elsewhere, OtherProcess, RunElsewhere
 from rampart.actors.supervision.process_title import RunProcess
-from rampart.cli.operate import kill_elsewhere
-from rampart.cli.operate.kill_elsewhere import listed
+from rampart.cli.operate import kill_node
+from rampart.cli.operate.kill_node import OtherProcess, RunElsewhere, listed
 from rampart.testing.ports import free_base_port
 
 HOSTS = {"robot": "supervisor", "ground": "supervisor_ground", "moon": "supervisor_moon"}
@@ -49,43 +47,47 @@ def test_who_was_not_heard_is_named_with_the_reason():
         "ground", "the processes of robot and moon are missing: nothing was heard")
 
 
-class Others(Elsewhere):
-    def __init__(self, *runs: RunElsewhere) -> None:
-        self._runs = list(runs)
-
-    def runs(self, _port):
-        return self._runs
-
-
 @pytest.fixture
 def here(monkeypatch):
+    """Return a function that says what the run on port 7450 has on other hosts."""
     monkeypatch.setattr(kill_node, "find_processes", lambda _port: [
         RunProcess(21, 7450, 20, ("pilot",), 3), RunProcess(31, 7460, 30, ("a", "b"), 1)])
+    monkeypatch.setattr(kill_node, "find_runs", list)
+
+    def has(elsewhere: RunElsewhere) -> None:
+        async def found(_run: RunInfo) -> RunElsewhere:
+            return elsewhere
+
+        monkeypatch.setattr(kill_node, "find_runs", lambda: [RUN])
+        monkeypatch.setattr(kill_node, "_listed", found)
+
+    return has
 
 
 def test_on_one_machine_the_list_is_as_it_was(here, capsys):
-    assert kill_node.main(["--list"], Others()) == 0
+    assert kill_node.main(["--list"]) == 0
     assert capsys.readouterr() == (
         "  7450       21 #3    pilot\n  7460       31 #1    a\n  7460       31 #1    b\n", "")
-    assert kill_node.main(["--list", "--json"], Others()) == 0
+    assert kill_node.main(["--list", "--json"]) == 0
     first = json.loads(capsys.readouterr().out)[0]
     assert first == {"name": "pilot", "pid": 21, "incarnation": 3, "port": 7450}
 
 
 def test_with_several_hosts_each_process_has_its_host(here, capsys):
-    run = RunElsewhere(7450, "robot", (OtherProcess("ground", "hmi", 12, 1),))
-    assert kill_node.main(["--list"], Others(run)) == 0
+    here(RunElsewhere(7450, "robot", (OtherProcess("ground", "hmi", 12, 1),)))
+    assert kill_node.main(["--list"]) == 0
     assert capsys.readouterr() == (
         "  7450       21 #3    robot  pilot\n  7460       31 #1           a\n"
         "  7460       31 #1           b\n  7450       12 #1    ground hmi\n", "")
-    assert kill_node.main(["--list", "--json"], Others(run)) == 0
+    assert kill_node.main(["--list", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert [(one["name"], one.get("host")) for one in rows] == [
         ("pilot", "robot"), ("a", None), ("b", None), ("hmi", "ground")]
 
 
 def test_what_is_missing_is_told_in_a_line_beside_the_list_of_this_machine(here, capsys):
-    assert kill_node.main(["--list"], Others(RunElsewhere(7450, "robot", (), "no\nground"))) == 0
+    here(RunElsewhere(7450, "robot", (), "no\nground"))
+    assert kill_node.main(["--list"]) == 0
     told = capsys.readouterr()
     assert "robot pilot" in told.out
     assert told.err == "kill-node: no ground\n"
@@ -113,13 +115,13 @@ def launcher(info: RunInfo):
             thread.join()
 
 
-def test_without_a_bus_the_others_are_not_waited_for_long(tmp_path, monkeypatch):
-    monkeypatch.setattr(kill_elsewhere, "_PATIENCE_S", 0.1)
-    monkeypatch.setattr(kill_elsewhere, "_LISTED_S", 0.1)
+def test_without_a_bus_the_others_are_not_waited_for_long(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(kill_node, "_PATIENCE_S", 0.1)
+    monkeypatch.setattr(kill_node, "_LISTED_S", 0.1)
     port = free_base_port()
     info = RunInfo(os.getpid(), port, 1.0, 0.0, "x.toml", str(tmp_path), (), "r", 0, "t",
                    hosts=HOSTS)
     with launcher(info):
-        [found] = kill_elsewhere.OtherHosts().runs(port)
-    assert found == RunElsewhere(
-        port, "robot", (), "the processes of ground and moon are missing: nothing was heard")
+        assert kill_node.main(["--list", "--port", str(port)]) == 0
+    assert capsys.readouterr().err == (
+        "kill-node: the processes of ground and moon are missing: nothing was heard\n")
