@@ -58,22 +58,20 @@ def find_processes(port: int | None = None, launcher: int | None = None) -> list
     Zombies are left out: they run no code and hold nothing.
     """
     found = [process for entry in Path("/proc").iterdir() if entry.name.isdecimal()
-             and (process := find_process(int(entry.name)))
+             and (process := _process_at(entry))
              and port in {None, process.port} and launcher in {None, process.launcher}]
     return sorted(found, key=lambda p: (p.port, p.pid))
 
 
-def find_process(pid: int) -> RunProcess | None:
-    """Return the process of a run that has this number, or None if there is none of this user."""
-    entry = Path(f"/proc/{pid}")
+def _process_at(entry: Path) -> RunProcess | None:
     try:
         raw = (entry / "cmdline").read_bytes()
         if not raw.startswith(b"rampart[") or entry.stat().st_uid != os.getuid():
             return None
     except OSError:
         return None  # it ended while we looked
-    process = parse_title(pid, raw.rstrip(b"\0").decode(errors="replace"))
-    return process if process and process_state(pid) not in "ZX" else None
+    process = parse_title(int(entry.name), raw.rstrip(b"\0").decode(errors="replace"))
+    return process if process and process_state(process.pid) not in "ZX" else None
 
 
 def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> bool:
@@ -85,14 +83,10 @@ def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> bool:
     return True
 
 
-def kill_leftovers(launcher: int) -> list[int]:
-    """SIGKILL all processes of a launcher's run except this one; return their pids."""
-    return [process.pid for process in find_processes(launcher=launcher)
-            if process.pid != os.getpid() and kill(process.pid)]
-
-
 def end_run(launcher: int, folder: str) -> None:
-    """Leave nothing of a run whose launcher has ended: neither processes nor its folder."""
+    """Leave nothing of a run whose launcher has ended but this process: nor its folder."""
     kill_programs(process.pid for process in find_processes(launcher=launcher))
-    kill_leftovers(launcher)
+    for process in find_processes(launcher=launcher):
+        if process.pid != os.getpid():
+            kill(process.pid)
     remove(folder)

@@ -111,14 +111,12 @@ class OsHandle(ProcessHandle):
         self.pidfd = os.pidfd_open(pid)
         self._pid = pid
         self._ended = ended
-        self._is_heard = True
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self.pidfd, self._told)
 
     def _told(self) -> None:
-        if self._is_heard:
-            self.ignore()
-            self._ended()
+        self.ignore()
+        self._ended()
 
     def kill(self) -> None:
         self.send(signal.SIGKILL)
@@ -145,8 +143,7 @@ class OsHandle(ProcessHandle):
         return usage(self._pid)
 
     def ignore(self) -> None:
-        if self._is_heard:
-            self._is_heard = False
+        if self.pidfd >= 0:
             self._loop.remove_reader(self.pidfd)
 
     def close(self) -> None:

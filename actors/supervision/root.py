@@ -45,8 +45,8 @@ from typing import Any, NoReturn
 import msgspec
 
 from rampart.actors.bus import run_folder, run_info
+from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.envelope import decoder
-from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.foreign.descendants import kill_orphans
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm.messages import AdaptedSystem
@@ -80,7 +80,7 @@ LAST_PORT = 32_000
 
 EXIT_INTERRUPTED = 1
 
-_STOP_S, _KILLED_S = 1.2, 1.0
+_STOP_S, _KILLED_S, _RETRY_S = 1.2, 1.0, 0.05
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 
 # A router holds a socket for each process of a run, and the supervisor a descriptor. With too few
@@ -252,10 +252,12 @@ class Root:
             if os.WIFSTOPPED(status):
                 if pid == self._watch_pid:
                     kill(pid, signal.SIGCONT)
-                elif self._pool is not None:
-                    self._pool.remove(pid)
+                elif self._pool is not None and self._pool.forget(pid):
+                    kill(pid)
                 continue
             names = self._children.pop(pid, ())
+            if self._pool is not None:
+                self._pool.forget(pid)
             if pid == self._watch_pid:
                 self._watch_pid = 0
                 if os.WIFSIGNALED(status):
@@ -379,7 +381,7 @@ class Root:
             self._start_supervisor()
         except OSError as error:
             raise LaunchError(f"no process can be started: {error.strerror}") from None
-        self._pool = Pool(layout.spec.supervision.spares, self._selector, self._fork_pooled)
+        self._pool = Pool(layout.spec.supervision.spares, self._fork_pooled)
         info = self._held[0]
         info.listen(8)
         info.setblocking(False)
@@ -426,10 +428,9 @@ class Root:
         if self._has_ended or self._pool is None:
             return None
         now_s, guarded = time.monotonic(), self._supervisor
-        wait_s = PERIOD_S
         self._absence.note(now_s)
         if not guarded.pid:
-            wait_s = min(wait_s, self._bring_supervisor_back(now_s))
+            self._bring_supervisor_back(now_s)
         elif now_s >= guarded.looked_s + PERIOD_S:
             guarded.looked_s = now_s
             if self._absence.excuses(now_s):
@@ -437,11 +438,11 @@ class Root:
             elif guarded.patience.look(now_s, guarded.pid, usage(guarded.pid)
                                      ) >= SUPERVISOR_PATIENCE_S:
                 kill(guarded.pid)
-        pool_s = self._pool.look()
-        return wait_s if pool_s is None else min(wait_s, pool_s)
+        self._pool.fill()
+        return PERIOD_S if guarded.pid else _RETRY_S
 
-    def _bring_supervisor_back(self, now_s: float) -> float:
-        """Start the next supervisor when it is due; return in how many seconds to look again."""
+    def _bring_supervisor_back(self, now_s: float) -> None:
+        """Start the next supervisor when it is due."""
         guarded = self._supervisor
         if guarded.due_s is None:
             delay_s = guarded.policy.delay_s(now_s)
@@ -449,20 +450,19 @@ class Root:
                 self._complain(f"the supervisor ended {guarded.policy.limits.intensity} times "
                                f"within {guarded.policy.limits.period_s:.0f} s: it is started "
                                "less often from now on")
-                return PERIOD_S
+                return
             guarded.due_s = now_s + delay_s
         if now_s < guarded.due_s:
-            return guarded.due_s - now_s
+            return
         try:
             self._start_supervisor()
         except OSError as error:
             self._complain(f"the supervisor cannot be started: {error.strerror}")
-            return PERIOD_S
+            return
         guarded.due_s = None
         guarded.policy.restarted(now_s)
         guarded.trouble = ""
         self._tell(requests.Restarted(self.plan.supervisor))
-        return PERIOD_S
 
     def _complain(self, trouble: str) -> None:
         if trouble != self._supervisor.trouble:
@@ -593,23 +593,26 @@ class Root:
         return pid
 
     def _fork_pooled(self, control: socket.socket) -> int:
-        pid = self._forked()
-        if pid == 0:
-            self._in_child(self._be_pooled(control), control)
-        self._children[pid] = ()
-        return pid
-
-    def _be_pooled(self, control: socket.socket) -> Callable[[], int]:
-        async def become(data: bytes, bus: ZenohBus | None) -> int:
+        async def wait_and_live() -> int:
+            try:
+                data, bus = await wait(control, self.plan)
+            except (BusError, OSError):  # there is no router, or the root has ended
+                return 0
+            if not data:
+                return 0
             request = msgspec.json.decode(data, type=ForkRequest)
             role = Role(self._names_of(request.name), request.incarnation)
             return await live(self._loaded, role, self._known(None), bus)
 
         def be_pooled() -> int:
             set_title(self.plan.base_port, self._pid, (POOL,), 1)
-            return asyncio.run(wait(control, self.plan, become))
+            return asyncio.run(wait_and_live())
 
-        return be_pooled
+        pid = self._forked()
+        if pid == 0:
+            self._in_child(be_pooled, control)
+        self._children[pid] = ()
+        return pid
 
     def _known(self, link: socket.socket | None) -> RunContext:
         assert self._run is not None  # noqa: S101 for the type checker
@@ -647,8 +650,9 @@ class Root:
         for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTTIN, signal.SIGTTOU):
             signal.signal(number, signal.SIG_IGN)
         registered = [key.fileobj for key in self._selector.get_map().values()]
-        for one in {*registered, *self._held} - set(kept):
-            os.close(one) if isinstance(one, int) else one.close()  # type: ignore[attr-defined]
+        pooled = self._pool.waiting.values() if self._pool else ()
+        for one in {*registered, *self._held, *pooled} - set(kept):
+            os.close(one) if isinstance(one, int) else one.close()
         os.close(wakes)
         self._selector.close()
 
