@@ -14,21 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Self
 
 import msgspec
 
 from rampart.actors import ROLES
 from rampart.actors.bus.topic import Topic
 from rampart.manager.spec.schema import SystemSpec
-
-
-class HasRun(Protocol):
-    """What an actor is given: something with the context of the run."""
-
-    @property
-    def run(self) -> Any:
-        """The `RunContext`."""
 
 
 class Application:
@@ -120,8 +112,8 @@ class Application:
         return []
 
     @classmethod
-    def of(cls, context: HasRun) -> Self:
-        """Return the application of the run in which an actor is started.
+    def of(cls, context: Any) -> Self:
+        """Return the application of the run in which an actor is started, by its `Context`.
 
         Raises:
             ValueError: it is another one.
@@ -130,7 +122,7 @@ class Application:
 
     @classmethod
     def of_run(cls, run: Any) -> Self:
-        """Return the application of a run; arguments and errors as of `of`."""
+        """Return the application of a run, by its `RunContext`; errors as of `of`."""
         found = run.application
         if not isinstance(found, cls):
             raise ValueError(f"needs an [application] of class {cls.__module__}:{cls.__name__}; "

@@ -15,7 +15,7 @@ from array import array
 from collections.abc import Callable, Iterator
 from functools import cache
 from random import Random
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -29,18 +29,55 @@ class InjectionError(ValueError):
     """An injection does not fit the message it is for; the text is one line."""
 
 
-def field_type(kind: type[Any], path: str) -> Any:
-    """Return the declared type of a field of a message type.
+class FieldType(NamedTuple):
+    """How a field of a message is declared.
+
+    Attributes:
+        declared: its type.
+        element: what a (nested) sequence holds; of any other field its type, without bounds.
+        metas: bounds of it and of its elements.
+    """
+
+    declared: Any
+    element: Any
+    metas: tuple[msgspec.Meta, ...]
+
+    @property
+    def is_list(self) -> bool:
+        """Whether it is a sequence."""
+        return self.element is not bare(self.declared)
+
+
+@cache
+def field_types(kind: Any) -> dict[str, FieldType]:
+    """Return the fields of a message type by their names; of what has none, none."""
+    found: dict[str, FieldType] = {}
+    for field in msgspec.structs.fields(kind) if isinstance(kind, type) and issubclass(
+            kind, msgspec.Struct) else ():
+        element, metas = field.type, tuple[msgspec.Meta, ...]()
+        while True:
+            metas += tuple(m for m in getattr(element, "__metadata__", ())
+                           if isinstance(m, msgspec.Meta))
+            element = bare(element)
+            if getattr(element, "__origin__", None) not in (tuple, list):
+                break
+            element = element.__args__[0]
+        found[field.name] = FieldType(field.type, element, metas)
+    return found
+
+
+def field_type(kind: type[Any], path: str) -> FieldType:
+    """Return how a field of a message type is declared.
 
     Raises:
         InjectionError: the message has no such field.
     """
-    found: Any = kind
+    found = FieldType(kind, kind, ())
     for name in path.split("."):
-        fields = _fields(_element(found))
+        fields = field_types(found.element)
         if name not in fields:
             raise InjectionError(f"field {path!r}: {kind.__name__} has no such field; "
-                                 f"known: {', '.join(_fields(kind)) or 'none'}")
+                                 f"known: {', '.join(fields) or 'none'}")
         found = fields[name]
     return found
 
@@ -62,8 +99,8 @@ def check_fields(kind: type[Any], order: Injection) -> None:
         for path in getattr(order, what):
             _check_number(kind, path, what, whole=what == "add_fields")
     for path in order.keep_ends:
-        declared = field_type(kind, path)
-        if not is_array(path, declared) and _element(declared) is bare(declared):
+        field = field_type(kind, path)
+        if not is_array(path, field.declared) and not field.is_list:
             raise InjectionError(f"keep_ends {path!r}: not a list")
 
 
@@ -92,7 +129,7 @@ def corrupt(body: Any, order: Injection, elapsed_s: float, draw: Random) -> Any:
         (order.noise_fields, lambda x, sigma: x + draw.gauss(0.0, sigma)))
     for fields, change in changes:
         for path, by in fields.items():
-            within = _within(kind, path)
+            within = narrow_range(field_type(kind, path).metas)
             for holder, name in _places(data, path):
                 holder[name] = _changed(
                     name, holder[name], lambda x: _turned(x, change(x, by), within))  # noqa: B023
@@ -113,20 +150,6 @@ def wrap(angle_rad: float) -> float:
         return angle_rad
     turned = math.remainder(angle_rad, 2 * math.pi)
     return math.pi if turned <= -math.pi else turned
-
-
-@cache
-def _within(kind: Any, path: str) -> tuple[float, float] | None:
-    """Return the range that a field declares, None if none; that of its elements if it has some."""
-    declared = field_type(kind, path)
-    metas: tuple[msgspec.Meta, ...] = ()
-    while True:
-        metas += tuple(m for m in getattr(declared, "__metadata__", ())
-                       if isinstance(m, msgspec.Meta))
-        declared = bare(declared)
-        if getattr(declared, "__origin__", None) not in (tuple, list):
-            return narrow_range(metas)
-        declared = declared.__args__[0]
 
 
 def _turned(true: float, wrong: float, within: tuple[float, float] | None) -> float:
@@ -192,22 +215,8 @@ def _flat(value: Any) -> Iterator[Any]:
         yield value
 
 
-def _element(kind: Any) -> Any:
-    """Return what a (nested) sequence type holds, or the type itself, without its bounds."""
-    kind = bare(kind)
-    while getattr(kind, "__origin__", None) in (tuple, list):
-        kind = bare(kind.__args__[0])
-    return kind
-
-
-def _fields(kind: Any) -> dict[str, Any]:
-    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
-        return {f.name: f.type for f in msgspec.structs.fields(kind)}
-    return {}
-
-
 def _check_number(kind: type[Any], path: str, what: str, *, whole: bool) -> None:
-    leaf = _element(field_type(kind, path))
+    leaf = field_type(kind, path).element
     if leaf is float or is_array(path, leaf) or (whole and leaf is int):
         return
     raise InjectionError(f"{what} {path!r}: {getattr(leaf, '__name__', leaf)} is no "
@@ -219,15 +228,14 @@ def _is_number(value: Any) -> bool:
 
 
 def _check_value(kind: type[Any], path: str, value: Any) -> None:
-    declared = field_type(kind, path)
-    if is_array(path, declared):
+    field = field_type(kind, path)
+    if is_array(path, field.declared):
         if isinstance(value, bool) or not isinstance(value, bytes | int | float):
             raise InjectionError(f"set_fields {path!r} = {value!r}: must be a number that fills "
                                  "the array, or its bytes")
         return
-    if _is_number(value):
-        declared = _element(declared)  # a number fills a sequence
-    try:
-        msgspec.convert(value, declared, builtin_types=(bytes,))
+    try:  # a number fills a sequence
+        msgspec.convert(value, field.element if _is_number(value) else field.declared,
+                        builtin_types=(bytes,))
     except msgspec.ValidationError as error:
         raise InjectionError(f"set_fields {path!r} = {value!r}: {error}") from None

@@ -213,7 +213,7 @@ def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
     if not equals:
         raise UsageError(f"{option} {text}: must be FIELD=VALUE")
     with refusing(InjectionError):
-        return name, value, field_type(topic.type, name)
+        return name, value, field_type(topic.type, name).declared
 
 
 def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:

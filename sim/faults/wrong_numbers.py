@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from rampart.actors.bus.bounds import bare, narrow_range
-from rampart.actors.runtime.corruption import is_array
+from rampart.actors.bus.bounds import narrow_range
+from rampart.actors.runtime.corruption import field_types, is_array
 
 OF_RANGE = (0.05, 0.3)
 """Of a field's range, the least and greatest share that it is wrong by."""
@@ -89,15 +89,12 @@ def _offset(number: Number, draw: Random, sizes: Sizes) -> float:
     return round(sign * draw.uniform(least, most), 3)
 
 
-def numbers(kind: Any, path: str = "", metas: tuple[msgspec.Meta, ...] = ()) -> Iterator[Number]:
-    """Yield each number in a type, through structs and sequences."""
-    metas += tuple(m for m in getattr(kind, "__metadata__", ()) if isinstance(m, msgspec.Meta))
-    kind = bare(kind)
-    if getattr(kind, "__origin__", None) in (tuple, list):
-        yield from numbers(kind.__args__[0], path, metas)
-    elif isinstance(kind, type) and issubclass(kind, msgspec.Struct):
-        for f in msgspec.structs.fields(kind):
-            if f.name != "pid":
-                yield from numbers(f.type, f"{path}.{f.name}" if path else f.name)
-    elif kind in (int, float) or is_array(path, kind):
-        yield Number(path, kind, metas)
+def numbers(kind: Any, within: str = "") -> Iterator[Number]:
+    """Yield each number in a message type, through structs and sequences."""
+    for name, field in field_types(kind).items():
+        path = f"{within}{name}"
+        if name == "pid":
+            continue
+        if field.element in (int, float) or is_array(path, field.element):
+            yield Number(path, field.element, field.metas)
+        yield from numbers(field.element, f"{path}.")

@@ -93,8 +93,8 @@ def one(folder: Path, seed: int, port: int) -> tuple[list[str], str]:
     moment_s = dice.uniform(3.0, LASTS_S)
     time.sleep(moment_s)
     if run.poll() is not None:
-        run.communicate()
-        return [], f"killed after {moment_s:.1f} s: it had ended"
+        told = run.communicate()[1]
+        return [told[-600:]] if run.returncode else [], f"after {moment_s:.1f} s it had ended"
     run.send_signal(signal.SIGKILL)
     run.communicate()
     node = dice.choice(STATES)

@@ -463,7 +463,7 @@ def test_a_process_is_given_the_heartbeat_period_of_the_spec():
 
 @pytest.mark.parametrize(("base", "name"), [
     (Actor, "clock"), (Actor, "publish"), (DetectionModule, "state"), (DetectionModule, "activate"),
-    (RecoveryModule, "state"), (RecoveryModule, "act")])
+    (RecoveryModule, "activated"), (RecoveryModule, "act")])
 def test_a_handler_with_a_name_that_the_base_class_has_is_refused(base, name):
     """Before, the base class's value took its place, or it that of the base class, in silence."""
     with pytest.raises(TypeError, match=rf"^Own\.{name}: \w+ has something of this name already"):
