@@ -1,27 +1,4 @@
-"""`rampart`: the toolbox's command line.
-
-Look at a running system, disturb it, and ask the arbiter.
-
-Examples:
-  rampart new courier                            a folder with a robot of your own
-  rampart run --virtual --seed 7                 start a system; `rampart run --help`
-  rampart status                                 the run at a glance
-  rampart top                                    the run in the terminal, live
-  rampart node list                              processes, states, restarts
-  rampart topic echo localization/pose           see messages go by
-  rampart inject command-not-updated             break something
-  rampart reset RM1                              release the emergency stop
-  rampart adapt set strategy guarded-repair      change mechanisms while it runs
-  rampart live foxglove                          see it in another viewer
-  rampart record run.mcap                        keep all that is said; `rampart replay` it
-  rampart check my_system.toml                   is it sound, before it runs? `explain` it
-  rampart table                                  what the manager would decide
-  rampart tree                                   see fault tree, FTMTree and orders
-  rampart campaign --paper                       break it a hundred times, and count
-  rampart verify                                 prove it, or show where it fails
-  rampart bench                                  kill each node, and time its restart
-`rampart VERB --help` shows more.
-"""
+"""`rampart`: the command line."""
 
 from __future__ import annotations
 
@@ -29,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
+from typing import Any
 
 from rampart.cli import new
 from rampart.cli.analyse import (
@@ -38,7 +16,7 @@ from rampart.cli.analyse import (
     tree_verbs,
     verify_verb,
 )
-from rampart.cli.look import ros_verbs, serving_verbs, topic_verbs
+from rampart.cli.look import doctor_verb, ros_verbs, serving_verbs, topic_verbs
 from rampart.cli.operate import (
     adapt_verb,
     bench_verb,
@@ -48,15 +26,52 @@ from rampart.cli.operate import (
     operator_verbs,
     token_verbs,
 )
-from rampart.cli.output import NoEffectError, UsageError, warn
+from rampart.cli.output import NoEffectError, UsageError, say_text, warn
 from rampart.cli.record import record_verbs
-from rampart.cli.verbs import FORMATTER, PORT, help_of
+from rampart.cli.verbs import FORMATTER, PORT
 from rampart.files import interrupts, streams, working_folder
 
-_OF_A_RUN = (node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs,
-             adapt_verb, record_verbs, keys_verb, token_verbs, bench_verb)
-_OF_A_SYSTEM = (check_verbs, cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
-# Each adds its verbs, in this order in the help.
+_MODULES = (
+    node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
+    record_verbs, keys_verb, token_verbs, bench_verb, check_verbs, cut_set_verbs, decide_verbs,
+    tree_verbs, verify_verb, doctor_verb)
+"""Each adds its verbs."""
+
+_GROUPS = {
+    "start": ("new", "run", "record", "replay", "doctor"),
+    "look": ("status", "top", "node", "topic", "bag", "live", "ros2"),
+    "operate": ("reset", "inject", "adapt", "bench"),
+    "analyse": ("check", "explain", "decide", "tree", "verify", "cut-sets", "campaign"),
+    "administer": ("keys", "tokens")}
+"""In the help. Verbs of other packages come last, under `robots`."""
+
+_HELP = """usage: rampart VERB ...
+
+Start a fault-tolerant robot controller, look at it, disturb it, prove what it decides.
+
+{groups}
+examples:
+  rampart run --virtual --seed 7          a whole mission in seconds
+  rampart run                             on real processes; then, in another shell:
+  rampart top                             processes, topics, decisions
+  kill-node localization                  a process crashes, and is back
+`rampart VERB --help` shows more.
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Lists its verbs in groups."""
+
+    verbs: Any = None
+
+    def format_help(self) -> str:
+        """Return the help of `rampart` itself."""
+        texts = {action.dest: action.help for action in self.verbs._choices_actions}
+        grouped = {name for names in _GROUPS.values() for name in names}
+        groups = {**_GROUPS, "robots": tuple(sorted(texts.keys() - grouped))}
+        return _HELP.format(groups="".join(
+            f"{group if name == names[0] else '':<12}{name:<10}{texts[name]}\n"
+            for group, names in groups.items() for name in names))
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -65,15 +80,14 @@ def build_parser() -> argparse.ArgumentParser:
     A package adds verbs of its own by entry points of the group `rampart.verbs`: functions of the
     verbs' subparsers, the formatter class, and a parent parser with `--port`.
     """
-    parser = argparse.ArgumentParser(prog="rampart", **help_of(__doc__))
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    parser = _Parser(prog="rampart")
+    verbs = parser.verbs = parser.add_subparsers(
+        dest="verb", required=True, metavar="VERB", parser_class=argparse.ArgumentParser)
     new.add(verbs)
     verbs.add_parser("run", add_help=False, help="start a system: the same as launch.py")
-    for module in _OF_A_RUN:
+    for module in _MODULES:
         module.add(verbs)
     verbs.add_parser("campaign", add_help=False, help="run many missions with faults in them")
-    for module in _OF_A_SYSTEM:
-        module.add(verbs)
     common = argparse.ArgumentParser(add_help=False)
     PORT(common)
     for found in sorted(entry_points(group="rampart.verbs"), key=lambda verb: verb.name):
@@ -130,6 +144,9 @@ def _run(arguments: Sequence[str]) -> int:
             options = campaign_verb.parse(arguments[1:])
         else:
             parser = build_parser()
+            if not arguments:
+                say_text(parser.format_help())
+                return 0
             options = parser.parse_args(_as_if_last(parser, arguments))
         return int(options.run(options))
     except (UsageError, NoEffectError) as error:

@@ -1,4 +1,4 @@
-"""What a robot adds to `rampart status`, `rampart top` and `rampart metrics`."""
+"""What a robot adds to `rampart status`, `rampart top` and `rampart live metrics`."""
 # ruff: noqa: ARG002 a robot that says nothing needs nothing
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class RobotLines:
     """The lines of a robot that says nothing; an application may name a class derived from this.
 
     Class attributes:
-        read: topics for `rampart top` and `rampart metrics`.
+        read: topics for `rampart top` and `rampart live metrics`.
         status_read: topics for `rampart status`.
     """
 
@@ -59,5 +59,5 @@ class RobotLines:
         return {}
 
     def families(self, latest: Latest) -> Iterator[Any]:
-        """Yield the families (`prometheus_client.Metric`) of `rampart metrics`."""
+        """Yield the families (`prometheus_client.Metric`) of `rampart live metrics`."""
         yield from ()

@@ -1,6 +1,6 @@
 """What a tool has heard of a run: the latest of everything, counts and rates. Pure.
 
-`rampart top` shows it and `rampart metrics` counts with it.
+`rampart top` shows it and `rampart live metrics` counts with it.
 """
 
 from __future__ import annotations

@@ -119,7 +119,8 @@ def served(port: int, what: str) -> tuple[Option, ...]:
         port_option("--run", _WHICH_RUN, dest="of", metavar="N"))
 
 
-def add_verb(verbs: Any, name: str, text: str, run: Run, *options: Option, doc: str = "") -> None:
+def add_verb(verbs: Any, name: str, text: str, run: Run, *options: Option, doc: str = "",
+             hidden: bool = False) -> None:
     """Add a verb to the command line.
 
     Args:
@@ -129,12 +130,14 @@ def add_verb(verbs: Any, name: str, text: str, run: Run, *options: Option, doc: 
         run: the verb's function, a coroutine function or not.
         options: those of the verb, as the help lists them.
         doc: with the help text; the function's docstring if it is empty.
+        hidden: not in the list of verbs: an old name.
     """
     def call(given: argparse.Namespace) -> int:
         done = run(given)
         return done if isinstance(done, int) else asyncio.run(done)
 
-    parser = verbs.add_parser(name, help=text, **help_of(doc or run.__doc__ or ""))
+    listed = {} if hidden else {"help": text}
+    parser = verbs.add_parser(name, **listed, **help_of(doc or run.__doc__ or ""))
     add_options(parser, options)
     parser.set_defaults(run=call)
 

@@ -11,7 +11,7 @@ from rampart.manager.spec.tables import Positive
 
 
 class StubDetection(DetectionModule):
-    """Active while it is told so on `stub/trigger` (`rampart trigger NAME`).
+    """Active while it is told so on `stub/trigger` (`rampart inject trigger:NAME`).
 
     What it was told dies with its process: the next incarnation is idle from the start.
     """

@@ -1,4 +1,4 @@
-"""`rampart decide` and `rampart table`: ask the arbiter, without any running system."""
+"""`rampart decide`: ask the arbiter, without any running system."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from rampart.cli import systems
 from rampart.cli.output import UsageError, print_json, print_table, refusing, say, say_text
-from rampart.cli.verbs import JSON, JSON_FORMAT, add_verb, flag, option, word
+from rampart.cli.verbs import JSON_FORMAT, add_verb, flag, option, word
 from rampart.manager.model.order import UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.decision import Decision
@@ -20,39 +20,49 @@ from rampart.manager.strategies.registry import UnknownStrategyError, decide, de
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
+    of_table = (
+        option("--strategy", metavar="NAME", action="append",
+               help="default the spec's; without FTM several are compared"),
+        flag("--differing", "without FTM: only the sets in which the strategies run different "
+             "recoveries"),
+        option("--format", choices=("table", "csv", "json"), default="table",
+               help="without FTM: default table"), JSON_FORMAT)
     add_verb(verbs, "decide", "what the manager decides for active mechanisms", show_decision,
-             option("ftm", nargs="+", metavar="FTM", help="active mechanisms, e.g. FTM3"),
-             word("--strategy", "NAME", "default the spec's"), JSON,
+             option("ftm", nargs="*", metavar="FTM", help="active mechanisms, e.g. FTM3; without "
+                    "one the table of all sets"), *of_table,
              word("--system", "SPEC", "file, or name of a shipped system; default the shipped one"))
-    add_verb(verbs, "table", "the decision for every set of active mechanisms", show_table,
-             option("--strategy", metavar="NAME", action="append",
-                    help="default the spec's; several are compared"),
-             flag("--differing", "only the sets in which the strategies run different recoveries"),
-             option("--format", choices=("table", "csv", "json"), default="table",
-                    help="default table"), JSON_FORMAT, systems.choice())
+    add_verb(verbs, "table", "", show_table, *of_table, systems.choice(), hidden=True)
 
 
 def show_decision(options: argparse.Namespace) -> int:
-    """Print one decision.
+    """Print one decision, or the table of all.
 
     Show the decision for a set of active mechanisms, with its certificate: the
     block (rule) that applies, the path of dominance, what was rejected and why. What
-    one of them explains does not act, and is named as such.
+    one of them explains does not act, and is named as such. Without a mechanism: the
+    decision for every set of them; with several strategies, side by side.
 
     Examples:
       rampart decide FTM3 FTM4
       rampart decide FTM1 FTM6 --json
       rampart decide FTM2 FTM5 --system my_system.toml
+      rampart decide --system paper
+      rampart decide --strategy safety-first --strategy guarded-repair --differing
     """
+    if not options.ftm:
+        return show_table(options)
     spec = systems.load(options.system)
-    strategy = options.strategy or spec.strategy
+    if len(options.strategy or ()) > 1 or options.differing or options.format == "csv":
+        raise UsageError("several --strategy, --differing and --format csv: only without FTM, for "
+                         "the table")
+    strategy = (options.strategy or [spec.strategy])[0]
     arbiter, mechanisms = _arbiter(spec, strategy), spec.build_mechanisms()
     decision = arbiter(options.ftm)
     acting = mechanisms.unexplained(decision.active, frozenset(mechanisms.detections))
     explained = [name for name in decision.active if name not in acting]
     if explained:
         decision = arbiter(acting)
-    if options.json:
+    if options.format == "json":
         print_json({
             **_row(decision), "path": decision.path,
             "rejected": [{"name": name, "reason": why} for name, why in decision.rejected],

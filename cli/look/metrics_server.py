@@ -1,4 +1,4 @@
-"""The server of `rampart metrics`: follows runs, and answers each scrape with what there is then.
+"""The server of `rampart live metrics`: follows runs, and answers each scrape with what there is.
 
 All on one event loop, so that a scrape sees a picture that nobody is drawing at.
 """

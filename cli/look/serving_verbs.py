@@ -1,10 +1,11 @@
-"""`rampart live` and `rampart metrics`: the run in somebody else's viewer, while it goes on.
+"""`rampart live`: serve the run to other programs, while it goes on.
 
-Show the run in a viewer for robots: what its system shows of the robot,
-and a log in words. Waits for a run, and for the next when one ends.
+Show the run in a viewer for robots, with a log in words, or serve its figures.
+Waits for a run, and for the next when one ends.
 
 Examples:
   rampart live foxglove
+  rampart live metrics
 """
 
 from __future__ import annotations
@@ -24,11 +25,13 @@ METRICS_PORT = 9464
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    viewers = add_family(verbs, "live", "see the run live in Foxglove", __doc__, metavar="VIEWER")
+    viewers = add_family(verbs, "live", "serve the run to Foxglove or Prometheus", __doc__,
+                         metavar="VIEWER")
     add_verb(viewers, "foxglove", "serve Foxglove's WebSocket protocol", foxglove,
              *served(FOXGLOVE_PORT, "look on"))
-    add_verb(verbs, "metrics", "serve the run's figures to Prometheus", metrics,
-             *served(METRICS_PORT, "read the figures"))
+    for family, hidden in ((viewers, False), (verbs, True)):
+        add_verb(family, "metrics", "serve the run's figures to Prometheus", metrics,
+                 *served(METRICS_PORT, "read the figures"), hidden=hidden)
 
 
 def foxglove(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
@@ -59,8 +62,8 @@ def metrics(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     Needs the extra: pip install 'rampart[prometheus]'.
 
     Examples:
-      rampart metrics
-      rampart metrics --port 9100 --host 0.0.0.0
+      rampart live metrics
+      rampart live metrics --port 9100 --host 0.0.0.0
       curl -s http://127.0.0.1:9464/metrics | grep node_up
     """
     extra("prometheus", "prometheus_client.exposition")

@@ -21,6 +21,7 @@ from rampart.actors.system.topics import find_topic
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
 from rampart.cli.operate.injecting import hit_process, run_fault
+from rampart.cli.operate.operator_verbs import trigger
 from rampart.cli.output import UsageError, positive, print_json, print_table, refusing, say
 from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, several, word
 from rampart.manager.spec.specification import SystemSpec
@@ -30,6 +31,7 @@ from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.topic_faults import NONSENSE, modes_of, systematic_faults
 
 _DEFAULT_DURATION_S = 5.0
+TRIGGER = "trigger:"
 _SECONDS = "must be seconds above 0"
 _OF_MESSAGES = ("mode", "share", "on", "off", "seed", "delay", "stamp", "set", "add", "ramp",
                 "noise", "keep_ends")
@@ -41,7 +43,7 @@ def add(verbs: Any) -> None:
     add_verb(
         verbs, "inject", "inject a fault", inject, PORT,
         option("fault", nargs="?", metavar="FAULT", help="a name from --list, MODE:TOPIC, "
-               "kill:NODE, stop:NODE or wedge:NODE"),
+               "kill:NODE, stop:NODE, wedge:NODE or trigger:MODULE"),
         flag("--list", "list the catalogue (needs no run)"),
         word("--system", "FILE", "for --list: system spec; default that of the run, else the "
              "shipped one"),
@@ -93,6 +95,7 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
       rampart inject drop:TOPIC --share 0.3           three messages in ten are lost
       rampart inject kill:NODE                        a process: it is gone at once ...
       rampart inject stop:NODE --duration 2           ... or stands still, and then goes on
+      rampart inject trigger:MODULE                   the stand-in of a detection module detects
     your own:
       rampart inject --topic KEY --mode delay --delay 0.8
       rampart inject --topic KEY --mode restamp --stamp=-0.2
@@ -111,6 +114,10 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
                          "the run that there is")
     if (options.fault or "").partition(":")[0] in PROCESS_FAULTS:
         return hit_process(options)
+    if (options.fault or "").startswith(TRIGGER):
+        return trigger(argparse.Namespace(
+            port=options.port, module=options.fault.removeprefix(TRIGGER),
+            duration=options.duration or _DEFAULT_DURATION_S))
     positive("--duration", options.duration, "must be seconds above 0, or inf")
     name, orders = orders_of(options)
     return run_fault(name, orders, options)

@@ -1,4 +1,4 @@
-"""`rampart reset` and `rampart trigger`: what an operator does to a run."""
+"""`rampart reset`: what an operator does to a run."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     add_verb(verbs, "reset", "release a latched recovery, e.g. the emergency stop", reset, PORT,
              option("recovery", metavar="NAME", help="e.g. RM1"))
-    add_verb(verbs, "trigger", "make the stand-in of a detection module detect", trigger, PORT,
+    add_verb(verbs, "trigger", "", trigger, PORT,
              option("module", metavar="NAME", help="detection module, e.g. D_LEVEL"),
              option("--for", dest="duration", type=float, default=2.0, metavar="S",
-                    help="simulated seconds (default 2)"))
+                    help="simulated seconds (default 2)"), hidden=True)
 
 
 async def reset(options: argparse.Namespace) -> int:
@@ -99,8 +99,8 @@ async def trigger(options: argparse.Namespace) -> int:
     simulated seconds. What real modules detect is injected: rampart inject.
 
     Examples:
-      rampart trigger D_LEVEL
-      rampart trigger D_VISION --for 5
+      rampart inject trigger:D_LEVEL
+      rampart inject trigger:D_VISION --for 5
     """
     positive("--for", options.duration, below=1e6)
     async with connect(options.port) as session:

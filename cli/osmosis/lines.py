@@ -1,4 +1,4 @@
-"""What `rampart status`, `rampart top` and `rampart metrics` tell of Osmosis. Pure."""
+"""What `rampart status`, `rampart top` and `rampart live metrics` tell of Osmosis. Pure."""
 
 from __future__ import annotations
 

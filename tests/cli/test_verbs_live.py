@@ -278,7 +278,7 @@ async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
 
 
 async def pictured(run, monkeypatch, system) -> RunPicture:
-    """What `rampart top` and `rampart metrics` have of a run of some system."""
+    """What `rampart top` and `rampart live metrics` have of a run of some system."""
     of = msgspec.structs.replace(run.info, system_file=str(system))
     monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: of)
     picture = RunPicture()

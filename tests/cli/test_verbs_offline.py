@@ -380,7 +380,8 @@ def test_the_help_of_each_verb_teaches_with_examples(path, parser, capsys):
         assert f"rampart {path[0]} --" in capsys.readouterr().out.partition("examples:")[2]
         return
     text = parser.format_help()
-    assert f"rampart {path[0]}" in text.partition("examples:")[2]
+    new_name = {"trigger": "inject trigger:", "metrics": "live metrics"}.get(path[0], path[0])
+    assert f"rampart {new_name}" in text.partition("examples:")[2]
     assert parser.description
 
 

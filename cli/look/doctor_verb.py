@@ -1,0 +1,155 @@
+"""`rampart doctor`: what of this machine a run uses, and what it costs not to have it."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import platform
+import re
+import resource
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from rampart.actors.supervision.root import needed_descriptors
+from rampart.cli.output import print_json, print_table
+from rampart.cli.verbs import JSON, add_verb
+
+PROCESSES = 40
+"""Of the largest system that ships."""
+
+LEAST_PYTHON = (3, 11)
+NEEDED_MB = 600
+"""Proportional memory of the largest system that ships, with room."""
+
+EXTRAS = {
+    "cryptography": ("keys", "no run with keys"),
+    "rosbags": ("ros2", "no gateway to ROS 2, no bags of ROS 2"),
+    "foxglove": ("foxglove", "no `rampart live foxglove`"),
+    "prometheus_client": ("prometheus", "no `rampart live metrics`"),
+    "optuna": ("search", "no `rampart campaign --search`")}
+"""Module → the extra that it is in, and what is missing without it."""
+
+State = Literal["ok", "without", "missing"]
+_SHOWN: dict[State, str] = {"ok": "ok", "without": "-", "missing": "NO"}
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One thing that a run uses.
+
+    Attributes:
+        what: its name.
+        state: *ok*; *without*: a run does without it, and something is worse; *missing*: no run.
+        found: what is there.
+        cost: what it costs not to have it; "" if it is there.
+    """
+
+    what: str
+    state: State
+    found: str
+    cost: str = ""
+
+
+def add(verbs: Any) -> None:
+    """Add the verb to the parser."""
+    add_verb(verbs, "doctor", "what this machine has of what a run uses", doctor, JSON)
+
+
+def doctor(options: argparse.Namespace) -> int:
+    """Look at the machine.
+
+    Look at what a run uses of this machine: Python, kernel, processors, memory,
+    limits, libraries, Chromium, ROS 2. What is missing is listed with what it
+    costs. Exit code 1 if no run can start.
+
+    Examples:
+      rampart doctor
+      rampart doctor --json
+    """
+    findings = [finding for look in LOOKS for finding in look()]
+    if options.json:
+        print_json(findings)
+    else:
+        print_table(("", "what", "found", "without it"), [
+            (_SHOWN[one.state], one.what, one.found, one.cost)
+            for one in findings])
+    return 1 if any(one.state == "missing" for one in findings) else 0
+
+
+def _finding(what: str, found: str, *, there: bool, cost: str, needed: bool = False) -> Finding:
+    return Finding(what, "ok" if there else "missing" if needed else "without", found,
+                   "" if there else cost)
+
+
+def python() -> Iterator[Finding]:
+    """Look at the interpreter."""
+    yield _finding("Python", platform.python_version(), there=sys.version_info >= LEAST_PYTHON,
+                   cost=f"nothing runs; {'.'.join(map(str, LEAST_PYTHON))} or later", needed=True)
+
+
+def kernel() -> Iterator[Finding]:
+    """Look at the kernel."""
+    is_linux, release = sys.platform == "linux", platform.release()
+    number = tuple(int(part) for part in release.split("-")[0].split(".")[:2] if part.isdigit())
+    yield _finding("Linux", f"{platform.system()} {release}", there=is_linux and number >= (5, 9),
+                   cost="no run on real processes; --virtual works", needed=True)
+
+
+def processors() -> Iterator[Finding]:
+    """Look at processors and memory."""
+    count = len(os.sched_getaffinity(0))
+    yield _finding("processors", f"{count}, load {os.getloadavg()[0]:.1f}", there=count >= 2,
+                   cost="rate 1 may be too much: use --rate 0.5, or --virtual")
+    meminfo = Path("/proc/meminfo").read_text(encoding="ascii")
+    free = int(re.findall(r"MemAvailable:\s+(\d+) kB", meminfo)[0]) / 1e3
+    yield _finding("memory", f"{free:,.0f} MB available", there=free >= NEEDED_MB,
+                   cost=f"the full system takes {NEEDED_MB} MB")
+
+
+def folders() -> Iterator[Finding]:
+    """Look at the place of a run's folder, in memory."""
+    place = Path(os.environ.get("XDG_RUNTIME_DIR") or "/dev/shm")  # noqa: S108 looked at only
+    can = os.access(place, os.W_OK)
+    free = shutil.disk_usage(place).free / 1e6 if can else 0.0
+    yield _finding("folder of a run", f"{place}, {free:,.0f} MB free" if can else f"{place}: no",
+                   there=can and free > 10, cost="no run starts", needed=True)
+
+
+def limits() -> Iterator[Finding]:
+    """Look at what this user may do."""
+    _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = needed_descriptors(PROCESSES)
+    yield _finding("open files", f"hard limit {files}", there=files >= needed, needed=True,
+                   cost=f"the full system needs {needed}: ulimit -Hn {needed}")
+    _, nice = resource.getrlimit(resource.RLIMIT_NICE)
+    may = os.geteuid() == 0 or nice >= 30
+    yield _finding("niceness -10", "permitted" if may else "not permitted", there=may,
+                   cost="a busy machine slows the simulated world, not the controller alone: "
+                        "ulimit -e 30")
+
+
+def libraries() -> Iterator[Finding]:
+    """Look at the libraries of extras."""
+    for module, (extra, cost) in EXTRAS.items():
+        there = importlib.util.find_spec(module) is not None
+        yield _finding(f"extra {extra}", module if there else "not installed", there=there,
+                       cost=cost)
+
+
+def programs() -> Iterator[Finding]:
+    """Look at other programs."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
+    yield _finding("Chromium", chromium or "not found", there=chromium is not None,
+                   cost="tests of the operator's page are skipped")
+    distribution = os.environ.get("ROS_DISTRO", "")
+    yield _finding("ROS 2", distribution or "not sourced", there=bool(distribution),
+                   cost="only `rampart ros2 check` compares with an installation")
+
+
+LOOKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+    python, kernel, processors, folders, limits, libraries, programs)
