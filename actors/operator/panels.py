@@ -28,7 +28,9 @@ LARGEST = 1e9
 MAX_KEPT = 32
 """Fields of all plots and maps together: of each, some minutes are kept for a page that opens."""
 
-FieldText = Annotated[str, msgspec.Meta(pattern=r"^[^:]+:[^:]+\Z", max_length=200)]
+FieldText = Annotated[str, msgspec.Meta(
+    pattern=r"^[^:]+:[^:]+\Z", max_length=200,
+    description="'topic:field', e.g. 'tank/level:height_m'")]
 """A field of the messages of a topic, "topic:field"."""
 _Short = Annotated[str, msgspec.Meta(max_length=60)]
 
@@ -180,8 +182,7 @@ def read_panels(spec: SystemSpec, file: str) -> tuple[Panel, ...]:
     Raises:
         SpecificationError: one makes no sense, or they do not together.
     """
-    panels = read_rows(spec.panels, Panel, "panel", file,
-                       "expected 'topic:field', e.g. 'tank/level:height_m'")
+    panels = read_rows(spec.panels, Panel, "panel", file)
     for place, panel in enumerate(panels):
         if panel.script is not None:
             raise SpecificationError(

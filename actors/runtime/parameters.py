@@ -16,6 +16,7 @@ from msgspec import inspect
 
 from rampart.actors.bus.fields import ANYTHING
 from rampart.manager.spec.budget import find_false_alarm
+from rampart.manager.spec.reading import expected
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Name, SpecificationError
 
@@ -53,11 +54,6 @@ ControlTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "control_p
 """How long, s, to wait for what comes as often as commands, poses and scans."""
 HeartbeatTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "heartbeat_period_s"})]
 """How long, s, to wait for a heartbeat."""
-
-_WORDS: dict[type[inspect.Type], str] = {
-    inspect.FloatType: "a number", inspect.IntType: "a whole number", inspect.StrType: "a text",
-    inspect.BoolType: "true or false", inspect.VarTupleType: "a list"}
-_BOUNDS = {"ge": ", {:g} or more", "gt": " > {:g}", "le": ", at most {:g}", "lt": ", below {:g}"}
 
 
 def read_parameters(kind: type[P], given: Mapping[str, Any] | msgspec.Struct, file: str, path: str,
@@ -156,7 +152,7 @@ def _explain(kind: type[msgspec.Struct], given: Mapping[str, Any], error: str) -
             try:
                 msgspec.convert(given[field.name], field.type)
             except msgspec.ValidationError as wrong:
-                words = _expected(inspect.type_info(field.type))
+                words = expected(inspect.type_info(field.type))
                 return field.name, f"expected {words}" if words else str(wrong).replace("`", "")
         elif field.required:
             return field.name, "missing; without it the node does not start"
@@ -187,21 +183,3 @@ def _misfits(kind: type[msgspec.Struct], given: Mapping[str, Any],
         if "period" in marks and (
                 problem := find_false_alarm(spec.timing, given[field], marks["period"])):
             yield field, problem
-
-
-def _expected(kind: inspect.Type) -> str:
-    """Say which values a type has, "" if there are no simple words for it."""
-    if isinstance(kind, inspect.Metadata):
-        if what := (kind.extra or {}).get("names"):
-            return (f"the name of a {what}" if isinstance(kind.type, inspect.StrType)
-                    else f"a list of {what} names")
-        return _expected(kind.type)
-    if isinstance(kind, inspect.UnionType):
-        return " or ".join(filter(None, map(_expected, kind.types)))
-    if isinstance(kind, inspect.LiteralType):
-        return " or ".join(map(repr, kind.values))
-    words = _WORDS.get(type(kind), "")
-    for name, text in _BOUNDS.items():
-        if (bound := getattr(kind, name, None)) is not None:
-            words += text.format(bound)
-    return words

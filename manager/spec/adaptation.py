@@ -16,7 +16,7 @@ import msgspec
 from rampart.files import toml
 from rampart.files.plain_text import shown
 from rampart.files.reading import FileError
-from rampart.manager.spec.schema import TABLES, SystemSpec
+from rampart.manager.spec.schema import DetectionSpec, MechanismSpec, RecoverySpec, SystemSpec
 from rampart.manager.spec.specification import check_document
 
 Document = dict[str, Any]
@@ -32,7 +32,7 @@ class Action(StrEnum):
     SET = "set"
 
 
-CHANGEABLE = ("detection", "recovery", "mechanism")
+CHANGEABLE = {"detection": DetectionSpec, "recovery": RecoverySpec, "mechanism": MechanismSpec}
 """Tables whose rows can be enabled, disabled, retuned and replaced, by name."""
 
 SETTINGS = ("strategy", "shadow", "order")
@@ -137,7 +137,7 @@ def _find(document: Document, name: str) -> tuple[str, dict[str, Any]]:
 def _retune(table: str, row: dict[str, Any], change: Change) -> None:
     if not change.values:
         raise ChangeError(f"retune {change.name}: nothing to change; name fields and values")
-    known = [field.encode_name for field in msgspec.structs.fields(TABLES[table])]
+    known = [field.encode_name for field in msgspec.structs.fields(CHANGEABLE[table])]
     for key, value in change.values.items():
         if key == "name":
             raise ChangeError(f"name = {value!r}: a name cannot be changed")

@@ -11,10 +11,11 @@ import msgspec
 
 from rampart.manager.spec.tables import Finding, Name, OptionalName, Positive, Table
 
-ClassPath = Annotated[str, msgspec.Meta(pattern=r"^[a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*\Z")]
-
+_A_CLASS = "'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
+ClassPath = Annotated[str, msgspec.Meta(
+    pattern=r"^[a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*\Z", description=_A_CLASS)]
 OptionalClassPath = Annotated[str, msgspec.Meta(
-    pattern=r"^([a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*)?\Z")]
+    pattern=r"^([a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*)?\Z", description=_A_CLASS)]
 
 
 class Kind(StrEnum):
@@ -98,7 +99,7 @@ class NodeSpec(Table, frozen=True):
     """
 
     name: Name
-    kind: Kind
+    kind: Annotated[Kind, msgspec.Meta(description=f"one of {', '.join(NODE_KINDS)}")]
     actor: OptionalClassPath = ""
     process: OptionalName = ""
     host: OptionalName = ""

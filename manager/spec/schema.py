@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
@@ -21,7 +21,7 @@ from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, Re
 from rampart.manager.model.order import PartialOrder, Tree, refine
 from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.mobile_robot import Hazard, Robot
-from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits, ClassPath, Kind, NodeSpec
+from rampart.manager.spec.nodes import ClassPath, Kind, NodeSpec
 from rampart.manager.spec.tables import (
     DERIVED,
     End,
@@ -34,6 +34,15 @@ from rampart.manager.spec.tables import (
     Table,
     Timing,
 )
+
+T = TypeVar("T")
+Few = Annotated[T, msgspec.Meta(max_length=16)]
+Rows = Annotated[tuple[T, ...], msgspec.Meta(max_length=1000)]
+"""Of a table; the shipped systems have 31 actors, and checks compare many with many."""
+
+Relation = Annotated[dict[str, Annotated[tuple[str, ...], msgspec.Meta(
+    description="a list of recovery names")]], msgspec.Meta(
+    description="a table, recovery = [recoveries that it is above]")]
 
 
 class DetectionSpec(Table, frozen=True):
@@ -137,7 +146,9 @@ class MechanismSpec(Table, frozen=True):
     detect: str
     recover: str
     event: Name
-    against: Hazard | Within = Hazard.DRIFT
+    against: Annotated[Hazard | Within, msgspec.Meta(description=(
+        "one of drift, runaway, intrusion, parent, or { within_s = ..., hazard = '...' }"
+        ))] = Hazard.DRIFT
     explains: frozenset[Name] = frozenset()
     enabled: bool = True
 
@@ -163,7 +174,8 @@ class EventSpec(Table, frozen=True):
 
     name: Name
     title: str = ""
-    gate: Literal["or", "and"] | AtLeast | None = None
+    gate: Annotated[Literal["or", "and"] | AtLeast | None, msgspec.Meta(
+        description="'or', 'and' or { at_least = k }")] = None
     of: tuple[Name, ...] = ()
 
     @property
@@ -196,7 +208,9 @@ class FaultSpec(Table, frozen=True):
         detected_by: Detection modules that should see it.
     """
 
-    name: Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9-]{0,63}\Z")]
+    name: Annotated[str, msgspec.Meta(
+        pattern=r"^[a-z][a-z0-9-]{0,63}\Z",
+        description="a name: a small letter, then small letters, digits and hyphens")]
     title: str
     topic: str
     mode: str
@@ -227,7 +241,7 @@ class SystemSpec(Table, frozen=True):
             "" for none.
         order: Name of an order of the recoveries, or several: what the first leaves open the
             next decides. The first is the one that says what is safer.
-        panels: Of the operator's page, besides those of its class; see `read_rows`.
+        panels: Of the operator's page, besides those of its class; see `rampart.actors.operator`.
         ros2: What is passed on between ROS 2 and the system, likewise.
     """
 
@@ -236,24 +250,25 @@ class SystemSpec(Table, frozen=True):
     application: dict[str, Any] = {}
     judge: dict[str, Any] = {}
     end: End = End()
-    hosts: tuple[HostSpec, ...] = msgspec.field(name="host", default=())
+    hosts: Few[tuple[HostSpec, ...]] = msgspec.field(name="host", default=())
     link: Link = Link()
     mobile: Robot | None = msgspec.field(name="robot", default=None)
     strategy: str = "safety-first"
     shadow: str = ""
-    order: Name | tuple[Name, ...] = "safer"
+    order: str | tuple[str, ...] = "safer"  # a pattern beside a list has msgspec 0.22 crash
     timing: Timing = Timing()
     layers: Layers = Layers()
     supervision: Supervision = Supervision()
-    nodes: tuple[NodeSpec, ...] = msgspec.field(name="node", default=())
-    detections: tuple[DetectionSpec, ...] = msgspec.field(name="detection", default=())
-    recoveries: tuple[RecoverySpec, ...] = msgspec.field(name="recovery", default=())
-    mechanisms: tuple[MechanismSpec, ...] = msgspec.field(name="mechanism", default=())
-    events: tuple[EventSpec, ...] = msgspec.field(name="event", default=())
-    orders: dict[str, dict[str, tuple[str, ...]]] = {}
-    faults: tuple[FaultSpec, ...] = msgspec.field(name="fault", default=())
-    panels: tuple[dict[str, Any], ...] = msgspec.field(name="panel", default=())
-    ros2: tuple[dict[str, Any], ...] = ()
+    nodes: Rows[NodeSpec] = msgspec.field(name="node", default=())
+    detections: Rows[DetectionSpec] = msgspec.field(name="detection", default=())
+    recoveries: Rows[RecoverySpec] = msgspec.field(name="recovery", default=())
+    mechanisms: Rows[MechanismSpec] = msgspec.field(name="mechanism", default=())
+    events: Annotated[tuple[EventSpec, ...], msgspec.Meta(max_length=5000)] = msgspec.field(
+        name="event", default=())
+    orders: Few[dict[str, Relation]] = {}
+    faults: Rows[FaultSpec] = msgspec.field(name="fault", default=())
+    panels: Rows[dict[str, Any]] = msgspec.field(name="panel", default=())
+    ros2: Rows[dict[str, Any]] = ()
 
     @property
     def titles(self) -> dict[str, str]:
@@ -359,12 +374,3 @@ class SystemSpec(Table, frozen=True):
     def build_safety_order(self) -> PartialOrder:
         """Build the order that says which recovery is safer: the first criterion alone."""
         return self.build_order(self.criteria[0])
-
-
-TABLES: dict[str, type[Table]] = {"": SystemSpec, "gate": AtLeast, "against": Within,
-                                  "heartbeat": ChildHeartbeat, "limits": ChildLimits}
-"""All tables of a spec by their names in the file; "" is the whole."""
-for _field in msgspec.structs.fields(SystemSpec):
-    for _type in (_field.type, *get_args(_field.type)):
-        if isinstance(_type, type) and issubclass(_type, Table):
-            TABLES[_field.encode_name] = _type

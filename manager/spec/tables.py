@@ -14,8 +14,11 @@ import msgspec
 
 from rampart.files.plain_text import one_line, shown
 
-OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]{0,63})?\Z")]
-Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
+_A_NAME = "a name: a letter, then letters, digits and underscores"
+OptionalName = Annotated[str, msgspec.Meta(
+    pattern=r"^([A-Za-z][A-Za-z0-9_]{0,63})?\Z", description=_A_NAME)]
+Name = Annotated[str, msgspec.Meta(
+    pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z", description=_A_NAME)]
 """As long as the address of a node's socket has room for (`actors.bus.run_folder`), and well
 below what a message takes as a name (`rampart.actors.bus.bounds`), which may add to it."""
 

@@ -18,11 +18,15 @@ from rampart.manager.spec.tables import (
     unknown,
 )
 
-RosName = Annotated[str, msgspec.Meta(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+\Z", max_length=200)]
-OptionalRosName = Annotated[
-    str, msgspec.Meta(pattern=r"^((/[A-Za-z_][A-Za-z0-9_]*)+)?\Z", max_length=200)]
+_A_ROS_NAME = "a name of ROS 2, e.g. '/scan'"
+RosName = Annotated[str, msgspec.Meta(
+    pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+\Z", max_length=200, description=_A_ROS_NAME)]
+OptionalRosName = Annotated[str, msgspec.Meta(
+    pattern=r"^((/[A-Za-z_][A-Za-z0-9_]*)+)?\Z", max_length=200,
+    description=_A_ROS_NAME)]
 RosType = Annotated[str, msgspec.Meta(
-    pattern=r"^[a-z][a-z0-9_]*/(msg|srv|action)/[A-Z][A-Za-z0-9_]*\Z", max_length=200)]
+    pattern=r"^[a-z][a-z0-9_]*/(msg|srv|action)/[A-Z][A-Za-z0-9_]*\Z", max_length=200,
+    description="a type of ROS 2, e.g. 'sensor_msgs/msg/LaserScan'")]
 Written = dict[str, str | float | bool]
 
 GATEWAY = "rampart.actors.ros2.gateway:Gateway"

@@ -107,9 +107,9 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
     ("retune", "FTM3", {"detect": "DM3 and not DM3"},
      "paper.toml: mechanism FTM3: detect = 'DM3 and not DM3': it can never be active"),
     ("retune", "RM3", {"deadline_s": "soon"},
-     "paper.toml: recovery RM3: deadline_s = 'soon': Expected float, got str"),
+     "paper.toml: recovery RM3: deadline_s = 'soon': expected a number > 0"),
     ("replace", "DM1", {"parameters": 3},
-     "paper.toml: detection DM1: parameters = 3: Expected object, got int"),
+     "paper.toml: detection DM1: parameters = 3: expected a table"),
 ])
 def test_refused_in_one_line(action, name, values, message):
     with pytest.raises((ChangeError, SpecificationError)) as caught:
@@ -297,7 +297,7 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
     ("retune", "DM1", '{"hold_s": -1}',
      "paper.toml: detection DM1: parameters.hold_s = -1: expected a number, 0 or more"),
     ("retune", "DM5", '{"process": "DM1"}',
-     "DM5: process = 'DM1': expected 'DM5', for while a system runs no actor moves to another"),
+     "DM5: process = 'DM1': expected 'DM5', which stays while a system runs"),
     ("retune", "DM3", '{"hold": 1}',
      "paper.toml: detection DM3: parameters.hold = 1: unknown parameter; known: hold_s, suspects"),
 ])

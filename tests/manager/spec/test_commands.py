@@ -63,10 +63,10 @@ WRONG = [
      "['./wheels']: the manager has to be an actor"),
     (BEAT, f"{BEAT}\nlimits = {{ memory = 1 }}", "node wheels: limits.memory = 1: unknown field; "
      "known: memory_mb, processor_s, open_files, file_mb"),
-    (BEAT, f"{BEAT}\nlimits = {{ open_files = 1 }}", "node wheels: limits.open_files = 1: Expected "
-     "int >= 8"),
+    (BEAT, f"{BEAT}\nlimits = {{ open_files = 1 }}", "node wheels: limits.open_files = 1: expected "
+     "a whole number, 8 or more, at most 1000000"),
     (BEAT, "heartbeat = { notify = true, timeout_s = 0 }", "node wheels: heartbeat.timeout_s = 0: "
-     "Expected float > 0.0"),
+     "expected a number > 0"),
     ("cart:VirtualWheels", "cart.VirtualWheels", "node wheels: stand_in = 'cart.VirtualWheels': "
      "expected "
      "'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"),
@@ -167,10 +167,10 @@ def test_a_topic_that_nobody_declares_is_one_line(tug):
 @pytest.mark.parametrize(("old", "new", "field"), [
     ("./wheels", "./other", "command"), (COMMAND, f'{COMMAND}\nfolder = "/tmp"', "folder"),
     (COMMAND, f'{COMMAND}\nenv = {{ LD_PRELOAD = "/tmp/x.so" }}', "env"),
-    ('name = "wheels"', 'name = "others"', "command")])
+    ('name = "wheels"', 'name = "others"', "others, wheels")])
 def test_no_change_of_a_running_system_changes_what_is_executed(old, new, field):
     before = parse_specification(TUG, "tug.toml")
     after = parse_specification(TUG.replace(old, new), "tug.toml")
     check_change(before, before)
-    with pytest.raises(ValueError, match=f": {field}: of a command nothing changes while it runs"):
+    with pytest.raises(ValueError, match=f"{field}(: a| = .* stays).* (keeps|while)"):
         check_change(before, after)

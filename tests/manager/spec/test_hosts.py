@@ -63,7 +63,7 @@ def test_to_go_home_when_nobody_can_reach_the_robot_fits_in_what_the_specificati
      "from 7460"),
     ('name = "ground"\naddress', 'name = "robot"\naddress', "$.host[1].name = 'robot': duplicate"),
     ('address = "192.168.7.2"', 'address = "192.168.7.2"\nport = 80',
-     "host ground: port = 80: Expected int >= 1024"),
+     "host ground: port = 80: expected a whole number, 1024 or more"),
     ('name = "DM13"\nhost = "ground"', 'name = "DM13"\nhost = "moon"',
      "detection DM13: host = 'moon': unknown host; known: robot, ground"),
     ('name = "safety_pilot"', 'name = "safety_pilot"\nhost = "ground"',

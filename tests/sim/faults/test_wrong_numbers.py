@@ -122,7 +122,7 @@ def test_a_fault_that_makes_no_sense_in_the_system(change, line):
     (('"trigger-lost"', '"Lost"'), "tank.toml: $.fault[0].name = 'Lost': expected a name: a small "
      "letter, then small letters, digits and hyphens"),
     (('mode = "stuck"', 'mode = "stuck"\nduration_s = 0'), "tank.toml: fault trigger-lost: "
-     "duration_s = 0: Expected float > 0.0"),
+     "duration_s = 0: expected a number > 0"),
 ])
 def test_a_fault_that_is_written_wrongly(change, line):
     with pytest.raises(SpecificationError) as caught:
