@@ -63,15 +63,14 @@ class _Module(msgspec.Struct, frozen=True):
         names: Of its variables, from the top.
         families: Store of the family.
         family: The minimal solutions.
-        weight: How many cut sets of each size, those of the modules below multiplied out.
-        below: The sizes of the sets below each node of the family as a bitmask.
+        sizes: How many cut sets of each size there are below each node of the family, those of the
+            modules below multiplied out.
     """
 
     names: tuple[str, ...]
     families: Families
     family: int
-    weight: Mapping[int, int]
-    below: dict[int, int]
+    sizes: Mapping[int, Mapping[int, int]]
 
 
 class CutSets:
@@ -80,7 +79,7 @@ class CutSets:
     Args:
         formula: The fault tree.
         progress: Told in words what is being done.
-        max_order: Sets with more events are neither made nor counted; None for all.
+        max_order: Sets with more events are neither listed nor counted; None for all.
 
     Attributes:
         sizes: How many minimal cut sets there are of each size, from 0 up.
@@ -92,7 +91,6 @@ class CutSets:
     def __init__(self, formula: Formula, progress: Progress = lambda _: None,
                  max_order: int | None = None) -> None:
         self.formula = formula
-        self._max_order = max_order
         self._gates, modules = prepare(formula)
         self._modules: dict[str, _Module] = {}
         self._constants = dict(formula.house)
@@ -100,10 +98,12 @@ class CutSets:
         for number, name in enumerate(modules, 1):
             progress(f"module {number} of {len(modules)}: {name}")
             module = self._modules[name] = self._solve(name, progress, managers)
-            if module.family in {EMPTY, UNIT}:  # by house events below it, or all sets too large
+            if module.family in {EMPTY, UNIT}:  # by house events below it
                 self._constants[name] = module.family == UNIT
-        weight = self._kept(self._weight(formula.top))
-        self.sizes = tuple(weight.get(size, 0) for size in range(max(weight, default=-1) + 1))
+        weight = self._weight(formula.top)
+        largest = max((size for size in weight if max_order is None or size <= max_order),
+                      default=-1)
+        self.sizes = tuple(weight.get(size, 0) for size in range(largest + 1))
 
     @property
     def count(self) -> int:
@@ -136,14 +136,10 @@ class CutSets:
         """Return how many sets of each size a name stands for."""
         module = self._modules.get(name)
         if module is not None:
-            return module.weight
+            return module.sizes[module.family]
         if name in self.formula.house:
             return {0: 1} if self.formula.house[name] else {}
         return {1: 1}
-
-    def _kept(self, sizes: Mapping[int, int]) -> Mapping[int, int]:
-        return {size: count for size, count in sizes.items()
-                if self._max_order is None or size <= self._max_order}
 
     def _of_size(self, name: str, size: int) -> Iterator[frozenset[str]]:
         module = self._modules.get(name)
@@ -153,7 +149,7 @@ class CutSets:
             yield frozenset((name,)) if size else frozenset()
 
     def _paths(self, module: _Module, node: int, size: int) -> Iterator[frozenset[str]]:
-        if size < 0 or not self._possible(module, node) >> size & 1:
+        if size not in module.sizes[node]:  # so no way is a dead end
             return
         if node == UNIT:
             yield frozenset()
@@ -165,16 +161,6 @@ class CutSets:
                 for own in self._of_size(name, part):
                     yield own | rest
         yield from self._paths(module, families.low[node], size)
-
-    def _possible(self, module: _Module, node: int) -> int:
-        """Return the sizes of the sets below a node as a bitmask, so that no way is a dead end."""
-        known, families = module.below, module.families
-        if node not in known:
-            for one in families.upwards(module.family):
-                known[one] = known[families.low[one]]
-                for size in self._weight(module.names[families.variable[one]]):
-                    known[one] |= known[families.high[one]] << size
-        return known[node]
 
     def _solve(self, top: str, progress: Progress, managers: _Managers) -> _Module:
         inside = _Inside(self._gates, self._modules, self._constants, top)
@@ -188,17 +174,15 @@ class CutSets:
                      if (diagram := inside.diagram(order, managers.of(bound, len(order))))
                      is not None]
             for diagram, order in sorted(built, key=lambda found: len(found[0].level)):
-                families = Families(bound, self._max_order,
-                                    [min(self._weight(name)) for name in order] or [0])
+                families = Families(bound)
                 try:
                     with deep_recursion(len(order)):
                         family = diagram.minimal_solutions(
                             len(diagram.level) - 1, families, monotone=self.formula.is_monotone)
                 except TooManyNodesError:
                     continue
-                weight = self._kept(
-                    families.sizes(family, [self._weight(name) for name in order]))
-                return _Module(order, families, family, weight, {EMPTY: 0, UNIT: 1})
+                sizes = families.sizes(family, [self._weight(name) for name in order])
+                return _Module(order, families, family, sizes)
         raise TooLargeError(f"gate {top!r} with {len(inside.leaves)} inputs and modules: more than "
                             f"{BOUNDS[-1]} nodes with every variable order tried")
 

@@ -86,15 +86,6 @@ class Formula:
                 "top" if tops else "no gates; a top is needed")
         return tops.pop()
 
-    def holds(self, occurred: frozenset[str]) -> bool:
-        """Tell whether the top occurs when exactly these basic events do."""
-        value = {name: name in occurred for name in self.basic} | self.house
-        for name in self.sequence:
-            gate = self.gates[name]
-            count = sum(value[entry] for entry in gate.inputs)
-            value[name] = (gate.low <= count <= gate.high) != gate.negated
-        return value[self.top]
-
 
 def first_few(names: Collection[str]) -> str:
     """Return the first eight names of some, for a message."""

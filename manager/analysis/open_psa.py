@@ -42,15 +42,6 @@ REFERENCES = ("event", "gate", "basic-event", "house-event")
 MAX_BYTES = 16 << 20
 """Of a file; published fault trees with thousands of gates have one or two million."""
 
-MAX_ELEMENTS = 200_000
-MAX_DEPTH = 10_000
-"""Nesting of XML elements beyond which a file is refused."""
-
-MAX_CONTAINERS = 50
-"""Fault trees and components in each other: names in them are looked up level by level."""
-
-MAX_NAME = 1000
-
 _PATH_SHOWN = 300
 """Characters of a path beyond which nothing is added to it."""
 
@@ -79,10 +70,6 @@ _XML = "{http://www.w3.org/XML/1998/namespace}"
 _WARNED_OF = 20
 """Doubts that are reported of a file; more say nothing new."""
 
-_COMPARED = 2000, 60
-"""How many names, and of how many characters, are compared with a misspelt one."""
-
-
 _Path = tuple[str, ...]
 
 
@@ -107,35 +94,16 @@ class _Element(ET.Element):
     line = 0
 
 
-class _BoundedBuilder(ET.TreeBuilder):
-    """Makes elements of XML until there are too many, or one lies too deep.
+class _Builder(ET.TreeBuilder):
+    """Makes elements of XML that know their line; `line` returns where the parser is."""
 
-    Attributes:
-        line: Returns the line at which the parser is.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(element_factory=_Element)
-        self._depth = self._count = 0
-        self.line: Callable[[], int] = int
+    line: Callable[[], int]
 
     def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
         """Open an element."""
-        self._depth += 1
-        self._count += 1
-        if self._depth > MAX_DEPTH:
-            raise FileError(f"elements are nested more than {MAX_DEPTH} deep; name the inner "
-                            "formulas as gates")
-        if self._count > MAX_ELEMENTS:
-            raise FileError(f"more than {MAX_ELEMENTS} elements")
         element = super().start(tag, attrs)
         element.line = self.line()  # type: ignore[attr-defined]  # made by the factory
         return element
-
-    def end(self, tag: str, /) -> ET.Element:
-        """Close an element."""
-        self._depth -= 1
-        return super().end(tag)
 
 
 class _Definition(msgspec.Struct, frozen=True):
@@ -173,7 +141,7 @@ def read_open_psa(text: str | bytes, file: str, top: str = "",
     """
     try:
         check_size(text, MAX_BYTES)
-        builder = _BoundedBuilder()
+        builder = _Builder(element_factory=_Element)
         parser = DefusedXMLParser(target=builder, forbid_dtd=True, forbid_entities=True,
                                   forbid_external=True)
         builder.line = lambda: parser.parser.CurrentLineNumber
@@ -225,10 +193,6 @@ class _Reader:
             parent, path, place, private = stack.pop()
             inner = []
             counts = Counter[str]()
-            if len(place) > MAX_CONTAINERS:
-                raise self._error(
-                    path, f"more than {MAX_CONTAINERS} fault trees and components in each other",
-                    parent.line)
             self._check_text(parent, path)
             element: _Element
             for element in parent:  # type: ignore[assignment]  # made by the factory
@@ -266,9 +230,6 @@ class _Reader:
     def _checked(self, name: str, path: str, line: int) -> str:
         if not name or "." in name:
             raise self._error(path, f"name {shown(name)}: expected a name without dots", line)
-        if len(name) > MAX_NAME:
-            raise self._error(path, f"name {shown(name)}: expected at most {MAX_NAME} characters",
-                              line)
         return name
 
     def _check_known(self, element: _Element, path: str, known: Collection[str],
@@ -276,7 +237,7 @@ class _Reader:
         """Refuse an element, or an attribute of one, that the format does not have here."""
         tag, line = element.tag, element.line
         if tag not in known:
-            near = difflib.get_close_matches(tag.rpartition("}")[2][:MAX_NAME], known, 1)
+            near = difflib.get_close_matches(tag.rpartition("}")[2], known, 1)
             hint = f"did you mean {near[0]!r}? " if near else ""
             raise self._error(path, f"unknown {what}; {hint}known: {', '.join(known)}", line)
         allowed = _ATTRIBUTES.get(tag, set())
@@ -416,11 +377,10 @@ class _Reader:
             self._doubt("/opsa-mef", f"none of the {len(self._undeclared)} basic events is "
                                      "defined; a misspelt name counts as another event", 0)
             self._undeclared.clear()
-        short = [name for name in defined if len(name) <= _COMPARED[1]][:_COMPARED[0]]
         for name, (path, line) in self._undeclared.items():
             if self._doubts >= _WARNED_OF:
                 break
-            near = difflib.get_close_matches(name[:_COMPARED[1]], short, 1)
+            near = difflib.get_close_matches(name, defined, 1)
             self._doubt(path, f"event {name!r} is not defined, and counts as an independent basic "
                               "event" + (f"; did you mean {near[0]!r}?" if near else ""), line)
         alike = defaultdict[str, list[str]](list)

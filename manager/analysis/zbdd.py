@@ -37,36 +37,14 @@ class Diagram:
         return len(self.level) - 1
 
     def minimal_solutions(self, top: int, families: Families, *, monotone: bool) -> int:
-        """Return the family of minimal sets of variables for which a node's function holds.
-
-        Sets beyond the size that the store keeps are dropped where they would be made.
-        """
-        room = self._room(top, families)
+        """Return the family of minimal sets of variables for which a node's function holds."""
         known = {EMPTY: EMPTY, UNIT: UNIT}
         for node in range(2, top + 1):  # inputs come before what uses them
-            if room and room[node] < 0:
-                known[node] = EMPTY
-                continue
-            level, low, high = self.level[node], known[self.low[node]], known[self.high[node]]
-            if room:
-                low = families.up_to(low, room[node])
-                high = families.up_to(high, room[node] - families.least[level])
+            low, high = known[self.low[node]], known[self.high[node]]
             rest = families.outside(high, self, self.low[node]) if monotone \
                 else families.without(high, low)
-            known[node] = families.node(level, rest, low)
+            known[node] = families.node(self.level[node], rest, low)
         return known[top]
-
-    def _room(self, top: int, families: Families) -> list[int]:
-        """Return how many events a set may still have below each node; nothing without a limit."""
-        if families.most is None:
-            return []
-        room = [-1] * (top + 1)
-        room[top] = families.most
-        for node in range(top, 1, -1):
-            for below, taken in ((self.high[node], families.least[self.level[node]]),
-                                 (self.low[node], 0)):
-                room[below] = max(room[below], room[node] - taken)
-        return room
 
 
 class Families:
@@ -74,13 +52,9 @@ class Families:
 
     Args:
         limit: Nodes that may be made.
-        most: Events in a set that is kept; None for any number.
-        least: For each variable, how many events it stands for at least; needed with `most`.
     """
 
-    def __init__(self, limit: int, most: int | None = None, least: Sequence[int] = ()) -> None:
-        self.most, self.least = most, least
-        self._up_to: dict[tuple[int, int], int] = {}
+    def __init__(self, limit: int) -> None:
         self.variable = [1 << 60, 1 << 60]
         self.high = [EMPTY, UNIT]
         self.low = [EMPTY, UNIT]
@@ -108,21 +82,6 @@ class Families:
             self.high.append(high)
             self.low.append(low)
         return found
-
-    def up_to(self, u: int, most: int) -> int:
-        """Return the sets of `u` with so many events at most."""
-        if most < 0 or u == EMPTY:
-            return EMPTY
-        if u == UNIT:
-            return UNIT
-        key = (u, most)
-        if (found := self._up_to.get(key)) is not None:
-            return found
-        x = self.variable[u]
-        result = self.node(x, self.up_to(self.high[u], most - self.least[x]),
-                           self.up_to(self.low[u], most))
-        self._up_to[key] = result
-        return result
 
     def without(self, u: int, v: int) -> int:
         """Return the sets of `u` that include no set of `v` (Rauzy 1993)."""
@@ -172,26 +131,25 @@ class Families:
         self._outside[key] = result
         return result
 
-    def upwards(self, family: int) -> tuple[int, ...]:
-        """Return the nodes of a family, those below before those above."""
-        return search(family, lambda node: (
-            (self.high[node], self.low[node]) if node > UNIT else ()))[0]
-
-    def sizes(self, family: int, weights: Sequence[Mapping[int, int]]) -> Counter[int]:
-        """Return how many sets of each size a family has.
+    def sizes(self, family: int, weights: Sequence[Mapping[int, int]]
+              ) -> dict[int, Mapping[int, int]]:
+        """Return how many sets of each size there are below each node of a family.
 
         Args:
             family: The family.
             weights: For each variable, how many sets of each size it stands for: one of size 1
                 if it stands for itself.
         """
-        found = {EMPTY: Counter[int](), UNIT: Counter({0: 1})}
-        for node in self.upwards(family):
-            found[node] = counts = found[self.low[node]].copy()
+        found: dict[int, Mapping[int, int]] = {EMPTY: {}, UNIT: {0: 1}}
+        nodes, _ = search(family, lambda node: (
+            (self.high[node], self.low[node]) if node > UNIT else ()))
+        for node in nodes:
+            counts = Counter(found[self.low[node]])
             for size, count in weights[self.variable[node]].items():
                 for more, times in found[self.high[node]].items():
                     counts[size + more] += count * times
-        return found[family]
+            found[node] = counts
+        return found
 
 
 @contextmanager
