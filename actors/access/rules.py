@@ -8,8 +8,8 @@ written for each identity.
 
 * A client gets its own rights (`rampart.actors.access.rights`).
 * The other router of the same host gets everything: it has checked what it hands on.
-* A router of another host gets what the nodes there may do together, and people if tools are used
-  there. What it says beyond that is refused, whoever it claims to hand it on for.
+* A router of another host gets what the nodes there and people may do together. What it says
+  beyond that is refused, whoever it claims to hand it on for.
 
 Going out, besides what somebody hears, is who else hears and asks: a publisher that did not know
 would not send. So of all subscriptions and questions of the system those go out that meet what the
@@ -19,8 +19,9 @@ other end may say.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -50,19 +51,17 @@ Grant = tuple[str, tuple[str, ...], frozenset[str]]
 
 @dataclass(frozen=True, slots=True)
 class Host:
-    """One machine of a system.
+    """One machine of a system, on which tools of operators and viewers may be used too.
 
     Attributes:
         name: of it; "" where there is one only.
         routers: names of its routers.
         nodes: names of the other processes there that have certificates.
-        people: whether tools of operators and viewers are used there.
     """
 
     name: str = ""
     routers: tuple[str, ...] = ROUTERS
     nodes: frozenset[str] = frozenset()
-    people: bool = True
 
 
 _parsed = cache(zenoh.KeyExpr)
@@ -100,32 +99,23 @@ _BETWEEN_ROUTERS: list[Grant] = [
     for flow in (INGRESS, EGRESS)]
 
 
-@dataclass(slots=True)
-class Rules:
-    """What the routers of one host let through, by the names in certificates."""
-
-    of: dict[str, list[Grant]] = field(default_factory=dict)
-
-    def config(self) -> dict[str, Any]:
-        """Return Zenoh's `access_control`."""
-        rules: list[dict[str, Any]] = []
-        subjects, policies = [], []
-        for name, granted in sorted(self.of.items()):
-            own = []
-            for number, (flow, messages, keys) in enumerate(granted):
-                own.append(f"{name} {number}")
-                rules.append({"id": own[-1], "permission": "allow", "flows": [flow],
-                              "messages": list(messages), "key_exprs": sorted(keys)})
-            if own:
-                subjects.append({"id": name, "cert_common_names": [name]})
-                policies.append({"rules": own, "subjects": [name]})
-        return {"enabled": True, "default_permission": "deny", "rules": rules,
-                "subjects": subjects, "policies": policies}
+def config_of(granted: Mapping[str, Iterable[Grant]]) -> dict[str, Any]:
+    """Return Zenoh's `access_control`, of what is let through by the names in certificates."""
+    rules = {name: [
+        {"id": f"{name} {number}", "permission": "allow", "flows": [flow],
+         "messages": list(messages), "key_exprs": sorted(keys)}
+        for number, (flow, messages, keys) in enumerate(grants)]
+        for name, grants in sorted(granted.items()) if grants}
+    return {"enabled": True, "default_permission": "deny",
+            "rules": [*chain.from_iterable(rules.values())],
+            "subjects": [{"id": name, "cert_common_names": [name]} for name in rules],
+            "policies": [{"rules": [rule["id"] for rule in own], "subjects": [name]}
+                         for name, own in rules.items()]}
 
 
 def rules_of(host: Host, hosts: Sequence[Host], rights: Mapping[str, Rights],
-             register: Register) -> Rules:
-    """Return what the routers of a host let through.
+             register: Register) -> dict[str, list[Grant]]:
+    """Return what the routers of a host let through, by the names in certificates.
 
     Args:
         host: theirs.
@@ -142,17 +132,16 @@ def rules_of(host: Host, hosts: Sequence[Host], rights: Mapping[str, Rights],
     for name in host.nodes:
         if name in nodes:
             found[nodes[name]] = grants(rights[name], everybody)
-    for kind in (OPERATOR, VIEWER) if host.people else ():
-        people = register.of_kind(kind)
-        granted = grants(rights[kind], everybody) if people else []
-        found.update((common_name, granted) for common_name in people.values())
+    people = {kind: rights[kind] for kind in (OPERATOR, VIEWER)}
+    for kind, own in people.items():
+        granted = grants(own, everybody)
+        found.update(dict.fromkeys(register.of_kind(kind).values(), granted))
     for other in hosts:
         if other.name != host.name:
             there = [rights[name] for name in (*other.nodes, *other.routers)]
-            there += [rights[kind] for kind in (OPERATOR, VIEWER) if other.people]
-            between = grants(together(there), everybody)
+            between = grants(together((*there, *people.values())), everybody)
             found.update((routers[name], between) for name in other.routers if name in routers)
-    return Rules(found)
+    return found
 
 
 def hosts_of(layout: Layout) -> dict[str, Host]:
@@ -173,5 +162,5 @@ def access_of(layout: Layout, keys: str) -> dict[str, Any]:
         KeysError: there is no sound register.
     """
     hosts = hosts_of(layout)
-    return rules_of(hosts[layout.plan.host], list(hosts.values()), rights_of_all(layout),
-                    read_register(Path(keys))).config()
+    return config_of(rules_of(hosts[layout.plan.host], list(hosts.values()), rights_of_all(layout),
+                              read_register(Path(keys))))

@@ -1,21 +1,15 @@
-"""What an actor needs of a bus. `ZenohBus` and `VirtualBus` fulfil it; one suite tests both.
-
-`SharedBus` is a second actor's access to a session that another actor of the same process opened.
-"""
+"""What an actor needs of a bus. `ZenohBus` and `VirtualBus` fulfil it; one suite tests both."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from rampart.actors.bus.topic import Topic
 
 Deliver = Callable[[str, bytes], None]
 """Called on the event loop with the concrete key and the payload."""
-
-"""Called on the event loop with node, incarnation, and whether it is there."""
-
 
 _LOOK_S = 0.005
 
@@ -83,71 +77,27 @@ class Bus(Protocol):
         """Leave the bus. Closing twice is harmless."""
 
 
-class SharedBus:
-    """Passes everything on to a bus that another actor opens and closes.
-
-    Args:
-        owner: The bus; it is opened by somebody else, perhaps later.
-    """
-
-    bursts = True
+class _SharedBus:
+    """Passes everything on to a bus that another actor opens and closes."""
 
     def __init__(self, owner: Bus) -> None:
         self._owner = owner
-        self._open = False
 
     async def open(self) -> None:
         """Wait until the owner has opened it."""
         while not self._owner.is_open:  # noqa: ASYNC110 polled, some milliseconds at most
             await asyncio.sleep(_LOOK_S)
-        self._open = True
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it is open."""
-        return self._open
-
-    def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
-        """Send over the owner's session."""
-        if self._open:
-            self._owner.publish(topic, key, payload)
-
-    def post(self, key: str, payload: bytes) -> bool:
-        """Post by the owner."""
-        return self._open and self._owner.post(key, payload)
-
-    def record(self, key: str, payload: bytes) -> None:
-        """Record by the owner."""
-        self._owner.record(key, payload)
-
-    def posted(self, key: str) -> bytes | None:
-        """Return what is posted."""
-        return self._owner.posted(key)
-
-    def has_readers(self, key: str) -> bool:
-        """Whether somebody hears a key, as far as the owner knows."""
-        return self._owner.has_readers(key)
-
-    def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:
-        """Subscribe in the owner's session."""
-        self._owner.subscribe(
-            topic, key_expression,
-            lambda key, payload: deliver(key, payload) if self._open else None)
-
-    def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
-        """Ask in the owner's session."""
-        self._owner.latest(
-            key_expression, lambda key, payload: deliver(key, payload) if self._open else None,
-            lambda: answered() if self._open else None)
-
-    def after_burst(self, call: Callable[[], None]) -> None:
-        """Have it made after what has arrived in the owner's session."""
-        self._owner.after_burst(call)
-
-    def moved(self) -> bool:
-        """Whether the owner's session has gone over to another router."""
-        return self._owner.moved()
 
     async def close(self) -> None:
-        """Hear and say nothing more; the session stays open."""
-        self._open = False
+        """Leave the session open."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._owner, name)
+
+
+def shared(owner: Bus) -> Bus:
+    """Return the access of a second actor to the session that another one opens, perhaps later.
+
+    The second one ends first.
+    """
+    return cast("Bus", _SharedBus(owner))

@@ -23,7 +23,7 @@ import msgspec
 import tomli_w
 
 from rampart.actors.bus import run_folder, run_info, topics
-from rampart.actors.bus.bus import BusError, SharedBus
+from rampart.actors.bus.bus import BusError, shared
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.recorder_connection import RecorderConnection
@@ -282,7 +282,7 @@ class Replay:
             panels = kind.given(PAGE, run.system, SYSTEM)["panels"]
         page: type[Hmi] = ReplayPage if kind is Hmi else type("ReplayPage", (ReplayPage, kind), {})
         return page(Context(
-            PAGE, 1, clock, SharedBus(bus), {"panels": tuple(
+            PAGE, 1, clock, shared(bus), {"panels": tuple(
                 panel for panel in panels if not panel.stick)}, run,
             topics={topic.key: topic for topic in self._known.topics}))
 

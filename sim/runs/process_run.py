@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from rampart.actors.access.register import KeysError
-from rampart.actors.bus.bus import SharedBus
+from rampart.actors.bus.bus import shared
 from rampart.actors.bus.run_folder import register_of
 from rampart.actors.hosts.launchers import FirstLauncher
 from rampart.actors.runtime.actor import Context
@@ -123,7 +123,7 @@ class ProcessRun:
 
         def context(name: str) -> Context:
             return Context(
-                name, 1, clock, bus if name == OBSERVER else SharedBus(bus),
+                name, 1, clock, bus if name == OBSERVER else shared(bus),
                 run=trial.run, register=register_of(plan.folder),
                 members=frozenset(launcher.names))
 

@@ -39,7 +39,6 @@ from tests import ROOT
 from tests.actors.osmosis.airport.test_formats import GRAPH, TOML
 
 SPEC = (ROOT / "systems" / "paper.toml").read_text("utf-8")
-DOTTED = "a" + ".a" * 50_000 + " = 1"
 
 
 def refusal(capsys: pytest.CaptureFixture[str], program: Callable[[list[str]], int],
@@ -75,13 +74,10 @@ def scribble(count: int) -> str:
             'half_width_m = 100.0\n')
 
 
+NESTED = "x = " + "[" * 100_000 + "]" * 100_000
 AIRPORTS = {
-    "nested 100,000 deep": (TOML + "x = " + "[" * 100_000 + "]" * 100_000, "more than 32 deep"),
+    "nested 100,000 deep": (TOML + NESTED, "more than 32 deep"),
     "tables nested without end": ("x = " + "{a=" * 100_000, "more than 32 deep"),
-    "100 kB of dotted keys": (DOTTED, "a key of more than 6 dotted parts"),
-    "a header of dotted parts": (f"[{'.'.join('a' * 50_000)}]", "more than 6 dotted parts"),
-    "dots behind a string that looks closed": ('x = "\\""\n' + DOTTED, "more than 6 dotted"),
-    "a key that is long": (f'["{"k" * 5000}"]\nx = 1', "a key of more than 200 characters"),
     "longer than any airport": (TOML + "#" * (5 << 20), "longer than 4 MB"),
     "a coordinate of 400 digits": (edited("T = [30.0", f"T = [1{'0' * 400}"),
                                    "nodes.T[0]: 1000000000"),
@@ -119,16 +115,14 @@ def test_an_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, tex
     assert words in refusal(capsys, launch.main, "--virtual", "--airport", str(path))
 
 
-@pytest.mark.parametrize("text", [AIRPORTS["nested 100,000 deep"][0], DOTTED])
-def test_a_mission_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, text):
+def test_a_mission_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys):
     path = tmp_path / "mission.toml"
-    path.write_text(text)
+    path.write_text(AIRPORTS["nested 100,000 deep"][0])
     refusal(capsys, launch.main, "--virtual", "--mission", str(path))
 
 
 SPECS = {
     "nested": ("x = " + "[" * 100_000, "more than 32 deep"),
-    "dotted": (DOTTED, "a key of more than 6 dotted parts"),
     "long": (SPEC + "#" * (1 << 20), "longer than 512 kB"),
     "many events": (SPEC + "".join(f'[[event]]\nname = "X{i}"\n' for i in range(6000)),
                     "$.event: 6"),
@@ -163,10 +157,10 @@ def test_a_device_without_end_is_read_no_further_than_a_spec_is_long(tmp_path, c
 
 def test_a_table_to_be_replaced_is_read_within_the_same_bounds(tmp_path, capsys):
     path = tmp_path / "table.toml"
-    path.write_text(DOTTED)
-    assert "6 dotted parts" in refusal(capsys, rampart, "adapt", "replace", "FTM7", str(path))
+    path.write_text(NESTED)
+    assert "32 deep" in refusal(capsys, rampart, "adapt", "replace", "FTM7", str(path))
     with pytest.raises(ChangeError, match="expected a TOML value"):
-        parse_value("{" + DOTTED + "}")
+        parse_value(NESTED)
 
 
 def test_a_gate_as_large_as_may_be_is_read_and_a_larger_one_is_not():

@@ -14,7 +14,7 @@ import zenoh
 
 from rampart.actors.access.register import Register
 from rampart.actors.access.rights import OPERATOR, VIEWER, rights_of_all
-from rampart.actors.access.rules import hosts_of, rules_of
+from rampart.actors.access.rules import config_of, hosts_of, rules_of
 from rampart.actors.bus.topic import ROOT, Members, Qos, Topic
 from rampart.actors.bus.topics import INJECT
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
@@ -69,8 +69,8 @@ def rules_as_declared(layout: Layout) -> dict[str, Any]:
     register = Register().issued([OPERATOR], OPERATOR).issued([VIEWER], VIEWER)
     for host in hosts.values():
         register = register.issued(host.routers, "router").issued(sorted(host.nodes), "node")
-    return rules_of(hosts[layout.plan.host], list(hosts.values()), rights_of_all(layout),
-                    register).config()
+    return config_of(rules_of(hosts[layout.plan.host], list(hosts.values()), rights_of_all(layout),
+                              register))
 
 
 def on_each_host(layout: Layout) -> Iterator[Layout]:

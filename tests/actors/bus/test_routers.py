@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from rampart.actors.bus import zenoh_bus
-from rampart.actors.bus.bus import BusError, SharedBus
+from rampart.actors.bus.bus import BusError, shared
 from rampart.actors.bus.run_folder import ROUTERS, socket_path
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
@@ -173,7 +173,7 @@ async def test_who_has_gone_over_to_another_router_knows_it_once(routers, socket
         await send_until(writer, lambda: heard)
         reader.moved()
         assert not reader.moved()
-        assert not SharedBus(reader).moved()
+        assert not shared(reader).moved()
         routers.send("router_b", signal.SIGKILL)
         await eventually(reader.moved)
         await asyncio.sleep(0.1)
@@ -207,15 +207,15 @@ async def test_numbers_of_one_client_arrive_in_their_sequence_over_a_change(rout
 
 async def test_an_actor_that_shares_a_bus_waits_until_that_is_open(routers, sockets):
     bus = ZenohBus("", endpoints(sockets))
-    shared = SharedBus(bus)
+    second = shared(bus)
     async with asyncio.TaskGroup() as group:
-        opening = group.create_task(shared.open())
+        opening = group.create_task(second.open())
         group.create_task(bus.open())
         await asyncio.sleep(0.1)
         assert not opening.done()
         await routers.start("router_a")
     heard: list[bytes] = []
-    shared.subscribe(topics.POSE, topics.POSE.at(), lambda _key, payload: heard.append(payload))
+    second.subscribe(topics.POSE, topics.POSE.at(), lambda _key, payload: heard.append(payload))
     async with client(sockets) as writer:
         await send_until(writer, lambda: heard)
     await bus.close()
