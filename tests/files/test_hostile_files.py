@@ -126,7 +126,8 @@ SPECS = {
     "long": (SPEC + "#" * (1 << 20), "longer than 512 kB"),
     "many events": (SPEC + "".join(f'[[event]]\nname = "X{i}"\n' for i in range(6000)),
                     "expected a list, at most 5000 long"),
-    "many orders": (SPEC + "".join(f"[orders.x{i}]\n" for i in range(20)), "expected a table, at most 16 long"),
+    "many orders": (SPEC + "".join(f"[orders.x{i}]\n" for i in range(20)),
+                    "expected a table, at most 16 long"),
     "a long name": (SPEC.replace('name = "DM1"', f'name = "D{"1" * 200}"', 1), "expected a name"),
     "a gate of a thousand names": (
         SPEC.replace('detect = "DM1"', f'detect = "{" and ".join(["DM1"] * 1000)}"', 1),
