@@ -132,14 +132,13 @@ def rules_of(host: Host, hosts: Sequence[Host], rights: Mapping[str, Rights],
     for name in host.nodes:
         if name in nodes:
             found[nodes[name]] = grants(rights[name], everybody)
-    people = {kind: rights[kind] for kind in (OPERATOR, VIEWER)}
-    for kind, own in people.items():
-        granted = grants(own, everybody)
+    for kind in (OPERATOR, VIEWER):
+        granted = grants(rights[kind], everybody)
         found.update(dict.fromkeys(register.of_kind(kind).values(), granted))
     for other in hosts:
         if other.name != host.name:
-            there = [rights[name] for name in (*other.nodes, *other.routers)]
-            between = grants(together((*there, *people.values())), everybody)
+            there = [rights[name] for name in (*other.nodes, *other.routers, OPERATOR, VIEWER)]
+            between = grants(together(there), everybody)
             found.update((routers[name], between) for name in other.routers if name in routers)
     return found
 

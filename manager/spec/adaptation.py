@@ -18,6 +18,7 @@ from rampart.files.plain_text import shown
 from rampart.files.reading import FileError
 from rampart.manager.spec.schema import DetectionSpec, MechanismSpec, RecoverySpec, SystemSpec
 from rampart.manager.spec.specification import check_document
+from rampart.manager.spec.tables import Table
 
 Document = dict[str, Any]
 
@@ -32,7 +33,8 @@ class Action(StrEnum):
     SET = "set"
 
 
-CHANGEABLE = {"detection": DetectionSpec, "recovery": RecoverySpec, "mechanism": MechanismSpec}
+CHANGEABLE: dict[str, type[Table]] = {
+    "detection": DetectionSpec, "recovery": RecoverySpec, "mechanism": MechanismSpec}
 """Tables whose rows can be enabled, disabled, retuned and replaced, by name."""
 
 SETTINGS = ("strategy", "shadow", "order")
