@@ -22,13 +22,28 @@ FORMATTER = argparse.RawDescriptionHelpFormatter
 Run = Callable[[argparse.Namespace], int | Coroutine[Any, Any, int]]
 """Does what a verb is for, and returns the exit code."""
 
+Completer = Callable[..., list[str]]
+"""Returns what can be typed; argcomplete calls it with the options so far, by name."""
+
 Option = Callable[[argparse._ActionsContainer], object]
 """Adds itself to a parser, or to a group of one."""
 
 
-def option(*names: str, **fields: Any) -> Option:
-    """Return an option or argument; names and fields are those of `add_argument` of argparse."""
-    return lambda parser: parser.add_argument(*names, **fields)
+def option(*names: str, completer: Completer | None = None, **fields: Any) -> Option:
+    """Return an option or argument.
+
+    Args:
+        names: as of `add_argument` of argparse.
+        completer: what the shell offers for it, see `rampart.cli.completion`.
+        fields: as of `add_argument`.
+    """
+    def add(parser: argparse._ActionsContainer) -> object:
+        action: Any = parser.add_argument(*names, **fields)
+        if completer is not None:
+            action.completer = completer
+        return action
+
+    return add
 
 
 def flag(name: str, text: str) -> Option:
@@ -41,9 +56,10 @@ def word(name: str, metavar: str, text: str, default: str | None = None) -> Opti
     return option(name, metavar=metavar, default=default, help=text)
 
 
-def several(name: str, metavar: str, text: str) -> Option:
+def several(name: str, metavar: str, text: str, completer: Completer | None = None) -> Option:
     """Return an option that may be repeated; its value is a list of texts."""
-    return option(name, action="append", default=[], metavar=metavar, help=text)
+    return option(name, action="append", default=[], metavar=metavar, help=text,
+                  completer=completer)
 
 
 def number(name: str, metavar: str, text: str, default: float | None = None) -> Option:

@@ -24,7 +24,7 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.ros2.translation.tables import ROUTER
-from rampart.cli import systems
+from rampart.cli import completion, systems
 from rampart.cli.following import LOOK_S, is_over
 from rampart.cli.look import ros_verbs
 from rampart.cli.look import topic_catalogue as catalogue
@@ -49,7 +49,7 @@ _HZ_REPORT_S = 1.0
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     topic = add_family(verbs, "topic", "what travels on the keys", __doc__)
-    key = option("key", metavar="KEY")
+    key = option("key", metavar="KEY", completer=completion.topics)
     ros = option("--ros", nargs="?", const=ROUTER, metavar="ENDPOINT",
                  help=f"of ROS 2, by the router there (default {ROUTER})")
     add_verb(topic, "list", "all topics (needs no run)", topic_list,

@@ -27,6 +27,7 @@ from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import Member, load_application
+from rampart.cli import completion
 from rampart.cli.output import (
     UsageError,
     between,
@@ -86,7 +87,7 @@ def add(verbs: Any) -> None:
     """Add the verb to the parser."""
     add_verb(verbs, "bench", "how soon each node works again after a SIGKILL", bench, PORT,
              several("--node", "NAME", "kill only this node; may be repeated (default: all nodes, "
-                     "one detection and one recovery module)"),
+                     "one detection and one recovery module)", completion.nodes),
              whole("--kills", "N", "kills of each node (default 5)", 5), JSON)
 
 

@@ -18,7 +18,7 @@ from rampart.actors.runtime.fault_watch import Order
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.actors.system.layout import published_keys
 from rampart.actors.system.topics import find_topic
-from rampart.cli import systems
+from rampart.cli import completion, systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
 from rampart.cli.operate.injecting import hit_process, run_fault
 from rampart.cli.operate.operator_verbs import trigger
@@ -42,8 +42,9 @@ def add(verbs: Any) -> None:
     """Add the verb to the parser."""
     add_verb(
         verbs, "inject", "inject a fault", inject, PORT,
-        option("fault", nargs="?", metavar="FAULT", help="a name from --list, MODE:TOPIC, "
-               "kill:NODE, stop:NODE, wedge:NODE or trigger:MODULE"),
+        option("fault", nargs="?", metavar="FAULT", completer=completion.faults,
+               help="a name from --list, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE or "
+               "trigger:MODULE"),
         flag("--list", "list the catalogue (needs no run)"),
         word("--system", "FILE", "for --list: system spec; default that of the run, else the "
              "shipped one"),

@@ -27,6 +27,7 @@ from rampart.actors.supervision.kill_node import (
     signal_node,
 )
 from rampart.actors.supervision.process_title import find_processes
+from rampart.cli import completion
 from rampart.cli.session import UsageError, connect
 from rampart.files import streams
 from rampart.files.plain_text import one_line
@@ -112,7 +113,9 @@ async def signal_anywhere(node: str, name: str, port: int | None) -> Signalled:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
     streams.secure()
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    completion.complete(parser)
+    options = parser.parse_args(arguments)
     act = _list_nodes if options.list else _signal_node
     try:
         for line in act(options):
@@ -127,7 +130,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="kill-node", description="Kill, stop or wedge a node of a running robot.",
         epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("node", nargs="?", help="name of the node, e.g. osmosis_control")
+    node: Any = parser.add_argument("node", nargs="?",
+                                    help="name of the node, e.g. osmosis_control")
+    node.completer = completion.nodes
     parser.add_argument("--signal", default="KILL", type=str.upper, metavar="SIG",
                         help="KILL (default), STOP, CONT, TERM, SEGV or WEDGE")
     parser.add_argument("--port", type=int, default=os.environ.get("RAMPART_PORT") or None,

@@ -27,7 +27,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.ros2.translation.tables import GATEWAY
-from rampart.cli import systems
+from rampart.cli import completion, systems
 from rampart.cli.following import is_over
 from rampart.cli.operate.operator_verbs import Holdings
 from rampart.cli.output import (
@@ -60,7 +60,8 @@ def add(verbs: Any) -> None:
     node = add_family(verbs, "node", "the nodes of the run", __doc__)
     add_verb(node, "list", "all nodes", node_list, PORT, JSON)
     add_verb(node, "log", "what the command of a node has printed", node_log, PORT,
-             option("name", metavar="NODE", help="a node that is a command"),
+             option("name", metavar="NODE", help="a node that is a command",
+                    completer=completion.nodes),
              whole("--lines", "N", "so many lines from its end (default 50)", 50),
              flag("--follow", "and what it prints from now on, until the run ends"))
     add_verb(verbs, "top", "the run in the terminal, refreshed four times a second", top, PORT,

@@ -64,7 +64,7 @@ _WIDTH = 11
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    topics = {"metavar": "GLOB", "nargs": "+", "action": "extend", "default": []}
+    topics: dict[str, Any] = {"metavar": "GLOB", "nargs": "+", "action": "extend", "default": []}
     add_verb(verbs, "record", "record a run that is there", record, PORT,
              option("file", metavar="FILE", nargs="?",
                     help="MCAP file (default: rampart-TIME.mcap)"),

@@ -1,0 +1,44 @@
+"""Completion in the shell (argcomplete): verbs, and nodes, topics and faults of the run at hand.
+
+`eval "$(register-python-argcomplete rampart kill-node)"` in the shell's start-up file turns it on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from typing import Any
+
+import argcomplete
+
+from rampart.actors.bus.run_info import find_runs
+from rampart.actors.system.layout import published_keys
+from rampart.cli import systems
+from rampart.cli.output import UsageError
+from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
+
+
+def complete(parser: argparse.ArgumentParser) -> None:
+    """Answer the shell and end, if it is the shell that has started this program."""
+    argcomplete.autocomplete(parser)
+
+
+def nodes(**_: Any) -> list[str]:
+    """Return the nodes of all runs of this machine."""
+    return sorted({name for run in find_runs() for name in run.nodes})
+
+
+def topics(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    """Return the keys that the system at hand publishes."""
+    with contextlib.suppress(UsageError, ValueError):
+        return sorted(published_keys(systems.at_hand(None, getattr(parsed_args, "port", None))))
+    return []
+
+
+def faults(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    """Return the faults of the system at hand, by name, and those of its processes."""
+    with contextlib.suppress(UsageError, ValueError):
+        known = faults_of(systems.at_hand(None, getattr(parsed_args, "port", None)))
+        return [*known.named, *(fault.name for fault in known.offered()),
+                *(f"{kind}:{node}" for kind in PROCESS_FAULTS for node in nodes())]
+    return []
