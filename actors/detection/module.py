@@ -88,12 +88,9 @@ class DetectionModule(Actor):
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.DETECTION,)
-    state: DetectionState
-    first_life: bool
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.state = DetectionState.IDLE
         self._report = DetectionReport(DetectionState.IDLE, "", (), self.clock.now())
         self.first_life = context.incarnation == 1
         self._told = False
@@ -114,6 +111,11 @@ class DetectionModule(Actor):
 
     # -- the state machine ----------------------------------------------------------------------
 
+    @property
+    def state(self) -> DetectionState:
+        """Idle or active."""
+        return self._report.state
+
     def activate(self, reason: str, nodes: tuple[str, ...] = ()) -> None:
         """Go from idle to active; when active already, renew reason and nodes. Report changes."""
         reason = clip(reason)
@@ -123,14 +125,12 @@ class DetectionModule(Actor):
             since_s = self._report.since_s
             if (reason, nodes) == (self._report.reason, self._report.nodes):
                 return
-        self.state = DetectionState.ACTIVE
-        self._tell(DetectionReport(self.state, reason, nodes, since_s))
+        self._tell(DetectionReport(DetectionState.ACTIVE, reason, nodes, since_s))
 
     def know_idle(self) -> None:
         """Say that the fault is known not to be there: go to idle, or stay. Report what is new."""
         if self.state is DetectionState.ACTIVE:
-            self.state = DetectionState.IDLE
-            self._tell(DetectionReport(self.state, "", (), self.clock.now()))
+            self._tell(DetectionReport(DetectionState.IDLE, "", (), self.clock.now()))
         elif not self._told:
             self._tell(self._report)
 
@@ -156,8 +156,6 @@ class DetectionModule(Actor):
             suspects: names of nodes.
             header: of the message that came last.
         """
-        if not suspects:
-            return ()
         self._senders[header.source] = header.incarnation
         return tuple(f"{name}#{self._senders[name]}" if name in self._senders else name
                      for name in suspects)

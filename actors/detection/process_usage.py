@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
@@ -51,10 +49,9 @@ class ProcessUsage(DetectionModule):
 
     parameters: Parameters
 
-    def __init__(self, context: Context, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, context: Context) -> None:
         super().__init__(context)
         said = self.parameters
-        self._now = now
         self._looks: dict[str, tuple[tuple[int, int], float, ProcessCount]] = {}
         self._running: dict[str, tuple[int, int]] = {}
         self.monitor = self.judged_by(Sustained(
@@ -83,9 +80,10 @@ class ProcessUsage(DetectionModule):
         self.follow()
 
     def _problem(self, node: str, pid: int, incarnation: int) -> str:
-        usage, now_s, said = self.context.usage(pid), self._now(), self.parameters
+        usage, said = self.context.usage(pid), self.parameters
         if usage is None:
             return ""
+        now_s = self.clock.now() / self.clock.rate  # the processor's time is real
         look = (pid, incarnation), now_s, usage
         process, before_s, before = self._looks.get(node, look)
         self._looks[node] = look

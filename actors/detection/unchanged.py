@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rampart.actors.bus.bounds import MANY
-from rampart.actors.bus.limits import Remembered
 from rampart.actors.detection.disagreement import apart
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
@@ -100,15 +98,13 @@ class Unchanged(DetectionModule):
         self.monitor = self.judged_by(UnchangedMonitor(
             said.value, said.for_s, said.clear_s, within=said.within, may_last=said.may_last,
             known_after_s=self.known_after_s(said.for_s)))
-        self._heard_of: dict[str, int] = Remembered(MANY)
         self.hear_field(said.value, self.heard)
 
     def heard(self, value: Any, header: Header) -> None:
         """Take note of a value."""
         if value is None:
             return
+        before = self._senders.get(header.source, header.incarnation)
         self.monitor.accused = self.accused(self.parameters.suspects, header)
-        before = self._heard_of.get(header.source, header.incarnation)
-        self._heard_of[header.source] = header.incarnation
         self.monitor.heard(value, self.clock.now(), renewed=before != header.incarnation)
         self.follow()

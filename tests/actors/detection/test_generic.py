@@ -387,7 +387,7 @@ def test_a_node_that_takes_too_much_is_named():
                                            "memory_mb": 50, "for_s": 1.0, "clear_s": 1.0})
             context = replace(
                 context, usage=lambda pid: ProcessCount(used["busy"], int(used["memory"]), 0.0))
-            module = ProcessUsage(context, system.clock.now)
+            module = ProcessUsage(context)
             task = asyncio.create_task(module.run())
             for _ in range(20):
                 system.say(bus_topics.HEARTBEAT, bm.Heartbeat(77, 1, 0.1, 0, 0), "a", incarnation=3)
