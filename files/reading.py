@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-_PART_BYTES = 1 << 18
-
 
 class FileError(ValueError):
     """Content that is refused. The text says why; which file it is, the caller knows."""
@@ -22,12 +20,10 @@ def read_bytes(path: Path, most: int) -> bytes:
         FileError: it is longer.
         OSError: it cannot be read.
     """
-    data = bytearray()
     with path.open("rb") as file:
-        while len(data) <= most and (part := file.read(_PART_BYTES)):  # no more memory than needed
-            data += part
+        data = file.read(most + 1)
     check_size(data, most)
-    return bytes(data)
+    return data
 
 
 def read_text(path: Path, most: int) -> str:
@@ -43,7 +39,7 @@ def read_text(path: Path, most: int) -> str:
         raise FileError("not UTF-8 text") from None
 
 
-def check_size(data: bytes | bytearray | str, most: int) -> None:
+def check_size(data: bytes | str, most: int) -> None:
     """Refuse content that is longer than it may be.
 
     Raises:

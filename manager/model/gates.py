@@ -16,9 +16,10 @@ not count as an assurance that all is well either, so `not DM1` holds too.
 
 from __future__ import annotations
 
+import ast
 import math
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import lru_cache, reduce
 from itertools import chain, combinations, product
 from operator import and_, or_
@@ -118,7 +119,7 @@ def detection_gate(text: str) -> Gate:
     Raises:
         GateError: It cannot be read, can never be active, or is active when nothing is wrong.
     """
-    gate = _Parser(text).read()
+    gate = _read(text)
     names = gate.names
     if len(names) > MAX_NAMES:
         raise GateError(f"a gate over {len(names)} modules; at most {MAX_NAMES} are right, more "
@@ -137,7 +138,7 @@ def recovery_gate(text: str) -> Gate:
     Raises:
         GateError: It cannot be read, or has more in it than names, `and` and `or`.
     """
-    gate = _Parser(text).read()
+    gate = _read(text)
     names = gate.names
     if len(names) > MAX_NAMES:
         raise GateError(f"{len(names)} recovery modules; at most {MAX_NAMES} are right")
@@ -187,94 +188,52 @@ def _count_ways(gate: Gate) -> int:
     return sum(counts) if gate.required == 1 else math.prod(counts)
 
 
-_TOKEN = re.compile(r"\s*(?:([A-Za-z][A-Za-z0-9_]*|[0-9]+|[(),])|(\S))")
+_TOKEN = re.compile(r"\w+|[(),]", re.ASCII)
+_STRANGE = re.compile(r"[^\w\s(),]", re.ASCII)
+_NAME = re.compile(r"\b[A-Za-z]\w*", re.ASCII)
+_AT_LEAST = re.compile(r"\b([0-9]+)\s+of\s*\(")
 _MAX_DIGITS = 9
+_LANGUAGE = ("expected names, 'and', 'or', 'not', 'k of (...)' and parentheses, e.g. "
+             "'DM1 and not DM2' or '2 of (DM1, DM2, DM3)'")
 
 
-class _Parser:
-    """Recursive descent; the depth is bounded, so is the recursion."""
+def _read(text: str) -> Gate:
+    """Read a gate: Python does, of a text in which names begin with n, and `2 of (` is `k2(`."""
+    tokens = len(_TOKEN.findall(text))
+    if tokens > MAX_TOKENS:
+        raise GateError(f"{tokens} names, words and parentheses; at most {MAX_TOKENS} are right, "
+                        "more belong into the fault tree")
+    spelt = _NAME.sub(lambda found: found[0] if found[0] in WORDS else f"n{found[0]}",
+                      " ".join(text.split()))
+    try:
+        if _STRANGE.search(text):
+            raise SyntaxError
+        return _gate(ast.parse(_AT_LEAST.sub(r"k\1(", spelt), mode="eval").body, 0)
+    except (SyntaxError, MemoryError):  # the latter of what is nested too deeply for Python
+        raise GateError(_LANGUAGE) from None
 
-    def __init__(self, text: str) -> None:
-        self._tokens: list[str] = []
-        for token, stranger in _TOKEN.findall(text):
-            if stranger:
-                raise GateError(f"unexpected {stranger!r}; a gate is made of names, 'and', 'or', "
-                                "'not', 'k of (...)' and parentheses")
-            self._tokens.append(token)
-        self._at = 0
-        self._depth = -1  # what stands in no parentheses is not nested
 
-    def read(self) -> Gate:
-        gate = self._nested(self._or)
-        if self._peek():
-            raise GateError(f"unexpected {self._peek()!r} after a complete gate; join two parts "
-                            "with 'and' or 'or'")
-        if len(self._tokens) > MAX_TOKENS:
-            raise GateError(f"{len(self._tokens)} names, words and parentheses; at most "
-                            f"{MAX_TOKENS} are right, more belong into the fault tree")
-        return gate
+def _gate(part: ast.expr, depth: int) -> Gate:
+    if depth > MAX_DEPTH:
+        raise GateError(f"nested more than {MAX_DEPTH} deep")
 
-    def _peek(self) -> str:
-        return self._tokens[self._at] if self._at < len(self._tokens) else ""
+    def each(parts: list[ast.expr]) -> tuple[Gate, ...]:
+        return tuple(_gate(inner, depth + 1) for inner in parts)
 
-    def _take(self, wanted: str = "") -> str:
-        token = self._peek()
-        if wanted and token != wanted:
-            raise GateError(f"expected {wanted!r}, got {token or 'the end'!r}")
-        self._at += 1
-        return token
-
-    def _nested(self, part: Callable[[], Gate]) -> Gate:
-        self._depth += 1
-        if self._depth > MAX_DEPTH:
-            raise GateError(f"nested more than {MAX_DEPTH} deep")
-        gate = part()
-        self._depth -= 1
-        return gate
-
-    def _separated(self, by: str, part: Callable[[], Gate]) -> tuple[Gate, ...]:
-        inputs = [part()]
-        while self._peek() == by:
-            self._take()
-            inputs.append(part())
-        return tuple(inputs)
-
-    def _or(self) -> Gate:
-        inputs = self._separated("or", self._and)
-        return Gate(required=1, inputs=inputs) if len(inputs) > 1 else inputs[0]
-
-    def _and(self) -> Gate:
-        inputs = self._separated("and", self._single)
-        return Gate(required=len(inputs), inputs=inputs) if len(inputs) > 1 else inputs[0]
-
-    def _single(self) -> Gate:
-        token = self._take()
-        if token == "not":  # noqa: S105 a word of the language
-            return _negate(self._nested(self._single))
-        if token == "(":  # noqa: S105
-            gate = self._nested(self._or)
-            self._take(")")
-            return gate
-        if token.isdigit():
-            if len(token) > _MAX_DIGITS:
-                raise GateError(f"{token[:_MAX_DIGITS]}... of: between 1 and the number of inputs "
-                                "is right")
-            return self._at_least(int(token))
-        if not token or token in WORDS or not token[0].isalpha():
-            raise GateError(f"expected a name, got {token or 'the end'!r}")
-        return Gate(name=token)
-
-    def _at_least(self, required: int) -> Gate:
-        self._take("of")
-        self._take("(")
-        inputs = self._separated(",", lambda: self._nested(self._or))
-        self._take(")")
-        count = len(inputs)
-        if count > MAX_INPUTS:
-            raise GateError(f"{required} of {count} inputs; at most {MAX_INPUTS} are right")
-        if not 1 <= required <= count:
-            raise GateError(f"{required} of {count} inputs; between 1 and {count} is right")
-        return Gate(required=required, inputs=inputs)
+    match part:
+        case ast.Name(id=name) if name.startswith("n"):
+            return Gate(name=name[1:])
+        case ast.UnaryOp(op=ast.Not(), operand=inner):
+            return _negate(_gate(inner, depth + 1))
+        case ast.BoolOp(op=op, values=parts):
+            return Gate(required=1 if isinstance(op, ast.Or) else len(parts), inputs=each(parts))
+        case ast.Call(func=ast.Name(id=name), args=parts) if name.startswith("k"):
+            required, count = int(name[1:1 + _MAX_DIGITS]), len(parts)
+            if not 1 <= required <= count or count > MAX_INPUTS:
+                raise GateError(f"{required} of {count} inputs; expected 1 to {count}, of at most "
+                                f"{MAX_INPUTS}")
+            return Gate(required=required, inputs=each(parts))
+    raise SyntaxError
 
 
 def _negate(gate: Gate) -> Gate:

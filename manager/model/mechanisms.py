@@ -108,15 +108,12 @@ class Mechanisms:
         explaining: The mechanisms that explain others.
 
     Raises:
-        ValueError: Two of one name, or a recovery without a contract.
         GateError: A gate that cannot be read.
     """
 
     def __init__(self, mechanisms: Sequence[Mechanism], contracts: Sequence[Contract]) -> None:
         self.by_name = {mechanism.name: mechanism for mechanism in mechanisms}
         self.contracts = {contract.name: contract for contract in contracts}
-        if len(self.by_name) != len(mechanisms) or len(self.contracts) != len(contracts):
-            raise ValueError("two mechanisms or two recoveries have the same name")
         self._alternatives = {m.name: tuple(recovery_gate(m.recover).alternatives())
                               for m in mechanisms}
         self._gates = {m.name: detection_gate(m.detect) for m in mechanisms}
@@ -131,8 +128,6 @@ class Mechanisms:
         run_for: dict[str, list[str]] = {detection: [] for detection in self.detections}
         for name, ways in self._alternatives.items():
             for recovery in chain.from_iterable(ways):
-                if recovery not in self.contracts:
-                    raise ValueError(f"{name} names unknown recovery {recovery!r}")
                 self.users[recovery].add(name)
                 self.causes[recovery].update(self.detect[name])
             for detection in self.detect[name]:

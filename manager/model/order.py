@@ -23,7 +23,6 @@ from __future__ import annotations
 import graphlib
 from collections.abc import Iterable, Mapping, Sequence
 from graphlib import TopologicalSorter
-from itertools import chain
 
 
 class CycleError(ValueError):
@@ -60,14 +59,10 @@ class PartialOrder:
 
     Raises:
         CycleError: The relation has a cycle.
-        UnknownElementError: The relation mentions something that is not in `names`.
     """
 
     def __init__(self, names: Sequence[str], above: Mapping[str, Iterable[str]]) -> None:
         relation = {name: tuple(above.get(name, ())) for name in names}
-        for name in chain(above, *above.values()):
-            if name not in relation:
-                raise UnknownElementError(f"unknown {name!r}; known: {', '.join(names)}")
         cycle = find_cycle(relation)
         if cycle:
             raise CycleError(cycle)
@@ -174,25 +169,15 @@ class Tree(PartialOrder):
 
     Args:
         parents: The parent of each element; exactly one, the root, has None.
-
-    Raises:
-        ValueError: Not exactly one root.
-        CycleError: Following the parents leads round in a circle.
     """
 
     def __init__(self, parents: Mapping[str, str | None]) -> None:
         children: dict[str, list[str]] = {name: [] for name in parents}
         for name, parent in parents.items():
             if parent is not None:
-                if parent not in children:
-                    raise UnknownElementError(f"unknown parent {parent!r} of {name!r}")
                 children[parent].append(name)
         super().__init__(tuple(parents), children)
-        roots = [name for name, parent in parents.items() if parent is None]
-        if len(roots) != 1:
-            raise ValueError(f"a tree has exactly one root, this has {len(roots)}: "
-                             f"{', '.join(roots) or 'none'}")
-        self.root = roots[0]
+        self.root = next(name for name, parent in parents.items() if parent is None)
         self.parents = dict(parents)
 
     def lowest_common_in(self, mask: int) -> int:

@@ -191,7 +191,7 @@ REFUSED = {
     "the same in hexadecimal": ([("width_m = 0.614", "width_m = 0x" + "f" * 5000)],
                                 ["$.robot.width_m = a value too large to show: expected"]),
     "a gate with thousands of digits": ([('detect = "DM3"', f'detect = "{"9" * 5000} of (DM3)"')],
-                                        ["999...: 999999999... of: between 1 and the number of"]),
+                                        ["999...: 999999999 of 1 inputs; expected 1 to 1"]),
     "a timeout that no float holds": (
         [('timeout_s = "command_timeout_s"', "timeout_s = 1" + "0" * 400)],
         ["detection DM2: parameters.timeout_s = 1000", "...: expected an integer of at most 9223"]),
