@@ -18,7 +18,7 @@ import msgspec
 from rampart.actors.bus.run_folder import register_of
 from rampart.actors.ftm.messages import ProcessEvent
 from rampart.actors.hosts.host_observer import HostObserver
-from rampart.actors.hosts.launchers import OtherHost, OtherLauncher
+from rampart.actors.hosts.launchers import OtherLauncher
 from rampart.actors.hosts.meeting import MeetingError
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import clock_of
@@ -69,8 +69,7 @@ class HostRun:
             UsageError: this host may not take part.
             LaunchError: its processes cannot be started.
         """
-        host = OtherHost(self._plan, _say, link)
-        launcher, task, why = host.launcher, asyncio.current_task(), ""
+        launcher, task, why = OtherLauncher(self._plan, _say, link), asyncio.current_task(), ""
         assert task is not None  # noqa: S101 for the type checker
 
         def interrupt(_signal: str) -> None:
@@ -80,22 +79,21 @@ class HostRun:
         launcher.on_interrupt = interrupt
         try:
             await launcher.connect()
-            await host.join()
-            await host.start()
-            why = await self._stay(host, launcher)
+            await launcher.join()
+            await launcher.start()
+            why = await self._stay(launcher)
         except asyncio.CancelledError:
             task.uncancel()
         except MeetingError as error:
             raise UsageError(f"--host {self._plan.host}: {error}") from None
         finally:
-            await host.close()
             await launcher.end()
         _say(f"the run is over: {why or self._failure or 'interrupted'}")
         if self._json:
             print(json.dumps({"format": FORMAT, "host": self._plan.host, "over": why}), flush=True)
         return EXIT_OVER if why else EXIT_FAILED
 
-    async def _stay(self, host: OtherHost, launcher: OtherLauncher) -> str:
+    async def _stay(self, launcher: OtherLauncher) -> str:
         plan = launcher.plan
         clock = clock_of(plan)
 
@@ -115,7 +113,7 @@ class HostRun:
         watch(task, f"the launcher's {name}", launcher.failed)
         _say(f"host {plan.host} takes part in run {plan.run_id}; ctrl-C ends it here")
         try:
-            why = await host.stay()
+            why = await launcher.stay()
             self._failure = launcher.failure
             return why
         finally:

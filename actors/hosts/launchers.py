@@ -28,7 +28,6 @@ from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_system, on_h
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.system.hosts import Hosts
 from rampart.actors.system.members import load_application
-from rampart.manager.spec.schema import SystemSpec
 
 _RETRY_S = 0.2
 
@@ -76,32 +75,34 @@ class FirstLauncher(Launcher):
         await super().end()
 
 
-class OtherHost:
-    """One of the other hosts, from the first question to the end of the run.
+class OtherLauncher(Launcher):
+    """Another host's, from the first question to the end of the run.
+
+    Use: `connect`, `join`, `start`, `stay`, `end`.
 
     Args:
         own: what of the plan is this host's own.
         say: is told what happens, in a line.
         link: connection to this host's root.
-
-    Attributes:
-        launcher: of this host's processes; it has the plan of the run from `join` on.
     """
 
     def __init__(self, own: RunPlan, say: Callable[[str], None], link: socket.socket) -> None:
+        self._spec = load_system(own)
+        super().__init__(own, self._spec.title, link)
+        hosts = Hosts(self._spec, own.host)
         self._own = own
         self._say = say
-        self._spec = load_system(own)
-        hosts = Hosts(self._spec, own.host)
         self._where = hosts.meeting_place()
-        self._link = hosts.link
+        self._clock_s = hosts.link.clock_s
         self._attendance = Attendance(
             own.host, self._where, contents_of(own),
             own.credentials(on_host(OBSERVER, own.host)))
-        self._clocks = ClockSync(self._link.clock_s)
+        self._clocks = ClockSync(self._clock_s)
+        self._run_id = ""
+        self._begins_s = 0.0
+        self._incarnations: dict[str, int] = {}
         self._said = self._unreachable = ""
         self._is_trusted = True
-        self.launcher = OtherLauncher(own, self._spec, link)
 
     async def join(self) -> None:
         """Wait for the first host, and take the plan of the run from it.
@@ -112,26 +113,41 @@ class OtherHost:
         while (told := await self._asked()) is None:
             pass
         plan = joined(told.plan, self._own)
-        application = load_application(plan, self._spec)
-        self._attendance.ready(contents_of(plan, application))
-        plan = msgspec.structs.replace(plan, incarnations=(told.starts - 1) * run_folder.EPOCH)
-        self.launcher.join(plan, told.incarnations)
+        self._attendance.ready(contents_of(plan, load_application(plan, self._spec)))
+        self._run_id, self._incarnations = plan.run_id, told.incarnations
+        self.plan = msgspec.structs.replace(
+            plan, incarnations=(told.starts - 1) * run_folder.EPOCH)
+
+    async def load(self) -> None:
+        """Have the root load the run, as any launcher."""
+        await super().load()
+        for name, incarnation in self._incarnations.items():
+            run_folder.issue(self.plan.folder, [name], incarnation)
 
     async def start(self) -> None:
-        """Start this host's processes when the first host says so.
+        """Load the run, and start this host's processes when the first host says so.
 
         Raises:
             LaunchError: They cannot be started.
             MeetingError: this host may not take part, or the run is over already, or another.
         """
-        launcher = self.launcher
-        await launcher.load()
+        await self.load()
         while (told := await self._asked()) is None or told.origin_s is None:
             if told is not None:
-                self._tell(f"waiting for {', '.join(told.waits_for) or 'the first host'}")
+                self._tell_user(f"waiting for {', '.join(told.waits_for) or 'the first host'}")
             await asyncio.sleep(PERIOD_S)
-        launcher.begins_s = told.origin_s - self._clocks.offset_s
-        await launcher.start()
+        self._begins_s = told.origin_s - self._clocks.offset_s
+        await super().start()
+
+    def origin_s(self) -> float:
+        """Return when simulated time began, or will, as the first host has it."""
+        self.follow(self._begins_s)
+        return self._begins_s
+
+    def follow(self, origin_s: float) -> None:
+        """Have all processes of this host go by this origin."""
+        keep_origin(origin_file(self.plan.folder), origin_s)
+        self.plan = msgspec.structs.replace(self.plan, origin_s=origin_s)
 
     async def stay(self) -> str:
         """Follow the first host's clock until the run is over; return why it is.
@@ -141,21 +157,21 @@ class OtherHost:
         Raises:
             MeetingError: the first host runs something else by now.
         """
-        launcher = self.launcher
-        while not launcher.failure:
+        while not self.failure:
             try:
                 told = await self._asked()
             except RunOverError as over:
                 return str(over)
             if told is not None and told.origin_s is not None:
-                launcher.follow(told.origin_s - self._clocks.offset_s)
+                self.follow(told.origin_s - self._clocks.offset_s)
                 self._judge_clock()
             await asyncio.sleep(PERIOD_S)
         return ""
 
-    async def close(self) -> None:
-        """Ask no more."""
+    async def end(self) -> None:
+        """Ask no more, and end this host's processes."""
         await self._attendance.close()
+        await super().end()
 
     async def _asked(self) -> Told | None:
         """Ask once, and note what the answer shows of the clocks; None if there is no answer now.
@@ -169,12 +185,12 @@ class OtherHost:
             why = error.strerror or str(error) or "no answer"
             self._unreachable = (f"the first host cannot be reached at {self._where[0]} port "
                                  f"{self._where[1]} ({why}); trying on")
-            self._tell(self._unreachable)
+            self._tell_user(self._unreachable)
             await asyncio.sleep(_RETRY_S)
             return None
         if self._said and self._said == self._unreachable:
-            self._tell("the first host answers")
-        if self.launcher.has_joined and told.plan.run_id != self.launcher.plan.run_id:
+            self._tell_user("the first host answers")
+        if told.plan.run_id != (self._run_id or told.plan.run_id):
             raise MeetingError(f"the first host has begun another run ({told.plan.run_id}); "
                                "start this host again")
         self._clocks.exchanged(asked_s, told.now_s, heard_s)
@@ -182,55 +198,14 @@ class OtherHost:
 
     def _judge_clock(self) -> None:
         bound_s = self._clocks.bound_at(time.monotonic())
-        is_trusted = bound_s <= self._link.clock_s
+        is_trusted = bound_s <= self._clock_s
         if is_trusted != self._is_trusted:
             self._is_trusted = is_trusted
-            self._tell(f"this host's clock is known within {bound_s * 1e3:.0f} ms of the first "
-                       f"host's; [link] clock_s = {self._link.clock_s:g} "
-                       + ("holds again" if is_trusted else "does not hold"))
+            self._tell_user(f"this host's clock is known within {bound_s * 1e3:.0f} ms of the "
+                            f"first host's; [link] clock_s = {self._clock_s:g} "
+                            + ("holds again" if is_trusted else "does not hold"))
 
-    def _tell(self, line: str) -> None:
+    def _tell_user(self, line: str) -> None:
         if line != self._said:
             self._said = line
             self._say(line)
-
-
-class OtherLauncher(Launcher):
-    """Another host's launcher.
-
-    Args:
-        own: what of the plan is this host's own.
-        spec: of the system.
-        link: connection to this host's root.
-
-    Attributes:
-        has_joined: whether it has the plan of the run.
-        begins_s: reading of this host's monotonic clock at simulated time 0.
-    """
-
-    def __init__(self, own: RunPlan, spec: SystemSpec, link: socket.socket) -> None:
-        super().__init__(own, spec.title, link)
-        self.has_joined = False
-        self.begins_s = 0.0
-        self._incarnations: dict[str, int] = {}
-
-    def join(self, plan: RunPlan, incarnations: dict[str, int]) -> None:
-        """Take the plan of the run, and the incarnations of its nodes that were issued already."""
-        self.has_joined = True
-        self.plan, self._incarnations = plan, incarnations
-
-    async def load(self) -> None:
-        """Have the root load the run, as any launcher."""
-        await super().load()
-        for name, incarnation in self._incarnations.items():
-            run_folder.issue(self.plan.folder, [name], incarnation)
-
-    def origin_s(self) -> float:
-        """Return when simulated time began, or will, as the first host has it."""
-        self.follow(self.begins_s)
-        return self.begins_s
-
-    def follow(self, origin_s: float) -> None:
-        """Have all processes of this host go by this origin."""
-        keep_origin(origin_file(self.plan.folder), origin_s)
-        self.plan = msgspec.structs.replace(self.plan, origin_s=origin_s)

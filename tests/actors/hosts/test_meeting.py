@@ -19,7 +19,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rampart.actors.access import key_folder
 from rampart.actors.bus.zenoh_session import credentials_in
-from rampart.actors.hosts.launchers import OtherHost
+from rampart.actors.hosts.launchers import OtherLauncher
 from rampart.actors.hosts.meeting import (
     DOOR,
     Attendance,
@@ -31,6 +31,7 @@ from rampart.actors.hosts.meeting import (
     joined,
 )
 from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.system.hosts import Hosts
 from rampart.actors.system.members import load_application
 from rampart.actors.web.page_plan import PagePlan
@@ -353,28 +354,13 @@ async def test_with_keys_a_first_host_that_is_silent_is_asked_anew_soon(keys):
 # ---- another run --------------------------------------------------------------------------------
 
 
-class Started:
-    """What `OtherHost` has of a launcher; it starts nothing."""
-
-    failure = ""
-    has_joined = False
-
-    def join(self, plan, incarnations):
-        self.plan, self.has_joined = plan, True
-        assert incarnations == {}
-
-    async def load(self):
-        pass
-
-    async def start(self):
-        pass
-
-    def follow(self, origin_s):
-        assert origin_s
-
-
-async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path):
+async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path, monkeypatch):
     """Its launcher was killed and started again, at another rate say: nobody told of an end."""
+    async def nothing(_launcher):
+        pass
+
+    monkeypatch.setattr(Launcher, "load", nothing)
+    monkeypatch.setattr(Launcher, "start", nothing)
     file = tmp_path / "two.toml"
     file.write_text(two_hosts({"robot": "127.0.7.1", "ground": "127.0.7.2"},
                               ("camera", "part_finder", "D_VISION_CRASH"), "cell", 0.1))
@@ -385,20 +371,19 @@ async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path):
     first = Meeting(plan, ("ground",), contents, dict)
     await first.open("127.0.7.1", port)
     link, root = socket.socketpair()
-    ground = OtherHost(own, said.append, link)
-    ground.launcher = Started()
+    ground = OtherLauncher(own, said.append, link)
     await ground.join()
     starting = asyncio.create_task(ground.start())
     await first.all_ready(said.append)
     first.begin(100.0)
     await starting
-    await ground.close()
+    await ground.end()
     await first.close()  # it cannot be told
     again = Meeting(msgspec.structs.replace(plan, run_id="r2"), ("ground",), contents, dict)
     await again.open("127.0.7.1", port)
     with pytest.raises(MeetingError, match=r"the first host has begun another run \(r2\)"):
         await asyncio.wait_for(ground.stay(), 15)
-    await ground.close()
+    await ground.end()
     await again.close()
     link.close()
     root.close()
