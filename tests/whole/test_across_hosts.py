@@ -71,7 +71,7 @@ def test_the_first_host_sees_what_the_other_does(net, tmp_path, keyed):
             capture_output=True, text=True, check=False, timeout=60)
         assert beside.returncode == 0, beside.stderr
         net.line = Line(is_cut=True)
-        robot.wait_for("camera respawned, incarnation 1000001")
+        robot.wait_for("camera respawned by supervisor, incarnation 1000001")
         found, told = listed(net, "robot", robot)
         assert found["camera"] == "robot"
         assert "supervisor_ground" not in found
@@ -132,7 +132,7 @@ def test_a_node_goes_on_from_its_checkpoint_on_the_first_host_and_from_that_one_
         ground.wait_for("router_b_ground adopted")
         time.sleep(3.0)
         net.line = Line(is_cut=True)
-        robot.wait_for("camera respawned, incarnation 1000001")
+        robot.wait_for("camera respawned by supervisor, incarnation 1000001")
         time.sleep(3.0)
         net.line = Line()
         ground.wait_for("camera handed over")

@@ -125,7 +125,7 @@ def test_a_loop_that_hangs_is_found_and_replaced(tmp_path: Path, how):
     (tmp_path / "loops.toml").write_text(SYSTEM.format(how=how))
     with RealRun(tmp_path, tmp_path / "loops.toml", "--duration", "6") as run:
         run.wait_for("(D): loop: process of incarnation 1 is hung")
-        run.wait_for("loop respawned, incarnation 2")
+        run.wait_for("loop respawned")
         assert run.process.wait(30) == 0, run.story
     result = json.loads((tmp_path / "stdout.txt").read_text().splitlines()[-1])
     assert result["restarts"] == {"loop": 1}

@@ -67,7 +67,7 @@ def test_each_may_lose_each(net, tmp_path: Path):
         comes_back(ground, robot)
         assert "as seen from the first" not in robot.story
         net.part(("ground", "desk"), ("ground", "robot"))
-        robot.wait_for("camera respawned, incarnation 1000001")
+        robot.wait_for("camera respawned by supervisor, incarnation 1000001")
         has(robot, ON_GROUND, run_here=True)
         comes_back(robot, robot)
         net.part()
@@ -75,7 +75,7 @@ def test_each_may_lose_each(net, tmp_path: Path):
         has(ground, ON_GROUND, run_here=True)
         time.sleep(LINKED_S)
         net.part(("ground", "robot"))
-        robot.wait_for("camera respawned, incarnation 2000001")
+        robot.wait_for("camera respawned by supervisor, incarnation 2000001")
         robot.wait_for("camera handed over, incarnation 2000001")  # heard by way of the desk
         has(robot, ON_GROUND, run_here=False)
         comes_back(ground, robot)

@@ -82,23 +82,23 @@ def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_ba
         robot.wait_for("ctrl-C ends it")
         ground.wait_for("router_b_ground adopted")
         ground.kill("camera")
-        robot.wait_for("camera respawned, incarnation 2")
+        robot.wait_for("camera respawned by R_RESTART_VISION, incarnation 2")
         assert robot.pid("camera") is None
         killed = kill_node(net, "robot", robot, "camera")
         assert killed.stdout.startswith("camera (pid "), killed.stderr
-        robot.wait_for("camera respawned, incarnation 3")
+        robot.wait_for("camera respawned by R_RESTART_VISION, incarnation 3")
         struck = subprocess.run(
             net.command("robot", sys.executable, "-P", "-m", "rampart.cli.main", "inject",
                         "kill:camera", "--json", "--port", str(robot.port)),
             capture_output=True, text=True, check=False, timeout=30)
         assert struck.returncode == 0, struck.stderr
-        robot.wait_for("camera respawned, incarnation 4")
+        robot.wait_for("camera respawned by R_RESTART_VISION, incarnation 4")
         refused = kill_node(net, "robot", robot, "kamera")
         assert refused.returncode == 2
         assert "kill-node: unknown node 'kamera'" in refused.stderr
         net.line = Line(is_cut=True)
         robot.wait_for("supervisor_ground unreachable")
-        robot.wait_for("camera respawned, incarnation 1000001")
+        robot.wait_for("camera respawned by supervisor, incarnation 1000001")
         ground.wait_for("supervisor unreachable host the first")
         robot.wait_until(lambda: None not in map(robot.pid, CELL_ON_GROUND), 5, "not taken over")
         assert ground.pid("camera") is not None  # it knows nothing of it
@@ -140,9 +140,9 @@ def test_the_manager_survives_its_machine_and_never_are_two_obeyed(net, tmp_path
         robot.wait_for("ctrl-C ends it")
         time.sleep(3.0)
         trigger(robot, "D_CURTAIN")
-        robot.wait_for("(R_SAFE_TORQUE_OFF), rule 1 for ")
+        robot.wait_for("(R_SAFE_TORQUE_OFF): ")
         net.line = Line(is_cut=True)
-        robot.wait_for("cell_manager respawned, incarnation 1000001")
+        robot.wait_for("cell_manager respawned by supervisor, incarnation 1000001")
         assert ground.pid("cell_manager") is not None  # it goes on, and nobody here hears it
         before = len(robot.story)
         trigger(robot, "D_CURTAIN")  # heard, too, after the links were closed: 2 s after the cut
