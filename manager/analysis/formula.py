@@ -137,7 +137,6 @@ def prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
         return gates, []
     if not formula.is_monotone:
         return gates, [formula.top]  # below a negation a module's cut sets are not its own
-    gates = _without_aliases(gates, formula.top)
     modules = _modules(gates, formula.top)
     users = Counter(entry for gate in gates.values() for entry in gate.inputs)
     for name in list(gates):
@@ -152,20 +151,6 @@ def prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
                 count = len(inputs)
                 gates[own] = Connective(tuple(inputs), 1 if gate.low == 1 else count, count)
     return gates, _modules(gates, formula.top)
-
-
-def _without_aliases(gates: dict[str, Connective], top: str) -> dict[str, Connective]:
-    """Take out gates that only pass one input on; `gates` has inputs before what uses them."""
-    stands_for: dict[str, str] = {}
-    left: dict[str, Connective] = {}
-    for name, gate in gates.items():
-        inputs = tuple(stands_for.get(entry, entry) for entry in gate.inputs)
-        gate = msgspec.structs.replace(gate, inputs=inputs)  # noqa: PLW2901
-        if len(gate.inputs) == 1 and gate.low == 1 and name != top:
-            stands_for[name] = gate.inputs[0]
-        else:
-            left[name] = gate
-    return left
 
 
 def _modules(gates: dict[str, Connective], top: str) -> list[str]:
@@ -195,7 +180,7 @@ def _modules(gates: dict[str, Connective], top: str) -> list[str]:
     for name, left_at in left.items():
         below = gates[name].inputs
         met_first, met_last = min(earliest[e] for e in below), max(latest[e] for e in below)
-        if first[name] < met_first and met_last < left_at:
+        if first[name] < met_first and met_last < left_at and (len(below) > 1 or name == top):
             modules.append(name)
         earliest[name] = min(first[name], met_first)
         latest[name] = max(last[name], met_last)

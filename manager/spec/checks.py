@@ -6,16 +6,17 @@ sequence and the first finding is the one reported, so a validator may rely on t
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import reduce
-from itertools import chain, permutations, product
+from itertools import chain, combinations, permutations, product
 from operator import or_
 
 from rampart.manager.model.fault_tree import FaultTreeError
 from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
 from rampart.manager.model.order import CycleError, PartialOrder, Tree, find_cycle
 from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
-from rampart.manager.spec.host_checks import find_wrong_hosts
+from rampart.manager.spec.hosts import PORTS
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
 from rampart.manager.spec.schema import MechanismSpec, SystemSpec
 from rampart.manager.spec.tables import Finding, find_wrong_names, numbered, unknown
@@ -52,12 +53,8 @@ def _first(spec: SystemSpec, validators: Iterable[Validator]) -> Finding | None:
 
 def modules(spec: SystemSpec) -> Iterator[tuple[str, str, str, str]]:
     """Yield path, name, process and respawner of all nodes, detection and recovery modules."""
-    for path, node in numbered("node", spec.nodes):
-        yield path, node.name, node.process, node.respawn
-    for path, detection in numbered("detection", spec.detections):
-        yield path, detection.name, detection.process, SUPERVISOR
-    for path, recovery in numbered("recovery", spec.recoveries):
-        yield path, recovery.name, recovery.process, SUPERVISOR
+    for path, row in spec.placed():
+        yield path, row.name, row.process, getattr(row, "respawn", SUPERVISOR)
 
 
 def _names(spec: SystemSpec) -> Iterator[Finding]:
@@ -253,6 +250,63 @@ def _faults(spec: SystemSpec) -> Iterator[Finding]:
                                     detections, "listed twice")
 
 
+# -- hosts ----------------------------------------------------------------------------------------
+
+
+def _hosts(spec: SystemSpec) -> Iterator[Finding]:
+    """Hosts that make no sense, and nodes that cannot be where they are."""
+    yield from _wrong_table(spec)
+    known = [host.name for host in spec.hosts]
+    for path, one in spec.placed():
+        if one.host and not known:
+            yield Finding(f"{path}.host", "there is no [[host]]", (one.host,))
+        elif one.host and one.host not in known:
+            yield unknown(f"{path}.host", one.host, "host", known)
+    if not known:
+        return
+    at: dict[str, tuple[str, str]] = {}
+    for path, one in spec.placed():
+        host = one.host or known[0]
+        first, other = at.setdefault(one.process or one.name, (host, one.name))
+        if host != first:
+            yield Finding(f"{path}.host", f"{other} lives in the same process, on {first}", (host,))
+    for path, node in numbered("node", spec.nodes):
+        if node.kind is Kind.PILOT and node.host not in ("", known[0]):
+            yield Finding(f"{path}.host", f"{node.name} moves the robot, so no link may be between "
+                          f"them; {known[0]!r}, the first host, is right", (node.host,))
+    yield from _too_short(spec)
+
+
+def _wrong_table(spec: SystemSpec) -> Iterator[Finding]:
+    if len(spec.hosts) == 1:
+        yield Finding("$.host", "one machine needs no [[host]]; leave it out, or name another one")
+    for path, host in numbered("host", spec.hosts):
+        try:
+            ipaddress.ip_address(host.address)
+        except ValueError:
+            yield Finding(f"{path}.address", "expected an IP address such as '192.168.7.1'",
+                          (host.address,))
+    for (_, one), (path, other) in combinations(numbered("host", spec.hosts), 2):
+        if one.name == other.name:
+            yield Finding(f"{path}.name", "duplicate name", (other.name,))
+        if one.address == other.address and abs(one.port - other.port) < PORTS:
+            yield Finding(f"{path}.port", f"each host uses {PORTS} ports, and {one.name} has the "
+                          f"same address and those from {one.port}", (other.port,))
+
+
+def _too_short(spec: SystemSpec) -> Iterator[Finding]:
+    """Find detection modules that would take the link's delay for silence."""
+    needed_s = spec.link.delay_s + 2 * spec.timing.heartbeat_period_s
+    host_of = spec.host_of
+    for path, detection in numbered("detection", spec.detections):
+        far = [name for name in detection.watch if host_of[name] != host_of[detection.name]]
+        timeout_s = detection.parameters.get("timeout_s", needed_s)
+        if far and isinstance(timeout_s, int | float) and timeout_s < needed_s:
+            yield Finding(f"{path}.parameters.timeout_s", f"{detection.name} watches {far[0]} over "
+                          f"the link: two heartbeats and [link] delay_s, {needed_s:.2f} s, is the "
+                          "least", (timeout_s,))
+
+
 # -- what is arbitrated -------------------------------------------------------------------------
 
 
@@ -391,6 +445,6 @@ def _delayed_last_resort(spec: SystemSpec, root: str) -> Iterator[Finding]:
 
 
 VALIDATORS: tuple[Validator, ...] = (
-    find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, find_wrong_hosts,
+    find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, _hosts,
     _mechanisms, _reachability, _faults, _wrong_tree, _wrong_policy, _wrong_orders,
     _contradictions, _wrong_compounds, _wrong_precedence, find_wrong_budget)

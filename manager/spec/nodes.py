@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from enum import StrEnum
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -140,17 +141,14 @@ def find_wrong_commands(nodes: Iterable[NodeSpec]) -> Iterator[Finding]:
     The finding's path names the node.
     """
     for node in nodes:
-        for field, problem, *value in _wrong(node):
+        found = chain(_wrong_command(node), _wrong_heartbeat(node), _wrong_keys(node)
+                      ) if node.command else _wrong_actor(node)
+        for field, problem, *value in found:
             yield Finding(f"{node.name}: {field}", problem, tuple(value))
 
 
-def _wrong(node: NodeSpec) -> Iterator[tuple[Any, ...]]:
+def _wrong_actor(node: NodeSpec) -> Iterator[tuple[Any, ...]]:
     """Yield field, problem, and the value if one is to blame."""
-    if node.command:
-        yield from _wrong_command(node)
-        yield from _wrong_heartbeat(node)
-        yield from _wrong_keys(node)
-        return
     for field in COMMAND_FIELDS:
         if (value := getattr(node, field)) != _NO_COMMAND[field]:
             yield field, "of use with a command only, and the node has none", _plain(value)

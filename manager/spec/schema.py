@@ -9,7 +9,7 @@ is checked by type alone: unknown fields, wrong types, names that are no names, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -33,6 +33,7 @@ from rampart.manager.spec.tables import (
     Supervision,
     Table,
     Timing,
+    numbered,
 )
 
 T = TypeVar("T")
@@ -304,12 +305,17 @@ class SystemSpec(Table, frozen=True):
         return tuple(msgspec.structs.replace(node, process=node.process or node.name)
                      for node in actors if self.layers.ftm or node.kind not in tolerance)
 
+    def placed(self) -> Iterator[tuple[str, NodeSpec | DetectionSpec | RecoverySpec]]:
+        """Yield all nodes, detection and recovery modules, each with its path in the file."""
+        yield from numbered("node", self.nodes)
+        yield from numbered("detection", self.detections)
+        yield from numbered("recovery", self.recoveries)
+
     @property
     def host_of(self) -> dict[str, str]:
         """Names of all nodes, detection and recovery modules with that of their host."""
         first = self.hosts[0].name if self.hosts else ""
-        return {one.name: one.host if first and one.host else first
-                for rows in (self.nodes, self.detections, self.recoveries) for one in rows}
+        return {one.name: one.host if first and one.host else first for _, one in self.placed()}
 
     def link_s(self, node: str, others: Iterable[str]) -> float:
         """Return how long a message between a node and any of others is under way on a network."""
