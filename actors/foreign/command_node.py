@@ -29,8 +29,8 @@ from rampart.actors.foreign.output_log import OutputLog
 from rampart.actors.foreign.program import LOGS, find_program, folder_of, log_folder
 from rampart.actors.foreign.program_process import ProgramProcess
 from rampart.actors.foreign.pulse import NotifySocket, Pulse, extension_s
-from rampart.actors.ftm.messages import ProcessEvent
-from rampart.actors.ftm.topics import PROCESS_EVENT
+from rampart.actors.ftm.messages import ProcessEvent, ProgramEnd
+from rampart.actors.ftm.topics import PROCESS_EVENT, PROGRAM_END
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.parameters import TopicsHeard, TopicsPublished
 from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits
@@ -54,7 +54,7 @@ class CommandNode(Actor):
         hears: TopicsHeard = ()
 
     parameters: Parameters
-    outputs = (PROCESS_EVENT,)
+    outputs = (PROGRAM_END,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -193,8 +193,7 @@ class CommandNode(Actor):
 
     def _report_failure(self) -> None:
         if self._program is None:
-            self.publish(PROCESS_EVENT, ProcessEvent(
-                self.name, "ended", self.context.pid, self._incarnation, self.name, self._failure))
+            self.publish(PROGRAM_END, ProgramEnd(self.context.pid, self._failure))
 
     def _close(self) -> None:
         if self._channel is not None:

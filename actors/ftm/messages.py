@@ -266,8 +266,7 @@ class SignalOrder(Message, frozen=True):
 class ProcessEvent(Message, frozen=True):
     """Something happened to a process: crashed, stopped, wedged, respawned, refused, given up.
 
-    And *signalled*, `by` the id of the order. The process of a command reports itself that its
-    program has *ended*.
+    And *signalled*, `by` the id of the order.
     """
 
     node: Name
@@ -285,13 +284,23 @@ class ProcessEvent(Message, frozen=True):
         return "clear" if self.event in _GOOD_NEWS else "fault"
 
 
+class ProgramEnd(Message, frozen=True):
+    """The program of a command has ended, or could not be started; its node's process `pid` stays.
+
+    Repeated with each heartbeat until the supervisor answers.
+    """
+
+    pid: Pid
+    detail: Text
+
+
 FAILURES = {"crashed": "gone", "stopped": "stopped", "wedged": "hung", "given up": "given up"}
 """Events after which no process of the node works, with what has become of it."""
 
 NEW_PROCESSES = ("started", "respawned")
 """Events that name a process which is there, and has not worked yet."""
 
-_ROUTINE = ("started", "running", "ended")
+_ROUTINE = ("started", "running")
 _GOOD_NEWS = ("respawned", "resumed", "adopted", "back")
 
 _Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]

@@ -47,6 +47,8 @@ SIGNAL = Topic("supervisor/signal", m.SignalOrder, Qos.COMMAND, 0, "",
                "own; in a system of several.", outside=True)
 PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",
                       "What happened to processes.")
+PROGRAM_END = Topic("supervisor/program_end", m.ProgramEnd, Qos.COMMAND, 0, "",
+                    "The program of a command has ended; its node's process stays.")
 
 # Stand-ins for modules that are not written yet.
 STUB_TRIGGER = Topic("stub/trigger", m.StubTrigger, Qos.COMMAND, 0, "",

@@ -114,7 +114,7 @@ class Supervisor(Actor):
 
     def listens(self, topic: Topic[Any]) -> bool:
         """Receive what becomes of programs if there is any."""
-        return topic is not topics.PROCESS_EVENT or any(node.command for node in self._spec.nodes)
+        return topic is not topics.PROGRAM_END or any(node.command for node in self._spec.nodes)
 
     def _held(self, unit: Unit) -> SupervisedProcess:
         known = self.context.run.known_incarnations
@@ -274,13 +274,13 @@ class Supervisor(Actor):
             process.requested_by = request.by
             self._restart(process, request.by)
 
-    @on(topics.PROCESS_EVENT)
-    def program_ended(self, message: fm.ProcessEvent, header: Header) -> None:
+    @on(topics.PROGRAM_END)
+    def program_ended(self, message: fm.ProgramEnd, header: Header) -> None:
         """Take the end of a command's program as that of its incarnation; it is repeated."""
         process = self._process_of(header.source)
-        if message.event != "ended" or process is None or message.pid != process.pid:
+        if process is None or message.pid != process.pid:
             return
-        if message.incarnation < process.incarnation:
+        if header.incarnation < process.incarnation:
             self._tell(process, "respawned", self.name, "already")
         elif process.state is not State.CRASHED and not process.waits:
             if len(process.names) > 1:  # they share an incarnation

@@ -158,6 +158,7 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
         assert tug.story.count("wheels crashed, incarnation 1 ") == 1
         exits = [line for line in tug.story.splitlines() if "wheels" in line and "SIGKILL" in line]
         assert len(exits) == 1, exits
+        assert "payload rejected" not in tug.story
         assert "Traceback" not in tug.story
         assert not list(tmp_path.rglob("errors.log"))  # what a program does is no traceback of ours
     tug.wait_until(lambda: gone(*pids), 3, "something is left")

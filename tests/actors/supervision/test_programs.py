@@ -8,7 +8,7 @@ import msgspec
 
 from rampart.actors.bus.envelope import decode
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import ProcessEvent
+from rampart.actors.ftm.messages import ProgramEnd
 from rampart.manager.spec.tables import Supervision
 from rampart.testing import eventually, run
 from tests.actors.supervision.test_supervisor import World, running
@@ -32,9 +32,8 @@ class Node:
     def end_program(self) -> None:
         """Report the end of its program."""
         self.world.silent.add(self.process.pid)
-        self.world.say(topics.PROCESS_EVENT, ProcessEvent(
-            self.name, "ended", self.process.pid, self.process.incarnation, self.name, REASON),
-            self.name, self.process.incarnation)
+        self.world.say(topics.PROGRAM_END, ProgramEnd(self.process.pid, REASON),
+                       self.name, self.process.incarnation)
 
     def _see(self, _now_s: float, _source: str, key: str, payload: bytes) -> None:
         if key != topics.PROCESS_EVENT.at() or self.is_deaf:
@@ -61,7 +60,7 @@ def test_a_program_that_ends_is_the_next_incarnation_in_the_same_process_at_once
                 await eventually(lambda n=incarnation: world.row(OWN) == (
                     "running", n, node.process.pid))
                 assert [event for name, event, _ in world.events if name == OWN] == [
-                    "ended", "crashed", "respawned", "running"]
+                    "crashed", "respawned", "running"]
             assert world.machine.forks == []
             assert not node.process.killed
             rows = {row.name: row for row in tables[-1].nodes}
@@ -172,9 +171,8 @@ def test_the_end_of_another_process_or_from_a_stranger_is_nothing():
     async def scenario() -> None:
         async with running(commands=["supervisor"]) as world:
             node = Node(world, OWN)
-            for name, pid, source in ((OWN, 999_999, OWN), (OWN, node.process.pid, "tester")):
-                world.say(topics.PROCESS_EVENT, ProcessEvent(
-                    name, "ended", pid, 1, source, REASON), source)
+            for pid, source in ((999_999, OWN), (node.process.pid, "tester")):
+                world.say(topics.PROGRAM_END, ProgramEnd(pid, REASON), source)
                 await asyncio.sleep(0.1)
             assert world.row(OWN) == ("running", 1, node.process.pid)
             assert node.starts == []
