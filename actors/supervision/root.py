@@ -50,7 +50,6 @@ from rampart.actors.bus.envelope import decoder
 from rampart.actors.foreign.descendants import kill_orphans
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.machine.absence import Absence
 from rampart.actors.machine.patience import Patience, usage
 from rampart.actors.machine.unix_peer import stat_fields
 from rampart.actors.runtime.run_context import RunContext
@@ -67,7 +66,7 @@ from rampart.files.plain_text import one_line
 from rampart.files.streams import complain
 
 PERIOD_S = 0.25
-"""Wall seconds between two looks at the supervisor; the root itself was absent if it is longer."""
+"""Wall seconds between two looks at the supervisor. If the root was stopped, twice that counts."""
 
 SUPERVISOR_PATIENCE_S = 1.5
 """A supervisor that could have said a word for so long is hung; it says four a second."""
@@ -149,7 +148,6 @@ class Root:
         self._pool: Pool | None = None
         self._held: list[socket.socket] = []
         self._supervisor = Guarded()
-        self._absence = Absence(time.monotonic())
 
     # -- the whole ------------------------------------------------------------------------------
 
@@ -428,15 +426,12 @@ class Root:
         if self._has_ended or self._pool is None:
             return None
         now_s, guarded = time.monotonic(), self._supervisor
-        self._absence.note(now_s)
         if not guarded.pid:
             self._bring_supervisor_back(now_s)
         elif now_s >= guarded.looked_s + PERIOD_S:
             guarded.looked_s = now_s
-            if self._absence.excuses(now_s):
-                guarded.patience.answered()
-            elif guarded.patience.look(now_s, guarded.pid, usage(guarded.pid)
-                                     ) >= SUPERVISOR_PATIENCE_S:
+            silent_s = guarded.patience.look(now_s, guarded.pid, usage(guarded.pid))
+            if silent_s >= SUPERVISOR_PATIENCE_S:
                 kill(guarded.pid)
         self._pool.fill()
         return PERIOD_S if guarded.pid else _RETRY_S
@@ -683,7 +678,7 @@ def _age_s() -> float:
     return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - begun_s)
 
 
-def kept_ports(first: int, number: int = len(run_folder.ROUTERS)) -> list[socket.socket]:
+def kept_ports(first: int) -> list[socket.socket]:
     """Return sockets that keep ports of loopback for the routers of a run with keys.
 
     A router listens on a port that is kept all the same, for both have SO_REUSEADDR; no other run
@@ -691,15 +686,12 @@ def kept_ports(first: int, number: int = len(run_folder.ROUTERS)) -> list[socket
 
     Args:
         first: of the ports that are tried.
-        number: of ports.
 
     Raises:
         LaunchError: there are too few.
     """
     found: list[socket.socket] = []
     for port in range(first, LAST_PORT + 1):
-        if len(found) == number:
-            break
         kept = socket.socket()
         try:
             kept.bind(("127.0.0.1", port))
@@ -708,9 +700,9 @@ def kept_ports(first: int, number: int = len(run_folder.ROUTERS)) -> list[socket
             continue
         kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # not before: it would fit any
         found.append(kept)
-    if len(found) < number:
-        raise LaunchError(f"--port {first}: no ports for the routers from there to {LAST_PORT}")
-    return found
+        if len(found) == len(run_folder.ROUTERS):
+            return found
+    raise LaunchError(f"--port {first}: no ports for the routers from there to {LAST_PORT}")
 
 
 def main() -> int:

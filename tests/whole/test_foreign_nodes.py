@@ -116,19 +116,19 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
         node = tug.pid("wheels")
 
         os.kill(find(tug, "wheels", "wheels"), signal.SIGKILL)  # the program
-        tug.wait_for("wheels crashed, incarnation 1 (./wheels ended: signal SIGKILL; "
-                     "`rampart node log wheels` shows its output)")
+        tug.wait_for("wheels crashed, incarnation 1: ./wheels ended: signal SIGKILL; "
+                     "`rampart node log wheels` shows its output")
         program = comes_back(tug, "wheels", 2, "wheels")
 
         os.kill(program, signal.SIGSTOP)
-        tug.wait_for("wheels crashed, incarnation 2 (./wheels was stopped for 0.5 s;")
+        tug.wait_for("wheels crashed, incarnation 2: ./wheels was stopped for 0.5 s;")
         comes_back(tug, "wheels", 3, "wheels")
         assert gone(program)
 
         file = tmp_path / "wheels"
         file.rename(tmp_path / "away")  # while it runs
         os.kill(find(tug, "wheels", "wheels"), signal.SIGSEGV)
-        tug.wait_for(f"wheels crashed, incarnation 4 (./wheels no such program in {tmp_path};")
+        tug.wait_for(f"wheels crashed, incarnation 4: ./wheels no such program in {tmp_path};")
         (tmp_path / "away").rename(file)
         tug.wait_until(lambda: state(tug, "wheels")[0] == "running", 10, "wheels did not come")
         assert tug.pid("wheels") == node, "its process has stayed"
@@ -155,7 +155,7 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
         assert (none.returncode, none.stderr) == (1, (
             "rampart: driver: no command, or its output is not kept; there is output of: forking, "
             "wheels\n"))
-        assert tug.story.count("wheels crashed, incarnation 1 ") == 1
+        assert tug.story.count("wheels crashed, incarnation 1:") == 1
         exits = [line for line in tug.story.splitlines() if "wheels" in line and "SIGKILL" in line]
         assert len(exits) == 1, exits
         assert "payload rejected" not in tug.story
@@ -170,7 +170,7 @@ def test_a_flood_and_one_that_ends_at_once_harm_nobody_and_a_killed_launcher_end
     system_of(tmp_path, MORE)
     with RealRun(tmp_path, "tug.toml") as tug:
         tug.sleep_until(0)
-        tug.wait_for("quitter crashed, incarnation 1 (sh ended: exit code 3;")
+        tug.wait_for("quitter crashed, incarnation 1: sh ended: exit code 3;")
         tug.wait_until(lambda: state(tug, "quitter")[0] == "given up", 20, "no end of restarts")
         quitter = state(tug, "quitter")[1]
         assert quitter >= 6
@@ -231,8 +231,8 @@ kind = "non-control"
 
 [[event]]"""))
     with RealRun(tmp_path, "tug.toml", "--duration", "3") as tug:
-        tug.wait_for("hungry crashed, incarnation 1 (python3 ended: exit code 1;")
-        tug.wait_for("odd crashed, incarnation 1 (./odd cannot be started: Exec format error;")
+        tug.wait_for("hungry crashed, incarnation 1: python3 ended: exit code 1;")
+        tug.wait_for("odd crashed, incarnation 1: ./odd cannot be started: Exec format error;")
         assert "MemoryError" in tug.tool("node", "log", "hungry").stdout
 
 
@@ -300,11 +300,11 @@ heartbeat = { notify = true, timeout_s = 1.0 }
 
 """ + rest[rest.index("[[event]]"):])
     with RealRun(tmp_path, "tug.toml") as tug:
-        tug.wait_for("child crashed, incarnation 1 (python3 was stopped for 1 s;")
-        tug.wait_for("stopping crashed, incarnation 1 (python3 hung: not heard for 1 s;")
-        tug.wait_for("cold crashed, incarnation 2 (python3 hung: not heard for 2.5 s after its "
+        tug.wait_for("child crashed, incarnation 1: python3 was stopped for 1 s;")
+        tug.wait_for("stopping crashed, incarnation 1: python3 hung: not heard for 1 s;")
+        tug.wait_for("cold crashed, incarnation 2: python3 hung: not heard for 2.5 s after its "
                      "start; a larger startup_grace_s in [timing] gives it more time;")
-        tug.wait_for("slow crashed, incarnation 1 (python3 hung: not heard for 1 s;")
+        tug.wait_for("slow crashed, incarnation 1: python3 hung: not heard for 1 s;")
         for name in spoken:
             comes_back(tug, name, 2, "program.py")
         (cold,) = (row for row in nodes(tug) if row["name"] == "cold")

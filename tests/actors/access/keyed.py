@@ -138,7 +138,7 @@ class Keyed:
 
     def __init__(self, folder: str, keys: Path, layout: Layout, where: str = "127.0.0.1"):
         self.folder, self.keys, self.layout = folder, keys, layout
-        self._kept = kept_ports(9_000, 1)
+        self._kept = kept_ports(9_000)
         self.port = self._kept[0].getsockname()[1]
         self.at = f"tls/{where}:{self.port}"
         self.socket = endpoint(folder, "router_a")

@@ -29,7 +29,7 @@ class Hosts:
 
     def __init__(self, keys):
         self.keys = keys
-        self.kept = kept_ports(9_100, 2)
+        self.kept = kept_ports(9_100)
         self.at = {name: f"tls/127.0.0.1:{kept.getsockname()[1]}"
                    for name, kept in zip(("router_a", "router_a_ground"), self.kept, strict=True)}
 
