@@ -16,7 +16,7 @@ from msgspec import inspect
 
 from rampart.actors.bus.fields import ANYTHING
 from rampart.manager.spec.budget import find_false_alarm
-from rampart.manager.spec.reading import expected
+from rampart.manager.spec.reading import MisfitError, read
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Name, SpecificationError
 
@@ -73,16 +73,13 @@ def read_parameters(kind: type[P], given: Mapping[str, Any] | msgspec.Struct, fi
     if not isinstance(given, Mapping):
         return msgspec.convert(given, kind)
     try:
-        read = msgspec.convert(given, kind)
-    except msgspec.ValidationError as error:
-        name, problem = _explain(kind, given, str(error))
-    else:
-        misfit = next(_misfits(kind, given, spec), None) if spec else None
-        if misfit is None:
-            return read
-        name, problem = misfit
-    value = [given[name]] if name in given else []
-    raise SpecificationError(file, f"{path}.{name}", problem, *value)
+        parameters = read(dict(given), kind, path)
+    except MisfitError as error:
+        raise SpecificationError(file, error.finding.path, error.finding.problem,
+                                 *error.finding.value) from None
+    for name, problem in _misfits(kind, given, spec) if spec else ():
+        raise SpecificationError(file, f"{path}.{name}", problem, given[name])
+    return parameters
 
 
 class Named(NamedTuple):
@@ -138,26 +135,6 @@ def messages_said(parameters: msgspec.Struct) -> dict[str, Said]:
                 f"{name}[{place}]": one for place, one in enumerate(said)}
             found |= {where: Said(topic, fields) for where, fields in each.items()}
     return found
-
-
-def _explain(kind: type[msgspec.Struct], given: Mapping[str, Any], error: str) -> tuple[str, str]:
-    """Return which parameter msgspec refuses, and what would be right."""
-    known = kind.__struct_fields__
-    for name in given:
-        if name not in known:
-            listed = ", ".join(known) or "none, its class declares no Parameters"
-            return name, f"unknown parameter; known: {listed}"
-    for field in msgspec.structs.fields(kind):
-        if field.name in given:
-            try:
-                msgspec.convert(given[field.name], field.type)
-            except msgspec.ValidationError as wrong:
-                words = expected(inspect.type_info(field.type))
-                return field.name, f"expected {words}" if words else str(wrong).replace("`", "")
-        elif field.required:
-            return field.name, "missing; without it the node does not start"
-    name, _, problem = error.partition(": ")  # of its `__post_init__`
-    return name, problem
 
 
 @cache

@@ -62,12 +62,14 @@ def _find_misfit(value: Any, kind: Any, path: str, problem: str) -> Finding:
             known = _fields(table)
             for key in value:
                 if key not in known:
-                    return Finding(f"{path}.{key}", f"unknown field; known: {', '.join(known)}",
-                                   (value[key],))
+                    return Finding(f"{path}.{key}", "unknown field; known: "
+                                   f"{', '.join(known) or 'none'}", (value[key],))
             if missing := [field.encode_name for field in msgspec.structs.fields(table)
                            if field.required and field.encode_name not in value]:
                 return Finding(path, f"required field {missing[0]!r} is missing")
-            return Finding(path, problem, (value,))  # its fields do not agree
+            name, _, why = problem.partition(": ")  # its fields do not agree
+            return (Finding(f"{path}.{name}", why, (value[name],)) if name in value
+                    else Finding(path, problem, (value,)))
     words = expected(inspect.type_info(kind))
     return Finding(path, f"expected {words}" if words else problem.replace("`", ""), (value,))
 

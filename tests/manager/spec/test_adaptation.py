@@ -299,7 +299,7 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
     ("retune", "DM5", '{"process": "DM1"}',
      "DM5: process = 'DM1': expected 'DM5', which stays while a system runs"),
     ("retune", "DM3", '{"hold": 1}',
-     "paper.toml: detection DM3: parameters.hold = 1: unknown parameter; known: hold_s, suspects"),
+     "paper.toml: detection DM3: parameters.hold = 1: unknown field; known: hold_s, suspects"),
 ])
 def test_what_is_refused_changes_nothing(action, name, values, words):
     async def scenario(system: Whole, engineer: Engineer) -> None:

@@ -100,7 +100,7 @@ def tug(tmp_path, monkeypatch):
     ("cart:Driver", COMMAND_NODE, f"node driver: actor = '{COMMAND_NODE}': say command = "
      "['./program', ...] instead"),
     ("stand_in", "parameters = { radius_m = 1 }\nstand_in", "node wheels: parameters.radius_m = 1: "
-     "unknown parameter; known: none, its class declares no Parameters")])
+     "unknown field; known: none")])
 def test_a_stand_in_is_held_to_what_the_file_says_of_it_in_real_runs_too(tug, old, new, line):
     plan = tug(old, new)
     with pytest.raises(ValueError, match="node") as refused:
