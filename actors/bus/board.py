@@ -62,6 +62,7 @@ class FileBoard:
     def __init__(self, folder: str) -> None:
         self._folder = folder
         self._files: dict[str, int] = {}
+        self._read: dict[str, int] = {}  # kept open: a reader without descriptors still reads
 
     def _path(self, key: str) -> str:
         return f"{self._folder}/{key.replace('/', ':')}"
@@ -82,15 +83,12 @@ class FileBoard:
     def read(self, key: str) -> bytes | None:
         """Return what is posted, unless it is damaged or being written in this moment."""
         try:
-            file = os.open(self._path(key), _READ)
-        except OSError:
+            file = self._read.get(key)
+            if file is None:
+                file = self._read[key] = os.open(self._path(key), _READ)
+            data = os.pread(file, _HEAD.size + MOST_BYTES, 0)
+        except OSError:  # there is none yet, or it is nothing that is read
             return None
-        try:
-            data = os.read(file, _HEAD.size + MOST_BYTES)
-        except OSError:  # it is a folder, or nothing that is read
-            return None
-        finally:
-            os.close(file)
         if len(data) < _HEAD.size:
             return None
         length, checksum = _HEAD.unpack_from(data)
