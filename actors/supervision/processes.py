@@ -38,15 +38,19 @@ Answer = Callable[[int, str], None]
 class ProcessHandle:
     """One process, held so that its number cannot come to mean another one.
 
-    This class itself is the hold on none.
+    This class itself is the hold on none: either there is no process, or (`is_gone` False) there
+    was no descriptor left to hold it by.
     """
+
+    def __init__(self, *, is_gone: bool = True) -> None:
+        self._is_gone = is_gone
 
     def kill(self) -> None:
         """End it at once (SIGKILL), if it is still there."""
 
     def gone(self) -> bool:
         """Whether it certainly runs no more and holds nothing, its ports included."""
-        return True
+        return self._is_gone
 
     def stopped(self) -> bool:
         """Whether it was stopped from outside (SIGSTOP); False if that cannot be known."""
@@ -87,6 +91,7 @@ class Processes(Protocol):
 
         Raises:
             ProcessLookupError: It is gone already.
+            OSError: There is no descriptor left to hold it by.
         """
 
     def adapt(self, adapted: AdaptedSystem) -> None:

@@ -40,6 +40,7 @@ from rampart.actors.machine.absence import Absence
 from rampart.actors.machine.patience import Patience
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.run_plan import SUPERVISOR
+from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.processes import (
     OsProcesses,
     Processes,
@@ -383,7 +384,7 @@ class Supervisor(Actor):
                     by = self.name if process.state is State.GIVEN_UP else by
                     self._fork_when_gone(process, by, process.delay_s)
                 case Action.HOLD:
-                    self._hold(process)
+                    self._hold(process, process.pid)
 
     def _recover(self, process: SupervisedProcess) -> None:
         if self._owns(process) or process.policy.attempts or process.requested_by:
@@ -426,7 +427,7 @@ class Supervisor(Actor):
                 ) -> None:
         process.asks = False
         if pid and not (process.waits and self._is_kept(process)):
-            self._kill_other(pid)
+            kill(pid)
         elif pid:
             event = Event.FORKED if process.highest else Event.STARTED
             process.take(pid, incarnation)
@@ -443,27 +444,32 @@ class Supervisor(Actor):
         found = sorted((p for p in living if p.names == process.names),
                        key=lambda p: -p.incarnation)
         for other in found[1:]:
-            self._kill_other(other.pid)
+            with contextlib.suppress(OSError):  # gone, or for the next search
+                handle = self._machine.hold(other.pid, lambda: None)
+                handle.kill()
+                handle.close()
         if found and (found[0].pid != process.pid or process.is_dead):
             process.take(found[0].pid, found[0].incarnation)
             process.heard_s = dict.fromkeys(process.names, self._loop.time())
             self._on(process, Event.ADOPTED)
         return bool(found)
 
-    def _hold(self, process: SupervisedProcess) -> None:
-        """Watch for the end of a process; without a descriptor for it this supervisor ends."""
-        pid = process.pid
+    def _hold(self, process: SupervisedProcess, pid: int) -> None:
+        if process.pid != pid:  # it was replaced while this waited
+            return
+        process.let_go()
         try:
             process.handle = self._machine.hold(pid, lambda: self._dispatcher.put(
                 f"exit {pid}", lambda: self._ended(process, pid)))
         except ProcessLookupError:
             self._ended(process, pid, "it ended before it could be watched")
-
-    def _kill_other(self, pid: int) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            handle = self._machine.hold(pid, lambda: None)
-            handle.kill()
-            handle.close()
+        except OSError as error:  # no descriptor left: perhaps later
+            process.handle = ProcessHandle(is_gone=False)
+            self.report_diagnostic("hold", str(error), process.unit.name)
+            self.call_later(_RETRY_S * self.clock.rate, lambda: self._hold(process, pid))
+        else:
+            if process.waits or not self._is_kept(process):
+                process.kill()
 
     # -- what it says ---------------------------------------------------------------------------
 

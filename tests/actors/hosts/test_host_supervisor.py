@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -21,6 +22,7 @@ from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_system
+from rampart.actors.supervision import supervisor
 from rampart.actors.supervision.node_process import make_actor
 from rampart.actors.system.layout import Layout
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
@@ -270,8 +272,32 @@ def test_one_that_is_being_forked_when_its_home_is_back_gives_way(tmp_path, monk
             made.is_cut = False
             await eventually(lambda: made.ground.runs("camera") > 1)
             assert made.ground.runs("camera") > asked[0][1]
-            fork(*asked[0])
+            ended: list[int] = []
+            monkeypatch.setattr(supervisor, "kill", ended.append)
+            asked[0][2](77, "")
+            assert ended == [77]
+
+    run(scenario)
+
+
+def test_one_that_could_not_be_held_is_ended_as_soon_as_it_can_be(tmp_path, monkeypatch):
+    async def scenario() -> None:
+        async with world(tmp_path) as made:
+            hold, is_full = made.robot.hold, [True]
+
+            def hold_if_there_is_room(pid, ended):
+                if is_full[0] and ("camera",) in (
+                        p.names for p in made.robot.living() if p.pid == pid):
+                    raise OSError(errno.EMFILE, "Too many open files")
+                return hold(pid, ended)
+
+            monkeypatch.setattr(made.robot, "hold", hold_if_there_is_room)
+            await made.taken_over()
+            made.is_cut = False
+            await eventually(lambda: made.robot.supervisor.highest_of("camera") == 0)
+            is_full[0] = False
             await eventually(lambda: not made.robot.of("camera"))
+            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
 
     run(scenario)
 

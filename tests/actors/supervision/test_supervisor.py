@@ -86,6 +86,7 @@ class Machine:
         self.fork_error: Exception | str | None = None
         self.is_slow = False
         self.waiting: list[Callable[[], None]] = []
+        self.hold_error: Exception | None = None
         self.ended: list[str] = []
         self.starving: set[str] = set()
         self.starves_from_s = 0.0
@@ -137,6 +138,8 @@ class Machine:
         answer(self.add(names, incarnation).pid, "")
 
     def hold(self, pid: int, ended: Callable[[], None]) -> Handle:
+        if self.hold_error:
+            raise self.hold_error
         process = self.processes.get(pid)
         if process is None or process.gone:
             raise ProcessLookupError(pid)
@@ -407,6 +410,69 @@ def test_a_process_that_waits_for_a_processor_has_longer_to_start():
 def status(world: World, life: int, stamp_s: float | None = None) -> None:
     world.say(topics.MANAGER_STATUS, ManagerStatus((), (), (), (), "safety-first", 0),
               "ftm_manager", life, stamp_s=stamp_s)
+
+
+def test_a_process_that_no_descriptor_is_left_for_is_held_as_soon_as_there_is_one():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.hold_error = no_descriptor()
+            world.kill("DM1")
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
+            world.machine.hold_error = None
+            await asyncio.sleep(0.1)
+            world.kill("DM1")
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
+            assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
+
+    run(scenario)
+
+
+def test_a_process_that_ends_while_nobody_can_hold_it_is_missed():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.hold_error = no_descriptor()
+            world.kill("DM1")
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
+            world.kill("DM1")
+            await asyncio.sleep(0.1)
+            world.machine.hold_error = None
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
+            assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
+
+    run(scenario)
+
+
+def test_a_process_that_nobody_can_hold_is_not_replaced_before_it_is_gone():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.hold_error = no_descriptor()
+            world.kill("DM1")
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
+            world.respawn("DM1", 2)
+            await asyncio.sleep(1.0)
+            assert world.machine.forks == [("DM1", 2)]
+            world.machine.hold_error = None
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
+            assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
+
+    run(scenario)
+
+
+def test_the_end_of_a_process_that_is_being_replaced_anyway_is_no_crash():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.hold_error = no_descriptor()
+            world.kill("DM1")
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
+            world.events.clear()
+            world.respawn("DM1", 2)
+            await asyncio.sleep(0.02)
+            world.kill("DM1")
+            world.machine.hold_error = None
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
+            assert world.events == [("DM1", "respawned", 3), ("DM1", "running", 3)]
+
+    run(scenario)
 
 
 def test_what_a_process_said_before_it_was_killed_does_not_make_it_run():
