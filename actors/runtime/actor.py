@@ -5,10 +5,9 @@ the mailbox: messages, timer ticks, changes of peers. Teardown calls `on_stop` a
 bus. Handlers are plain functions and run to their end before the next item, so an actor's state
 needs no lock and its code no `await`.
 
-A handler that raises ends the actor: the error is reported on `diagnostic/NAME`, `on_failure`
-is called, and the process exits non-zero so that its supervisor starts a fresh one. The
-heartbeat is an item of the same mailbox: a handler that never returns silences it, although the
-process is still there.
+A handler that raises ends the actor: the error is reported on `diagnostic/NAME`, and the process
+exits non-zero so that its supervisor starts a fresh one. The heartbeat is an item of the same
+mailbox: a handler that never returns silences it, although the process is still there.
 """
 
 from __future__ import annotations
@@ -93,7 +92,7 @@ class Actor(Declared):
             context.checkpoints, lambda line: self.report_diagnostic("checkpoint", line, self.name),
             context.clock.now, expected=context.incarnation > 1 or context.run.plan.part > 0)
         self._dispatcher = Dispatcher(
-            context.bus.bursts, self._overflowed, after_burst=context.bus.after_burst)
+            context.bus.bursts, self._overflowed, context.bus.after_burst)
         self._timers = Timers(context.clock, self._dispatcher)
         self._questions = Questions(
             context.bus, lambda: self._dispatcher.put("go to work", self._go_to_work))
@@ -131,9 +130,6 @@ class Actor(Declared):
 
     def on_stop(self) -> None:
         """Runs on the loop after the last item, bus still open, also after a failure."""
-
-    def on_failure(self, error: BaseException) -> None:
-        """Runs on the loop after a handler raised, before `on_stop`. A raise here is ignored."""
 
     def is_well(self) -> bool:
         """Whether its heartbeat is to be sent; asked whenever one is due."""
@@ -359,7 +355,6 @@ class Actor(Declared):
             self._reports.clear()
             self.report_diagnostic("handler failed", f"{type(error).__name__}: {error}", self.name)
             self._keeper.failed()
-            self.on_failure(error)
         except Exception as second:  # the first error is the one that counts
             error.add_note(f"and while reporting it: {second!r}")
         self.context.failed(error)

@@ -44,8 +44,6 @@ class Dispatcher:
         bursts: Whether messages arrive in bursts, see `Bus`.
         on_overflow: Called with a message that is refused because too many wait.
         after_burst: See `Bus`.
-        capacity: Commands that may wait.
-        slots: Keys of which a message may wait.
 
     Attributes:
         stance: `RESTING`, `IDLE` or `AWAKE`.
@@ -54,16 +52,13 @@ class Dispatcher:
         overflowed: Messages refused because too many waited.
     """
 
-    def __init__(self, bursts: bool, on_overflow: Callable[[Any], None], *,
-                 after_burst: Callable[[Callable[[], None]], None] = lambda call: call(),
-                 capacity: int = COMMAND_CAPACITY, slots: int = MESSAGE_SLOTS) -> None:
+    def __init__(self, bursts: bool, on_overflow: Callable[[Any], None],
+                 after_burst: Callable[[Callable[[], None]], None]) -> None:
         self.stance = AWAKE
         self.progress = 0
         self.stopping = False
         self.overflowed = 0
         self._on_overflow = on_overflow
-        self._capacity = capacity
-        self._slots = slots
         self._waiting: deque[tuple[str | None, Any]] = deque()
         self._latest: dict[str, Any] = {}
         self._commands = 0
@@ -96,9 +91,9 @@ class Dispatcher:
         """
         share = 1.0 if reserved else _OPEN_SHARE
         if slot is None:
-            fits = self._commands < self._capacity * share
+            fits = self._commands < COMMAND_CAPACITY * share
         else:
-            fits = slot in self._latest or len(self._latest) < self._slots * share
+            fits = slot in self._latest or len(self._latest) < MESSAGE_SLOTS * share
         if not fits:
             self.overflowed += 1
             self._on_overflow(item)

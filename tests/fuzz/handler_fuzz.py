@@ -126,9 +126,10 @@ class Machine:
     def living(self) -> Sequence[Any]:
         return ()
 
-    def fork(self, _names: tuple[str, ...], _incarnation: int) -> int:
+    def fork(self, _names: tuple[str, ...], _incarnation: int,
+             answer: Callable[[int, str], None]) -> None:
         self._pid += 1
-        return self._pid
+        answer(self._pid, "")
 
     def hold(self, pid: int, _ended: Callable[[], None], node: str = "") -> Any:
         if pid < 100:

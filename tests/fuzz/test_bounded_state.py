@@ -27,7 +27,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.runtime.actor import Actor, Context, on
 from rampart.actors.runtime.injection import MAX_DELAYED, MAX_IN_FORCE
-from rampart.actors.runtime.mailbox import Dispatcher
+from rampart.actors.runtime.mailbox import COMMAND_CAPACITY, MESSAGE_SLOTS, Dispatcher
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
@@ -207,17 +207,17 @@ def test_a_flood_of_strangers_does_not_bring_a_superseded_node_back():
 
 def test_strangers_in_the_mailbox_leave_room_for_the_nodes_of_the_system():
     refused = []
-    mailbox = Dispatcher(True, refused.append, capacity=8, slots=8)
-    assert [mailbox.put_message(None, n, reserved=False) for n in range(6)] == (
-        [True] * 4 + [False] * 2)
-    assert [mailbox.put_message(None, n) for n in range(6)] == [True] * 4 + [False] * 2
-    assert [mailbox.put_message(f"{n}", n, reserved=False) for n in range(6)] == (
-        [True] * 4 + [False] * 2)
-    assert [mailbox.put_message(f"node {n}", n) for n in range(6)] == [True] * 4 + [False] * 2
+    mailbox = Dispatcher(True, refused.append, lambda call: call())
+    for room, slot in ((COMMAND_CAPACITY, lambda _: None), (MESSAGE_SLOTS, str)):
+        half = room // 2
+        strangers = [mailbox.put_message(slot(n), n, reserved=False) for n in range(half + 2)]
+        assert strangers == [True] * half + [False] * 2
+        nodes = [mailbox.put_message(slot(-1 - n), n) for n in range(half + 2)]
+        assert nodes == [True] * half + [False] * 2
     assert mailbox.put_message("0", "the newest", reserved=False)
     assert mailbox.overflowed == len(refused) == 8
     mailbox.put("timer", "an item of its own always has room")
-    assert len(mailbox) == 17
+    assert len(mailbox) == COMMAND_CAPACITY + MESSAGE_SLOTS + 1
 
 
 def test_remembered_forgets_what_was_put_in_first_and_counts():
