@@ -128,14 +128,8 @@ def draw(spec: SystemSpec, what: str, order: PartialOrder, criteria: Sequence[st
 
 def covers(order: PartialOrder) -> tuple[tuple[str, str], ...]:
     """Return the pairs of neighbours of an order (its transitive reduction, the Hasse diagram)."""
-    pairs = []
-    for number, name in enumerate(order.names):
-        rest = order.below[number]
-        while rest:  # whatever lies between two has a lower bit than the lower of them
-            nearest = (rest & -rest).bit_length() - 1
-            pairs.append((name, order.names[nearest]))
-            rest &= ~(order.below[nearest] | 1 << nearest)
-    return tuple(pairs)
+    return tuple((upper, lower) for upper in order.names
+                 for lower in order.maximal(order.members(order.below[order.number[upper]])))
 
 
 _Parts = tuple[tuple[Box, ...], tuple[tuple[str, str], ...]]
@@ -157,7 +151,7 @@ def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:
     titles |= {r.name: one_line(r.title) for r in spec.recoveries}
     boxes = []
     for mechanism in spec.mechanisms:
-        detects, recovers = (gate.said_with(titles) for gate in (
+        detects, recovers = (str(gate.renamed(titles)) for gate in (
             detection_gate(mechanism.detect), recovery_gate(mechanism.recover)))
         box = Box(mechanism.name, f"{detects} → {recovers}")
         boxes.append(_bar(box, mechanism, spec, situation))

@@ -83,13 +83,10 @@ class Gate(msgspec.Struct, frozen=True):
             return self.name in active
         return sum(gate.holds(active, silent) for gate in self.inputs) >= self.required
 
-    def said_with(self, words: Mapping[str, str]) -> str:
-        """Return the gate in text, with names replaced by words for those that have some."""
-        return str(self._renamed(words))
-
-    def _renamed(self, words: Mapping[str, str]) -> Gate:
+    def renamed(self, words: Mapping[str, str]) -> Gate:
+        """Return the gate with names replaced by words for those that have some."""
         return Gate(words.get(self.name) or self.name, self.negated, self.required,
-                    tuple(gate._renamed(words) for gate in self.inputs))
+                    tuple(gate.renamed(words) for gate in self.inputs))
 
     def alternatives(self) -> Iterator[tuple[str, ...]]:
         """Yield the sets of names that satisfy a gate without negation, preferred ones first."""

@@ -98,31 +98,23 @@ class PartialOrder:
         """Tell whether `upper` is strictly above `lower`."""
         return bool(self.below[self.number[upper]] & self.bit[lower])
 
-    def greatest_in(self, mask: int) -> int:
-        """Return the number of the greatest element of a set, or -1 if it has none."""
+    def greatest(self, names: Iterable[str]) -> str | None:
+        """Return the member above all other members (`dom` of the paper), or None."""
+        mask = self.mask(names)
         lowest = mask & -mask
         bit = lowest.bit_length() - 1
         if bit < 0 or mask & ~(self.below[bit] | lowest):
-            return -1
-        return bit
-
-    def greatest(self, names: Iterable[str]) -> str | None:
-        """Return the member above all other members (`dom` of the paper), or None."""
-        bit = self.greatest_in(self.mask(names))
-        return None if bit < 0 else self.names[bit]
-
-    def maximal_in(self, mask: int) -> tuple[str, ...]:
-        """Return the members of a set that no other member is above, greater ones first."""
-        names = []
-        while mask:  # the lowest bit is maximal, and whatever is below it is not
-            bit = (mask & -mask).bit_length() - 1
-            names.append(self.names[bit])
-            mask &= ~(self.below[bit] | 1 << bit)
-        return tuple(names)
+            return None
+        return self.names[bit]
 
     def maximal(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Return the members that no other member is above."""
-        return self.maximal_in(self.mask(names))
+        """Return the members that no other member is above, greater ones first."""
+        mask, found = self.mask(names), []
+        while mask:  # the lowest bit is maximal, and whatever is below it is not
+            bit = (mask & -mask).bit_length() - 1
+            found.append(self.names[bit])
+            mask &= ~(self.below[bit] | 1 << bit)
+        return tuple(found)
 
     def chain(self, upper: str, lower: str) -> tuple[str, ...]:
         """Return a longest-to-read chain from `upper` down to `lower`, both included.
@@ -180,17 +172,6 @@ class Tree(PartialOrder):
         self.root = next(name for name, parent in parents.items() if parent is None)
         self.parents = dict(parents)
 
-    def lowest_common_in(self, mask: int) -> int:
-        """Return the number of the closest element above or equal to all of a non-empty set."""
-        bit = (mask & -mask).bit_length() - 1
-        common = self.up_set[bit]
-        # Climb from the first member; whatever it is not above yet takes it further up, never
-        # down, so this ends after no more steps than the tree is deep.
-        while rest := mask & ~(self.below[bit] | 1 << bit):
-            common &= self.up_set[rest.bit_length() - 1]
-            bit = common.bit_length() - 1
-        return bit
-
     def lowest_common_dominant(self, names: Iterable[str]) -> str:
         """Return the closest element above or equal to all `names` (`low_com_dom` of the paper).
 
@@ -200,7 +181,14 @@ class Tree(PartialOrder):
         mask = self.mask(names)
         if not mask:
             raise ValueError("the empty set has no lowest common dominant")
-        return self.names[self.lowest_common_in(mask)]
+        bit = (mask & -mask).bit_length() - 1
+        common = self.up_set[bit]
+        # Climb from the first member; whatever it is not above yet takes it further up, never
+        # down, so this ends after no more steps than the tree is deep.
+        while rest := mask & ~(self.below[bit] | 1 << bit):
+            common &= self.up_set[rest.bit_length() - 1]
+            bit = common.bit_length() - 1
+        return self.names[bit]
 
 
 def _linear_extension(relation: Mapping[str, Iterable[str]]) -> tuple[str, ...]:
