@@ -12,7 +12,7 @@ from itertools import chain, combinations, product
 
 import msgspec
 
-from rampart.manager.model.order import PartialOrder
+from rampart.manager.model.order import PartialOrder, contradictions
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision, Strategy
 from rampart.manager.strategies.escalation import succession
@@ -225,16 +225,13 @@ class ActiveSets:
 def order_agrees_with_tree(arrangement: Arrangement, safety: PartialOrder) -> Property:
     """Check that no mechanism's recovery is safer than that of a mechanism above it."""
     tree, recover = arrangement.tree, arrangement.mechanisms.recover
-    pairs = [(upper, lower) for upper in tree.names
-             for lower in tree.members(tree.below[tree.number[upper]])]
-    found: list[Trace] = []
-    for upper, lower in pairs:
-        safer = [both for both in product(recover[lower], recover[upper]) if safety.is_above(*both)]
-        if safer:
-            high, low = safer[0]
-            found.append((f"{upper} is above {lower} in the FTMTree, but {high} of {lower} is "
-                          f"safer than {low} of {upper}",))
-    return judge("order-agrees-with-tree", "", len(pairs), found)
+    found: dict[tuple[str, str], Trace] = {}
+    for upper, lower, high, low in contradictions(tree, safety, recover):
+        found.setdefault((upper, lower), (
+            f"{upper} is above {lower} in the FTMTree, but {high} of {lower} is safer than {low} "
+            f"of {upper}",))
+    pairs = sum(below.bit_count() for below in tree.below)
+    return judge("order-agrees-with-tree", "", pairs, list(found.values()))
 
 
 def judge(name: str, strategy: str, cases: int, found: Sequence[Trace]) -> Property:

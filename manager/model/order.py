@@ -21,8 +21,11 @@ a tree the two definitions agree.
 from __future__ import annotations
 
 import graphlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import reduce
 from graphlib import TopologicalSorter
+from itertools import product
+from operator import or_
 
 
 class CycleError(ValueError):
@@ -189,6 +192,28 @@ class Tree(PartialOrder):
             common &= self.up_set[rest.bit_length() - 1]
             bit = common.bit_length() - 1
         return self.names[bit]
+
+
+def contradictions(tree: Tree, order: PartialOrder, of: Mapping[str, Sequence[str]]
+                   ) -> Iterator[tuple[str, str, str, str]]:
+    """Yield where elements of an order contradict the tree of those that they belong to.
+
+    Args:
+        tree: Of the owners.
+        order: Of what they own.
+        of: By owner.
+
+    Yields:
+        An upper owner, a lower one, what of the lower one is above what of the upper one.
+    """
+    own = {name: order.mask(owned) for name, owned in of.items()}
+    under = {name: reduce(or_, (order.below[order.number[one]] for one in owned))
+             for name, owned in of.items()}
+    for upper in tree.names:
+        for lower in tree.members(tree.below[tree.number[upper]]):
+            if under[lower] & own[upper]:
+                yield from ((upper, lower, high, low) for high, low in product(of[lower], of[upper])
+                            if order.is_above(high, low))
 
 
 def _linear_extension(relation: Mapping[str, Iterable[str]]) -> tuple[str, ...]:

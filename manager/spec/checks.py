@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Callable, Collection, Iterable, Iterator
-from functools import reduce
 from itertools import chain, combinations, permutations, product
-from operator import or_
 
 from rampart.manager.model.fault_tree import FaultTreeError
 from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
-from rampart.manager.model.order import CycleError, PartialOrder, Tree, find_cycle
+from rampart.manager.model.order import CycleError, contradictions, find_cycle
 from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
 from rampart.manager.spec.hosts import PORTS
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
@@ -404,31 +402,18 @@ def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
         if tree.root in mechanism.explains:
             yield Finding(f"{path}.explains", f"{tree.root} is the root of the FTMTree; the last "
                           "barrier acts whatever explains it", (sorted(mechanism.explains),))
-    yield from _against_tree(spec, order, tree)
+    recover = {mechanism.name: mechanism.recoveries for mechanism in spec.mechanisms}
+    safer = spec.criteria[0]
+    for upper, lower, high, low in contradictions(tree, order, recover):
+        yield Finding(f"$.orders.{safer}.{high}", f"contradicts the FTMTree: {high} of {lower} is "
+                      f"above {low} of {upper}, but {upper} is above {lower}",
+                      (list(spec.orders[safer].get(high, ())),))
     for path, recovery in numbered("recovery", spec.recoveries):
         if recovery.escalate_to and order.is_above(recovery.name, recovery.escalate_to):
             yield Finding(f"{path}.escalate_to", f"{recovery.name} is above it in the order "
                           f"{spec.criteria[0]!r}; escalation must not lead to less",
                           (recovery.escalate_to,))
     yield from _delayed_last_resort(spec, tree.root)
-
-
-def _against_tree(spec: SystemSpec, order: PartialOrder, tree: Tree) -> Iterator[Finding]:
-    """Recoveries of a lower mechanism that are above those of an upper one."""
-    safer = spec.criteria[0]
-    recover = {mechanism.name: mechanism.recoveries for mechanism in spec.mechanisms}
-    own = {name: order.mask(names) for name, names in recover.items()}
-    under = {name: reduce(or_, (order.below[order.number[r]] for r in names))
-             for name, names in recover.items()}
-    for upper in tree.names:
-        for lower in tree.members(tree.below[tree.number[upper]]):
-            if not under[lower] & own[upper]:
-                continue
-            for above, below in product(recover[lower], recover[upper]):
-                if order.is_above(above, below):
-                    yield Finding(f"$.orders.{safer}.{above}", f"contradicts the FTMTree: {above} "
-                                  f"of {lower} is above {below} of {upper}, but {upper} is above "
-                                  f"{lower}", (list(spec.orders[safer].get(above, ())),))
 
 
 def _delayed_last_resort(spec: SystemSpec, root: str) -> Iterator[Finding]:
