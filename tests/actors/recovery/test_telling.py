@@ -242,11 +242,11 @@ def test_a_call_that_is_not_answered_fails_and_names_the_answer():
 
 
 @pytest.mark.parametrize(("kind", "parameters", "words"), [
-    (Hold, {"message": {}}, "topic: missing"),
+    (Hold, {"message": {}}, "required field 'topic' is missing"),
     (Hold, {"topic": "a", "message": 3}, "message = 3"),
     (Hold, {**SHUT, "confirm": "a:b"}, "equals: missing"),
     (Hold, {**SHUT, "equals": 1}, "confirm"),
-    (Call, {"topic": "a", "messages": [{}]}, "answer: missing"),
+    (Call, {"topic": "a", "messages": [{}]}, "required field 'answer' is missing"),
 ])
 def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, words):
     with pytest.raises(ValueError, match=r".") as caught:
