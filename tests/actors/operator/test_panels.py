@@ -207,7 +207,7 @@ def test_panels_that_no_node_shows_are_refused():
 
 def test_more_panels_than_a_page_has_room_for_are_refused():
     many = "".join(panel(f"P{i}", 'text = "tank/level:height_m"') for i in range(MAX_PANELS + 1))
-    with pytest.raises(ValueError, match=rf"tank.toml: \$.panel: {MAX_PANELS + 1} of them; at "
+    with pytest.raises(ValueError, match=rf"tank.toml: \$.panel: {MAX_PANELS + 1} panels; at "
                                          rf"most {MAX_PANELS} are right"):
         layout(many)
 
