@@ -24,6 +24,7 @@ test-slow: setup
 test-nightly: setup
 	@command -v scram >/dev/null || { echo "make test-nightly: scram is missing; install Debian's package scram" >&2; exit 2; }
 	$(BIN)/python -m pytest -m nightly
+	$(BIN)/python -m pytest --hypothesis-profile=thorough -n auto -m "not slow and not alone and not processes"
 
 lint: setup
 	$(BIN)/python -m ruff check .
