@@ -82,7 +82,7 @@ soak: setup
 	$(BIN)/python -m tests.whole.soak_runs --hours $(HOURS)
 
 # 100,000 inputs into each decoder of what others write; half an hour. FUZZ="--runs 1000000" makes
-# more, FUZZ=--help says what else there is. Coverage guides it where `rampart[fuzz]` is installed.
+# more, FUZZ=--help says what else there is. Coverage guides it where `rampart-robot[fuzz]` is installed.
 # Then 100,000 messages, as extreme as their types allow, into the handlers of all actors.
 fuzz: setup
 	$(BIN)/python -m tests.fuzz.run $(FUZZ)

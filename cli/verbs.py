@@ -192,4 +192,4 @@ def extra(name: str, module: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         raise UsageError(f"this needs the extra {name!r}, which is not installed ({error}); "
-                         f"install it with: pip install 'rampart[{name}]'") from None
+                         f"install it with: pip install 'rampart-robot[{name}]'") from None

@@ -117,7 +117,7 @@ def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
             continue
         files.append((name, _MEDIA.get(path.suffix.lower(), "text/plain"), data))
     try:
-        own_version = version("rampart")
+        own_version = version("rampart-robot")
     except PackageNotFoundError:
         own_version = "unknown"
     return Documents(plan=plan, files=tuple(files), version=own_version, known=known, **described)

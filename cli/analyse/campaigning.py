@@ -378,8 +378,8 @@ def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
             made = search(space, options.search, run, seed=options.seed,
                           seeds=options.seeds or 1, at_once=workers, seen=seen)
         except ImportError:
-            raise UsageError("--search: Optuna is not installed; pip install 'rampart[search]'"
-                             ) from None
+            raise UsageError("--search: Optuna is not installed; pip install "
+                             "'rampart-robot[search]'") from None
     unsafe = [job for job, result in made if not result.safe]
     store.close()
     shrunk = [_shrunk(job, directory) for job in unsafe[:_SHRUNK_AT_MOST]]

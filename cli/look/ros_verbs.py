@@ -1,7 +1,7 @@
 """`rampart ros2`: whether a system and the ROS 2 beside it fit.
 
 `rampart topic list|echo|hz --ros` looks at topics of ROS 2. Neither needs a ROS
-installation; pip install 'rampart[ros2]'. ROS_DOMAIN_ID and ROS_DISTRO say
+installation; pip install 'rampart-robot[ros2]'. ROS_DOMAIN_ID and ROS_DISTRO say
 which domain and distribution is meant, as they do to ROS 2.
 
 Examples:

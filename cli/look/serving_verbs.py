@@ -39,7 +39,7 @@ def foxglove(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
 
     Serve viewers that speak Foxglove's WebSocket protocol. They only read:
     nothing that they send reaches the robot. Needs the extra:
-    pip install 'rampart[foxglove]'.
+    pip install 'rampart-robot[foxglove]'.
 
     Examples:
       rampart live foxglove
@@ -59,7 +59,7 @@ def metrics(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     for who asks for it: nodes, heartbeats, detections, recoveries, decisions,
     message counts and rates, processes, what the robot adds. Waits for a run,
     and for the next when one ends; meanwhile rampart_up is 0.
-    Needs the extra: pip install 'rampart[prometheus]'.
+    Needs the extra: pip install 'rampart-robot[prometheus]'.
 
     Examples:
       rampart live metrics

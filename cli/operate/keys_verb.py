@@ -6,7 +6,7 @@ A folder of keys has an authority and a private key and certificate of each
 process and of each person. `rampart run --keys DIR` starts a run in which
 every link is mutual TLS, and in which a router lets through what the owner of
 a certificate declares and no more. Needs the extra:
-pip install 'rampart[keys]'.
+pip install 'rampart-robot[keys]'.
 
 Examples:
   rampart keys init                               an authority, in keys/

@@ -73,7 +73,7 @@ def content_of(job: Job) -> str:
 def _engine() -> str:
     """Return the version of the engine, and a digest of its code."""
     root = Path(rampart.__file__).parent
-    digest = hashlib.sha256(version("rampart").encode())
+    digest = hashlib.sha256(version("rampart-robot").encode())
     for room in _ENGINE_ROOMS:
         folder = (root / room).resolve()
         for path in sorted(p for p in folder.rglob("*") if p.suffix in _ENGINE_FILES):

@@ -114,7 +114,8 @@ def _dask(address: str) -> Iterator[Any]:
     try:
         from distributed import Client  # noqa: PLC0415 an extra
     except ImportError:
-        raise BackendError("--backend dask: not installed; pip install 'rampart[dask]'") from None
+        raise BackendError(
+            "--backend dask: not installed; pip install 'rampart-robot[dask]'") from None
     if not address:
         raise BackendError("--backend dask: --address is missing, e.g. tcp://HOST:8786")
     try:
@@ -133,7 +134,8 @@ def _ray(address: str) -> Iterator[Any]:
         import ray  # noqa: PLC0415 an extra
         from ray.util.joblib import register_ray  # noqa: PLC0415
     except ImportError:
-        raise BackendError("--backend ray: not installed; pip install 'rampart[ray]'") from None
+        raise BackendError(
+            "--backend ray: not installed; pip install 'rampart-robot[ray]'") from None
     if not address:
         raise BackendError("--backend ray: --address is missing, e.g. HOST:6379 or auto")
     try:

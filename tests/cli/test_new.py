@@ -139,7 +139,7 @@ def test_from_a_wheel_in_an_empty_environment_outside_of_the_checkout(tmp_path):
     subprocess.run([sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir",
                     str(tmp_path), str(source)], check=True)
     shutil.rmtree(source)
-    (wheel,) = tmp_path.glob("rampart-*.whl")
+    (wheel,) = tmp_path.glob("rampart_robot-*.whl")
     home = tmp_path / "empty"
     venv.create(home, with_pip=False)
     python = home / "bin" / "python"

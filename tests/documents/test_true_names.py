@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import pkgutil
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -74,3 +75,15 @@ def test_verbs_are_there(page):
     said = set(re.findall(
         r"(?:^|`|\$ |; |bin/)rampart ([a-z][a-z0-9-]*)", PAGES[page], re.MULTILINE))
     assert said - TO_COME <= known
+
+
+def test_no_text_installs_another_project_s_package():
+    """On the package index `rampart` is not this project; ours is `rampart-robot`."""
+    files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True,
+                           capture_output=True).stdout.decode().split("\0")
+    foreign = re.compile(r"pip3? +install[^\n`]* ['\"]?rampart(?![\w-]|/)"
+                         r"|dependencies\s*=\s*\[\s*['\"]rampart['\"\[=<>~!]")
+    found = [name for name in files if name and not name.startswith("docs/log/")
+             and (ROOT / name).is_file() and foreign.search(
+                 (ROOT / name).read_text(encoding="utf-8", errors="replace"))]
+    assert found == []

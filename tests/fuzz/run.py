@@ -1,9 +1,9 @@
 """Fuzz the decoders: random inputs, each under limits of time and memory; `make fuzz`.
 
 Every target is run in processes of its own. Where atheris is installed (`pip install
-'rampart[fuzz]'`), libFuzzer chooses the inputs by the code that they reach; else our own engine
-changes samples, and goes on from inputs with a new outcome. What is found is made smaller, written
-to tests/fuzz/corpus/TARGET, and run by the ordinary suite from then on.
+'rampart-robot[fuzz]'`), libFuzzer chooses the inputs by the code that they reach; else our own
+engine changes samples, and goes on from inputs with a new outcome. What is found is made smaller,
+written to tests/fuzz/corpus/TARGET, and run by the ordinary suite from then on.
 """
 
 from __future__ import annotations
@@ -243,8 +243,8 @@ def main() -> int:
         return 2
     engine = options.engine or ("guided" if find_spec("atheris") else "own")
     if engine == "own" and not options.engine:
-        print("atheris is not installed (pip install 'rampart[fuzz]'): inputs are made by our own "
-              "engine, without regard to coverage", file=sys.stderr)
+        print("atheris is not installed (pip install 'rampart-robot[fuzz]'): inputs are made by "
+              "our own engine, without regard to coverage", file=sys.stderr)
     chosen = [targets.ALL[name] for name in options.target or sorted(targets.ALL)]
     screen = Screen()
 

@@ -37,7 +37,7 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install(
     assert main(arguments) == 2
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1
-    assert f"pip install 'rampart[{extra}]'" in told[0]
+    assert f"pip install 'rampart-robot[{extra}]'" in told[0]
 
 
 @pytest.mark.parametrize("arguments", [
