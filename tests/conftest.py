@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
+import tempfile
 
 import hypothesis
 import pytest
@@ -75,6 +77,19 @@ class LastLine:
 
 def pytest_configure(config):
     config.pluginmanager.register(LastLine())
+
+
+@pytest.fixture(autouse=True)
+def own_path():
+    """What a test has admitted to the path of imports, as its working folder, ends with it."""
+    before, loaded = list(sys.path), set(sys.modules)
+    yield
+    sys.path[:] = before
+    for name in sys.modules.keys() - loaded:
+        spec = getattr(sys.modules[name], "__spec__", None)
+        places = [spec.origin, *(spec.submodule_search_locations or ())] if spec else []
+        if any(place and place.startswith(tempfile.gettempdir()) for place in places):
+            del sys.modules[name]
 
 
 @pytest.fixture
