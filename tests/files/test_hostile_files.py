@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import random
 import sqlite3
 import struct
 import zlib
@@ -57,23 +56,6 @@ def edited(old: str, new: str) -> str:
     return TOML.replace(old, new, 1)
 
 
-def crossing_combs(teeth: int) -> str:
-    """Two outlines that cross each other as often as the square of their teeth."""
-    points = [p for i in range(teeth) for p in ((i, 0), (i, teeth), (i + .5, teeth), (i + .5, 0))]
-    points += [(teeth, -10), (0, -10)]
-    return "".join(
-        f'[[surface]]\nname = "comb{n}"\nkind = "area"\n'
-        f'polygon = {[[p[n], p[1 - n]] for p in points]}\n'
-        for n in (0, 1))
-
-
-def scribble(count: int) -> str:
-    draw = random.Random(1)
-    points = [[draw.random(), draw.random()] for _ in range(count)]
-    return (f'[[surface]]\nname = "scribble"\nkind = "taxiway"\ncentre_line = {points}\n'
-            'half_width_m = 100.0\n')
-
-
 NESTED = "x = " + "[" * 100_000 + "]" * 100_000
 AIRPORTS = {
     "nested 100,000 deep": (TOML + NESTED, "more than 32 deep"),
@@ -88,16 +70,7 @@ AIRPORTS = {
                                            "surface[0].half_width_m: 1e+308: must be between"),
     "a fillet beyond all measure": ("fillet_radius_m = 1e300\n" + TOML, "fillet_radius_m: 1e+300"),
     "a thousand million lights": (edited("count = 3", "count = 1000000000"), "row[0].count"),
-    "a million lights": (edited("count = 3", "count = 1000000"),
-                         "lights of all rows: 1000000: at most 100000"),
-    "two thousand areas": (TOML + "".join(
-        f'[[prohibited]]\nname="p{i}"\npolygon=[[0,10],[1,10],[0,11]]\n' for i in range(2000)),
-        "prohibited: 2000: at most 1000"),
-    "two combs": (TOML + crossing_combs(150), "too many of them lie within 0 m of each other"),
-    "a scribble as wide as a runway": (TOML + scribble(400), "lie within 200 m of each other"),
-    "more corners than airports have": (TOML + scribble(60_000), "points of all outlines: 60002"),
-    "a mission with more goals than are searched": (edited(
-        "goals = [", "goals = [" + "{x_m=1,y_m=0,mode='taxi'}," * 1500), "goals of all missions"),
+    "a million lights": (edited("count = 3", "count = 1000000"), "1000000 lights: at most 100000"),
     "a name that steers the terminal": (edited(
         'name = "R"', 'name = "\\u001b[2J\\nlaunch.py: all is well"'
         ).split("[world")[0].replace("10.0, 0.0", "10.0, 9.0"), "off the pavement"),
@@ -229,10 +202,7 @@ FOREIGN = {
                         "must be within 1,000,000 m"),
     "half a character as a name": ({"graph": '{"nodes":[{"id":"\\ud800","x":1,"y":0}],'
                                     '"edges":[]}'}, "'\\ud800': must be a name"),
-    "100,000 nodes": ({"graph": json.dumps({"nodes": [0] * 100_000, "edges": []})},
-                      "nodes: 100000: at most 5000"),
     "a graph of a megabyte and more": ({"graph": " " * (2 << 20)}, "longer than 1 MB"),
-    "2,000 goals": ({"mission": "x=9.5,y=6,taxi=1\n" * 2000}, "goals: 1001: at most 1000"),
     "a line of a megabyte": ({"mission": "x=" + "1" * 1_000_000}, "must be like"),
 }
 
@@ -402,8 +372,6 @@ def test_a_document_at_the_limits_is_read_and_strings_and_comments_hold_anything
     n = {"[" * 30}{"]" * 30}
     '''
     assert toml.parse(text)["w"] == f"{dots} '' {brackets}"
-    with pytest.raises(FileError, match="6 dotted"):
-        toml.parse("a.b.c.d.e.f.g = 1")
     with pytest.raises(FileError, match="32 deep"):
         toml.parse("n = " + "[" * 33 + "]" * 33)
 

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import shutil
 import signal
 import sqlite3
 import subprocess
@@ -14,7 +13,6 @@ import sys
 import time
 from collections import Counter
 from functools import partial
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -758,21 +756,6 @@ def test_a_log_gets_a_line_a_minute_with_the_time_left_and_one_at_the_end():
     assert [i for i, line in enumerate(lines) if line] == [6, 12, 18, 19]
     assert lines[-1] == "30 of 30 runs, 0 unsafe"
     assert ProgressLog(total=1, done=0).made_one(5.0, unsafe=1) == "1 of 1 runs, 1 unsafe"
-
-
-def test_a_store_of_version_0_6_is_read_and_its_runs_are_repeated(tmp_path, capsys):
-    shutil.copy(Path(__file__).with_name("store_06.sqlite"), tmp_path / "runs.sqlite")
-    store = Store(tmp_path)
-    runs = list(store.runs())
-    assert {(run.job.row, run.job.options.get("obstacles"), run.result.success, run.result.safe)
-            for run in runs} == {("none", None, True, True), ("none", 2, True, True), (
-                SHORT.fault, None, False, True), (SHORT.fault, 2, False, True)}
-    assert all(0 < run.result.margin < math.inf for run in runs)
-    key = min(store.keys())
-    store.add(*runs[0])
-    store.close()
-    assert rampart(["campaign", "--replay", key, "--out", str(tmp_path), "--json"]) in {0, 1}
-    assert json.loads(capsys.readouterr().out)["job"]["options"]["mission"] == "A"
 
 
 def test_a_search_of_osmosis_goes_further_into_the_mission_than_a_sample():
