@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from typing import Any
 
@@ -13,6 +14,10 @@ MAX_SIZE = 1 << 19
 MAX_DEPTH = 32
 """Of tables and arrays in each other."""
 
+MAX_KEY_PARTS = 200
+"""Of a dotted key: `tomllib` takes memory by the square of their number."""
+
+_DOTTED = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){{{MAX_KEY_PARTS}}}""")
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 
 
@@ -23,6 +28,8 @@ def parse(text: str, most: int = MAX_SIZE) -> dict[str, Any]:
         FileError: it is no TOML, or beyond the limits of this module.
     """
     check_size(text, most)
+    if _DOTTED.search(text):
+        raise FileError(f"a key of more than {MAX_KEY_PARTS} dotted parts")
     try:
         document = tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:

@@ -372,6 +372,8 @@ def test_a_document_at_the_limits_is_read_and_strings_and_comments_hold_anything
     n = {"[" * 30}{"]" * 30}
     '''
     assert toml.parse(text)["w"] == f"{dots} '' {brackets}"
+    with pytest.raises(FileError, match="200 dotted"):
+        toml.parse(".".join("a" * 50_000) + " = 1")
     with pytest.raises(FileError, match="32 deep"):
         toml.parse("n = " + "[" * 33 + "]" * 33)
 

@@ -111,7 +111,7 @@ DECLARED = f"""{PLAIN}
 """
 SAID = {
     "none declared": (f"{PLAIN}    pass\n", "highest_m = 1", "parameters.highest_m = 1: unknown "
-                      "parameter; known: none, its class declares no Parameters"),
+                      "field; known: none"),
     "wrong type": (DECLARED, 'highest_m = "x"', "parameters.highest_m = 'x': expected a number"),
     "no struct": (f"{PLAIN}    class Parameters:\n        highest_m = 2.0\n", "highest_m = 1",
                   "actor = 'own:Level': Parameters: "),

@@ -103,8 +103,7 @@ def test_no_name_of_the_first_system_is_in_the_engine_s_code(room):
      'title = "x"\nairport = "vallombre"\n',
      "cell.toml: $.airport = 'vallombre': unknown field; known: name, title, application, judge, "
      "end, host, link, robot, strategy, shadow, order, timing, layers, supervision, node, "
-     "detection, recovery, mechanism, event, orders, fault, panel, ros2; what an application is "
-     "told stands in [application]"),
+     "detection, recovery, mechanism, event, orders, fault, panel, ros2"),
     ('shadow', 'shadow', None),
 ])
 def test_refused(old, new, message):

@@ -298,7 +298,7 @@ async def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(tmp_path, at_s):
         await asyncio.sleep(at_s)
         root.send_signal(signal.SIGINT)
         _, err = await asyncio.to_thread(root.communicate, timeout=20)
-    assert root.returncode in {1, 4}
+    assert root.returncode in {1, 4, -signal.SIGINT}  # the last before anything is loaded
     before = err.startswith("Fatal Python error")  # the interpreter's own words, at its start
     assert before or "Traceback" not in err
     assert find_processes(port) == []
