@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -84,8 +85,9 @@ def test_with_a_full_disk_a_run_is_refused_in_one_line_and_the_one_before_it_can
         run.send_signal(signal.SIGKILL)
         run.communicate()
         filler = fill(disk)
-        for again in (first_part(tmp_path, PORT, disk / "report"),
-                      started(tmp_path, PORT, "--resume", str(disk / "report"))):
+        for start in (partial(first_part, tmp_path, PORT, disk / "report"),
+                      partial(started, tmp_path, PORT, "--resume", str(disk / "report"))):
+            again = start()
             told = again.communicate(timeout=60)[1]
             assert again.returncode == 2
             assert "run.json: cannot be written: No space left on device" in told

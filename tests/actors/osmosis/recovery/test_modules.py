@@ -527,5 +527,5 @@ def test_it_hears_the_heartbeats_of_its_nodes_and_its_own_commands_only():
 
 @pytest.mark.parametrize("nodes", ["a", [], [1], [""]])
 def test_a_list_of_nodes_that_is_none_is_refused_by_name(nodes):
-    with pytest.raises(ValueError, match=r"RM3: x\.nodes = .*: expected a list of node names"):
+    with pytest.raises(ValueError, match=r"RM3: x\.nodes.* = .*: expected a "):
         read_parameters(Respawn.Parameters, {"nodes": nodes}, "RM3", "x")
