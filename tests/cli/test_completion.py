@@ -11,13 +11,15 @@ from types import SimpleNamespace
 import pytest
 
 from rampart.cli import completion
+from rampart.testing.ports import free_base_port
 
 
 def offered(line: str, told: Path) -> set[str]:
     """Return what is offered at the end of a line, as argcomplete's shell function asks for it."""
     subprocess.run([sys.executable, "-m", "rampart.cli.main"], check=True, timeout=30, env={
         **os.environ, "COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9",
-        "_ARGCOMPLETE": "1", "IFS": "\013", "_ARGCOMPLETE_STDOUT_FILENAME": str(told)})
+        "_ARGCOMPLETE": "1", "IFS": "\013", "_ARGCOMPLETE_STDOUT_FILENAME": str(told),
+        "RAMPART_PORT": str(free_base_port())})  # no run is there, whatever else runs
     return {word.strip() for word in told.read_text().split("\013")} - {""}
 
 
