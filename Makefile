@@ -30,7 +30,7 @@ lint: setup
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
 
-# Times loading, deciding and verifying; two minutes. The figures are in docs/measurements.md.
+# Times loading, deciding and verifying; two minutes. The figures are in docs/evidence/performance.md.
 bench: setup
 	$(BIN)/python -m pytest benchmarks -q -s
 

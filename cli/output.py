@@ -26,7 +26,10 @@ class NoEffectError(Exception):
 
 
 FORMAT = 1
-"""Of every JSON object that a verb prints, see docs/json.md; it grows when a field changes."""
+"""Of every JSON object that a verb prints; it grows when a field changes its meaning.
+
+See docs/reference/json.md.
+"""
 
 _LISTED = 12
 _NEAREST = 3

@@ -1,7 +1,7 @@
 """Rampart: a fault-tolerant robot controller you can kill, node by node, while it works.
 
-What `__init__.pyi` lists is for classes and tests of one's own; `docs/api.md` says what each is
-for. A name is imported when it is first used, so that a process that needs little starts soon.
+`__init__.pyi` lists the public names, and `docs/reference/api.md` describes each. A name is
+imported when it is first used, so that a process that needs little starts soon.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The names for classes and tests of one's own; `docs/api.md` says what each is for."""
+"""The names for classes and tests of one's own; `docs/reference/api.md` says what each is for."""
 
 from rampart.actors.bus.envelope import Header as Header
 from rampart.actors.bus.messages import InjectionReport as InjectionReport

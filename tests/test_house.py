@@ -157,7 +157,7 @@ def test_no_circle_of_imports():
 
 def the_map() -> str:
     """Return the part of the architecture's page that says which code is where."""
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
     return page.partition("## The house")[2].partition("\n## ")[0]
 
 

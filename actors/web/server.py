@@ -3,7 +3,7 @@
 Uvicorn's own `Server` takes over signals and wakes up ten times a second, so it is not used. What
 is bounded: connections (beyond `ROOM` uvicorn answers 503), the length of a message, idle
 connections, WebSockets that do not answer a ping. On a network with strangers the server stands
-behind a reverse proxy (docs/security.md).
+behind a reverse proxy (docs/explanation/security.md).
 """
 
 from __future__ import annotations

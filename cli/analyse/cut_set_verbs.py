@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     Find the minimal sets of events that make the top event of a fault tree
     occur. For a system spec also the mechanisms that are barriers on each, and
     what single event is left before the top. Sets are counted without listing
-    them, so millions are no problem. docs/fault-trees.md says how.
+    them, so millions are no problem. docs/explanation/fault-trees.md says how.
 
     Examples:
       rampart cut-sets                              the shipped system

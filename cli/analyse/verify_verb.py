@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> int:
     Check a system as `rampart check` does, and its arbitration exhaustively:
     what each strategy decides for every set of active mechanisms, and every state
     of the arbiter that carries it out, from when it has heard every module. A property holds, or
-    the shortest counterexamples are shown. docs/verification.md explains the
+    the shortest counterexamples are shown. docs/explanation/arbitration.md explains the
     properties, and what is not looked at.
 
     Examples:

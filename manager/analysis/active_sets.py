@@ -29,7 +29,7 @@ class Property(msgspec.Struct, frozen=True):
     """One property of one strategy, as checked.
 
     Attributes:
-        name: See `docs/verification.md`.
+        name: See `docs/explanation/arbitration.md`.
         strategy: Of which strategy; "" if it does not depend on one.
         holds: No counterexample exists.
         cases: How many cases were checked.

@@ -9,8 +9,8 @@ What is explored is the arbiter itself (`Arbiter.step`), in two compositions:
   reported at any moment. It shows that the arbiter never lets two hold the same resource.
 
 In both, detection modules change at any moment, a message takes any time or is lost, and any
-deadline may pass. Three reductions keep that finite and small; `docs/verification.md` argues for
-each:
+deadline may pass. Three reductions keep that finite and small;
+`docs/explanation/arbitration.md` argues for each:
 
 * *Time.* A deadline may pass whenever it runs. That is more than can happen, so what holds here
   holds in time.

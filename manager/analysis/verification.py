@@ -2,7 +2,7 @@
 
 `verify` puts together what `rampart.manager.analysis.active_sets` finds about decisions and what
 `rampart.manager.analysis.transitions` finds about their execution. What each property means, why it
-matters, and what was found about the paper's strategy is in `docs/verification.md`.
+matters, and what was found about the paper's strategy is in `docs/explanation/arbitration.md`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What tests of a robot need: actors in virtual time, real runs, faults; see docs/testing.md.
+"""Tests of a robot: actors in virtual time, real runs, faults; see docs/how-to/testing.md.
 
 Nothing here knows a robot. Failed expectations are `AssertionError`s; pytest is not needed.
 """

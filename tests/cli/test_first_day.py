@@ -126,7 +126,7 @@ class Sick(Actor):
 @pytest.mark.processes
 @pytest.mark.alone
 def test_a_real_run_with_a_node_that_never_comes_up_ends_with_1_and_names_it(tmp_path):
-    head = (ROOT / "docs" / "specification.md").read_text(encoding="utf-8").split(
+    head = (ROOT / "docs/reference/specification.md").read_text(encoding="utf-8").split(
         "```toml\n")[1].split("[[node]]")[0]
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "first_day_parts.py").write_text(PARTS)

@@ -1,4 +1,4 @@
-"""docs/api.md: what it lists is there."""
+"""docs/reference/api.md: what it lists is there."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import rampart.testing
 from rampart.actors.system.members import load_class
 from tests import ROOT
 
-DOCUMENT = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+DOCUMENT = (ROOT / "docs/reference/api.md").read_text(encoding="utf-8")
 NAMES = re.findall(r"^\| `(\w+)` \| `(rampart\.[\w.]+)` \|", DOCUMENT, re.MULTILINE)
 CLASSES = re.findall(r"^\| `(rampart\.[\w.]+:\w+)` \|", DOCUMENT, re.MULTILINE)
 

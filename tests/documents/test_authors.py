@@ -1,4 +1,4 @@
-"""docs/authors.md: followed to the letter, block by block."""
+"""docs/tutorials/your-own-robot.md: followed to the letter, block by block."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests import ROOT
 
-DOCUMENT = (ROOT / "docs" / "authors.md").read_text(encoding="utf-8")
+DOCUMENT = (ROOT / "docs/tutorials/your-own-robot.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", DOCUMENT, re.DOTALL | re.MULTILINE)
 
 

@@ -1,4 +1,4 @@
-"""docs/foreign_nodes.md: its C and its Python are nodes that work, its numbers are right."""
+"""docs/how-to/any-language.md: its C and its Python are nodes that work, its numbers are right."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rampart.testing import RealRun, VirtualSystem, run
 from tests import ROOT
 from tests.actors.access.keyed import layout_of, make_keys
 
-TEXT = (ROOT / "docs/foreign_nodes.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs/how-to/any-language.md").read_text(encoding="utf-8")
 
 
 def block(language: str, begins: str = "") -> str:

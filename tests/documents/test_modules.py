@@ -1,4 +1,4 @@
-"""docs/modules.md: its system is what it says, and its table has the parameters there are."""
+"""docs/how-to/ready-modules.md: its system is sound, its table complete."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rampart.actors.system.members import load_class
 from rampart.testing import VirtualSystem, run
 from tests import ROOT
 
-TEXT = (ROOT / "docs/modules.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs/how-to/ready-modules.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| `(\w+):(\w+)` \|.*\| (.*) \|$", TEXT, re.MULTILINE)
 
 

@@ -1,4 +1,4 @@
-"""docs/specification.md: every field is in it, and its worked example works."""
+"""docs/reference/specification.md: every field is in it, and its worked example works."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from rampart.testing import run, virtual_run
 from tests import ROOT
 from tests.osmosis_system import System
 
-DOCUMENT = (ROOT / "docs" / "specification.md").read_text(encoding="utf-8")
+DOCUMENT = (ROOT / "docs/reference/specification.md").read_text(encoding="utf-8")
 EXAMPLE = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 MODULES = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 

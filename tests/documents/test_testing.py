@@ -1,4 +1,4 @@
-"""docs/testing.md: its examples, on the tank of docs/specification.md, are run as they stand."""
+"""docs/how-to/testing.md: its examples, on the tank of the specification's page, are run."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import pytest
 from rampart import testing
 from tests import ROOT
 
-DOCUMENT = (ROOT / "docs" / "testing.md").read_text(encoding="utf-8")
+DOCUMENT = (ROOT / "docs/how-to/testing.md").read_text(encoding="utf-8")
 EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n(?:(?!^## ).)*?```python\n(.*?)```", DOCUMENT,
                            re.DOTALL | re.MULTILINE))
-TANK = (ROOT / "docs" / "specification.md").read_text(encoding="utf-8")
+TANK = (ROOT / "docs/reference/specification.md").read_text(encoding="utf-8")
 GAUGE = '[[node]]\nname = "gauge"\nactor = "tank_actors:Gauge"\nkind = "non-control"\n\n'
 
 

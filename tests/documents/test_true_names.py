@@ -22,7 +22,8 @@ TO_COME = {"run"}
 """Verbs that are documented and not there yet."""
 
 PAGES = {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8")
-         for file in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
+         for file in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+         if file.parent.name != "log"}
 PAGES["CHANGELOG.md"] = (ROOT / "CHANGELOG.md").read_text(
     encoding="utf-8").partition("## Unreleased")[2].partition("\n## ")[0]
 KEYS = set(re.findall(r"^\| `([^`]+)` \|", (ROOT / "topics.md").read_text(encoding="utf-8"),

@@ -58,7 +58,7 @@ def test_a_folder_that_is_gone_is_not_searched(tmp_path, monkeypatch):
     assert working_folder.why_not() == "the working folder is gone (No such file or directory)"
 
 
-TANK = (ROOT / "docs" / "modules.md").read_text(encoding="utf-8")
+TANK = (ROOT / "docs/how-to/ready-modules.md").read_text(encoding="utf-8")
 TANK_ACTORS = TANK.split("```python\n")[1].split("```")[0]
 TANK_TOML = TANK.split("```toml\n")[1].split("```")[0]
 

@@ -32,7 +32,7 @@ def application_of(text: str) -> str:
     return text[text.index("[application]"):text.index("\n\n", text.index("[application]"))]
 
 
-TANK = (ROOT / "docs" / "specification.md").read_text(
+TANK = (ROOT / "docs/reference/specification.md").read_text(
     encoding="utf-8").split("```toml\n")[1].split("```")[0]
 PORTER = changed(PAPER, (application_of(PAPER), ""), (WORLD, ""))
 

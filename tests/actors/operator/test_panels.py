@@ -136,7 +136,7 @@ def test_what_the_page_hears_anyway_can_be_shown_as_well():
 
 
 def test_the_examples_of_the_document_are_sound(tmp_path):
-    document = (ROOT / "docs" / "hmi.md").read_text("utf-8")
+    document = (ROOT / "docs/how-to/operator-page.md").read_text("utf-8")
     toml, python = (re.findall(rf"```{kind}\n(.*?)```", document, re.DOTALL)[0]
                     for kind in ("toml", "python"))
     assert shown(layout(toml)) == [

@@ -100,7 +100,7 @@ def test_the_handbook_lists_every_metric_with_its_labels():
     found = {s.name: set(s.labels) for f in parser.text_string_to_metric_families(text)
              for s in f.samples}
     listed = {}
-    for line in (ROOT / "docs" / "operations.md").read_text("utf-8").splitlines():
+    for line in (ROOT / "docs/how-to/terminal.md").read_text("utf-8").splitlines():
         if line.startswith("| `rampart_") and "of a run with keys" not in line:
             _, names, labels, _ = line.split("|")
             for name in re.findall(r"`(?:rampart)?_(\w+)`", names):

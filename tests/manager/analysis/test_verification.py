@@ -143,7 +143,7 @@ def test_every_alternative_and_every_number_of_failures_is_explored():
 
 
 def test_the_start_of_a_manager_is_not_explored_and_holds_less():
-    """The example in docs/verification.md: if this fails, the limits there can be narrowed."""
+    """If this fails, the limits in docs/explanation/arbitration.md can be narrowed."""
     bench = Bench(oriented=False)
     bench.active("DM6")
     bench.report("RM2", RecoveryPhase.DEGRADED, 41)  # ordered by the manager before this one

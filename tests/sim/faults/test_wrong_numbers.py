@@ -67,7 +67,7 @@ def test_a_number_stays_within_its_range_and_is_wrong_all_the_same(field, by, wr
     assert getattr(corrupt(JOINT, order, 0.0, Random(1)), field) == wrong
 
 
-TANK = (ROOT / "docs" / "specification.md").read_text(
+TANK = (ROOT / "docs/reference/specification.md").read_text(
     encoding="utf-8").split("```toml\n")[1].split("```")[0]
 FAULT = """
 [[fault]]

@@ -3,8 +3,8 @@
 While localization is dead, frozen or late, its reader still hears the wheels. The last pose plus
 the way that odometry measured since *the pose's stamp* is where the robot is now: wheels and a
 straight way are good to a few millimetres per metre, a turn of a skid-steer robot to a tenth of a
-radian (docs/localization.md). That holds for some metres and not for ever, so beyond the bound
-there is no pose, and its reader has to stop.
+radian (docs/case-study/localization.md). That holds for some metres only. Beyond the bound there
+is no pose, and its reader has to stop.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ _TOO_LONG_S = 1.0
 
 
 class FilterLimits(msgspec.Struct, frozen=True):
-    """Noise, gates and bounds; docs/localization.md says where the numbers come from.
+    """Noise, gates and bounds; docs/case-study/localization.md says where the numbers come from.
 
     Args:
         bridge_m: how far the robot may go while fewer than two witnesses agree.

@@ -33,7 +33,7 @@ WHEELS = "dead reckoning"
 
 Place = tuple[float, float]
 
-# When witnesses agree; docs/localization.md says where the numbers come from.
+# When witnesses agree; docs/case-study/localization.md says where the numbers come from.
 APART_M = 0.3
 """Two positions farther apart than this differ."""
 

@@ -39,7 +39,7 @@ NAMES = [name for name in SENSOR_FAULTS if name.startswith(SENSORS)]
 NAMES += [f"{mode}:{key}" for mode in ("drop", "freeze", "delay", "corrupt") for key in KEYS]
 
 BOUND_M = 0.15
-"""Of the true error under any single fault of a source; docs/localization.md."""
+"""Of the true error under any single fault of a source; docs/case-study/localization.md."""
 
 
 @dataclass
