@@ -17,7 +17,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -85,6 +85,25 @@ def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO
     except OSError as error:
         raise BagError(f"{path}: cannot be written: {error.strerror or error}") from None
     return file
+
+
+@contextlib.contextmanager
+def new_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
+    """Have a new file; an incomplete one is not left behind.
+
+    Raises:
+        BagError: it exists, or cannot be written.
+    """
+    file = open_target(path, overwrite=overwrite)
+    try:
+        with file:
+            yield file
+    except BaseException as error:
+        if path.is_file():  # not a device
+            path.unlink()
+        if isinstance(error, OSError):
+            raise BagError(f"{path}: {error.strerror or error}") from None
+        raise
 
 
 class SequenceGaps:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import sqlite3
 import struct
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Message, Metadata
 
 from rampart.actors.recording.bag_reader import BagReader, repair
+from rampart.actors.recording.bag_writer import BagError
 from tests.actors.recording.mcap_conformance import DIGEST, variants
 
 FILES = list(variants())
@@ -62,3 +65,35 @@ def test_a_bag_of_rosbag2_is_read_as_the_independent_reader_reads_it(tmp_path, p
             for one in reader.records() if isinstance(one, Message)] == expected
     assert (reader.closed, reader.damage, len(messages)) == (True, "", len(expected))
     assert repair(reader, tmp_path / "copy.mcap") == len(expected)
+
+
+def test_a_bag_of_rosbag2_in_sqlite_is_read_and_copied_into_mcap(tmp_path):
+    path, copy = tmp_path / "talker_0.db3", tmp_path / "talker.mcap"
+    with contextlib.closing(sqlite3.connect(path)) as bag, bag:
+        bag.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, "
+            "serialization_format TEXT, offered_qos_profiles TEXT);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
+            "data BLOB);"
+            "INSERT INTO topics VALUES(7, '/talker', 'std_msgs/msg/String', 'cdr', '');")
+        bag.executemany("INSERT INTO messages VALUES(NULL, 7, ?, ?)",
+                        [(20, b"b"), (10, b"a" * 9000)])
+    messages, _, reader = found(path)
+    assert [one[14:22] for one in messages] == [struct.pack("<Q", at) for at in (10, 20)]
+    assert (reader.channels[7].topic, reader.schemas[7].name, reader.damage) == (
+        "/talker", "std_msgs/msg/String", "")
+    assert repair(reader, copy) == 2
+    with copy.open("rb") as file:
+        assert [(schema.name, channel.message_encoding, message.data) for schema, channel, message
+                in make_reader(file).iter_messages()] == [
+            ("std_msgs/msg/String", "cdr", data) for data in (b"a" * 9000, b"b")]
+    path.write_bytes(path.read_bytes()[:4096])  # its first page, without the messages
+    assert found(path)[2].gaps
+
+
+def test_a_folder_or_a_file_compressed_as_a_whole_is_refused_with_the_remedy(tmp_path):
+    (tmp_path / "run_0.mcap.zstd").write_bytes(b"\x28\xb5\x2f\xfd\0\0\0\0")
+    for path, words in ((tmp_path, "it has run_0.mcap.zstd"),
+                        (tmp_path / "run_0.mcap.zstd", "decompress it first")):
+        with pytest.raises(BagError, match=words):
+            BagReader(path)

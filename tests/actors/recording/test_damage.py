@@ -93,7 +93,7 @@ def test_a_damaged_attachment_is_left_out_and_reported(tmp_path, recording):
     at = data.index(b"[[node]]")
     found, reader = spoiled(tmp_path / "run.mcap", data, at, 1)
     assert found == everything
-    assert [gap.what.split(" (")[0] for gap in reader.gaps] == ["an attachment"]
+    assert [gap.what.split(" (")[0] for gap in reader.gaps] == ["attachment"]
 
 
 @pytest.fixture
