@@ -122,7 +122,6 @@ async def world():
 @pytest.fixture
 def patient(monkeypatch):
     """For tests in which time is not the subject: a busy machine is no silent page."""
-    from rampart.actors.operator import stick as hmi_stick
+    from rampart.actors.operator import stick_arbitration
 
-    monkeypatch.setattr(hmi_stick, "SILENCE_S", 5.0)
-    monkeypatch.setattr(hmi_stick, "TICKET_S", 5.0)
+    monkeypatch.setattr(stick_arbitration, "TIMEOUT_S", 5.0)

@@ -225,7 +225,7 @@ class Operating:
 
     def _view_stick(self, panel: str, stick: Stick, now_s: float) -> dict[str, Any]:
         works, text = self.effect(panel, now_s)
-        return {"holder": stick.desk.holder, "works": works, "text": text, "note": stick.note}
+        return {"holder": stick.holder, "works": works, "text": text, "note": stick.note}
 
     def view(self, now_s: float) -> dict[str, Any]:
         """Return the section: who drives, the strategy and the faults."""

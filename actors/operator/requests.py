@@ -16,6 +16,7 @@ from rampart.actors.web.visitors import Role
 
 Name = Annotated[str, msgspec.Meta(max_length=200)]
 _Seconds = Annotated[float, msgspec.Meta(ge=0, le=86_400)]
+_Share = Annotated[float, msgspec.Meta(ge=-1, le=1)]
 R = TypeVar("R")
 
 
@@ -71,15 +72,17 @@ class EndFaultRequest(Request, frozen=True, tag="end-fault"):
 class StickRequest(Request, frozen=True, tag="stick"):
     """Where the stick of a panel is, and whether the operator holds it.
 
-    `ticket` is the newest that the page was given (`stick`). Forward and left are in [-1, 1].
+    `ticket` is the newest that the page was given (`stick`), `pressed_s` for how long the stick has
+    been held by the browser's clock.
     """
 
     role = Role.DRIVE
     panel: Name
     held: bool
-    ticket: int = 0
-    forward: float = 0.0
-    left: float = 0.0
+    ticket: float = 0.0
+    forward: _Share = 0.0
+    left: _Share = 0.0
+    pressed_s: float = 0.0
 
 
 REQUESTS: tuple[type[Request], ...] = (

@@ -1,17 +1,12 @@
 // A stick: arrow keys or WASD, a pad to drag, a gamepad. Each is its own dead man.
 //
 // While something is held, the position is sent 20 times a second with the newest ticket of the
-// HMI; silence is letting go. Whatever ends the hold (key up, pointer up, focus lost, tab hidden,
-// page closed) says so at once.
-//
-// *Barred* is what was held when it must not drive: before there was a connection, across the loss
-// of one, without focus, or so long that the connection must be stalled. It has to be let go first:
-// the robot moves because somebody presses, never because something recovers.
+// HMI, which alone decides who drives; silence is letting go. Whatever ends the hold (key up,
+// pointer up, focus lost, tab hidden, page closed) is sent at once.
 
 import { element, pill, say } from "./dom.js";
 
 const PERIOD_MS = 50;
-const PATIENCE_MS = 1000;  // so long a press may wait until it drives; see `answered`
 const DEAD_ZONE = .12;
 const SHOULDERS = [4, 5];  // of a standard gamepad: either is the dead man
 const KEYS = {
@@ -25,53 +20,44 @@ export class Stick {
   static kind = "stick";
 
   constructor(room, page) {
-    this.send = page.send;
     this.visitor = page;
     this.panel = page.declared.title;
     this.axes = page.declared.stick.length;  // forward alone, or left as well
     this.gamepads = false;  // a gamepad is for the first stick of a page
+    this.armed = false;     // whether the gamepad was seen at rest, in this window
     this.keys = new Set();
     this.dragged = null;
-    this.held = false;
-    this.heldSince = 0;
-    this.met = false;  // whether the present hold was answered
-    this.drove = false;  // whether it has driven
-    this.barred = false;
-    this.focused = document.hasFocus();
+    this.timer = 0;         // of a hold
+    this.since = 0;
+    this.drives = false;
+    this.text = "";
     this.ticket = 0;
-    this.page = null;
-    this.grip = "free";
-    this.refusal = "";
+    this.page = null;       // its number; null while not connected
     this.status = null;
-    this.timer = null;
     this.build(room);
     this.listen();
   }
 
   build(room) {
-    const named = (tag, what) => Object.assign(element(tag), { id: `${room.title.id}-${what}` });
+    const keys = this.axes > 1 ? "arrow keys or W A S D" : "up or down key, W or S";
     room.section.classList.add("operate");
+    this.state = element("span", "pill");
     const state = element("span", "stick-state");
-    this.state = element("span", "pill warn", "not connected");
     state.append(this.state);
     room.title.append(" ", state);
     this.pad = element("div", this.axes > 1 ? "stick" : "stick upright");
     this.pad.tabIndex = 0;
-    this.wanted = this.axes > 1 ? "arrow keys or W A S D" : "up or down key, W or S";
     this.pad.setAttribute("role", "application");
-    this.pad.setAttribute("aria-label", `Stick: hold the ${this.wanted} to drive`);
+    this.pad.setAttribute("aria-label", `Stick: hold the ${keys} to drive`);
     this.knob = element("div", "stick-knob");
     this.pad.append(this.knob);
-    const words = element("div", "stick-words");
     const speed = element("label", "", "Speed ");
     this.share = Object.assign(element("input"), { type: "range", min: 10, max: 100, step: 10, value: 50 });
     speed.append(this.share);
-    this.how = named("p", "how");
-    this.how.className = "quiet";
-    this.words = named("p", "text");
-    this.words.className = "stick-text";
-    this.words.setAttribute("role", "status");
+    this.how = Object.assign(element("p", "quiet", `Drag the stick, or click it and hold the ${keys}. Letting go stops.`), { id: `${room.title.id}-how` });
+    this.words = Object.assign(element("p", "stick-text"), { id: `${room.title.id}-text`, role: "status" });
     this.pad.setAttribute("aria-describedby", `${this.how.id} ${this.words.id}`);
+    const words = element("div", "stick-words");
     words.append(this.how, speed, this.words);
     this.row = element("div", "stick-row");
     this.row.append(this.pad, words);
@@ -95,20 +81,21 @@ export class Stick {
     addEventListener("pagehide", () => this.letGo());
     document.addEventListener("visibilitychange", () => { if (document.hidden) this.letGo(); });
     addEventListener("gamepadconnected", () => {
-      if (this.pressed()) this.barred = true;  // plugging in moves nothing
-      this.pollGamepad();
+      this.armed = false;  // plugging in moves nothing
+      this.update();
+      this.polling ||= setInterval(() => this.update(), PERIOD_MS);
     });
     addEventListener("gamepaddisconnected", () => this.update());
   }
 
   key(event, down) {
     if (event.ctrlKey || event.altKey || event.metaKey) {
-      this.letGo();  // a browser need not tell which keys are let go under one of these
+      this.letGo();  // a browser need not report which keys are released under one of these
       return;
     }
     if (!KEYS[event.code]?.slice(0, this.axes).some(Boolean)) return;
     event.preventDefault();  // do not scroll
-    if (down && event.repeat && !this.keys.has(event.code)) return;  // held since before: press anew
+    if (down && event.repeat && !this.keys.has(event.code)) return;  // held since before: press again
     if (down) this.keys.add(event.code); else this.keys.delete(event.code);
     this.update();
   }
@@ -116,150 +103,92 @@ export class Stick {
   drag(event) {
     const box = this.pad.getBoundingClientRect();
     const radius = box.width / 2;
-    let [x, y] = [(event.clientX - box.left) / radius - 1, (event.clientY - box.top) / radius - 1];
-    if (this.axes < 2) x = 0;
-    const length = Math.hypot(x, y);
-    if (length > 1) { x /= length; y /= length; }
-    this.dragged = [-y, -x];
+    const x = this.axes > 1 ? (event.clientX - box.left) / radius - 1 : 0;
+    const y = (event.clientY - box.top) / radius - 1;
+    const length = Math.max(Math.hypot(x, y), 1);
+    this.dragged = [-y / length, -x / length];
     this.update();
   }
 
-  pollGamepad() {
-    if (this.polling) return;
-    this.polling = setInterval(() => {
-      if (![...navigator.getGamepads()].some(Boolean)) {
-        clearInterval(this.polling);
-        this.polling = null;
-      }
-      this.update();
-    }, PERIOD_MS);
-  }
-
-  /** Position of the gamepad whose shoulder button is held, or null: it drives a window with focus. */
+  /** Where the gamepad is whose shoulder button is held; a press in another window does not count. */
   gamepad() {
-    return document.hasFocus() ? this.pressed() : null;
+    const pads = this.gamepads && navigator.getGamepads ? [...navigator.getGamepads()] : [];
+    const pad = pads.find((one) => one?.connected && SHOULDERS.some((i) => one.buttons[i]?.pressed));
+    if (!pad || !document.hasFocus()) this.armed = !pad;
+    if (!pad || !this.armed) return null;
+    const axis = (i) => (Math.abs(pad.axes[i] || 0) < DEAD_ZONE ? 0 : -pad.axes[i]);
+    return [axis(1), this.axes > 1 ? axis(0) : 0];
   }
 
-  /** The same, whoever has the focus. */
-  pressed() {
-    for (const pad of this.gamepads && navigator.getGamepads ? navigator.getGamepads() : []) {
-      if (!pad || !pad.connected || !SHOULDERS.some((i) => pad.buttons[i]?.pressed)) continue;
-      const axis = (i) => (Math.abs(pad.axes[i] || 0) < DEAD_ZONE ? 0 : pad.axes[i]);
-      return [-axis(1), this.axes > 1 ? -axis(0) : 0];
-    }
-    return null;
-  }
-
-  /** Where the stick is: [forward, left] in [-1, 1], or null if nothing is held. */
+  /** Where the stick is: [forward, left] in [-1, 1], or null if it is not held. */
   position() {
+    const pad = this.gamepad();
     if (this.visitor.barred("stick")) return null;
     const share = this.share.valueAsNumber / 100;
-    const pad = this.gamepad();
-    if (this.dragged || pad) return (this.dragged || pad).map((value) => clip(value * share));
-    if (!this.keys.size) return null;
-    let [forward, left] = [0, 0];
-    for (const code of this.keys) { forward += KEYS[code][0]; left += KEYS[code][1]; }
-    return [clip(forward) * share, clip(left) * share];
+    let at = this.dragged || pad;
+    if (!at && this.keys.size) at = [0, 1].map((axis) => [...this.keys].reduce((sum, code) => sum + KEYS[code][axis], 0));
+    return at && at.map((value) => clip(value) * share);
   }
 
   /** Something was pressed or let go. */
   update() {
-    const focused = document.hasFocus();
-    if (focused && !this.focused && this.pressed()) this.barred = true;  // meant for another window
-    this.focused = focused;
     const at = this.position();
-    if (!at) {
-      this.barred = false;
-      this.release();
-    } else if (this.page === null) {
-      this.barred = true;
-    } else if (!this.held && !this.barred) {
-      this.held = true;
-      this.heldSince = performance.now();
-      this.met = this.drove = false;
-      this.refusal = "";
-      this.timer = setInterval(() => this.speak(), PERIOD_MS);
-      this.speak();
+    if (at && !this.timer) {
+      this.since = performance.now();
+      this.text = "";
+      this.timer = setInterval(() => this.report(), PERIOD_MS);
+      this.report();
+    } else if (!at && this.timer) {
+      clearInterval(this.timer);
+      this.timer = 0;
+      this.drives = false;
+      this.report();
     }
     this.draw();
   }
 
-  /** Forget what is held: its end may not be told to a page without focus. */
+  /** Forget what is held: a page without focus need not be told of its end. */
   letGo() {
     this.keys.clear();
     this.dragged = null;
-    this.barred = this.pressed() !== null;  // it is still
-    this.release();
-    this.draw();
+    this.armed = false;
+    this.update();
   }
 
-  release() {
-    if (!this.held) return;
-    this.held = false;
-    clearInterval(this.timer);
-    this.send({ type: "stick", panel: this.panel, held: false });
-  }
-
-  speak() {
+  report() {
     const at = this.position();
-    if (!at) { this.update(); return; }
-    this.send({ type: "stick", panel: this.panel, held: true, ticket: this.ticket, forward: at[0], left: at[1] });
+    if (this.page === null) return;
+    this.visitor.send(at ? { type: "stick", panel: this.panel, held: true, ticket: this.ticket,
+      forward: at[0], left: at[1], pressed_s: (performance.now() - this.since) / 1000 }
+      : { type: "stick", panel: this.panel, held: false });
   }
 
   // ---- what the HMI says ------------------------------------------------------------------------
 
   begin(hello) {
     this.gamepads = hello.panels.find((panel) => panel.stick).title === this.panel;
-    const gamepad = this.gamepads ? ", or hold a shoulder button of a gamepad" : "";
-    say(this.how, `Drag the stick, or click it and hold the ${this.wanted}${gamepad}. Letting go stops.`);
+    if (this.gamepads && !this.how.textContent.includes("gamepad")) this.how.append(" Or hold a shoulder button of a gamepad.");
   }
 
   receive(message) {
-    if (message.type === "operating") this.introduced(message.page);
-    if (message.type !== "stick" || message.panel !== this.panel) return false;
-    this.answered(message);
-    return true;
-  }
-
-  introduced(page) {
-    this.page = page;
-    this.visitor.bar(this.row, "stick");
-    this.ticket = 0;
-    this.barred = this.position() !== null;
-    this.draw();
-  }
-
-  answered(message) {
-    this.ticket = message.ticket;
-    this.grip = message.grip;
-    if (message.text) this.refusal = message.text;
-    else if (message.grip === "drives") this.refusal = "";
-    if (this.held && !this.drove && ["waits", "drives"].includes(message.grip)) this.go(message.grip);
-    this.draw();
-  }
-
-  /** The present hold was answered and has not driven yet: go on, unless it was pressed too long ago. */
-  go(grip) {
-    if (performance.now() - this.heldSince > PATIENCE_MS) {
-      this.release();
-      this.barred = true;
-      this.refusal = "the connection is too slow to drive, or was stalled";
-    } else if (grip === "drives") {
-      this.drove = true;
-    } else if (!this.met) {
-      this.met = true;
-      this.speak();  // now with a ticket
+    if (message.type === "operating") {
+      this.page = message.page;
+      this.ticket = 0;
+      this.visitor.bar(this.row, "stick");
+      if (!this.visitor.barred("stick")) this.report();  // the HMI follows who was seen at rest
+    } else if (message.type === "stick" && message.panel === this.panel) {
+      ({ ticket: this.ticket, drives: this.drives } = message);
+      if (message.text || message.drives) this.text = message.text;
+    } else {
+      return false;
     }
+    this.draw();
+    return message.type === "stick";
   }
 
   offline() {
-    if (this.held) {
-      this.held = false;
-      this.barred = true;
-      clearInterval(this.timer);
-    }
-    this.grip = "free";
     this.page = null;
+    this.drives = false;
     this.draw();
   }
 
@@ -270,23 +199,20 @@ export class Stick {
   }
 
   draw() {
-    const at = this.position();
-    const [forward, left] = at || [0, 0];
+    const [forward, left] = this.position() || [0, 0];
     this.knob.style.transform = `translate(${-left * 100}%, ${-forward * 100}%)`;
-    const driving = this.held && this.grip === "drives";
+    const driving = Boolean(this.timer) && this.drives;
     this.pad.classList.toggle("driving", driving);
-    const status = this.status;
+    const { status } = this;
     const other = status && status.holder !== null && status.holder !== this.page;
-    if (this.page === null || !status) pill(this.state, "warn", "not connected");
-    else if (this.visitor.barred("stick")) pill(this.state, "", "not for you");
-    else if (other) pill(this.state, "warn", `page ${status.holder} drives`);
-    else if (!status.works) pill(this.state, "warn", "no effect now");
-    else if (driving && status.note) pill(this.state, "warn", "not followed");
-    else if (driving) pill(this.state, "good", "you drive");
-    else pill(this.state, "", "free");
-    this.pad.classList.toggle("useless", Boolean(status && (other || !status.works)));
-    const texts = [this.refusal, this.barred ? "let go first, then press again" : "",
-      status ? status.text : "", status ? status.note : ""];
-    say(this.words, texts.filter(Boolean).join(" · "));
+    const [kind, text] = this.page === null || !status ? ["warn", "not connected"]
+      : this.visitor.barred("stick") ? ["", "not for you"]
+        : other ? ["warn", `page ${status.holder} drives`]
+          : !status.works ? ["warn", "no effect now"]
+            : !driving ? ["", "free"]
+              : status.note ? ["warn", "not followed"] : ["good", "you drive"];
+    pill(this.state, kind, text);
+    this.pad.classList.toggle("useless", Boolean(other || (status && !status.works)));
+    say(this.words, [this.text, status?.text, status?.note].filter(Boolean).join(" · "));
   }
 }

@@ -16,7 +16,6 @@ from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.panels import Panel
-from rampart.actors.operator.stick import TICKET_S
 from rampart.actors.runtime.actor import Actor, Header, on
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import published
@@ -301,43 +300,17 @@ async def test_it_is_told_again_and_again_while_it_is_held_and_at_rest_once(worl
     assert robot.hands.count(AT_REST) == 2
 
 
-async def test_a_page_that_falls_silent_closes_or_is_late_has_let_go(world, monkeypatch):
-    async with driven(world) as (robot, _, at):
-        async with open_page(at) as page:
-            await Driver(page).take()
-            await rests(robot)
-        async with open_page(at) as page:
-            await Driver(page).take()
-        await rests(robot)
-        async with open_page(at) as page:
-            hand = Driver(page)
-            await hand.take()
-            monkeypatch.setattr("rampart.actors.operator.stick.TICKET_S", -1.0)
-            assert (await hand.hold())["grip"] == "late"
-            await rests(robot)
-            monkeypatch.setattr("rampart.actors.operator.stick.TICKET_S", TICKET_S)
-            assert (await hand.hold())["grip"] == "lapsed"
-            await rests(robot)
-
-
 @pytest.mark.usefixtures("patient")
 async def test_what_is_no_message_of_this_stick_moves_nothing(world):
     async with driven(world) as (robot, _, at):
         async with open_page(at) as page:
             told = await ask(page, type="stick", panel="Drvie", held=True)
             assert told == {"type": "error", "text": "no stick 'Drvie'; there are: Drive"}
-            for wrong in ('"forward":NaN', '"forward":1e999', '"left":"x"', '"forward":[1]'):
+            for wrong in ('"forward":NaN', '"forward":1e999', '"left":"x"', '"forward":[1]',
+                          '"forward":-1e308'):
                 await page.send(f'{{"type":"stick","panel":"Drive","held":true,{wrong}}}')
                 assert "not understood" in (await hear(page, "error"))["text"]
-            hand = Driver(page)
-            await hand.take()
-            await page.send('{"type":"stick","panel":"Drive","held":true,"forward":-1e308}')
-            told = await hear(page, "stick")
-            assert (told["grip"], told["text"]) == (
-                "refused", "forward = -1e+308: must be between -1 and 1; the stick was taken from "
-                "you, let go first")
-            await rests(robot)
-    assert {hand.forward for hand in robot.hands} <= {0.0, 0.25}
+    assert set(robot.hands) <= {AT_REST}
 
 
 @pytest.mark.usefixtures("patient")
@@ -348,7 +321,8 @@ async def test_two_sticks_are_held_by_two_pages_and_each_by_one(world):
         async with open_page(at) as one, open_page(at) as two:
             await Driver(one, "Level").take()
             other = Driver(two, "Level")
-            assert (await other.hold())["text"] == "page 1 has the stick"
+            await other.hold()
+            assert "page 1 has the stick" in (await other.hold())["text"]
             await Driver(two, "Place").take()
             shown = (await hear(two, "state"))["operating"]["sticks"]
             while not all(stick["holder"] for stick in shown.values()):

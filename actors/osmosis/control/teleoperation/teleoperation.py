@@ -1,21 +1,23 @@
 """Teleoperation: the operator's stick as a velocity command.
 
 Silent while the dead-man button is released, so the Safety Pilot's joystick mode ends with it. The
-stick may be a device on this machine or anybody who publishes `topics.JOYSTICK`; who is followed
-if there are several is decided in `stick_arbitration`.
+stick may be a device on this machine or any node that publishes `topics.JOYSTICK`;
+`stick_arbitration` decides which of several is followed.
 """
 
 from __future__ import annotations
 
 import math
 
+import msgspec
+
+from rampart.actors.operator.stick_arbitration import Ruling, StickArbiter
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     JoystickDevice,
     StickMapping,
 )
-from rampart.actors.osmosis.control.teleoperation.stick_arbitration import Ruling, StickArbiter
 from rampart.actors.osmosis.messages import Joystick, StickTwist
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.timer import Timer
@@ -28,21 +30,20 @@ _REPLUG_S = 0.5
 """Period in which a device that is not there is looked for."""
 
 
-def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float,
-                since_s: float = 0.0) -> StickTwist | None:
+def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float
+                ) -> StickTwist | None:
     """Return the velocity for a stick position, None while the dead man is released.
 
     Args:
         stick: positions in [-1, 1]; beyond, they are cut; not finite counts as released.
         max_linear_mps: speed at full stick.
         max_angular_radps: turn rate at full stick.
-        since_s: when the stick was taken in hand.
     """
     if not (stick.dead_man and math.isfinite(stick.forward) and math.isfinite(stick.left)):
         return None
     forward = min(max(stick.forward, -1.0), 1.0)
     left = min(max(stick.left, -1.0), 1.0)
-    return StickTwist(forward * max_linear_mps, left * max_angular_radps, since_s)
+    return StickTwist(forward * max_linear_mps, left * max_angular_radps)
 
 
 class Teleoperation(Actor):
@@ -95,7 +96,12 @@ class Teleoperation(Actor):
         self._offer(header.source, message, header.stamp)
 
     def _offer(self, source: str, stick: Joystick, stamp_s: float) -> None:
-        self._obey(self._arbiter.offer(source, stick, stamp_s, self.clock.now()), stamp_s)
+        twist = stick_twist(stick, self._linear_mps, self._angular_radps)
+        ruling = self._arbiter.offer(source, twist is not None, stamp_s, self.clock.now())
+        if twist is not None and ruling.follows:
+            self.publish(topics.TELEOP_COMMAND, msgspec.structs.replace(
+                twist, held_since_s=ruling.since_s), stamp=stamp_s)
+        self._obey(ruling)
         self._attend()
 
     def _attend(self) -> None:
@@ -103,13 +109,9 @@ class Teleoperation(Actor):
         if (self._device.stick.dead_man or self._arbiter.holder) and self._look is None:
             self._look = self.call_later(_LOOK_S, self._again)
 
-    def _obey(self, ruling: Ruling, stamp_s: float) -> None:
-        """Publish the stick's velocity; on release one last zero, so the stop does not wait."""
-        twist = ruling.stick and stick_twist(
-            ruling.stick, self._linear_mps, self._angular_radps, ruling.since_s)
-        if twist is not None:
-            self.publish(topics.TELEOP_COMMAND, twist, stamp=stamp_s)
-        elif ruling.released:
+    def _obey(self, ruling: Ruling) -> None:
+        """On release publish one last zero, so the stop does not wait."""
+        if ruling.released and not ruling.follows:
             self.publish(topics.TELEOP_COMMAND, StickTwist(0.0, 0.0))
         if ruling.told:
             self.report_diagnostic("joystick", ruling.told, ruling.whom)
@@ -120,8 +122,7 @@ class Teleoperation(Actor):
         if self._device.stick.dead_man:
             self._moved()
         else:
-            now_s = self.clock.now()
-            self._obey(self._arbiter.expire(now_s), now_s)
+            self._obey(self._arbiter.expire(self.clock.now()))
         self._attend()
 
     # -- the device -----------------------------------------------------------------------------

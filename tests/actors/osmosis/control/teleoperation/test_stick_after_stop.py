@@ -7,13 +7,10 @@ import asyncio
 import pytest
 
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.teleoperation.stick_arbitration import FIRST_S, StickArbiter
-from rampart.actors.osmosis.messages import Joystick
 from rampart.testing import run
 from tests.actors.osmosis.driven_robot import driven
 
 STANDING_MPS = 0.02
-HELD, FREE = Joystick(0.5, 0.0, True), Joystick(0.0, 0.0, False)
 
 
 @pytest.mark.parametrize("restarted", ["", "safety_pilot", "teleoperation"])
@@ -54,15 +51,3 @@ def test_teleoperation_that_dies_in_a_stop_and_is_back_after_it_does_not_follow_
             assert await robot.fastest(1.0) > 0.7
 
     run(scenario)
-
-
-def test_a_fresh_arbiter_follows_who_was_seen_to_rest_and_who_comes_later():
-    arbiter = StickArbiter(started_s=10.0)
-    assert arbiter.offer("page", HELD, 10.1, 10.1).told == "not followed: it has to let go first"
-    assert arbiter.offer("page", HELD, 11.2, 11.2).stick is None
-    arbiter.offer("device", FREE, 10.2, 10.2)
-    assert arbiter.offer("device", HELD, 10.3, 10.3).since_s == 10.3
-    assert arbiter.offer("device", HELD, 10.4, 10.4).since_s == 10.3
-    arbiter.offer("device", FREE, 10.5, 10.5)
-    late_s = 10.0 + FIRST_S
-    assert arbiter.offer("tool", HELD, late_s, late_s).stick == HELD

@@ -218,7 +218,7 @@ async def test_a_page_that_falls_silent_while_holding_stops_the_robot(tmp_path):
     async with desk(tmp_path) as it:
         it.page.publish(topics.JOYSTICK, m.Joystick(1.0, 0.0, True))
         await it.until(lambda: it.page.commands == [m.Twist(1.0, 0.0), STOP])
-        await it.until(lambda: it.told("not heard for 0.3 s"))
+        await it.until(lambda: it.told("silent for 0.3 s"))
 
 
 async def test_a_device_that_is_not_there_is_waited_for_and_the_page_drives_meanwhile(tmp_path):

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.control.teleoperation.stick_arbitration import TIMEOUT_S, StickArbiter
-from rampart.actors.osmosis.messages import Joystick
+from rampart.actors.operator.stick_arbitration import FIRST_S, TIMEOUT_S, StickArbiter
 
-HELD = Joystick(0.5, 0.0, True)
-FREE = Joystick(0.0, 0.0, False)
+HELD, FREE = True, False
+LONG_AGO = -10.0
 
 
 def play(page: str, device: str) -> str:
@@ -22,7 +21,7 @@ def play(page: str, device: str) -> str:
         page: one character a step: `#` held, `.` let go, blank silent.
         device: likewise.
     """
-    arbiter = StickArbiter()
+    arbiter = StickArbiter(LONG_AGO)
     seen = []
     for step, marks in enumerate(zip(page, device, strict=True)):
         now_s = step / 10
@@ -32,7 +31,7 @@ def play(page: str, device: str) -> str:
             if mark == " ":
                 continue
             ruling = arbiter.offer(name, HELD if mark == "#" else FREE, now_s, now_s)
-            followed += name if ruling.stick is not None else ""
+            followed += name if ruling.follows else ""
         seen.append(followed or ("." if not arbiter.holder else "-"))
     return "".join(seen)
 
@@ -63,53 +62,56 @@ def test_who_is_followed(page, device, followed):
     assert play(page, device) == followed
 
 
-def test_who_waits_is_told_once_and_again_only_after_having_let_go():
-    arbiter = StickArbiter()
+def test_who_waits_is_told_who_has_the_stick():
+    arbiter = StickArbiter(LONG_AGO)
     arbiter.offer("page", HELD, 0.0, 0.0)
-    told = [arbiter.offer("device", HELD, t, t).told for t in (0.05, 0.1)]
-    assert told == ["not followed: page has the stick", ""]
-    arbiter.offer("device", FREE, 0.15, 0.15)
-    assert arbiter.offer("device", HELD, 0.2, 0.2).told == "not followed: page has the stick"
+    assert arbiter.offer("device", HELD, 0.1, 0.1).told == "not followed: page has the stick"
+
+
+def test_a_fresh_arbiter_follows_who_was_seen_to_rest_and_who_comes_later():
+    arbiter = StickArbiter(started_s=10.0)
+    assert "let go first" in arbiter.offer("page", HELD, 10.1, 10.1).told
+    assert not arbiter.offer("page", HELD, 11.2, 11.2).follows
+    arbiter.offer("device", FREE, 10.2, 10.2)
+    assert arbiter.offer("device", HELD, 10.3, 10.3).since_s == 10.3
+    assert arbiter.offer("device", HELD, 10.4, 10.4).since_s == 10.3
+    arbiter.offer("device", FREE, 10.5, 10.5)
+    late_s = 10.0 + FIRST_S
+    assert arbiter.offer("tool", HELD, late_s, late_s).follows
+    assert not StickArbiter().offer("page", HELD, 1e6, 1e6).follows  # a page reports its rest
 
 
 def test_who_was_lost_is_told_so_and_told_again_when_it_comes_back_holding():
-    arbiter = StickArbiter()
+    arbiter = StickArbiter(LONG_AGO)
     arbiter.offer("page", HELD, 0.0, 0.0)
     lost = arbiter.expire(1.0)
     assert (lost.released, lost.whom) == (True, "page")
-    assert "not heard for 0.3 s" in lost.told
-    assert arbiter.offer("page", HELD, 1.1, 1.1).told == "not followed: it has to let go first"
+    assert "silent for 0.3 s" in lost.told
+    assert "let go first" in arbiter.offer("page", HELD, 1.1, 1.1).told
 
 
 def test_a_release_stops_once():
-    arbiter = StickArbiter()
+    arbiter = StickArbiter(LONG_AGO)
     arbiter.offer("page", HELD, 0.0, 0.0)
     assert [arbiter.offer("page", FREE, t, t).released for t in (0.1, 0.2)] == [True, False]
 
 
 @pytest.mark.parametrize("stamp_s", [-1.0, math.nan, -math.inf])
 def test_a_position_that_is_old_on_arrival_moves_nothing(stamp_s):
-    arbiter = StickArbiter()
+    arbiter = StickArbiter(LONG_AGO)
     ruling = arbiter.offer("page", HELD, stamp_s, 0.0)
-    assert (ruling.stick, ruling.told) == (None, "its position came too late")
+    assert (ruling.follows, ruling.told) == (False, "its position came too late")
     assert arbiter.holder == ""
 
 
 def test_a_stamp_from_the_future_holds_no_longer_than_one_from_now():
-    arbiter = StickArbiter()
-    assert arbiter.offer("page", HELD, math.inf, 0.0).stick == HELD
+    arbiter = StickArbiter(LONG_AGO)
+    assert arbiter.offer("page", HELD, math.inf, 0.0).follows
     assert arbiter.expire(TIMEOUT_S + 0.01).released
 
 
-@pytest.mark.parametrize("stick", [Joystick(math.nan, 0.0, True), Joystick(0.0, math.inf, True)])
-def test_a_position_that_is_no_number_is_letting_go(stick):
-    arbiter = StickArbiter()
-    arbiter.offer("page", HELD, 0.0, 0.0)
-    assert arbiter.offer("page", stick, 0.1, 0.1).released
-
-
 def test_sources_that_come_and_go_for_ever_are_not_kept_for_ever():
-    arbiter = StickArbiter()
+    arbiter = StickArbiter(LONG_AGO)
     for number in range(1000):
         arbiter.offer(f"tool {number}", HELD, number, number)
     assert len(arbiter._barred) <= 64
@@ -122,7 +124,7 @@ steps = st.lists(st.tuples(
 
 @given(steps)
 def test_no_order_of_events_breaks_the_rules(events):
-    arbiter = StickArbiter()
+    arbiter = StickArbiter(LONG_AGO)
     now_s = 0.0
     holding: set[str] = set()  # dead man down since before its source could have got the stick
     last_s: dict[str, float] = {}
@@ -139,16 +141,16 @@ def test_no_order_of_events_breaks_the_rules(events):
             ruling = arbiter.offer(source, FREE if what == "free" else HELD, stamp_s, now_s)
             if what == "free":
                 holding.discard(source)
-                assert ruling.stick is None
+                assert not ruling.follows
                 assert ruling.released or owner != source
                 owner = "" if owner == source else owner
             elif what == "late":
-                assert ruling.stick is None
+                assert not ruling.follows
             elif owner in {"", source} and source not in holding:
-                assert ruling.stick == HELD
+                assert ruling.follows
                 owner = source
                 last_s[source] = now_s
             else:
-                assert ruling.stick is None
+                assert not ruling.follows
                 holding.add(source)
         assert arbiter.holder == owner
