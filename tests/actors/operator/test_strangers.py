@@ -14,7 +14,7 @@ import pytest
 from rampart.actors.web import server as web_server
 from rampart.actors.web.tcp_peer import user_of_peer
 from rampart.testing import eventually, free_port
-from tests.actors.operator.test_operating import TOKEN, Hand, ask, open_page
+from tests.actors.operator.test_operating import TOKEN, Hand, open_page
 from tests.actors.operator.world import served
 from tests.other_user import as_nobody, needs_root
 
