@@ -43,7 +43,7 @@ def disagreements(layout: Layout, config: Mapping[str, Any]) -> tuple[list[str],
     Returns what is let through and not declared, or the other way round; and who may publish on
     each key.
     """
-    declared = _Declared(layout)
+    declared = Declared(layout)
     keys = {key: zenoh.KeyExpr(f"{ROOT}/{key}") for key in dict.fromkeys(declared.keys())}
     wrong: list[str] = []
     speakers: dict[str, set[str]] = {}
@@ -103,7 +103,7 @@ def _includer(expressions: list[str]) -> Callable[[zenoh.KeyExpr], bool]:
     return lambda key: str(key) in literal or any(one.includes(key) for one in wide)
 
 
-class _Declared:
+class Declared:
     """What the classes of a system declare, asked key by key."""
 
     def __init__(self, layout: Layout) -> None:

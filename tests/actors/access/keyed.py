@@ -21,10 +21,9 @@ from rampart.actors.access import key_folder
 from rampart.actors.access.certificates import new_authority, new_certificate
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, endpoint, session_config
-from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.root import kept_ports
-from rampart.actors.system.layout import Layout, router
+from rampart.actors.system.layout import Layout
 from tests import ROOT
 
 PATIENCE_S = 20.0
@@ -45,40 +44,13 @@ def make_keys(folder: Path, layout: Layout, addresses=()) -> Path:
     return folder
 
 
-def members_of(layout: Layout) -> dict:
-    return {**{name: router(name) for name in layout.routers}, **layout.members}
-
-
 def every_key(layout: Layout) -> list[str]:
     """All keys of topics.md below the root, families spelt out for each member of the system."""
     table = (line.split("`")[1] for line in
              (ROOT / "topics.md").read_text().splitlines() if line.startswith("| `"))
-    names = sorted(members_of(layout))
+    names = sorted((*layout.routers, *layout.members))
     return [key for row in table for key in (
         [row.replace("{name}", name) for name in names] if "{name}" in row else [row])]
-
-
-def may_say(member, key: str) -> bool:
-    """Whether a class declares that it publishes a key, or its parameters say so."""
-    return member.actor.published(key, member.name, member.parameters) is not None or any(
-        topic == key for topic in member.publishes)
-
-
-def may_hear(member, key: str) -> bool:
-    for topic in (*member.actor.inputs(), *BASE_INPUTS):
-        one = topic.member(key)
-        if one is not None:
-            names = (member.actor.names(topic, member.name, member.parameters)
-                     if topic.is_family else None)
-            if names is None or one in names:
-                return True
-    return any(key == topic or (names is not None and any(
-        key == topic.replace("{name}", name) for name in names))
-        for topic, names in member.hears.items())
-
-
-def is_own(key: str, name: str) -> bool:
-    return any(topic.member(key) == name for topic in BASE_OUTPUTS if topic.is_family)
 
 
 def shown_by_strangers(public: Path, keys: Path, forged: str = "safety_pilot", kind: str = "node",

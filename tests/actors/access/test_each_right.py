@@ -1,4 +1,7 @@
-"""Each identity of the full system tries everything, over real TLS: its rights and no more."""
+"""Identities of each kind try everything, over real TLS: what they declare, and no more.
+
+That the rules hold for all identities is checked without a router, in test_rights_and_rules.py.
+"""
 
 from __future__ import annotations
 
@@ -9,43 +12,21 @@ import pytest
 import zenoh
 
 from rampart.actors.bus import run_folder
-from rampart.actors.bus.topic import Qos
 from rampart.actors.bus.topics import INJECT
-from tests.actors.access.keyed import (
-    Keyed,
-    every_key,
-    layout_of,
-    make_keys,
-    may_hear,
-    may_say,
-    members_of,
-    wait_for,
-)
+from tests.actors.access.declared import Declared
+from tests.actors.access.keyed import Keyed, every_key, layout_of, make_keys, wait_for
 
 pytestmark = pytest.mark.processes
 
 LAYOUT = layout_of("osmosis")
-MEMBERS = members_of(LAYOUT)
+DECLARED = Declared(LAYOUT)
 KEYS = every_key(LAYOUT)
-NODES = sorted(set(MEMBERS) - set(LAYOUT.routers))
-OPERATED = {"inject/order", "manager/adapt", "manager/reset", "mission/order", "mission/request",
-            "stub/trigger", "supervisor/signal", "teleoperation/joystick", "way_out/request",
-            "world/actuator_fault", "world/obstacle"}
-COMMANDS = {topic.key for m in MEMBERS.values() for topic in (*m.actor.outputs, *m.actor.inputs())
-            if topic.qos is Qos.COMMAND} | {"inject/order", "inject/report"}
+NODES = ("safety_pilot", "ftm_manager", "supervisor", "DM4", "hmi", "observer")
+PEOPLE = {"ada": "operator", "bob": "viewer"}
 
 
-def is_kept(key):
-    return key not in COMMANDS and not key.startswith("diagnostic/")
-
-
-def says(name):
-    return {key for key in KEYS if may_say(MEMBERS[name], key)
-            or (name == "observer" and key in OPERATED)}
-
-
-def hears(name):
-    return {key for key in KEYS if may_hear(MEMBERS[name], key)}
+def may(name, what):
+    return {key for key in KEYS if DECLARED.may(PEOPLE.get(name, name), what, key)}
 
 
 @pytest.fixture(scope="module")
@@ -83,26 +64,19 @@ def test_what_it_publishes_arrives_and_nothing_else(keyed):
     heard, arrived = Heard(), {}
     with keyed.joined("bob") as viewer:
         held = viewer.declare_subscriber("rampart/**", heard.take)
-        for name in [*NODES, "ada", "bob"]:
-            expected = OPERATED if name == "ada" else set() if name == "bob" else says(name)
+        for name in [*NODES, *PEOPLE]:
+            arrived[name] = may(name, "says")
             with keyed.joined(name) as session:
                 def tries(session=session, name=name):
-                    for key in KEYS:
-                        session.put(f"rampart/{key}", name)
-                    for key in ("nothing/declared", "alive/DM4/9", "**", "heartbeat/*"):
+                    for key in (*KEYS, "nothing/declared", "alive/DM4/9", "**", "heartbeat/*"):
                         session.put(f"rampart/{key}", name)
                     for key in KEYS:
                         session.delete(f"rampart/{key}")
+                    return arrived[name] <= heard.of(name)
 
-                def is_there(name=name, expected=expected, tries=tries):
-                    tries()
-                    return expected <= heard.of(name)
-
-                assert wait_for(is_there), (name, expected - heard.of(name))
+                assert wait_for(tries), (name, arrived[name] - heard.of(name))
                 tries()
-            arrived[name] = expected
-            assert heard.of(name) == arrived[name], name
-        assert {name: heard.of(name) for name in arrived} == arrived  # late ones included
+        assert {name: heard.of(name) for name in arrived} == arrived
         assert heard.of("") == set()  # nothing was deleted
         held.undeclare()
 
@@ -110,47 +84,41 @@ def test_what_it_publishes_arrives_and_nothing_else(keyed):
 def test_it_hears_what_it_declares_and_nothing_else(keyed):
     with keyed.joined("router_b") as everybody:
         for name in NODES:
-            heard, expected = Heard(), hears(name)
+            heard, expected = Heard(), may(name, "hears")
             with keyed.joined(name) as session:
-                held = [session.declare_subscriber(f"rampart/{key}", heard.take) for key in KEYS]
-                held += [session.declare_subscriber(key, heard.take)
-                         for key in ("**", "rampart/**", "rampart/gone/*")]
+                held = [session.declare_subscriber(key, heard.take) for key in (
+                    *(f"rampart/{key}" for key in KEYS), "**", "rampart/**", "rampart/gone/*")]
 
                 def is_there(name=name, expected=expected, heard=heard):
-                    for key in KEYS:
+                    for key in (*KEYS, "nothing/declared"):
                         everybody.put(f"rampart/{key}", name)
-                    everybody.put("rampart/nothing/declared", name)
                     return expected <= heard.of(name)
 
                 assert wait_for(is_there), (name, expected - heard.of(name))
-                everybody.put(INJECT.at(), "last")  # each one hears it
-                assert wait_for(lambda heard=heard: "inject/order" in heard.of("last"))
+                assert wait_for(lambda heard=heard: everybody.put(INJECT.at(), "last")
+                                or "inject/order" in heard.of("last"))  # each one hears it
                 assert heard.of(name) == expected, name
                 del held
+
+
+def replies(session, key, **how):
+    return {str(reply.ok.key_expr).removeprefix("rampart/"): reply.ok.payload.to_bytes()
+            for reply in session.get(f"rampart/{key}", timeout=2.0, **how) if reply.ok is not None}
 
 
 def test_it_answers_for_its_own_topics_only(keyed):
     with keyed.joined("router_b") as everybody:
         for name in NODES:
-            expected = {key for key in KEYS if may_say(MEMBERS[name], key) and is_kept(key)}
+            expected = may(name, "answers")
             with keyed.joined(name) as session:
                 held = [session.declare_queryable(
-                    f"rampart/{key}", lambda q, key=key, name=name: q.reply(f"rampart/{key}", name))
+                    f"rampart/{key}", lambda q, key=key: q.reply(f"rampart/{key}", "answer"))
                     for key in (*KEYS, "**")]
-
-                def answered(name=name):
-                    found = set()
-                    for reply in everybody.get("rampart/**", target=zenoh.QueryTarget.ALL,
-                                               consolidation=zenoh.ConsolidationMode.NONE,
-                                               timeout=5.0):
-                        if reply.ok is not None and reply.ok.payload.to_bytes() == name.encode():
-                            found.add(str(reply.ok.key_expr).removeprefix("rampart/"))
-                    return found
-
-                assert answered() <= expected, name
+                found = replies(everybody, "**", target=zenoh.QueryTarget.ALL,
+                                consolidation=zenoh.ConsolidationMode.NONE)
+                assert found.keys() <= expected, name
                 one = min(expected)
-                assert wait_for(lambda one=one: [r for r in everybody.get(
-                    f"rampart/{one}", timeout=2.0) if r.ok is not None]), (name, one)
+                assert wait_for(lambda one=one: replies(everybody, one)), (name, one)
                 del held
 
 
@@ -159,17 +127,13 @@ def test_it_asks_for_what_it_hears_only(keyed):
         held = everybody.declare_queryable(
             "rampart/**", lambda q: q.reply(q.key_expr, "answer"), complete=True)
         for name in NODES:
+            asks = may(name, "asks")
             with keyed.joined(name) as session:
-                def is_answered(key, session=session):
-                    return any(reply.ok is not None for reply in session.get(
-                        f"rampart/{key}", timeout=2.0))
-
-                kept = {key for key in hears(name) if is_kept(key)}
-                for key in sorted(kept)[:3]:
-                    assert wait_for(lambda key=key: is_answered(key)), (name, key)
-                for key in KEYS:
-                    if key not in kept and (name in {"DM4", "hmi"} or key == "localization/pose"):
-                        assert not is_answered(key), (name, key)
+                for key in sorted(asks)[:3]:
+                    assert wait_for(lambda key=key: replies(session, key)), (name, key)
+                others = [key for key in KEYS if key not in asks]
+                for key in others if name in {"DM4", "hmi"} else others[:3]:
+                    assert not replies(session, key), (name, key)
         held.undeclare()
 
 

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
-import multiprocessing
 import os
-import signal
 import stat
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, ed25519, rsa
 
 from rampart.actors.access import certificates, key_folder
-from rampart.actors.access.certificates import check_address, new_authority, read_certificate
+from rampart.actors.access.certificates import check_address, read_certificate
 from rampart.actors.access.key_folder import check, entries, init, issue, revoke, rotate
-from rampart.actors.access.register import Identity, KeysError, Register, read_register
+from rampart.actors.access.register import KeysError, read_register
 
-GENERATED = ec.generate_private_key
 NOW = dt.datetime.now(dt.UTC)
 
 
@@ -51,27 +48,24 @@ def test_private_keys_are_their_users_alone(keys):
     assert b"PRIVATE" not in (keys / "ca.crt").read_bytes() + (keys / "register.json").read_bytes()
 
 
-KINDS = {
-    "RSA of 1024 bits": lambda: rsa.generate_private_key(65537, 1024),
-    "RSA of 1536 bits": lambda: rsa.generate_private_key(65537, 1536),
-    "curve secp521r1": lambda: GENERATED(ec.SECP521R1()),
-    "curve secp256k1": lambda: GENERATED(ec.SECP256K1()),
-    "DSA": lambda: dsa.generate_private_key(2048),
-    "": lambda: rsa.generate_private_key(65537, 2048), " ": lambda: GENERATED(ec.SECP384R1()),
-    "  ": ed25519.Ed25519PrivateKey.generate}
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_key_that_no_router_takes_is_refused_before_a_run(keys, monkeypatch, kind):
+@pytest.mark.parametrize(("made", "is_taken"), [
+    (lambda: rsa.generate_private_key(65537, 1536), False),
+    (lambda: rsa.generate_private_key(65537, 2048), True),
+    (lambda: ec.generate_private_key(ec.SECP521R1()), False),
+    (lambda: ec.generate_private_key(ec.SECP256K1()), False),
+    (lambda: ec.generate_private_key(ec.SECP384R1()), True),
+    (lambda: dsa.generate_private_key(2048), False),
+    (ed25519.Ed25519PrivateKey.generate, True)])
+def test_a_key_that_no_router_takes_is_refused_before_a_run(keys, monkeypatch, made, is_taken):
+    key = made()
     with monkeypatch.context() as patched:
-        patched.setattr(certificates.ec, "generate_private_key", lambda _: KINDS[kind]())
+        patched.setattr(certificates.ec, "generate_private_key", lambda _: key)
         issue(keys, ["DM4"], "node")
-    if kind.strip():
-        with pytest.raises(KeysError, match=rf"DM4.pem: its key is [^\n]*{kind}") as raised:
-            check(keys, ["DM4"])
-        assert "rampart keys issue DM4" in str(raised.value)
-    else:
+    if is_taken:
         check(keys, ["DM4"])
+    else:
+        with pytest.raises(KeysError, match=r"DM4.pem: its key is .*rampart keys issue DM4"):
+            check(keys, ["DM4"])
 
 
 def test_of_expired_certificates_each_is_named_with_its_file(keys):
@@ -87,36 +81,31 @@ def test_of_expired_certificates_each_is_named_with_its_file(keys):
     assert "rampart keys rotate DM4" in found["DM4"]
 
 
-def test_a_certificate_says_who_and_for_how_long(keys):
+def test_a_certificate_says_who_where_and_for_how_long(keys):
     issue(keys, ["DM4"], "node", days=2)
     found = certificate(keys, "DM4")
-    assert (found.common_name, found.kind, found.is_ours, found.has_key) == (
-        "DM4", "node", True, True)
+    assert (found.common_name, found.kind, found.is_ours, found.has_key, found.addresses) == (
+        "DM4", "node", True, True, ())
     assert found.not_before < NOW
     assert found.not_after - found.not_before < dt.timedelta(days=2, minutes=6)
-    assert found.addresses == ()
-
-
-def test_people_have_theirs_for_a_shorter_time(keys):
     issue(keys, ["ada"], "operator")
-    issue(keys, ["DM4"], "node")
-    assert certificate(keys, "ada").not_after < certificate(keys, "DM4").not_after
-
-
-def test_a_router_is_reached_on_loopback_and_where_it_is_said(keys):
+    issue(keys, ["DM5"], "node")
+    assert certificate(keys, "ada").not_after < certificate(keys, "DM5").not_after
     issue(keys, ["router_a"], "router", ["10.0.0.2", "rover.local", "fe80::1"])
-    assert set(certificate(keys, "router_a").addresses) == {
+    before = certificate(keys, "router_a")
+    assert set(before.addresses) == {
         "127.0.0.1", "::1", "localhost", "10.0.0.2", "rover.local", "fe80::1"}
+    assert rotate(keys, ["router_a"]) == ["router_a"]
+    after = certificate(keys, "router_a")
+    assert after.fingerprint != before.fingerprint
+    assert (after.common_name, after.addresses) == ("router_a", before.addresses)
 
 
-@pytest.mark.parametrize("text", ["10.0.0.2", "::1", "rover", "rover-2.example.org"])
-def test_an_address_is_one(text):
-    check_address(text)
-
-
-@pytest.mark.parametrize("text", ["", "a b", "10.0.0.2:7450", "x..y", "*", "rövér", "a" * 64])
-def test_what_is_no_address_is_refused(text):
-    with pytest.raises(ValueError, match="is no IP address"):
+@pytest.mark.parametrize(("text", "is_one"), [
+    ("10.0.0.2", True), ("::1", True), ("rover-2.example.org", True), ("", False), ("a b", False),
+    ("10.0.0.2:7450", False), ("x..y", False), ("*", False), ("rövér", False), ("a" * 64, False)])
+def test_an_address_is_one_of_ip_or_the_name_of_a_host(text, is_one):
+    with contextlib.nullcontext() if is_one else pytest.raises(ValueError, match="no IP address"):
         check_address(text)
 
 
@@ -131,41 +120,26 @@ def test_openssl_verifies_what_is_issued(keys):
         assert (done.returncode == 0) == works, (name, purpose, done.stderr)
 
 
-def test_a_second_authority_does_not_replace_the_first(keys):
+def test_what_cannot_be_done_with_a_folder_is_refused_in_one_line(keys):
+    issue(keys, ["DM4"], "node")
     before = (keys / "authority.key").read_bytes()
-    with pytest.raises(KeysError, match="has an authority already"):
-        init(keys)
+    for what, why in (
+            (lambda: init(keys), "has an authority already"),
+            (lambda: rotate(keys, ["DM5"]), "DM5: has no certificate"),
+            (lambda: revoke(keys, ["bob"]), "bob: has no certificate that could be revoked"),
+            (lambda: issue(keys, ["DM4"], "operator"), "DM4: is the name of a node")):
+        with pytest.raises(KeysError, match=why):
+            what()
     assert (keys / "authority.key").read_bytes() == before
-
-
-def test_a_folder_that_others_can_enter_is_refused(keys):
+    (keys / "authority.key").unlink()
+    with pytest.raises(KeysError, match="issued where the authority is"):
+        issue(keys, ["DM5"], "node")
+    assert check(keys, ["DM4"]) > NOW  # a run needs no authority
     keys.chmod(0o750)
     for what in (lambda: issue(keys, ["DM4"], "node"), lambda: check(keys, []),
                  lambda: init(keys)):
         with pytest.raises(KeysError, match="must be yours alone; chmod 700"):
             what()
-
-
-def test_who_is_not_where_the_authority_is_issues_nothing(keys):
-    issue(keys, ["DM4"], "node")
-    (keys / "authority.key").unlink()
-    with pytest.raises(KeysError, match="issued where the authority is"):
-        issue(keys, ["DM5"], "node")
-    assert check(keys, ["DM4"]) > NOW  # a run needs it not
-
-
-def test_a_rotated_certificate_has_a_new_key_and_the_same_name_and_addresses(keys):
-    issue(keys, ["router_a"], "router", ["10.0.0.2"])
-    before = certificate(keys, "router_a")
-    assert rotate(keys, []) == ["router_a"]
-    after = certificate(keys, "router_a")
-    assert after.fingerprint != before.fingerprint
-    assert (after.common_name, set(after.addresses)) == ("router_a", set(before.addresses))
-
-
-def test_nobody_is_rotated_who_has_none(keys):
-    with pytest.raises(KeysError, match="DM4: has no certificate"):
-        rotate(keys, ["DM4"])
 
 
 def test_a_revoked_name_comes_back_as_somebody_else(keys):
@@ -176,14 +150,6 @@ def test_a_revoked_name_comes_back_as_somebody_else(keys):
     issue(keys, ["ada"], "operator")
     assert read_register(keys).of_kind("operator") == {"ada": "ada.2"}
     assert certificate(keys, "ada").common_name == "ada.2"
-    with pytest.raises(KeysError, match="bob: has no certificate that could be revoked"):
-        revoke(keys, ["bob"])
-
-
-def test_a_name_is_of_one_kind(keys):
-    issue(keys, ["DM4"], "node")
-    with pytest.raises(KeysError, match="DM4: is the name of a node"):
-        issue(keys, ["DM4"], "operator")
 
 
 def test_a_run_is_started_with_certificates_that_are_valid(keys):
@@ -227,39 +193,27 @@ def test_a_register_that_is_none_is_refused(keys, text):
         read_register(keys)
 
 
-def test_a_register_is_read_as_it_was_written():
-    register = Register({"DM4": Identity("node", 3, revoked=True)})
-    assert msgspec.json.decode(msgspec.json.encode(register), type=Register) == register
-
-
-def _killed_at(folder, number):
-    """Do what changes a folder of keys, and be killed at the n-th change of a name on the disk."""
-    count = 0
-    whole = Path.replace
-
-    def replace(self, target):
-        nonlocal count
-        count += 1
-        if count == number:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return whole(self, target)
-
-    Path.replace = replace
-    init(folder)
-    issue(folder, ["DM4", "router_a"], "node")
-    rotate(folder, ["DM4"])
-    revoke(folder, ["DM4"])
-    issue(folder, ["DM4"], "node")
+class Killed(BaseException):
+    """Ends a change of a folder of keys, as the end of its process would."""
 
 
 @pytest.mark.parametrize("number", range(1, 12))
-def test_who_is_killed_leaves_whole_files_and_can_go_on(tmp_path, number):
-    folder = tmp_path / "keys"
-    process = multiprocessing.get_context("spawn").Process(target=_killed_at, args=(folder, number))
-    process.start()
-    process.join(60)
-    assert process.exitcode in {0, -signal.SIGKILL}
-    if process.exitcode and number <= 3:
+def test_who_is_killed_leaves_whole_files_and_can_go_on(tmp_path, monkeypatch, number):
+    folder, left, whole = tmp_path / "keys", iter(range(1, number)), Path.replace
+
+    def replace(self, target):
+        if next(left, None) is None:
+            raise Killed
+        return whole(self, target)
+
+    with monkeypatch.context() as patched, contextlib.suppress(Killed):
+        patched.setattr(Path, "replace", replace)
+        init(folder)
+        issue(folder, ["DM4", "router_a"], "node")
+        rotate(folder, ["DM4"])
+        revoke(folder, ["DM4"])
+        issue(folder, ["DM4"], "node")
+    if number <= 3:
         init(folder)  # completes it
     for entry in entries(folder):
         if entry.certificate is not None and not entry.identity.revoked:
@@ -277,8 +231,3 @@ def test_two_at_once_lose_nothing(keys):
                for name in ("A", "B")]
     assert [one.wait(60) for one in running] == [0, 0]
     assert set(read_register(keys).of_kind("node")) == {f"{n}{i}" for n in "AB" for i in range(8)}
-
-
-def test_an_authority_is_one():
-    assert new_authority(NOW, 1) != new_authority(NOW, 1)
-    assert key_folder.DAYS["operator"] < key_folder.DAYS["node"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import datetime as dt
 import os
-import subprocess
 import tempfile
 import threading
 import time
@@ -39,25 +38,18 @@ KEYS = every_key(LAYOUT)
 NOW = dt.datetime.now(dt.UTC)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def folder():
     made = run_folder.make(0, os.getpid())
     yield made
     run_folder.remove(made)
 
 
-@pytest.fixture
-def keyed(folder, tmp_path):
-    with Keyed(folder, make_keys(tmp_path / "keys", LAYOUT), LAYOUT) as one:
+@pytest.fixture(scope="module")
+def keyed(folder, tmp_path_factory):
+    keys = make_keys(tmp_path_factory.mktemp("strangers") / "keys", LAYOUT)
+    with Keyed(folder, keys, LAYOUT) as one:
         yield one
-
-
-@pytest.fixture
-def shown(keyed):
-    """What any stranger may have, where every user can read it."""
-    with tempfile.TemporaryDirectory(prefix="stranger-", dir="/tmp") as place:
-        Path(place).chmod(0o755)
-        yield shown_by_strangers(Path(place), keyed.keys)
 
 
 @contextlib.contextmanager
@@ -85,10 +77,13 @@ def a_busy_bus(keyed):
 
 
 @needs_root
-def test_another_user_reads_nothing_and_is_not_heard(keyed, shown):
-    with a_busy_bus(keyed) as accepted:
-        plain = f"tcp/127.0.0.1:{keyed.port}"
-        found = try_all([keyed.at, plain, keyed.socket], shown, KEYS, becomes_nobody=True)
+def test_another_user_reads_nothing_and_is_not_heard(keyed):
+    with tempfile.TemporaryDirectory(prefix="stranger-", dir="/tmp") as place:
+        Path(place).chmod(0o755)
+        with a_busy_bus(keyed) as accepted:
+            plain = f"tcp/127.0.0.1:{keyed.port}"
+            found = try_all([keyed.at, plain, keyed.socket],
+                            shown_by_strangers(Path(place), keyed.keys), KEYS, becomes_nobody=True)
         assert found["user"] == 65534
         assert len(found["tried"]) == 9
         assert sum(one["heard"] for one in found["tried"].values()) == 0, found
@@ -96,9 +91,12 @@ def test_another_user_reads_nothing_and_is_not_heard(keyed, shown):
 
 
 def test_the_same_attempts_succeed_with_a_key(keyed):
-    """So the others fail for want of one."""
+    """So the others fail for want of one; the socket in the folder lets nothing through."""
     own, ours = str(keyed.keys / "ada.pem"), str(keyed.keys / "ca.crt")
     with a_busy_bus(keyed) as accepted:
+        assert try_all([keyed.socket], {"nothing": {}}, KEYS)["tried"][
+            f"{keyed.socket} nothing"]["heard"] == 0
+        assert accepted == []
         found = try_all([keyed.at], {"a key": {
             "root_ca_certificate": ours, "enable_mtls": True,
             "connect_private_key": own, "connect_certificate": own}}, KEYS)
@@ -110,62 +108,6 @@ def test_the_same_attempts_succeed_with_a_key(keyed):
             "stub/trigger", "supervisor/signal",
             "teleoperation/joystick", "way_out/request", "world/actuator_fault",
             "world/obstacle")}
-
-
-@pytest.fixture
-def network():
-    """Another network namespace with a cable to this one: (its name, our address on it)."""
-    name, own = f"rampart{os.getpid()}", f"10.231.{os.getpid() % 250}"
-    cable = (f"rv{os.getpid() % 100_000}a", f"rv{os.getpid() % 100_000}b")
-
-    def ip(*words):
-        subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
-
-    try:
-        ip("netns", "add", name)
-    except (OSError, subprocess.CalledProcessError) as error:
-        why = getattr(error, "stderr", "") or str(error)
-        pytest.skip(f"no network namespace can be made here: {why.strip()}")
-    try:
-        ip("link", "add", cable[0], "type", "veth", "peer", "name", cable[1], "netns", name)
-        ip("addr", "add", f"{own}.1/24", "dev", cable[0])
-        ip("link", "set", cable[0], "up")
-        ip("-n", name, "addr", "add", f"{own}.2/24", "dev", cable[1])
-        ip("-n", name, "link", "set", cable[1], "up")
-        ip("-n", name, "link", "set", "lo", "up")
-        yield name, f"{own}.1"
-    finally:
-        ip("netns", "del", name)
-
-
-@needs_root
-def test_another_network_reads_nothing_and_is_not_heard(folder, tmp_path, network):
-    name, address = network
-    keys = make_keys(tmp_path / "keys", LAYOUT, (address,))
-    inside = ("ip", "netns", "exec", name)
-    with Keyed(folder, keys, LAYOUT, address) as keyed:
-        shown = shown_by_strangers(tmp_path, keys, "router_b", "router", (address,))
-        with a_busy_bus(keyed) as accepted:
-            plain = f"tcp/{address}:{keyed.port}"
-            found = try_all([keyed.at, plain, f"tls/127.0.0.1:{keyed.port}"], shown, KEYS,
-                            before=inside)
-            assert len(found["tried"]) == 9
-            assert sum(one["heard"] for one in found["tried"].values()) == 0, found
-            assert accepted == []
-            own = str(keys / "bob.pem")
-            with_key = try_all([keyed.at], {"a key": {
-                "root_ca_certificate": str(keys / "ca.crt"), "enable_mtls": True,
-                "connect_private_key": own, "connect_certificate": own}},
-                KEYS, before=inside)
-            assert next(iter(with_key["tried"].values()))["heard"] > 0  # the cable is there
-
-
-def test_the_socket_in_the_folder_lets_nothing_through(keyed):
-    """By it a client finds out that the router is there, as the run's user; and no more."""
-    with a_busy_bus(keyed) as accepted:
-        found = try_all([keyed.socket], {"nothing": {}}, KEYS)
-        assert found["tried"][f"{keyed.socket} nothing"]["heard"] == 0
-        assert accepted == []
 
 
 def written(keyed, content, name="own"):
@@ -192,29 +134,29 @@ def is_let_in(keyed, credentials):
     return bool(seen)
 
 
-def test_a_certificate_of_the_authority_is_let_in(keyed):
+def issued(authority, now=NOW, chain=b""):
+    return new_certificate(authority, "safety_pilot", "node", addresses=(), now=now,
+                           days=8) + chain
+
+
+@pytest.mark.parametrize(("what", "taken"), [
+    ("of the authority", True), ("expired", False), ("of another authority", False),
+    ("signed by a node", False)])
+def test_only_a_certificate_of_the_authority_that_is_valid_is_let_in(keyed, what, taken):
+    authority, node = ((keyed.keys / name).read_bytes() for name in ("authority.key", "DM4.pem"))
+    made = {"of the authority": lambda: issued(authority),
+            "expired": lambda: issued(authority, NOW - dt.timedelta(days=9)),
+            "of another authority": lambda: issued(new_authority(NOW, 9)),
+            "signed by a node": lambda: issued(node, chain=public_part(node))}[what]()
+    assert is_let_in(keyed, written(keyed, made)) == taken
+
+
+def test_a_rotated_one_is_taken_by_the_same_router(keyed):
+    before = (keyed.keys / "safety_pilot.pem").read_bytes()
+    key_folder.rotate(keyed.keys, ["safety_pilot"])
+    assert (keyed.keys / "safety_pilot.pem").read_bytes() != before
     assert is_let_in(keyed, keyed.shown("safety_pilot"))
-
-
-def test_an_expired_certificate_is_not(keyed):
-    authority = (keyed.keys / "authority.key").read_bytes()
-    old = new_certificate(authority, "safety_pilot", "node", addresses=(),
-                          now=NOW - dt.timedelta(days=9), days=8)
-    assert not is_let_in(keyed, written(keyed, old))
-
-
-def test_nor_is_one_of_another_authority(keyed):
-    other = new_certificate(new_authority(NOW, 9), "safety_pilot", "node", addresses=(), now=NOW,
-                            days=8)
-    assert not is_let_in(keyed, written(keyed, other))
-
-
-def test_nor_one_that_another_certificate_has_signed(keyed):
-    """A node's certificate is no authority."""
-    signed = new_certificate((keyed.keys / "DM4.pem").read_bytes(), "safety_pilot", "node",
-                             addresses=(), now=NOW, days=8)
-    chain = signed + public_part((keyed.keys / "DM4.pem").read_bytes())
-    assert not is_let_in(keyed, written(keyed, chain))
+    assert is_let_in(keyed, written(keyed, before))  # until it expires
 
 
 def test_a_revoked_one_is_out_when_the_router_has_restarted(keyed):
@@ -229,14 +171,6 @@ def test_a_revoked_one_is_out_when_the_router_has_restarted(keyed):
     assert not is_let_in(keyed, stolen)  # the same name, another identity
 
 
-def test_a_rotated_one_is_taken_by_the_same_router(keyed):
-    before = (keyed.keys / "safety_pilot.pem").read_bytes()
-    key_folder.rotate(keyed.keys, ["safety_pilot"])
-    assert (keyed.keys / "safety_pilot.pem").read_bytes() != before
-    assert is_let_in(keyed, keyed.shown("safety_pilot"))
-    assert is_let_in(keyed, written(keyed, before))  # until it expires
-
-
 def test_who_is_in_is_cut_off_when_his_certificate_expires(keyed):
     authority = (keyed.keys / "authority.key").read_bytes()
     short = written(keyed, new_certificate(
@@ -247,7 +181,7 @@ def test_who_is_in_is_cut_off_when_his_certificate_expires(keyed):
         assert wait_for(lambda: not list(session.info.routers_zid()))
 
 
-def test_nobody_poses_as_a_router_with_a_nodes_key(keyed, folder, tmp_path):
+def test_nobody_poses_as_a_router_with_a_nodes_key(keyed, folder):
     own = keyed.shown("DM4")
     socket = f"unixsock-stream/{folder}/router_b"
     there = Credentials(own.authority, own.own, {socket: "tls/127.0.0.1:9499"})
@@ -259,8 +193,7 @@ def test_nobody_poses_as_a_router_with_a_nodes_key(keyed, folder, tmp_path):
 
 async def test_who_is_refused_is_told_which_certificate_was_not_taken(keyed, monkeypatch):
     monkeypatch.setattr("rampart.actors.bus.zenoh_bus.PATIENCE_S", 0.5)
-    other = written(keyed, new_certificate(
-        new_authority(NOW, 9), "safety_pilot", "node", addresses=(), now=NOW, days=8))
+    other = written(keyed, issued(new_authority(NOW, 9)))
     bus = ZenohBus("", [keyed.socket], credentials=other)
     with pytest.raises(BusError, match=r"no router at .* that takes the certificate in .*own\.pem"):
         await bus.open()

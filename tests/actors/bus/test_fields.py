@@ -72,9 +72,6 @@ class Fixed(Message):
 def test_an_index_beyond_a_list_of_known_length_is_refused(kind, path):
     with pytest.raises(ValueError, match=r"at most 7 items, expected -7 to 6"):
         Field(kind, path)
-
-
-def test_the_last_item_of_a_list_of_known_length_is_a_field():
     assert Field(Arm, "angles_rad[6]")(Arm((0.5,) * 7)) == 0.5
     assert Field(Arm, "angles_rad[-7]").kind == "number"
     assert Field(Fixed, "angles[6]").kind == "text"

@@ -43,65 +43,55 @@ def test_it_leaves_room_for_the_names_of_nodes(sockets):
         run_folder.socket_path(sockets, "n" * 108)
 
 
-def test_what_was_issued_last_is_known():
+def test_what_was_issued_last_is_known_and_to_which_process():
     folder = run_folder.make(1, os.getpid())
     try:
         register = run_folder.register_of(folder)
-        assert register("DM1") is None
+        for name in ("DM1", "", "..", "../issued/DM1", "a/b", "x\0", "\ud800", "n" * 5000):
+            assert register(name) is None
+        Path(folder, "issued", "DM1~").symlink_to("7")  # its writer died here
+        assert run_folder.issued(folder) == {}
         run_folder.issue(folder, ("DM1", "RM1"), 1)
-        run_folder.issue(folder, ("DM1",), 12)
+        run_folder.issue(folder, ("DM1",), 12, os.getpid())
         assert (register("DM1"), register("RM1")) == (12, 1)
         assert run_folder.issued(folder) == {"DM1": 12, "RM1": 1}
+        assert run_folder.is_here(folder, "DM1")
+        assert not run_folder.is_here(folder, "DM2")
+        run_folder.issue(folder, ["DM1"], 13)  # of another machine
+        assert not run_folder.is_here(folder, "DM1")
     finally:
         run_folder.remove(folder)
     assert register("DM1") is None
     assert run_folder.issued(folder) == {}
     with pytest.raises(OSError, match="No such file"):
-        run_folder.issue(folder, ("DM1",), 13)
+        run_folder.issue(folder, ("DM1",), 14)
 
 
-def test_it_is_known_which_process_an_incarnation_is(sockets):
-    own = os.getpid()
-    run_folder.issue(sockets, ["DM1"], 3, own)
-    assert run_folder.register_of(sockets)("DM1") == 3
-    assert run_folder.issued(sockets) == {"DM1": 3}
-    assert run_folder.is_here(sockets, "DM1")
-    assert not run_folder.is_here(sockets, "DM2")
-    run_folder.issue(sockets, ["DM1"], 4)  # of another machine
-    assert not run_folder.is_here(sockets, "DM1")
+@pytest.fixture
+def ended():
+    """The id of a process that has ended."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
 
 
-def test_a_number_that_was_half_issued_is_issued_again(sockets):
-    Path(sockets, "issued", "DM1~").symlink_to("7")  # its writer died here
-    assert run_folder.issued(sockets) == {}
-    run_folder.issue(sockets, ("DM1",), 8)
-    assert run_folder.issued(sockets) == {"DM1": 8}
-
-
-@pytest.mark.parametrize("name", ["", "..", "../issued/DM1", "a/b", "x\0", "\ud800", "n" * 5000])
-def test_a_name_that_is_none_has_no_number(sockets, name):
-    assert run_folder.register_of(sockets)(name) is None
-
-
-def test_what_dead_runs_left_is_removed_and_what_lives_is_not(place):
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    left, other = place / f"rampart-7450-{ended.pid}-abc", place / "rampart-notes"
-    left.mkdir()
-    (left / "DM1").write_text("")
-    other.mkdir()
+def test_what_dead_runs_left_is_removed_and_what_lives_or_is_not_theirs_stays(place, ended):
+    left, link, other = (place / f"rampart-{one}" for one in (
+        f"7450-{ended}-abc", f"7450-{ended}-def", "notes"))
+    for folder in (left, other):
+        folder.mkdir()
+        (folder / "thesis").write_text("done")
+    link.symlink_to(other)
     mine = run_folder.make(7450, os.getpid())
     again = run_folder.make(7451, os.getpid())
     assert not left.exists()
-    assert other.exists()
+    assert (other / "thesis").read_text() == "done"
     assert Path(mine).exists()
     assert Path(again).exists()
 
 
-def test_a_run_lives_as_long_as_its_folder_is_locked_whatever_its_process_is_called(place):
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    of_a_container = run_folder.make(7450, ended.pid)  # here there is no such process
+def test_a_run_lives_as_long_as_its_folder_is_locked_whatever_its_process_is_called(place, ended):
+    of_a_container = run_folder.make(7450, ended)  # here there is no such process
     left = subprocess.run([sys.executable, "-c", _MAKE, str(place), str(os.getpid())],
                           stdin=subprocess.DEVNULL, capture_output=True, text=True,
                           check=True).stdout.strip()
@@ -131,17 +121,6 @@ def test_several_may_issue_a_number_of_one_node_at_once(sockets):
             for first in (1, 2)]
     assert [one.wait(30) for one in both] == [0, 0]
     assert run_folder.issued(sockets)["DM1"] > 19_000
-
-
-def test_a_link_of_that_name_is_not_followed(place, tmp_path):
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    precious = tmp_path / "precious"
-    precious.mkdir()
-    (precious / "thesis").write_text("done")
-    (place / f"rampart-7450-{ended.pid}-abc").symlink_to(precious)
-    run_folder.make(7450, os.getpid())
-    assert (precious / "thesis").read_text() == "done"
 
 
 def test_where_one_place_cannot_be_written_the_next_one_serves(tmp_path, monkeypatch):

@@ -11,7 +11,6 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.detection.overload import Overload
 from rampart.actors.machine.patience import Usage
-from rampart.manager.spec.budget import allowed_late_s
 from rampart.testing import Ear, VirtualSystem, run
 
 NODES = ("a", "b", "c", "d", "e", "f")
@@ -91,13 +90,3 @@ def test_a_successor_says_nothing_before_it_knows():
     assert states([], until_s=0.9, incarnation=2) == []
     assert states([], until_s=2.0, incarnation=2) == [(1.0, "idle")]
     assert states([(0.5, "abc", 0.2)], until_s=0.9, incarnation=2) == [(0.5, "active")]
-
-
-def test_by_default_late_is_half_the_slack_of_the_systems_shortest_timeout():
-    async def scenario() -> tuple[float, float]:
-        async with VirtualSystem.load("osmosis") as system:
-            module = Overload(system.context("D", {"watch": ["safety_pilot", "hmi"]}))
-            return module._too_late_s, allowed_late_s(module.context.run.system.timing)
-
-    told, expected = run(scenario)
-    assert told == expected > 0

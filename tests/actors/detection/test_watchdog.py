@@ -11,7 +11,6 @@ from rampart.actors.detection.watchdog import Watchdog, WatchdogCore
 from rampart.actors.ftm import messages as m
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.parameters import read_parameters
-from rampart.actors.system.members import Member, heard
 from rampart.testing import Ear, play, run, table
 from tests.osmosis_system import System
 
@@ -88,6 +87,8 @@ def test_it_names_those_who_failed_and_why():
     core.expire(0.5)
     assert core.nodes == ("a", "b", "c")
     core.beat("a", 2, 0.6, 0.6)
+    core.event("stranger", "crashed", 1, 0.6, 0.6)
+    core.beat("stranger", 1, 0.6, 0.6)
     assert core.nodes == ("b", "c")
 
 
@@ -100,18 +101,6 @@ def test_a_heartbeat_of_no_possible_time_does_not_bring_the_dead_to_life(stamp_s
     assert core.nodes == ("a",)
     core.beat("a", 1, 0.12, 0.12)
     assert core.nodes == ()
-
-
-def test_strangers_are_ignored():
-    core = WatchdogCore(["a"], 0.3, 0.0, 0.5)
-    core.event("z", "crashed", 1, 0.1, 0.1)
-    core.beat("z", 1, 0.1, 0.1)
-    assert core.nodes == ()
-
-
-def test_it_hears_the_heartbeats_of_its_nodes_only():
-    member = Member("DM4", Watchdog, Watchdog.Parameters(watch=("a", "b")))
-    assert heard(member) == {"heartbeat/{name}": ("a", "b"), "supervisor/event": None}
 
 
 @pytest.mark.parametrize("watch_list", ["a", [], [1], [""]])

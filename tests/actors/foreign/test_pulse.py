@@ -9,12 +9,14 @@ import pytest
 from rampart.actors.foreign.pulse import NotifySocket, Pulse, extension_s
 
 
-def test_silence_counts_from_the_last_beat():
+def test_silence_counts_from_the_last_beat_and_what_it_says_itself_at_once():
     pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
     pulse.beat()
     assert [pulse.is_well(n / 10) for n in range(8)] == [True] * 6 + [False] * 2
     pulse.beat()
     assert pulse.is_well(0.8)
+    pulse.trigger()
+    assert not pulse.is_well(0.8)
 
 
 def test_the_first_beat_may_come_later():
@@ -32,13 +34,6 @@ def test_time_in_which_the_node_itself_stood_still_does_not_count():
     assert pulse.is_well(60.0)
     assert pulse.is_well(60.1)
     assert not any(pulse.is_well(60.0 + n / 10) for n in range(5, 10))
-
-
-def test_it_may_say_itself_that_something_is_wrong():
-    pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
-    pulse.beat()
-    pulse.trigger()
-    assert not pulse.is_well(0.0)
 
 
 @pytest.mark.parametrize("started", [False, True])
@@ -65,12 +60,9 @@ def test_one_that_says_that_it_ends_has_to_end():
 
 
 @pytest.mark.parametrize(("text", "seconds"), [
-    ("5000000", 5.0), ("0", 0.0), ("000000000000000000005000000", 5.0), ("00", 0.0),
-    ("3600000000", 3600.0), ("3600000001", 3600.0), ("9" * 6000, 3600.0),
-    ("0" * 7000 + "1000000", 1.0), ("18446744073709551615", 3600.0),
-    ("", None), ("-1", None), ("+1", None), (" 1", None), ("1 ", None), ("1e6", None),
-    ("1_000", None), ("0x10", None), ("1.5", None), ("nan", None), ("\u0663", None),
-    ("\ufffd", None)])
+    ("5000000", 5.0), ("0", 0.0), ("3600000001", 3600.0), ("9" * 6000, 3600.0),
+    ("0" * 7000 + "1000000", 1.0), ("", None), ("-1", None), (" 1", None), ("1e6", None),
+    ("1_000", None), ("nan", None), ("\u0663", None)])
 def test_how_much_time_it_asks_for(text, seconds):
     assert extension_s(text) == seconds
 

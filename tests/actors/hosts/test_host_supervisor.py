@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
+import tempfile
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,7 @@ from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run
 from tests.actors.supervision.test_supervisor import Machine
 from tests.two_hosts import two_hosts
+from tests.virtual_time import within
 
 EPOCH = run_folder.EPOCH
 DELAY_S = 0.05
@@ -124,7 +127,7 @@ class Host(Machine):
 class World:
     """The robot, the ground station, and the line between them."""
 
-    def __init__(self, folder: Path, checkpoints: str = "kept") -> None:
+    def __init__(self, folder: Path, checkpoints: str) -> None:
         loop = asyncio.get_running_loop()
         self.clock = Clock(loop.time(), source=loop.time)
         self.is_cut = False
@@ -182,264 +185,206 @@ class World:
 
 
 @asynccontextmanager
-async def world(folder: Path, **options: str) -> AsyncIterator[World]:
-    made = World(folder, **options)
-    beats = asyncio.create_task(made.beats())
-    try:
-        await eventually(lambda: made.ground.runs("camera") == 1)
-        await asyncio.sleep(1.0)
-        yield made
-    finally:
-        tasks = (beats, made.robot.task, made.ground.task)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        for host in (made.robot, made.ground):
-            run_folder.remove(host.folder)
+async def world(checkpoints: str = "kept") -> AsyncIterator[World]:
+    with tempfile.TemporaryDirectory() as folder:
+        made = World(Path(folder), checkpoints)
+        beats = asyncio.create_task(made.beats())
+        try:
+            await eventually(lambda: made.ground.runs("camera") == 1)
+            await asyncio.sleep(1.0)
+            yield made
+        finally:
+            tasks = (beats, made.robot.task, made.ground.task)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            for host in (made.robot, made.ground):
+                run_folder.remove(host.folder)
 
 
-def test_what_a_node_keeps_is_on_the_other_host_after_one_delay(tmp_path):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            made.ground.files.keep("camera", record(1, 1))
-            await asyncio.sleep(DELAY_S + 0.001)
-            assert made.robot.disk == {"camera": record(1, 1)}
-
-    run(scenario)
-
-
-def test_the_first_host_goes_on_from_it_and_its_home_from_what_was_kept_there(tmp_path):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            await made.taken_over()
-            assert made.robot.loaded["camera", EPOCH + 1] == record(1, 2)
-            made.ground.files.keep("camera", record(1, 3))  # it knows nothing of that yet
-            made.robot.files.keep("camera", record(EPOCH + 1, 3))
-            await asyncio.sleep(2.0)
-            made.robot.files.keep("camera", record(EPOCH + 1, 4))
-            made.is_cut = False
-            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
-            assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 4)
-            assert made.robot.runs("camera") == 0
-            assert not [one for one in made.told if one[0] == "checkpoint"]
-            made.ground.files.keep("camera", record(EPOCH + 2, 5))
-            await asyncio.sleep(DELAY_S + 0.001)
-            assert made.robot.disk["camera"] == record(EPOCH + 2, 5)
-
-    run(scenario)
+@within(world)
+async def test_the_first_host_goes_on_from_it_and_its_home_from_what_was_kept_there(made):
+    await made.taken_over()
+    assert made.robot.loaded["camera", EPOCH + 1] == record(1, 2)
+    made.ground.files.keep("camera", record(1, 3))  # it knows nothing of that yet
+    made.robot.files.keep("camera", record(EPOCH + 1, 3))
+    await asyncio.sleep(2.0)
+    made.robot.files.keep("camera", record(EPOCH + 1, 4))
+    made.is_cut = False
+    await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+    assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 4)
+    assert made.robot.runs("camera") == 0
+    assert not [one for one in made.told if one[0] == "checkpoint"]
+    made.ground.files.keep("camera", record(EPOCH + 2, 5))
+    await asyncio.sleep(DELAY_S + 0.001)
+    assert made.robot.disk["camera"] == record(EPOCH + 2, 5)
 
 
-def test_a_process_that_ends_while_it_is_given_back_is_not_begun_anew(tmp_path, monkeypatch):
+@within(world)
+async def test_a_process_that_ends_while_it_is_given_back_is_not_begun_anew(made, monkeypatch):
     """The news of its end waits in the mailbox."""
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            await made.taken_over()
-            ended, hand_over = [], made.robot.supervisor.hand_over
+    await made.taken_over()
+    ended, hand_over = [], made.robot.supervisor.hand_over
 
-            def end_and_hand_over(unit):
-                for one in made.robot.of(unit):
-                    ended.append(one.names)
-                    one.killed = True
-                    made.robot._exited(one)
-                return hand_over(unit)
+    def end_and_hand_over(unit):
+        for one in made.robot.of(unit):
+            ended.append(one.names)
+            one.killed = True
+            made.robot._exited(one)
+        return hand_over(unit)
 
-            monkeypatch.setattr(made.robot.supervisor, "hand_over", end_and_hand_over)
-            made.is_cut = False
-            await eventually(lambda: made.ground.runs("D_VISION_CRASH") == EPOCH + 2)
-            await asyncio.sleep(2.0)
-            assert ("D_VISION_CRASH",) in ended
-            for name in ("camera", "part_finder", "D_VISION_CRASH"):
-                assert (made.robot.runs(name), made.ground.runs(name)) == (0, EPOCH + 2)
-
-    run(scenario)
+    monkeypatch.setattr(made.robot.supervisor, "hand_over", end_and_hand_over)
+    made.is_cut = False
+    await eventually(lambda: made.ground.runs("D_VISION_CRASH") == EPOCH + 2)
+    await asyncio.sleep(2.0)
+    assert ("D_VISION_CRASH",) in ended
+    for name in ("camera", "part_finder", "D_VISION_CRASH"):
+        assert (made.robot.runs(name), made.ground.runs(name)) == (0, EPOCH + 2)
 
 
-def test_one_that_is_being_forked_when_its_home_is_back_gives_way(tmp_path, monkeypatch):
+@within(world)
+async def test_one_that_is_being_forked_when_its_home_is_back_gives_way(made, monkeypatch):
     """The root may be slow; what it forks yet must not have the number of what the home forks."""
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            fork, asked = made.robot.fork, []
+    fork, asked = made.robot.fork, []
 
-            def slow(names, incarnation, answer):
-                if "camera" in names and not asked:
-                    asked.append((names, incarnation, answer))
-                else:
-                    fork(names, incarnation, answer)
+    def slow(names, incarnation, answer):
+        if "camera" in names and not asked:
+            asked.append((names, incarnation, answer))
+        else:
+            fork(names, incarnation, answer)
 
-            monkeypatch.setattr(made.robot, "fork", slow)
-            made.is_cut = True
-            await eventually(lambda: asked)
-            made.is_cut = False
-            await eventually(lambda: made.ground.runs("camera") > 1)
-            assert made.ground.runs("camera") > asked[0][1]
-            ended: list[int] = []
-            monkeypatch.setattr(supervisor, "kill", ended.append)
-            asked[0][2](77, "")
-            assert ended == [77]
-
-    run(scenario)
+    monkeypatch.setattr(made.robot, "fork", slow)
+    made.is_cut = True
+    await eventually(lambda: asked)
+    made.is_cut = False
+    await eventually(lambda: made.ground.runs("camera") > 1)
+    assert made.ground.runs("camera") > asked[0][1]
+    ended: list[int] = []
+    monkeypatch.setattr(supervisor, "kill", ended.append)
+    asked[0][2](77, "")
+    assert ended == [77]
 
 
-def test_one_that_could_not_be_held_is_ended_as_soon_as_it_can_be(tmp_path, monkeypatch):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            hold, is_full = made.robot.hold, [True]
+@within(world)
+async def test_one_that_could_not_be_held_is_ended_as_soon_as_it_can_be(made, monkeypatch):
+    hold, is_full = made.robot.hold, [True]
 
-            def hold_if_there_is_room(pid, ended):
-                if is_full[0] and ("camera",) in (
-                        p.names for p in made.robot.living() if p.pid == pid):
-                    raise OSError(errno.EMFILE, "Too many open files")
-                return hold(pid, ended)
+    def hold_if_there_is_room(pid, ended):
+        if is_full[0] and ("camera",) in (
+                p.names for p in made.robot.living() if p.pid == pid):
+            raise OSError(errno.EMFILE, "Too many open files")
+        return hold(pid, ended)
 
-            monkeypatch.setattr(made.robot, "hold", hold_if_there_is_room)
-            await made.taken_over()
-            made.is_cut = False
-            await eventually(lambda: made.robot.supervisor.highest_of("camera") == 0)
-            is_full[0] = False
-            await eventually(lambda: not made.robot.of("camera"))
-            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
-
-    run(scenario)
+    monkeypatch.setattr(made.robot, "hold", hold_if_there_is_room)
+    await made.taken_over()
+    made.is_cut = False
+    await eventually(lambda: made.robot.supervisor.highest_of("camera") == 0)
+    is_full[0] = False
+    await eventually(lambda: not made.robot.of("camera"))
+    await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
 
 
-def test_what_was_let_go_comes_home_though_the_supervisor_there_is_another_one_by_now(tmp_path):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            await made.taken_over()
-            made.robot.files.keep("camera", record(EPOCH + 1, 3))
-            await asyncio.sleep(1.0)
-            made.is_cut = False
-            await eventually(lambda: not made.ground.of("camera"))
-            made.ground.supervisor.abandon()
-            made.ground.task.cancel()
-            await asyncio.gather(made.ground.task, return_exceptions=True)
-            made.ground.begin(2)
-            for name in ("camera", "part_finder", "D_VISION_CRASH"):
-                await eventually(lambda name=name: made.ground.runs(name) == EPOCH + 2)
-                assert made.robot.runs(name) == 0
-            assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 3)
-
-    run(scenario)
+@within(world)
+async def test_what_was_let_go_comes_home_though_the_supervisor_there_is_another_one_by_now(made):
+    await made.taken_over()
+    made.robot.files.keep("camera", record(EPOCH + 1, 3))
+    await asyncio.sleep(1.0)
+    made.is_cut = False
+    await eventually(lambda: not made.ground.of("camera"))
+    made.ground.supervisor.abandon()
+    made.ground.task.cancel()
+    await asyncio.gather(made.ground.task, return_exceptions=True)
+    made.ground.begin(2)
+    for name in ("camera", "part_finder", "D_VISION_CRASH"):
+        await eventually(lambda name=name: made.ground.runs(name) == EPOCH + 2)
+        assert made.robot.runs(name) == 0
+    assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 3)
 
 
-def test_who_stood_still_for_a_moment_takes_nothing_over(tmp_path):
+@within(world)
+async def test_who_stood_still_for_a_moment_takes_nothing_over(made):
     """What the others said meanwhile is still to be read when the timers are due."""
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            for _ in range(10):
-                made.is_cut = True
-                await asyncio.sleep(DELAY_S + 0.01)  # what was under way has been read
-                asyncio.get_running_loop().jump(0.9)  # no callback runs meanwhile
-                made.is_cut = False
-                await asyncio.sleep(0.53)
-            assert not [names for names, _ in made.robot.forks if "camera" in names]
-
-    run(scenario)
+    for _ in range(10):
+        made.is_cut = True
+        await asyncio.sleep(DELAY_S + 0.01)  # what was under way has been read
+        asyncio.get_running_loop().jump(0.9)  # no callback runs meanwhile
+        made.is_cut = False
+        await asyncio.sleep(0.53)
+    assert not [names for names, _ in made.robot.forks if "camera" in names]
 
 
-def test_what_is_kept_in_the_moment_of_its_end_goes_home_as_well(tmp_path):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            await made.taken_over()
-            (process,) = made.robot.of("camera")
-            made.robot.ends_after_s = 0.4
-            made.is_cut = False
-            await eventually(lambda: process.killed)
-            await asyncio.sleep(0.3)
-            made.robot.disk["camera"] = record(EPOCH + 1, 9)  # and it is not gone yet
-            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
-            assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 9)
-
-    run(scenario)
+@within(world)
+async def test_what_is_kept_in_the_moment_of_its_end_goes_home_as_well(made):
+    await made.taken_over()
+    (process,) = made.robot.of("camera")
+    made.robot.ends_after_s = 0.4
+    made.is_cut = False
+    await eventually(lambda: process.killed)
+    await asyncio.sleep(0.3)
+    made.robot.disk["camera"] = record(EPOCH + 1, 9)  # and it is not gone yet
+    await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+    assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 9)
 
 
-def test_a_last_state_that_never_comes_is_waited_for_two_seconds_and_told(tmp_path):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            await made.taken_over()
-            made.robot.files.is_stuck = True
-            made.is_cut = False
-            await eventually(lambda: not made.robot.of("camera"))
-            given_back_s = made.clock.now()
-            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
-            assert 2.0 < made.clock.now() - given_back_s < 2.5
-            assert any("the last state was not sent in time" in why for _, why in made.told)
-
-    run(scenario)
+@within(world)
+async def test_a_last_state_that_never_comes_is_waited_for_two_seconds_and_told(made):
+    await made.taken_over()
+    made.robot.files.is_stuck = True
+    made.is_cut = False
+    await eventually(lambda: not made.robot.of("camera"))
+    given_back_s = made.clock.now()
+    await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+    assert 2.0 < made.clock.now() - given_back_s < 2.5
+    assert any("the last state was not sent in time" in why for _, why in made.told)
 
 
-def test_a_host_that_is_started_anew_with_an_empty_disk_goes_on_from_what_the_first_holds(tmp_path):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            await made.taken_over()
-            made.robot.files.keep("camera", record(EPOCH + 1, 3))
-            made.ground.task.cancel()
-            await asyncio.gather(made.ground.task, return_exceptions=True)
-            await made.ground.supervisor.context.bus.close()
-            run_folder.remove(made.ground.folder)
-            made.ground = Host(made, "ground", EPOCH + 1)
-            for name in ("camera", "part_finder", "D_VISION_CRASH"):
-                run_folder.issue(made.ground.folder, [name], EPOCH + 1)
-            await asyncio.sleep(0.26)  # out of step with what is repeated
-            made.is_cut = False
-            await asyncio.sleep(0.1 + 4 * DELAY_S + 0.01)  # a heartbeat, and what the first holds
-            assert made.ground.disk == {"camera": record(EPOCH + 1, 3)}
-            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
-            assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 3)
-
-    run(scenario)
+@within(world)
+async def test_a_host_that_is_started_anew_with_an_empty_disk_goes_on_from_the_first_s_copy(made):
+    await made.taken_over()
+    made.robot.files.keep("camera", record(EPOCH + 1, 3))
+    made.ground.task.cancel()
+    await asyncio.gather(made.ground.task, return_exceptions=True)
+    await made.ground.supervisor.context.bus.close()
+    run_folder.remove(made.ground.folder)
+    made.ground = Host(made, "ground", EPOCH + 1)
+    for name in ("camera", "part_finder", "D_VISION_CRASH"):
+        run_folder.issue(made.ground.folder, [name], EPOCH + 1)
+    await asyncio.sleep(0.26)  # out of step with what is repeated
+    made.is_cut = False
+    await asyncio.sleep(0.1 + 4 * DELAY_S + 0.01)  # a heartbeat, and what the first holds
+    assert made.ground.disk == {"camera": record(EPOCH + 1, 3)}
+    await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+    assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 3)
 
 
-def forged(incarnation: int = 1) -> Checkpoints:
-    return Checkpoints("r", (KeptState("camera", *record(incarnation, 99), issued=9, final=True),))
+@within(partial(world, checkpoints=""))
+async def test_without_checkpoints_nothing_is_said_of_states(made):
+    await asyncio.sleep(5.0)
+    made.is_cut = True
+    await eventually(lambda: made.robot.runs("camera") == EPOCH + 1)
+    made.is_cut = False
+    await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
+    assert made.states == 0
 
 
-@pytest.mark.parametrize("source", ["stranger#1", "camera#1", "supervisor_ground#0"])
-def test_a_stranger_s_word_changes_nothing(tmp_path, source):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            made.say("ground", source, topics.CHECKPOINTS, forged(), "supervisor_ground")
-            await asyncio.sleep(1.0)
-            assert made.robot.disk == {}
+@within(world)
+async def test_with_checkpoints_little_is_said_and_what_is_forged_changes_nothing(made):
+    def forge(source: str) -> None:
+        state = KeptState("camera", *record(1, 99), issued=9, final=True)
+        made.say("ground", source, topics.CHECKPOINTS, Checkpoints("r", (state,)),
+                 "supervisor_ground")
 
-    run(scenario)
-
-
-@pytest.mark.parametrize("garbage", [b"", b"\xc1", pack(("supervisor_ground", 1, 900, 0.0, (1,)))])
-def test_garbage_changes_nothing_and_is_told(tmp_path, garbage):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            made._buses["ground"].publish(
-                topics.CHECKPOINTS, topics.CHECKPOINTS.at("supervisor_ground"), garbage)
-            await asyncio.sleep(1.0)
-            assert made.robot.disk == {}
-            assert any(why.startswith("not a Checkpoints") for _, why in made.told), made.told
-
-    run(scenario)
-
-
-def test_without_checkpoints_nothing_is_said_of_states(tmp_path):
-    async def scenario() -> None:
-        async with world(tmp_path, checkpoints="") as made:
-            await asyncio.sleep(5.0)
-            assert made.states == 0
-            made.is_cut = True
-            await eventually(lambda: made.robot.runs("camera") == EPOCH + 1)
-            made.is_cut = False
-            await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
-            assert made.states == 0
-
-    run(scenario)
-
-
-def test_with_checkpoints_little_is_said_while_nothing_happens(tmp_path):
-    async def scenario() -> None:
-        async with world(tmp_path) as made:
-            before = made.states
-            await asyncio.sleep(10.0)
-            assert made.states - before == pytest.approx(2 * 20, abs=2)
-
-    run(scenario)
+    before = made.states
+    await asyncio.sleep(10.0)
+    assert made.states - before == pytest.approx(2 * 20, abs=2)
+    for garbage in (b"", b"\xc1", pack(("supervisor_ground", 1, 900, 0.0, (1,)))):
+        made._buses["ground"].publish(
+            topics.CHECKPOINTS, topics.CHECKPOINTS.at("supervisor_ground"), garbage)
+    for source in ("stranger#1", "camera#1", "supervisor_ground#0"):
+        forge(source)
+    await asyncio.sleep(1.0)
+    assert made.robot.disk == {}
+    assert any(why.startswith("not a Checkpoints") for _, why in made.told), made.told
 
 
 def test_a_module_takes_no_number_of_another_machine_for_a_process_of_its_own(tmp_path, sockets):

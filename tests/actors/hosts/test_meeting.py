@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import re
-import shutil
 import socket
 import ssl
 import threading
@@ -18,7 +17,7 @@ from websockets.asyncio.server import serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rampart.actors.access import key_folder
-from rampart.actors.bus.zenoh_session import credentials_in
+from rampart.actors.bus.zenoh_session import Credentials, credentials_in
 from rampart.actors.hosts.launchers import OtherLauncher
 from rampart.actors.hosts.meeting import (
     DOOR,
@@ -47,12 +46,12 @@ FIRST = {"rampart": "aa", "specification": "bb"}
 
 
 @asynccontextmanager
-async def meeting(*hosts: str):
-    port = free_port()
+async def meeting(*hosts: str, shown: Credentials | None = None):
+    where = ("127.0.0.1", free_port())
     made = Meeting(PLAN, hosts or ("ground",), CONTENTS, lambda: {"hmi": 3})
-    await made.open("127.0.0.1", port)
+    await made.open(*where, shown)
     try:
-        yield made, ("127.0.0.1", port)
+        yield made, where
     finally:
         await made.close()
 
@@ -63,6 +62,9 @@ async def test_the_first_waits_until_the_others_are_ready_and_all_begin():
         waiting = asyncio.create_task(made.all_ready(said.append))
         ground = Attendance("ground", where, FIRST)
         told, asked_s, heard_s = await ground.ask()
+        assert not re.search(b"t0ken|k3y", msgspec.json.encode(told.plan))  # no secret travels
+        own = RunPlan(base_port=7451, system_file="/here/x.toml", host="ground")
+        assert joined(told.plan, own) == msgspec.structs.replace(own, run_id="r1", seed=7)
         assert (told.plan.seed, told.origin_s, told.waits_for) == (7, None, ("ground",))
         assert told.incarnations == {"hmi": 3}
         assert asked_s <= told.now_s <= heard_s
@@ -76,39 +78,23 @@ async def test_the_first_waits_until_the_others_are_ready_and_all_begin():
         await ground.close()
 
 
-async def test_what_is_a_host_s_own_stays_there_and_no_secret_travels():
-    async with meeting() as (_, where):
-        ground = Attendance("ground", where, FIRST)
-        plan = (await ground.ask())[0].plan
-        assert not re.search(b"t0ken|k3y", msgspec.json.encode(plan))
-        own = RunPlan(base_port=7451, system_file="/here/x.toml", host="ground")
-        assert joined(plan, own) == msgspec.structs.replace(own, run_id="r1", seed=7)
-        await ground.close()
-
-
 @pytest.mark.parametrize(("host", "contents", "words"), [
     ("moon", FIRST, "no host 'moon' waits to take part; known: ground"),
-    ("ground", FIRST | {"specification": "xx"},
-     "specification: not the same as on the first host (xx here, bb there); copy it from there"),
-    ("ground", FIRST | {"rampart": "older"}, "rampart: not the same as on the first host"),
-])
+    ("ground", FIRST | {"specification": "xx"}, "specification: not the same .*copy it from there"),
+    ("ground", FIRST | {"rampart": "older"}, "rampart: not the same as on the first host")])
 async def test_who_may_not_take_part_is_told_why(host, contents, words):
     async with meeting() as (_, where):
-        with pytest.raises(MeetingError, match=words.replace("(", r"\(").replace(")", r"\)")):
+        with pytest.raises(MeetingError, match=words):
             await Attendance(host, where, contents).ask()
 
 
-async def test_files_that_the_plan_names_are_compared_when_they_are_known():
-    async with meeting() as (_, where):
+async def test_who_is_there_already_is_not_taken_for_another_and_has_the_files_of_the_plan():
+    async with meeting("ground", "moon") as (_, where):
         ground = Attendance("ground", where, FIRST)
         await ground.ask()
         ground.ready(FIRST)
         with pytest.raises(MeetingError, match="airport: not the same"):
             await ground.ask()
-
-
-async def test_who_is_there_already_is_not_taken_for_another():
-    async with meeting("ground", "moon") as (_, where):
         ground = Attendance("ground", where, FIRST)
         ground.ready(CONTENTS)
         await ground.ask()
@@ -158,10 +144,17 @@ async def test_the_end_is_told(later_s):
         await closing
 
 
-async def test_nobody_there_is_an_error_that_may_pass():
-    ground = Attendance("ground", ("127.0.0.1", free_port()), FIRST)
+async def test_no_answer_and_one_that_makes_no_sense_are_errors_that_may_pass():
     with pytest.raises(OSError, match="Connect call failed"):
-        await ground.ask()
+        await Attendance("ground", ("127.0.0.1", free_port()), FIRST).ask()
+
+    async def answer(connection):
+        async for _ in connection:
+            await connection.send("nonsense")
+
+    async with serve(answer, "127.0.0.1", 0) as server:
+        with pytest.raises(OSError, match="no answer"):
+            await Attendance("ground", server.sockets[0].getsockname(), FIRST).ask()
 
 
 async def is_undisturbed(where) -> bool:
@@ -171,7 +164,7 @@ async def is_undisturbed(where) -> bool:
     return told.plan.run_id == "r1"
 
 
-@pytest.mark.parametrize("sent", [b"", b"\n", b"GET / HTTP/1.1\r\n\r\n", b"x" * 2_000_000])
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\n\r\n", b"x" * 2_000_000])
 async def test_a_stranger_is_let_go_and_disturbs_nobody(sent):
     async with meeting() as (_, where):
         reader, writer = await asyncio.open_connection(*where)
@@ -180,8 +173,8 @@ async def test_a_stranger_is_let_go_and_disturbs_nobody(sent):
             writer.write_eof()
             assert b"r1" not in await asyncio.wait_for(reader.read(), 10)
         writer.close()
-        with contextlib.suppress(ConnectionError):
-            await writer.wait_closed()
+        with pytest.raises(InvalidStatus, match="403"):  # a page in a browser
+            await connect("ws://first/", host=where[0], port=where[1], origin="http://evil.example")
         assert await is_undisturbed(where)
 
 
@@ -194,23 +187,6 @@ async def test_questions_that_make_no_sense_end_their_connection_only(sent):
             with pytest.raises(ConnectionClosed):
                 await asyncio.wait_for(stranger.recv(), 10)
         assert await is_undisturbed(where)
-
-
-async def test_a_page_in_a_browser_cannot_ask():
-    async with meeting() as (_, where):
-        with pytest.raises(InvalidStatus, match="403"):
-            await connect("ws://first/", host=where[0], port=where[1], origin="http://evil.example")
-
-
-async def test_an_answer_that_makes_no_sense_is_an_error_that_may_pass():
-    async def answer(connection):
-        async for _ in connection:
-            await connection.send("nonsense")
-
-    async with serve(answer, "127.0.0.1", 0) as server:
-        ground = Attendance("ground", server.sockets[0].getsockname(), FIRST)
-        with pytest.raises(OSError, match="no answer"):
-            await ground.ask()
 
 
 async def test_an_address_that_is_not_this_machine_s_is_told_in_a_line():
@@ -236,58 +212,35 @@ def test_contents_do_not_depend_on_where_the_files_are(tmp_path):
 def keys(tmp_path_factory):
     folder = tmp_path_factory.mktemp("meeting") / "keys"
     key_folder.init(folder)
-    key_folder.issue(folder, ["router_a"], "router")
-    key_folder.issue(folder, ["observer", "observer_ground", "DM5"], "node")
+    key_folder.issue(folder, ["router_a", "router_b"], "router")
+    key_folder.issue(folder, ["observer", "observer_ground", "observer_moon", "DM5"], "node")
+    revoked = (folder / "observer_moon.pem").read_bytes()
+    key_folder.revoke(folder, ["observer_moon"])
+    (folder / "observer_moon.pem").write_bytes(revoked)
+    (folder / "observer_moon.pem").chmod(0o600)
     return folder
 
 
-@asynccontextmanager
-async def meeting_with(keys):
-    made, where = Meeting(PLAN, ("ground",), CONTENTS, dict), ("127.0.0.1", free_port())
-    await made.open(*where, credentials_in(str(keys), DOOR))
-    try:
-        yield where
-    finally:
-        await made.close()
-
-
-async def test_with_keys_the_launchers_know_each_other(keys):
-    async with meeting_with(keys) as where:
-        ground = Attendance("ground", where, FIRST, credentials_in(str(keys), "observer_ground"))
-        assert (await ground.ask())[0].plan.run_id == "r1"
+@pytest.mark.parametrize("name", ["observer_ground", "DM5", "observer", "observer_moon", ""])
+async def test_with_keys_nobody_but_the_other_launcher_is_told_anything(keys, name):
+    """The key of observer_moon is revoked."""
+    async with meeting(shown=credentials_in(str(keys), DOOR)) as (_, where):
+        ground = Attendance("ground", where, FIRST, credentials_in(str(keys), name)
+                            if name else None)
+        if name == "observer_ground":
+            assert (await ground.ask())[0].plan.run_id == "r1"
+        else:
+            with pytest.raises(OSError):  # noqa: PT011 of the connection, whatever it is
+                await ground.ask()
         await ground.close()
 
 
-@pytest.mark.parametrize("name", ["DM5", "observer", ""])
-async def test_with_another_s_key_or_none_nobody_is_told_anything(keys, name):
-    async with meeting_with(keys) as where:
-        stranger = Attendance(
-            "ground", where, FIRST, credentials_in(str(keys), name) if name else None)
-        with pytest.raises(OSError):  # noqa: PT011 of the connection, whatever it is
-            await stranger.ask()
-        await stranger.close()
-
-
-async def test_a_revoked_key_is_no_key(keys, tmp_path):
-    copy = tmp_path / "keys"
-    shutil.copytree(keys, copy)
-    shown = credentials_in(str(keys), "observer_ground")
-    key_folder.revoke(copy, ["observer_ground"])
-    async with meeting_with(copy) as where:
-        with pytest.raises(OSError):  # noqa: PT011 likewise
-            await Attendance("ground", where, FIRST, shown).ask()
-
-
 async def test_who_answers_in_the_first_host_s_place_with_a_node_s_key_is_not_believed(keys):
-    made, port = Meeting(PLAN, ("ground",), CONTENTS, dict), free_port()
-    key_folder.issue(keys, ["router_b"], "router")
-    await made.open("127.0.0.1", port, credentials_in(str(keys), "router_b"))
-    ground = Attendance("ground", ("127.0.0.1", port), FIRST,
-                        credentials_in(str(keys), "observer_ground"))
-    with pytest.raises(MeetingError, match="somebody else answers in the first host's place"):
-        await ground.ask()
-    await ground.close()
-    await made.close()
+    async with meeting(shown=credentials_in(str(keys), "router_b")) as (_, where):
+        ground = Attendance("ground", where, FIRST, credentials_in(str(keys), "observer_ground"))
+        with pytest.raises(MeetingError, match="somebody else answers in the first host's place"):
+            await ground.ask()
+        await ground.close()
 
 
 # ---- one that is silent -------------------------------------------------------------------------
@@ -312,23 +265,21 @@ def in_a_thread(talk):
 
 async def test_with_keys_the_end_waits_for_nobody_who_is_silent(keys):
     """A line that was cut, a launcher that is stopped: TLS would wait half a minute for a word."""
-    shown = credentials_in(str(keys), "observer_ground")
-    made, where = Meeting(PLAN, ("ground",), CONTENTS, dict), ("127.0.0.1", free_port())
-    await made.open(*where, credentials_in(str(keys), DOOR))
-    heard = threading.Event()
+    async with meeting(shown=credentials_in(str(keys), DOOR)) as (made, where):
+        heard = threading.Event()
 
-    def talk(silent):
-        secure = context(shown, ssl.Purpose.SERVER_AUTH)
-        with secure.wrap_socket(socket.create_connection(where)) as ground:
-            ground.sendall(UPGRADE)
-            assert ground.recv(100_000).startswith(b"HTTP/1.1 101 ")
-            heard.set()
-            silent()
+        def talk(silent):
+            secure = context(credentials_in(str(keys), "observer_ground"), ssl.Purpose.SERVER_AUTH)
+            with secure.wrap_socket(socket.create_connection(where)) as ground:
+                ground.sendall(UPGRADE)
+                assert ground.recv(100_000).startswith(b"HTTP/1.1 101 ")
+                heard.set()
+                silent()
 
-    with in_a_thread(talk):
-        await asyncio.to_thread(heard.wait)
-        async with asyncio.timeout(15):
-            await made.close()
+        with in_a_thread(talk):
+            await asyncio.to_thread(heard.wait)
+            async with asyncio.timeout(15):
+                await made.close()
 
 
 async def test_with_keys_a_first_host_that_is_silent_is_asked_anew_soon(keys):

@@ -44,14 +44,12 @@ def test_only_time_in_which_it_could_have_run_counts(how, over_s):
     assert found == (None if over_s is None or over_s >= 25 else pytest.approx(over_s, abs=0.25))
 
 
-def test_whoever_stood_still_himself_blames_no_other_for_it():
+@pytest.mark.parametrize(("looks", "counted_s"), [
+    ([(0.0,), (60.0,), (60.25,)], [0.0, 0.5, 0.75]),  # the observer itself stood still
+    ([(10.0, 8.0), (10.25, 8.0)], [2.0, 2.25])])  # what it owes for longer counts from then
+def test_time_between_looks_counts_as_far_as_both_could_run(looks, counted_s):
     patience = Patience(0.5)
-    assert [patience.look(at, 7, AT_LEISURE) for at in (0.0, 60.0, 60.25)] == [0.0, 0.5, 0.75]
-
-
-def test_what_it_owes_for_longer_counts_from_then():
-    patience = Patience(0.5)
-    assert [patience.look(at, 7, AT_LEISURE, 8.0) for at in (10.0, 10.25)] == [2.0, 2.25]
+    assert [patience.look(at, 7, AT_LEISURE, *since) for at, *since in looks] == counted_s
 
 
 @pytest.mark.parametrize(("ran_s", "counted_s"), [(0.2, 2.2), (0.0, 0.0), (0.1, 0.1)])
