@@ -31,6 +31,7 @@ from rampart.actors.recording.json_schema import plain_schema
 from rampart.actors.recording.message_form import Forms, Recorded
 from rampart.actors.recording.run_documents import Documents
 from rampart.actors.recording.views import View, Views, encode
+from rampart.actors.system.topics import find_topic
 
 PROFILE = "rampart"
 RUN = "rampart.run"
@@ -172,9 +173,10 @@ class BagWriter:
         self._file = file
         self._zero_s = time_zero_s
         self._forms = Forms(documents.known.topics)
+        self._own = documents.own
         self._views = views
         self._wants = wants
-        self._schemas: dict[str, int] = {}
+        self._schemas: dict[Any, int] = {}
         self._channels: dict[str, int | None] = {}
         self._view_channels: dict[str, int] = {}
         self._writer = Writer(file, compression=CompressionType.LZ4)
@@ -270,20 +272,20 @@ class BagWriter:
     # -- channels -------------------------------------------------------------------------------
 
     def _channel(self, key: str, topic: Topic[Any] | None) -> int:
+        name = key.removeprefix(f"{ROOT}/")
+        topic = topic or find_topic(name, self._own)
         described, schema = {KEY: key}, 0
         if topic is not None:
-            name = topic.type.__name__
-            schema = self._schema(f"rampart.{name}", Recorded[topic.type])  # type: ignore[name-defined]
+            schema = self._schema(f"rampart.{topic.type.__name__}", Recorded[topic.type])  # type: ignore[name-defined]
             described |= {"qos": topic.qos.value, "rate_hz": f"{topic.rate_hz:g}",
                           "frame": topic.frame, "about": topic.doc}
-        return self._writer.register_channel(
-            key.removeprefix(f"{ROOT}/"), "json", schema, described)
+        return self._writer.register_channel(name, "json", schema, described)
 
     def _schema(self, name: str, kind: Any) -> int:
-        if name not in self._schemas:
-            self._schemas[name] = self._writer.register_schema(
+        if kind not in self._schemas:
+            self._schemas[kind] = self._writer.register_schema(
                 name, "jsonschema", plain_schema(kind))
-        return self._schemas[name]
+        return self._schemas[kind]
 
     def _show(self, views: Views, found: list[View], log_ns: int) -> None:
         for name, view in found:

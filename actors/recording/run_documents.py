@@ -18,6 +18,7 @@ from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.members import application_class, import_class, load_application
+from rampart.actors.system.topics import own_topics
 from rampart.files.reading import FileError, read_bytes
 from rampart.manager.spec.specification import SystemSpec
 
@@ -68,6 +69,7 @@ class Documents(msgspec.Struct, frozen=True):
         files: system, and what the application names, as files.
         version: of the program.
         known: system and application.
+        own: topics that the system's actors declare themselves.
     """
 
     run_id: str
@@ -79,6 +81,7 @@ class Documents(msgspec.Struct, frozen=True):
     files: tuple[File, ...] = ()
     version: str = ""
     known: Known = Known()
+    own: tuple[Topic[Any], ...] = ()
 
     def metadata(self) -> dict[str, str]:
         """Return what stands in the metadata record; of a file that was chosen its name."""
@@ -106,6 +109,9 @@ def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
         described: the other attributes of `Documents`.
     """
     known = known_of(plan)
+    own: tuple[Topic[Any], ...] = ()
+    with contextlib.suppress(ValueError):  # an actor whose module is missing
+        own = own_topics(known.system)
     paths = [(SYSTEM, Path(str(plan.get("system_file", ""))))]
     with contextlib.suppress(OSError):  # a folder that cannot be listed
         paths += known.application.documents() if known.application else []
@@ -120,7 +126,8 @@ def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
         own_version = version("rampart-robot")
     except PackageNotFoundError:
         own_version = "unknown"
-    return Documents(plan=plan, files=tuple(files), version=own_version, known=known, **described)
+    return Documents(plan=plan, files=tuple(files), version=own_version, known=known, own=own,
+                     **described)
 
 
 def known_of(plan: Mapping[str, Any]) -> Known:

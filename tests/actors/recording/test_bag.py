@@ -37,6 +37,7 @@ from rampart.actors.recording.virtual import VirtualRecording
 from rampart.cli.main import main
 from rampart.systems import SHIPPED
 from tests.actors.recording.samples import NAN, PLAN, documents, pose, sample, write
+from tests.porter_actors import LOAD, Load, write_porter_system
 
 form_of = Forms(topics.ALL).of
 
@@ -272,6 +273,22 @@ def test_topics_that_only_the_robot_knows_are_neither_garbage_nor_lost(tmp_path)
         writer.close()
     told = Summary(BagReader(tmp_path / "run.mcap")).end
     assert (told["messages"], told["garbage"], told["lost"]) == ("11", "1", "{}")
+
+
+def test_a_topic_that_only_the_robot_s_actors_declare_has_schema_unit_and_description(tmp_path):
+    told = collect({"system_file": str(write_porter_system(tmp_path))}, run_id="", title="",
+                   rate=1.0, nodes=("platform",), started="")
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = BagWriter(file, told)
+        writer.take(0.1, LOAD.at(), encode(Header("platform", 1, 1, 0.1), Load(20.0)))
+        writer.close()
+    with (tmp_path / "run.mcap").open("rb") as file:
+        [(schema, channel, message)] = make_reader(file).iter_messages()
+    body = json.loads(schema.data)["properties"]["body"]
+    assert body["description"] == "What it carries."
+    assert body["properties"]["mass_kg"] == {"type": "number", "unit": "kg"}
+    assert (channel.metadata["about"], channel.metadata["frame"]) == (LOAD.doc, LOAD.frame)
+    assert json.loads(message.data)["body"] == {"mass_kg": 20.0}
 
 
 def test_a_file_cut_off_anywhere_is_read_as_far_as_it_goes(tmp_path):
