@@ -39,7 +39,8 @@ from rampart.actors.recording.bag_writer import (
     RUN,
     UNHEARD,
     BagError,
-    new_file,
+    complete,
+    open_target,
 )
 from rampart.actors.recording.run_documents import MAX_FILE_BYTES
 from rampart.files.plain_text import shown
@@ -448,7 +449,8 @@ def repair(reader: BagReader, target: Path, *, overwrite: bool = False) -> int:
     records = reader.records()
     first = next(records, None)  # the header is read by now
     copied = 0
-    with new_file(target, overwrite=overwrite) as file:
+    file = open_target(target, overwrite=overwrite)
+    with complete(target), file:
         writer = Writer(file, compression=CompressionType.LZ4)
         writer.start(reader.profile, reader.library)
         schemas: dict[int, int] = {}

@@ -16,6 +16,7 @@ import errno
 import json
 import math
 import os
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -89,18 +90,18 @@ def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO
 
 
 @contextlib.contextmanager
-def new_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
-    """Have a new file; an incomplete one is not left behind.
+def complete(path: Path) -> Iterator[None]:
+    """Have a new file or folder written; an incomplete one is not left behind.
 
     Raises:
-        BagError: it exists, or cannot be written.
+        BagError: it cannot be written.
     """
-    file = open_target(path, overwrite=overwrite)
     try:
-        with file:
-            yield file
+        yield
     except BaseException as error:
-        if path.is_file():  # not a device
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        elif path.is_file():  # not a device
             path.unlink()
         if isinstance(error, OSError):
             raise BagError(f"{path}: {error.strerror or error}") from None

@@ -8,7 +8,6 @@ each key of the bus below `/rampart`, in a type of its own (`ros_structs`); and 
 from __future__ import annotations
 
 import re
-import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,13 +22,13 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode
 from rampart.actors.bus.topic import ROOT, ROS_SIDE, Topic
 from rampart.actors.bus.topic import Qos as BusQos
 from rampart.actors.recording.bag_reader import BagReader, key_of
-from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.bag_writer import BagError, complete
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.recording.ros_structs import StructTypes
 from rampart.actors.recording.ros_views import RosViews
@@ -80,18 +79,11 @@ class RosBag:
                 be read.
         """
         version: Any = 8 if self._types.distribution in _OLDER else 9
-        try:
-            writer = Writer(folder, version=version, storage_plugin=StoragePlugin.MCAP)
-        except WriterError:
-            raise BagError(f"{folder}: exists already; choose another name") from None
-        try:
-            with writer:
-                self._copy(reader, writer)
-        except BaseException as error:
-            shutil.rmtree(folder, ignore_errors=True)
-            if isinstance(error, OSError):
-                raise BagError(f"{folder}: {error.strerror or error}") from None
-            raise
+        if folder.exists():
+            raise BagError(f"{folder}: exists already; choose another name")
+        with complete(folder), Writer(
+                folder, version=version, storage_plugin=StoragePlugin.MCAP) as writer:
+            self._copy(reader, writer)
 
     def _copy(self, reader: BagReader, writer: Writer) -> None:
         for channel, message in reader.messages():

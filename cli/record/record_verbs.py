@@ -6,6 +6,7 @@ others.
 Examples:
   rampart bag info run.mcap
   rampart bag repair torn.mcap whole.mcap
+  rampart bag export run.mcap --to parquet
   rampart bag ros2 run.mcap run-ros2
 """
 
@@ -14,11 +15,14 @@ from __future__ import annotations
 import argparse
 import asyncio
 import fnmatch
-import json
+import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from rampart.actors.bus.run_info import NoRunError, RunInfo, find_run
 from rampart.actors.bus.topic import ROOT, Topic
@@ -41,6 +45,7 @@ from rampart.cli.output import (
     refusing,
     say,
 )
+from rampart.cli.record.export import Export
 from rampart.cli.record.replaying import DEFAULT_PORT, Replay
 from rampart.cli.session import tools_credentials
 from rampart.cli.verbs import (
@@ -58,8 +63,6 @@ from rampart.files import working_folder
 from rampart.files.plain_text import one_line
 
 _PORTS = (1024, 65535)
-_WIDTH = 11
-"""Of the names in front of the lines of `rampart bag info`."""
 
 
 def add(verbs: Any) -> None:
@@ -88,6 +91,11 @@ def add(verbs: Any) -> None:
     add_verb(bag, "repair", "write what can be read into a whole file", bag_repair,
              option("file", metavar="IN"), option("out", metavar="OUT"),
              flag("--overwrite", "OUT may exist"))
+    add_verb(bag, "export", "write it as tables, CSV or Parquet", bag_export,
+             option("file", metavar="IN"),
+             option("out", metavar="FOLDER", nargs="?", help="default: IN without its suffix"),
+             option("--to", choices=("csv", "parquet"), default="csv", help="default: csv"),
+             option("--topics", **topics, help="only channels that match one"), JSON)
     add_verb(bag, "ros2", "write it as a bag of ROS 2", bag_ros2,
              option("file", metavar="IN"), option("out", metavar="FOLDER"),
              option("--system", metavar="SPEC", help="file, or name of a shipped system, whose "
@@ -242,37 +250,54 @@ def bag_info(options: argparse.Namespace) -> int:
     """
     with refusing(BagError):
         summary = Summary(BagReader(Path(options.file)))
-    code = 1 if summary.reader.gaps else 0
     if options.json:
         print_json(described(summary))
-        return code
+    else:
+        for name, text in _lines(summary):
+            say(f"{name:<11}{one_line(text)}")
+        say()
+        print_table(("channel", "schema", "messages", "rate"), [
+            (one_line(row["channel"]), one_line(row["schema"]), row["messages"],
+             f"{row['rate_hz']:.2f} Hz" if row["rate_hz"] is not None else "")
+            for row in summary.table()])
+    return 1 if summary.reader.gaps else 0
+
+
+def _lines(summary: Summary) -> Iterator[tuple[str, str]]:
+    """Yield name and text of each line about a file."""
     reader, run = summary.reader, summary.run
-    _say(f"file       {options.file}, {reader.size_bytes / 1e6:.1f} MB, {reader.library}")
+    yield "file", f"{reader.path}, {reader.size_bytes / 1e6:.1f} MB, {reader.library}"
+    duration = f"{summary.duration_s:.1f} s"
     if reader.is_recording:
-        _say(f"run        {run.get('title', '')} ({run.get('run_id', '')}), "
-            f"rate {run.get('rate', '')}, rampart {run.get('rampart_version', '')}")
-        _say(f"began      {run.get('started') or 'in virtual time'}")
+        yield "run", (f"{run.get('title', '')} ({run.get('run_id', '')}), rate "
+                      f"{run.get('rate', '')}, rampart {run.get('rampart_version', '')}")
+        yield "began", run.get("started") or "in virtual time"
+        first_s = (summary.first_ns or 0) / 1e9 + summary.time_zero_s
+        duration += f", from {first_s:.1f} s of simulated time"
     else:
         profile = f", profile {reader.profile!r}" if reader.profile else ""
-        _say(f"run        none: not a recording of a run{profile}")
-    first_s = (summary.first_ns or 0) / 1e9 + summary.time_zero_s
-    say(f"duration   {summary.duration_s:.1f} s, from {first_s:.1f} s of simulated time"
-        if reader.is_recording else f"duration   {summary.duration_s:.1f} s")
-    say(f"messages   {summary.messages} on {len(reader.channels)} channels")
-    _say(f"lost       {_lost(summary)}")
+        yield "run", f"none: not a recording of a run{profile}"
+    yield "duration", duration
+    yield "messages", f"{summary.messages} on {len(reader.channels)} channels"
+    losses = _losses(summary)
+    yield "lost", "unknown" if losses is None else (
+        ", ".join(f"{count} of {name}" for name, count in losses.items()) or "none")
     if summary.unheard:
-        _say(f"unheard    {_unheard(summary)}")
-    _say(f"closed     {_closing(summary)}")
-    for line in left_behind(summary.reader, summary.time_zero_s):
-        _say(f"gone       {line}")
+        spans = [f"{host} from {begin_s:.1f} s {'on' if end_s is None else f'to {end_s:.1f} s'}"
+                 for host, those in summary.unheard.items() for begin_s, end_s in those]
+        yield "unheard", (", ".join(spans)
+                          or f"no host: {' and '.join(summary.unheard)} all the time")
+    if not reader.closed:
+        closing = "no: its writer did not come to the end"
+    elif reader.damage:
+        closing = "yes"
+    else:
+        closing = f"properly, because {summary.end.get('ended', 'its writer came to the end')}"
+    yield "closed", closing + (f"; damaged: {reader.damage}" if reader.damage else "")
+    for line in left_behind(reader):
+        yield "gone", line
     if summary.files:
-        _say(f"attached   {', '.join(name for name, _, _ in summary.files)}")
-    say()
-    print_table(("channel", "schema", "messages", "rate"), [
-        (one_line(row["channel"]), one_line(row["schema"]), row["messages"],
-         f"{row['rate_hz']:.2f} Hz" if row["rate_hz"] is not None else "")
-        for row in summary.table()])
-    return code
+        yield "attached", ", ".join(name for name, _, _ in summary.files)
 
 
 def bag_repair(options: argparse.Namespace) -> int:
@@ -288,10 +313,35 @@ def bag_repair(options: argparse.Namespace) -> int:
     with refusing(BagError):
         reader = BagReader(Path(options.file))
         copied = repair(reader, Path(options.out), overwrite=options.overwrite)
-    lines = left_behind(reader, time_zero_s(reader))
+    lines = left_behind(reader)
     say(f"{options.out}: {copied} messages; left behind: "
         f"{one_line(', '.join(lines)) or 'nothing'}")
     return 1 if lines else 0
+
+
+def bag_export(options: argparse.Namespace) -> int:
+    """Write a recording as tables.
+
+    One file per topic in a new folder, one row per message: CSV, or Parquet with
+    the extra `export`. The first column is simulated time; the others are the
+    fields of the message, such as body.x_m. Without --topics the channels for
+    viewers (view/…) are left out. The exit code is 1 if the recording is damaged
+    and something of it was left behind.
+
+    Examples:
+      rampart bag export run.mcap
+      rampart bag export run.mcap tables --to parquet --topics 'localization/*'
+    """
+    path = Path(options.file)
+    folder = Path(options.out or path.with_suffix(""))
+    with refusing(BagError):
+        reader = BagReader(path)
+        wants = None
+        if options.topics:
+            wants = matcher(options.topics, [row["channel"] for row in Summary(reader).table()])
+        done = Export(reader, wants)
+        done.write(folder, options.to)
+    return _copied(options, folder, done.counts, done.left_out, reader)
 
 
 def bag_ros2(options: argparse.Namespace) -> int:
@@ -311,26 +361,33 @@ def bag_ros2(options: argparse.Namespace) -> int:
     extra("ros2", "xxhash")
     from rampart.cli.record.ros_bags import write  # noqa: PLC0415 of the extra
 
-    bag, reader = write(
-        Path(options.file), Path(options.out), options.system, options.distribution)
-    code = 1 if reader.gaps else 0
-    left = {one_line(what): {"times": times, "why": one_line(why)}
-            for what, (times, why) in bag.left_out.items()}
+    folder = Path(options.out)
+    bag, reader = write(Path(options.file), folder, options.system, options.distribution)
+    return _copied(options, folder, bag.counts, bag.left_out, reader)
+
+
+def _copied(options: argparse.Namespace, folder: Path, counts: Counter[str],
+            left_out: Mapping[str, tuple[int, str]], reader: BagReader) -> int:
+    """Report what of a recording is in a folder and what is not, and return the exit code.
+
+    Raises:
+        NoEffectError: nothing is in it.
+    """
+    if not counts:
+        shutil.rmtree(folder)
+        raise NoEffectError(f"{options.file}: no message that could be written")
+    left = {one_line(topic): {"times": times, "why": one_line(why)}
+            for topic, (times, why) in left_out.items()}
     if options.json:
-        print_json({"folder": options.out, "messages": dict(bag.counts), "left_out": left,
-                    "gone": gone(reader, time_zero_s(reader))})
-        return code
-    say(f"{options.out}: {bag.counts.total()} messages on {len(bag.counts)} topics")
-    for what, one in left.items():
-        say(f"left out: {what}: {one['why']} ({one['times']} times)")
-    for line in left_behind(reader, time_zero_s(reader)):
-        say(f"gone: {one_line(line)}")
-    return code
-
-
-def _say(line: str) -> None:
-    """Print a line in which words of the file are; they steer no terminal."""
-    say(line[:_WIDTH] + one_line(line[_WIDTH:]))
+        print_json({"folder": str(folder), "messages": dict(counts), "left_out": left,
+                    "gone": gone(reader)})
+    else:
+        say(f"{folder}: {counts.total()} messages on {len(counts)} topics")
+        for topic, one in left.items():
+            say(f"left out: {topic}: {one['why']} ({one['times']} times)")
+        for line in left_behind(reader):
+            say(f"gone: {one_line(line)}")
+    return 1 if reader.gaps else 0
 
 
 def described(summary: Summary) -> dict[str, Any]:
@@ -339,55 +396,31 @@ def described(summary: Summary) -> dict[str, Any]:
     return {
         "file": str(reader.path), "size_bytes": reader.size_bytes, "profile": reader.profile,
         "library": reader.library, "recording": reader.is_recording, "closed": reader.closed,
-        "damage": reader.damage, "gone": gone(reader, summary.time_zero_s),
-        "duration_s": round(summary.duration_s, 3),
+        "damage": reader.damage, "gone": gone(reader), "duration_s": round(summary.duration_s, 3),
         "messages": summary.messages, "time_zero_s": summary.time_zero_s, "run": summary.run,
-        "end": summary.end, "lost": _losses(summary),
-        "unheard": summary.unheard,
+        "end": summary.end, "lost": _losses(summary), "unheard": summary.unheard,
         "attachments": [name for name, _, _ in summary.files], "channels": summary.table()}
 
 
-def gone(reader: BagReader, zero_s: float) -> list[dict[str, Any]]:
+def gone(reader: BagReader) -> list[dict[str, Any]]:
     """Return what could not be read, as plain data; times are simulated seconds, or null."""
+    def seconds(at_ns: int | None) -> float | None:
+        return None if at_ns is None else round(at_ns / 1e9 + time_zero_s(reader), 3)
+
     return [{"what": gap.what, "from_byte": gap.from_byte, "to_byte": gap.to_byte,
-             "from_s": None if gap.from_ns is None else round(gap.from_ns / 1e9 + zero_s, 3),
-             "to_s": None if gap.to_ns is None else round(gap.to_ns / 1e9 + zero_s, 3)}
-            for gap in reader.gaps]
+             "from_s": seconds(gap.from_ns), "to_s": seconds(gap.to_ns)} for gap in reader.gaps]
 
 
-def left_behind(reader: BagReader, zero_s: float) -> list[str]:
+def left_behind(reader: BagReader) -> list[str]:
     """Return the same in words, one for each gap."""
     return [f"bytes {one['from_byte']} to {one['to_byte']}" + (
         f", {one['from_s']:.2f} to {one['to_s']:.2f} s" if one["from_s"] is not None else "")
-        + f": {one['what']}" for one in gone(reader, zero_s)]
+        + f": {one['what']}" for one in gone(reader)]
 
 
 def _losses(summary: Summary) -> dict[str, int] | None:
-    """Return source → messages lost; None if the file does not say."""
+    """Return source → lost messages; None if the file has no count."""
     try:
-        return {str(k): int(v) for k, v in json.loads(summary.end["lost"]).items()}
-    except (KeyError, ValueError, AttributeError, TypeError, RecursionError, OverflowError):
+        return msgspec.json.decode(summary.end.get("lost", ""), type=dict[str, int])
+    except (ValueError, RecursionError):
         return None
-
-
-def _lost(summary: Summary) -> str:
-    losses = _losses(summary)
-    if losses is None:
-        return "unknown"
-    return ", ".join(f"{count} of {name}" for name, count in losses.items()) or "none"
-
-
-def _unheard(summary: Summary) -> str:
-    """Return when other hosts were not heard, so that what they said is missing."""
-    spans = [f"{host} from {begin_s:.1f} s {'on' if end_s is None else f'to {end_s:.1f} s'}"
-             for host, those in summary.unheard.items() for begin_s, end_s in those]
-    return ", ".join(spans) or f"no host: {' and '.join(summary.unheard)} all the time"
-
-
-def _closing(summary: Summary) -> str:
-    reader = summary.reader
-    if reader.closed:
-        why = f", because {summary.end['ended']}" if "ended" in summary.end else ""
-        return f"properly{why}" if not reader.damage else f"yes; damaged: {reader.damage}"
-    return "no: its writer did not come to the end" + (
-        f"; {reader.damage}" if reader.damage else "")

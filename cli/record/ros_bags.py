@@ -13,7 +13,7 @@ from rampart.actors.ros2.gateway import Gateway
 from rampart.actors.ros2.translation.tables import GATEWAY
 from rampart.actors.ros2.translation.types import Types
 from rampart.cli import systems
-from rampart.cli.output import NoEffectError, UsageError, refusing
+from rampart.cli.output import UsageError, refusing
 from rampart.cli.record.replaying import recorded_system
 from rampart.manager.spec.schema import SystemSpec
 
@@ -33,7 +33,6 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
 
     Raises:
         UsageError: a file cannot be read or written, or a word is wrong.
-        NoEffectError: there was nothing to be written.
     """
     with refusing(BagError, ValueError):
         reader = BagReader(file)
@@ -49,8 +48,6 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
             topics = systems.topics_of(spec)
         bag = RosBag(_types(spec, distribution), topics)
         bag.write(reader, folder)
-    if not bag.counts:
-        raise NoEffectError(f"{file}: no message that could be written")
     return bag, reader
 
 

@@ -1,0 +1,125 @@
+"""Recordings as tables, read back by other readers."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+
+import pytest
+from mcap.writer import Writer
+
+from rampart.cli.main import main
+from tests.actors.recording.samples import sample, write
+
+
+def table(path):
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def recording(tmp_path):
+    write(tmp_path / "run.mcap", sample())
+    return tmp_path / "run.mcap"
+
+
+def foreign(path, *values):
+    """An MCAP file of another tool with a JSON channel, and one that is not JSON."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("", "others")
+        texts = writer.register_channel("/a/b", "json", 0)
+        writer.add_message(writer.register_channel("a-b", "cdr", 0), 0, b"\0", 0)
+        for number, value in enumerate(values):
+            writer.add_message(texts, number * 10**9, json.dumps(value).encode(), 0)
+        writer.finish()
+    return path
+
+
+def test_each_topic_is_a_table_with_one_row_per_message(recording, capsys):
+    assert main(["bag", "export", str(recording), "--json"]) == 0
+    folder = recording.with_suffix("")
+    told = json.loads(capsys.readouterr().out)
+    assert told["folder"] == str(folder)
+    assert told["messages"] == {"localization/pose": 21, "detection/DM1": 2, "no/such/topic": 1}
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "detection-DM1.csv", "localization-pose.csv", "no-such-topic.csv"]
+    rows = table(folder / "localization-pose.csv")
+    assert [float(row["time_s"]) for row in rows] == sorted(float(row["time_s"]) for row in rows)
+    assert (rows[2]["time_s"], rows[2]["source"], rows[2]["body.x_m"]) == (
+        "0.1", "localization", "3.0")
+    assert rows[3]["body.yaw_rad"] == "", "NaN"
+    assert [row["error"] != "" for row in rows].count(True) == 1, "the message that is garbage"
+
+
+def test_parquet_has_numbers_and_lists(tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    path = foreign(tmp_path / "other.mcap", {"x": 1, "list": [1, 2]}, {"x": 2.5, "more": None}, 7)
+    assert main(["bag", "export", str(path), str(tmp_path / "out"), "--to", "parquet"]) == 0
+    assert parquet.read_table(tmp_path / "out" / "a-b.parquet").to_pylist() == [
+        {"time_s": 0.0, "x": 1.0, "list": [1, 2], "more": None, "value": None},
+        {"time_s": 1.0, "x": 2.5, "list": None, "more": None, "value": None},
+        {"time_s": 2.0, "x": None, "list": None, "more": None, "value": 7}]
+
+
+def test_parquet_of_a_recording_has_the_same_rows_as_csv(recording, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    for kind in ("csv", "parquet"):
+        assert main(["bag", "export", str(recording), str(tmp_path / kind), "--to", kind]) == 0
+    for path in (tmp_path / "csv").iterdir():
+        rows = parquet.read_table(tmp_path / "parquet" / f"{path.stem}.parquet").to_pylist()
+        assert [float(row["time_s"]) for row in table(path)] == [row["time_s"] for row in rows]
+    poses = parquet.read_table(tmp_path / "parquet" / "localization-pose.parquet").to_pylist()
+    assert math.isclose(poses[2]["body.x_m"], 3.0)
+
+
+def test_what_cannot_be_in_a_table_is_left_out_and_named(tmp_path, capsys):
+    pytest.importorskip("pyarrow")
+    path = foreign(tmp_path / "other.mcap", {"x": 1})
+    assert main(["bag", "export", str(path), str(tmp_path / "csv")]) == 0
+    assert "left out: a-b: encoding 'cdr', not JSON (1 times)" in capsys.readouterr().out
+    path = foreign(tmp_path / "mixed.mcap", {"x": 1}, {"x": "text"})
+    assert main(["bag", "export", str(path), str(tmp_path / "out"), "--to", "parquet"]) == 1
+    assert "no message that could be written" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_topics_with_the_same_file_name_are_two_files(tmp_path):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("", "others")
+        for topic in ("/a/b", "a-b", "/../../a/b"):
+            writer.add_message(writer.register_channel(topic, "json", 0), 0, b"{}", 0)
+        writer.finish()
+    assert main(["bag", "export", str(path), str(tmp_path / "out")]) == 0
+    assert len(list((tmp_path / "out").iterdir())) == 3
+
+
+def test_topics_are_chosen_and_a_damaged_recording_is_exported_as_far_as_it_goes(
+        recording, tmp_path, capsys):
+    out = str(tmp_path / "out")
+    assert main(["bag", "export", str(recording), out, "--topics", "detection/*"]) == 0
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["detection-DM1.csv"]
+    whole = recording.read_bytes()
+    recording.write_bytes(whole[:len(whole) * 2 // 3])
+    assert main(["bag", "export", str(recording), str(tmp_path / "torn")]) == 1
+    assert "gone: bytes " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("words", "told"), [
+    (["there"], "there: exists already"), (["no/such/place"], "No such file or directory"),
+    (["new", "--topics", "nothing"], "--topics nothing: matches no topic"),
+    (["new", "--to", "parquet"], "pip install 'rampart-robot[export]'")])
+def test_an_export_that_cannot_be_is_refused_in_one_line(
+        recording, monkeypatch, capsys, words, told):
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    monkeypatch.chdir(recording.parent)
+    (recording.parent / "there").mkdir()
+    assert main(["bag", "export", str(recording), *words]) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert not (recording.parent / "new").exists()
