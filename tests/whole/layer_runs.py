@@ -1,7 +1,7 @@
 """Whole missions in virtual time with only some layers of guards on.
 
 `python -m tests.whole.layer_runs N` makes N of each kind at random moments and prints the table of
-docs/explanation/safety.md.
+docs/evidence/results.md.
 """
 
 from __future__ import annotations
