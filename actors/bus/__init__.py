@@ -1,1 +1,1 @@
-"""Topics, messages, their bounds and envelopes, and the bus that carries them. Knows no robot."""
+"""Topics, messages with bounds and envelopes, and the bus that carries them. Knows no robot."""

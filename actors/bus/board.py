@@ -1,13 +1,13 @@
-"""The newest messages of the nodes of a host, where others of that host look when they need them.
+"""Posted states: the newest messages of a host's nodes, in files that its other nodes read.
 
-A message that is sent costs 0.2 to 0.3 ms of a processor for each reader, nearly all of it wake-ups
-on the way: of the sender's Zenoh, the router's, the reader's, and of the reader. Most messages of a
-robot that is well repeat the one before, to show that their sender works. Such a message is posted:
-it is written to a file in the folder of the run, and a reader looks there before it draws a
-conclusion from silence. To write and to read takes some microseconds and wakes no process.
+Sending a message costs 0.2 to 0.3 ms of processor time for each reader. Nearly all of that is
+wake-ups: of the sender's Zenoh, the router, the reader's Zenoh, and the reader. Most messages of a
+healthy robot repeat the previous one, to show that their sender works. Such a message is posted: it
+is written to a file in the run's folder, and a reader looks there before it concludes anything from
+silence. Writing and reading take microseconds and wake no process.
 
-A posting has a checksum. One that is damaged, cut short by the death of its writer, or not a file,
-counts as none: its node is silent.
+A posting has a checksum. A posting that is damaged, cut short by the death of its writer, or not a
+file counts as absent: its node is silent.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from typing import Protocol
 _HEAD = struct.Struct("<II")
 
 MOST_BYTES = 60_000
-"""A longer message is not posted, but sent."""
+"""A longer message is sent instead."""
 
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 _WRITE = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class Board(Protocol):
-    """Postings by key: of each the newest."""
+    """The newest posting of each key."""
 
     def post(self, key: str, payload: bytes) -> bool:
-        """Post a message in the place of the one before; False if that cannot be done."""
+        """Post a message, replacing the previous one; False if that fails."""
 
     def read(self, key: str) -> bytes | None:
-        """Return what is posted, None if nothing is, or nothing whole."""
+        """Return the posted message; None if there is none, or if it is damaged."""
 
 
 class MemoryBoard:
-    """The board of a system in one process."""
+    """Board of a system that runs in one process."""
 
     def __init__(self) -> None:
         self._payloads: dict[str, bytes] = {}
@@ -48,7 +48,7 @@ class MemoryBoard:
         return True
 
     def read(self, key: str) -> bytes | None:
-        """Return what is posted."""
+        """Return the posted message, None if there is none."""
         return self._payloads.get(key)
 
 
@@ -56,7 +56,7 @@ class FileBoard:
     """One process's access to the board of a run.
 
     Args:
-        folder: with a file for each posting. Only the user of the run can enter it.
+        folder: Holds one file per posting. Only the run's user can enter it.
     """
 
     def __init__(self, folder: str) -> None:
@@ -68,7 +68,7 @@ class FileBoard:
         return f"{self._folder}/{key.replace('/', ':')}"
 
     def post(self, key: str, payload: bytes) -> bool:
-        """Post a message; False if it is too long, or its file cannot be written."""
+        """Post a message; False if it is too long or its file cannot be written."""
         if len(payload) > MOST_BYTES:
             return False
         data = _HEAD.pack(len(payload), zlib.crc32(payload)) + payload
@@ -77,17 +77,17 @@ class FileBoard:
             if file is None:
                 file = self._files[key] = os.open(self._path(key), _WRITE, 0o600)
             return os.pwrite(file, data, 0) == len(data)
-        except OSError:  # the run is over, or there is no room
+        except OSError:  # the run is over, or the disk is full
             return False
 
     def read(self, key: str) -> bytes | None:
-        """Return what is posted, unless it is damaged or being written in this moment."""
+        """Return the posted message, unless it is damaged or being written right now."""
         try:
             file = self._read.get(key)
             if file is None:
                 file = self._read[key] = os.open(self._path(key), _READ)
             data = os.pread(file, _HEAD.size + MOST_BYTES, 0)
-        except OSError:  # there is none yet, or it is nothing that is read
+        except OSError:  # there is none yet, or it is not a file
             return None
         if len(data) < _HEAD.size:
             return None

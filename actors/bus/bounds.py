@@ -1,17 +1,16 @@
-"""The kinds of fields that messages are made of, each with its bounds.
+"""Field types of messages, each with its bounds.
 
-A field is bounded where it is decoded, once, so that no handler has to ask whether a number can be
-added to or a text be shown: whatever is beyond never reaches an actor, and is reported as `payload
-rejected`. The bounds are no contract of the robot's but what a message can mean at all: generous,
-and the same for all systems. `tests/actors/bus/test_message_bounds.py` finds a field that has none.
+A field is checked once, where it is decoded. A message beyond the bounds never reaches an actor and
+is reported as `payload rejected`, so no handler has to check sizes. The bounds are generous and the
+same for all systems: they limit what a message can mean, not what a robot does.
+`tests/actors/bus/test_message_bounds.py` finds fields without bounds.
 
 Measurements and commands (poses, velocities, distances, an illuminance) are plain `float` on
-purpose. NaN and infinity are what a broken sensor or controller publishes, and it is the subject of
-detection modules and of the Safety Pilot to see them and to judge them, which they could not if the
-bus took them away.
+purpose. A broken sensor or controller publishes NaN and infinity. Detection modules and the Safety
+Pilot have to see these values, so the bus must not remove them.
 
-A node must not publish what its readers refuse: a text that it did not make itself (of an
-exception, of a request, of names joined) is shortened with `clip` where the message is made.
+A node must not publish what its readers refuse. Text from elsewhere (exceptions, requests, joined
+names) is shortened with `clip` when the message is made.
 """
 
 from __future__ import annotations
@@ -25,22 +24,22 @@ Meta = msgspec.Meta
 T = TypeVar("T")
 
 NAME_CHARS = 256
-"""Longest name of a node, module, topic, light or order; a file name has as many at most."""
+"""Longest name of a node, module, topic, light or order; also the limit of file names."""
 
 TEXT_CHARS = 2000
 """Longest reason or explanation."""
 
 DOCUMENT_CHARS = 500_000
-"""Longest system spec; that of the full robot has ten thousand."""
+"""Longest system specification."""
 
 MAX_PAYLOAD_BYTES = 1 << 20
-"""Longest message of any topic, header included. It is looked at before anything is decoded."""
+"""Longest message of any topic, header included; checked before decoding."""
 
 MANY = 4096
-"""Most nodes, modules, goals of a mission: things that a system or a person counts one by one."""
+"""Most items of lists that people write: nodes, modules, goals of a mission."""
 
 MOST = 10_000
-"""Most way points of a route, lights of an airport: things that are counted by a program."""
+"""Most items of lists that programs make: way points of a route, lights of an airport."""
 
 Name = Annotated[str, Meta(max_length=NAME_CHARS)]
 Text = Annotated[str, Meta(max_length=TEXT_CHARS)]
@@ -51,19 +50,19 @@ Most = Annotated[tuple[T, ...], Meta(max_length=MOST)]
 Names = Many[Name]
 Texts = Many[Text]
 Explained = Many[tuple[Name, Text]]
-"""Names, each with what there is to say of it."""
+"""Names, each with an explanation."""
 
 Count = Annotated[int, Meta(ge=0, le=2**53)]
-"""Whole numbers that are counted up; exact in JSON and in a page's script too."""
+"""A counter; exact in JSON and JavaScript too."""
 
 Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-"""A whole number that stands for nothing countable, as a seed does."""
+"""Any integer of 64 bits, such as a seed."""
 
 Pid = Annotated[int, Meta(ge=0, le=2**22)]
-"""Process of this machine: Linux has no higher ones. 0 if there is none."""
+"""Process of this machine, up to the kernel's maximum; 0 for none."""
 
 Incarnation = Count
-"""How many-th process of a node, from 1; 0 before the first. A lost host takes a million."""
+"""Number of a node's process, from 1; 0 before the first. A lost host adds a million."""
 
 Seconds = Annotated[float, Meta(ge=-1e12, le=1e12)]
 """A point in simulated time: finite."""
@@ -72,30 +71,30 @@ Duration = Annotated[float, Meta(ge=0, le=1e12)]
 """A length of simulated time: finite."""
 
 Lasting = Annotated[float, Meta(ge=0)]
-"""A length of simulated time, which may be infinite: then it does not end."""
+"""A length of simulated time; infinity means without end."""
 
 Floats32 = Annotated[bytes, Meta(max_length=4 * 65_536)]
 """Little-endian float32 numbers."""
 
 
 def clip(text: str, chars: int = TEXT_CHARS) -> str:
-    """Return a text as a message can carry it: not longer than `chars`, and encodable."""
+    """Return a text shortened to `chars` and encodable, as messages require."""
     if not text.isascii():
         text = text.encode("utf-8", "replace").decode()
     return text if len(text) <= chars else f"{text[:chars - 3]}..."
 
 
 def bare(kind: Any) -> Any:
-    """Return the type of a field without its bounds; those of its parts are left."""
+    """Return the type of a field without its bounds; bounds of its parts stay."""
     return kind.__origin__ if hasattr(kind, "__metadata__") else kind
 
 
 NARROW = 1e6
-"""A range that is wider says what a message can mean at all, and nothing of what is usual."""
+"""Widest range that describes usual values; wider ones only limit what a message can mean."""
 
 
 def narrow_range(metas: Sequence[msgspec.Meta]) -> tuple[float, float] | None:
-    """Return the least and the greatest number that a field declares; None if it does not."""
+    """Return the range that a field declares; None if it has none, or a wide one."""
     low = [b for m in metas for b in (m.ge, m.gt) if b is not None]
     high = [b for m in metas for b in (m.le, m.lt) if b is not None]
     if not low or not high or not 0 < min(high) - max(low) < NARROW:
@@ -104,12 +103,12 @@ def narrow_range(metas: Sequence[msgspec.Meta]) -> tuple[float, float] | None:
 
 
 def oversized(value: Any, budget: int, depth: int) -> bool:
-    """Tell whether a value of any type holds more than `budget` bytes, or is nested too deep.
+    """Return whether a value has more than `budget` bytes or is nested too deep.
 
     Args:
-        value: of what msgpack can hold.
-        budget: bytes, where each number or container counts as eight.
-        depth: containers that may lie within each other.
+        value: Anything that msgpack can hold.
+        budget: Bytes; each number or container counts as eight.
+        depth: Most levels of nested containers.
     """
     left = budget
 

@@ -1,4 +1,4 @@
-"""What an actor needs of a bus. `ZenohBus` and `VirtualBus` fulfil it; one suite tests both."""
+"""The interface of a bus. `ZenohBus` and `VirtualBus` implement it; one suite tests both."""
 
 from __future__ import annotations
 
@@ -19,58 +19,57 @@ class BusError(Exception):
 
 
 class Bus(Protocol):
-    """Publish and subscribe on keys, and know who is there.
+    """Publish and subscribe on keys.
 
     Attributes:
-        bursts: Whether several messages may be delivered one after the other before the event
-            loop turns again.
+        bursts: Whether several messages may be delivered in one turn of the event loop.
     """
 
     bursts: bool
 
     @property
     def is_open(self) -> bool:
-        """Whether it has been opened, and not closed since."""
+        """Whether it is open."""
 
     async def open(self) -> None:
-        """Join the bus, if that has not been done.
+        """Join the bus; does nothing if it is open.
 
         Raises:
-            BusError: an endpoint is taken or invalid.
+            BusError: An endpoint is taken or invalid.
         """
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
-        """Send to all present subscribers of the key, without waiting for them."""
+        """Send to all present subscribers of the key without waiting."""
 
     def post(self, key: str, payload: bytes) -> bool:
-        """Put a message where the nodes of this host look; False if it has to be sent instead."""
+        """Post a message for the nodes of this host; False if it has to be sent instead."""
 
     def record(self, key: str, payload: bytes) -> None:
-        """Have a message that was posted and is not sent recorded: a recording has no gaps."""
+        """Record a message that is posted and not sent, so that a recording has no gaps."""
 
     def posted(self, key: str) -> bytes | None:
-        """Return the newest message that was posted by a node of this host; None if none was."""
+        """Return the newest message posted by a node of this host; None if there is none."""
 
     def has_readers(self, key: str) -> bool:
-        """Whether somebody hears a key now; True if that cannot be known."""
+        """Whether a key has subscribers now; True if that cannot be known."""
 
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:
-        """Have `deliver` called for each message on keys that match."""
+        """Call `deliver` for each message on matching keys."""
 
     def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
-        """Have `deliver` called once with the newest message on each key that matches.
+        """Call `deliver` once with the newest message of each matching key.
 
-        As far as it was published and its publisher is there; commands are not kept. `answered` is
-        called after the last of them, or when no answer is waited for any more.
+        Only living publishers answer, and commands are not kept. `answered` is called after the
+        last answer or at a timeout.
         """
 
     def after_burst(self, call: Callable[[], None]) -> None:
-        """Have `call` made when what has arrived together was delivered; soon if nothing has."""
+        """Call `call` when the present burst has been delivered, or soon if there is none."""
 
     def moved(self) -> bool:
-        """Whether, since this was last asked, messages were lost because a router has died.
+        """Whether messages were lost since the last call because a router died.
 
-        Also as long as there is none.
+        True as long as there is no router.
         """
 
     async def close(self) -> None:
@@ -78,7 +77,7 @@ class Bus(Protocol):
 
 
 class _SharedBus:
-    """Passes everything on to a bus that another actor opens and closes."""
+    """Forwards everything to a bus that another actor opens and closes."""
 
     def __init__(self, owner: Bus) -> None:
         self._owner = owner
@@ -96,8 +95,8 @@ class _SharedBus:
 
 
 def shared(owner: Bus) -> Bus:
-    """Return the access of a second actor to the session that another one opens, perhaps later.
+    """Return a second actor's access to a session that another actor opens, perhaps later.
 
-    The second one ends first.
+    The second actor has to end first.
     """
     return cast("Bus", _SharedBus(owner))

@@ -1,9 +1,8 @@
 """The wire format: a msgpack array of header and body, and the guard that checks what arrives.
 
-`[source, incarnation, sequence, stamp, body]`. The guard refuses what does not decode, what an
-older incarnation of a node still sends after its successor was heard or started, what claims an
-incarnation that was never issued, what comes twice, and what is stamped ahead of now: it would stay
-fresh for ever, and shut out all that is true after it.
+`[source, incarnation, sequence, stamp, body]`. The guard refuses messages that do not decode,
+messages of a superseded incarnation or of one that was never issued, duplicates, and stamps in the
+future. A stamp in the future would stay fresh indefinitely and shut out all later messages.
 """
 
 from __future__ import annotations
@@ -23,31 +22,29 @@ from rampart.actors.bus.topic import Qos, Topic
 B = TypeVar("B")
 
 UNREADABLE = (ValueError, RecursionError)
-"""What decoding the bytes of a stranger raises: msgspec's errors are ValueErrors, and so is that of
-a text which is no UTF-8; nesting without end is the other."""
+"""Errors of decoding foreign bytes: those of msgspec and of invalid UTF-8, and of deep nesting."""
 
 AHEAD_S = 0.1
-"""A stamp this far ahead of now (simulated seconds) is no jitter of a clock but wrong."""
+"""Largest clock jitter, simulated seconds; a stamp further in the future is wrong."""
 
 _PAUSE_S = 0.25
-"""After a pause of so many simulated seconds it is looked up again which process of a source
-counts: the host of this one may have been lost, and another process started in its place."""
+"""Pause of a source, simulated seconds, after which its issued incarnation is looked up again: its
+host may have been lost, and another process started in its place."""
 
 _REMEMBERED_COMMANDS = 64
 
 STRANGERS = 512
-"""Sources that are no nodes of the system, tools for the most part, of which something is
-remembered."""
+"""Most sources outside the system, such as tools, whose state is remembered."""
 
 _KEYS = 256
-"""On which one source may publish; of those above the first is forgotten."""
+"""Most keys per source whose state is remembered; the oldest is forgotten first."""
 
 
 class Header(msgspec.Struct, frozen=True, gc=False):
-    """Who sent a message and when.
+    """Source and time of a message.
 
-    `incarnation` counts the processes of a node; `sequence` the messages of one; `stamp` is the
-    simulated time at which the content was true (for a sensor: when it was measured).
+    `incarnation` counts the processes of a node, `sequence` the messages of one process. `stamp` is
+    the simulated time at which the content was true (for a sensor: of the measurement).
     """
 
     source: Name
@@ -64,7 +61,7 @@ class Envelope(Header, Generic[B], frozen=True, array_like=True, gc=False):
 
 pack: Callable[[tuple[str, int, int, float, msgspec.Struct]], bytes] = (
     msgspec.msgpack.Encoder().encode)
-"""Returns the payload for source, incarnation, sequence, stamp and body: `encode` in a hurry."""
+"""Return the payload for source, incarnation, sequence, stamp and body; faster than `encode`."""
 
 _decoders: dict[type[Any], Callable[[bytes], Envelope[Any]]] = {}
 
@@ -75,7 +72,7 @@ def encode(header: Header, body: msgspec.Struct) -> bytes:
 
 
 def strange_value(body: msgspec.Struct) -> str:
-    """Return which field of a message has a value that no message can have, "" if none has."""
+    """Return which field of a message cannot be encoded, and why; "" if all can."""
     waiting: list[tuple[str, Any]] = [("", body)]
     while waiting:
         path, value = waiting.pop()
@@ -100,8 +97,7 @@ def decode(topic: Topic[Any], payload: bytes) -> tuple[Header, Any]:
     """Return header and body of a payload.
 
     Raises:
-        ValueError, RecursionError: the payload is not a message of this topic's type, or longer
-            than any may be.
+        ValueError, RecursionError: The payload is too long, or not a message of this topic's type.
     """
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(too_long(payload))
@@ -110,12 +106,12 @@ def decode(topic: Topic[Any], payload: bytes) -> tuple[Header, Any]:
 
 
 def too_long(payload: bytes) -> str:
-    """Return what is wrong with a payload that is too long to be decoded."""
-    return f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are right"
+    """Return the error text of a payload that is too long."""
+    return f"{len(payload)} bytes, expected at most {MAX_PAYLOAD_BYTES}"
 
 
 def decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
-    """Return what decodes payloads with a kind of body; made in 0.1 ms, and then kept."""
+    """Return the decoder of payloads with this body; made in 0.1 ms and cached."""
     decode = _decoders.get(kind)
     if decode is None:
         made = msgspec.msgpack.Decoder(Envelope[kind])  # type: ignore[valid-type]
@@ -125,13 +121,13 @@ def decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
 
 @dataclass(slots=True)
 class _Heard:
-    """What was heard from the present incarnation of a node.
+    """Messages received from the present incarnation of a source.
 
     Attributes:
-        incarnation: which.
-        at_s: when, simulated seconds.
-        newest: newest sequence number by key, of the topics of which only the newest counts.
-        recent: of commands, by key, the last numbers.
+        incarnation: Its number.
+        at_s: Time of the last message, simulated seconds.
+        newest: Newest sequence number by key, for sensors and states.
+        recent: Last sequence numbers by key, for commands.
     """
 
     incarnation: int
@@ -143,17 +139,16 @@ class _Heard:
 class ArrivalGuard:
     """Decides for each arriving payload whether the actor may see it.
 
-    What it has to remember is bounded: nodes of the system are never forgotten, and of all others
-    only the last `STRANGERS`. So no flood of names can bring a superseded node back.
+    Its memory is bounded: it never forgets nodes of the system, and keeps the last `STRANGERS` of
+    all others. So a flood of names cannot bring a superseded node back.
 
     Args:
-        now: returns simulated seconds.
-        members: names of the nodes of the system.
-        crowded: called for each stranger that is forgotten.
-        register: returns the incarnation of a node that was issued last; None if that is not known,
-            as of tools.
-        command_age_s: a command older than this is refused, simulated seconds: it was under way
-            for so long that what it was meant for is past.
+        now: Returns simulated seconds.
+        members: Names of the nodes of the system.
+        crowded: Called for each stranger that is forgotten.
+        register: Returns the newest issued incarnation of a node; None if unknown, as for tools.
+        command_age_s: Oldest accepted command, simulated seconds. An older one was under way for
+            so long that its purpose is past.
     """
 
     def __init__(self, now: Callable[[], float], members: Collection[str] = (),
@@ -169,19 +164,19 @@ class ArrivalGuard:
 
     def receiver(self, topic: Topic[Any], take: Callable[[str, Envelope[Any]], None],
                  refuse: Callable[[str, str], None]) -> Callable[[str, bytes], None]:
-        """Return what is to be called with key and payload of each message of a topic.
+        """Return the receiver of a topic: a function of key and payload.
 
         Args:
-            topic: Which.
-            take: Called with the key and the message, unless it is a duplicate or was overtaken.
-            refuse: Called with the key and the reason, if it does not decode, is stamped ahead of
-                now, is a command that is too old, or comes from a superseded incarnation.
+            topic: The topic.
+            take: Called with key and message, unless the message is a duplicate or overtaken.
+            refuse: Called with key and reason if the message does not decode, has a stamp in the
+                future, is an old command, or comes from a superseded incarnation.
         """
         unpack, kind = decoder(topic.type), topic.type.__name__
         heard_of, meet, is_command = self._heard, self._meet, topic.qos is Qos.COMMAND
         now, object_to, age_s = self._now, self._object_to, self._command_age_s
 
-        def receive(key: str, payload: bytes) -> None:  # made of every message
+        def receive(key: str, payload: bytes) -> None:  # called for every message
             if len(payload) > MAX_PAYLOAD_BYTES:
                 refuse(key, f"not a {kind}: {too_long(payload)}")
                 return
@@ -191,7 +186,7 @@ class ArrivalGuard:
                 refuse(key, f"not a {kind}: {error}")
                 return
             now_s = now()
-            ahead_s = message.stamp - now_s  # which may be no number
+            ahead_s = message.stamp - now_s  # may be NaN
             if not ahead_s <= AHEAD_S or (is_command and ahead_s < -age_s):
                 refuse(key, f"stamped {ahead_s:.2f} s ahead of now" if not ahead_s <= AHEAD_S
                        else f"a command, given {-ahead_s:.2f} s ago")
@@ -227,7 +222,7 @@ class ArrivalGuard:
         return receive
 
     def _object_to(self, heard: _Heard | None, message: Header) -> str:
-        """Return why an incarnation is not that of a node's present process; "" if it may be."""
+        """Return why an incarnation is not a node's present one; "" if it may be."""
         which = f"incarnation {message.incarnation} of {message.source}"
         if heard is not None and message.incarnation < heard.incarnation:
             return f"{which} was superseded by {heard.incarnation}"
