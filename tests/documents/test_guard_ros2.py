@@ -1,0 +1,79 @@
+"""docs/tutorials/guard-a-ros2-robot.md: followed to the letter, up to the robot itself.
+
+Not run: the last step, which needs a robot with ROS 2. On processes the router of ROS 2 has a port
+of its own, where the page has the usual one.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rampart.testing import RealRun, free_port
+from tests import ROOT
+from tests.documents.test_authors import follow
+
+TEXT = (ROOT / "docs/tutorials/guard-a-ros2-robot.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+COMMANDS = [line for language, block in BLOCKS if language == "sh" for line in block.splitlines()]
+RUN = "rampart run --system guarded.toml"
+SECOND_TERMINAL = COMMANDS[COMMANDS.index(RUN) + 1:]
+
+
+def write(folder: Path) -> None:
+    """Write the files of the page into a new folder."""
+    folder.mkdir()
+    for language, block in BLOCKS:
+        if language != "sh":
+            first, _, rest = block.partition("\n")
+            follow(folder, first, rest)
+
+
+def execute(line: str, folder: Path, **more: str) -> str:
+    """Run a command of the page, and return what it prints."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(shlex.split(line), cwd=folder, check=False, text=True,
+                          env={**os.environ, "PATH": path, **more},
+                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=100)
+    assert done.returncode == 0, f"{line}\n{done.stdout}"
+    return done.stdout
+
+
+def test_the_guarded_robot_is_sound_and_its_navigation_restarted_in_virtual_time(tmp_path):
+    write(tmp_path / "guarded")
+    make, enter, *rest = COMMANDS[:COMMANDS.index(RUN)]
+    assert (make, enter) == ("mkdir guarded", "cd guarded")
+    check, run = rest
+    assert "sound" in execute(check, tmp_path / "guarded")
+    assert "navigation respawned by R_RESTART" in execute(run, tmp_path / "guarded")
+
+
+@pytest.mark.processes
+def test_on_processes_the_base_gets_the_guarded_command(tmp_path):
+    folder, port = tmp_path / "guarded", free_port()
+    write(folder)
+    file = folder / "guarded.toml"
+    text = file.read_text().replace("7447", str(port))
+    for row, parameter in (("robot:Navigation", f'connect = ["tcp/localhost:{port}"]'),
+                           ("robot:Base", f'connect = ["tcp/localhost:{port}"]'),
+                           ("rampart.actors.ros2.router:RosRouter",
+                            f'listen = "tcp/127.0.0.1:{port}"')):
+        assert f'"{row}"' in text
+        text = text.replace(f'"{row}"', f'"{row}"\nparameters = {{ {parameter} }}')
+    file.write_text(text)
+    check, echo, kill, status = SECOND_TERMINAL
+    with RealRun(folder, "guarded.toml") as real:
+        real.sleep_until(3)
+        here = {"RAMPART_PORT": str(real.port)}
+        assert "/base, geometry_msgs/msg/Twist" in execute(check, folder, **here)
+        velocity = execute(echo.replace("--ros", f"--ros tcp/localhost:{port}"), folder, **here)
+        assert "0.8" in velocity
+        execute(kill, folder, **here)
+        real.wait_until(lambda: "1 restarts" in execute(status, folder, **here), 20,
+                        "the navigation is not back")
