@@ -194,7 +194,7 @@ def test_a_stick_that_cannot_be_is_refused_in_one_line(rest, line):
 
 def test_the_example_of_the_document_is_sound():
     page = (ROOT / "docs/how-to/operator-page.md").read_text("utf-8")
-    document = page.partition("### A stick of your own")[2]
+    document = page.partition("### Add a joystick")[2]
     toml = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)[0]
     found = layout(toml.replace("tug/stick", "tank/hand"), PAGE + node("Needs"))
     assert [p.stick for p in found.members["page"].parameters.panels] == [DRIVE.stick]

@@ -1,0 +1,120 @@
+"""The how-to pages for operators: their commands are accepted, their files agree with the code.
+
+Commands that need no run are executed. The others need a run, a second terminal, another machine or
+a device; of these the options are parsed. Tests of each verb execute them on real runs.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+
+import pytest
+
+from rampart.cli import run_options
+from rampart.cli.main import build_parser, main
+from rampart.cli.operate import kill_node
+from rampart.cli.run import main as run_main
+from tests import ROOT, system_file, two_hosts
+
+HOW_TO = {name: (ROOT / f"docs/how-to/{name}.md").read_text(encoding="utf-8") for name in (
+    "operator-page", "terminal", "recordings", "several-machines", "credentials",
+    "troubleshooting")}
+COMMANDS = [(page, line.partition("  #")[0].strip()) for page, text in HOW_TO.items()
+            for block in re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+            for line in block.splitlines()]
+ELSEWHERE = {"pip": "needs an index", "scp": "needs another machine"}
+ALONE = re.compile(r"rampart (keys|tokens|bag|doctor)\b")
+"""Commands that need no run."""
+
+
+def words(line: str) -> list[str]:
+    """Return a command without the variables in front of it."""
+    return shlex.split(re.sub(r"^\w+=(\$\(.*?\)|\S*) ", "", line))
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS)
+def test_a_command_is_accepted(page, line):
+    program, *arguments = words(line)
+    if program == "kill-node":
+        kill_node._parser().parse_args(arguments)
+    elif program == "rampart":
+        build_parser().parse_args(arguments)
+    elif program == "python":
+        assert arguments.pop(0) == "launch.py"
+        found = [word for word in arguments if word not in ("--system", "my.toml")]
+        run_options.parse(found, "launch.py")
+    else:
+        assert program in ELSEWHERE, page
+
+
+def follow(capsys, *pages: str) -> str:
+    """Execute the commands of pages that need no run, in order, and return what they print."""
+    told = []
+    for page, line in COMMANDS:
+        if page in pages and ALONE.match(line):
+            code = main(words(line)[1:])
+            out, err = capsys.readouterr()
+            assert code == 0, f"{line}\n{out}{err}"
+            told.append(out)
+    return "".join(told)
+
+
+def test_credentials_are_made_shared_renewed_and_revoked(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("cryptography")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my.toml").write_text(two_hosts.two_hosts(
+        {"robot": "192.168.7.1", "ground": "192.168.7.2"}))
+    told = follow(capsys, "credentials")
+    assert "keys for host ground" in told
+    assert not (tmp_path / "keys" / "ada.pem").exists()
+    assert (tmp_path / "robot-keys" / "DM5.pem").exists()  # it takes over from the ground station
+    assert not (tmp_path / "ground-keys" / "safety_pilot.pem").exists()
+    assert not (tmp_path / "robot-keys" / "authority.key").exists()
+
+
+def test_tokens_are_issued_and_revoked(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    follow(capsys, "operator-page")
+    assert "anna" not in (tmp_path / "page.tokens").read_text(encoding="utf-8")
+
+
+def test_a_recording_is_made_repaired_and_written_for_ros_2(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("rosbags")
+    monkeypatch.chdir(tmp_path)
+    assert run_main(["--system", str(system_file("cell")), "--virtual", "--duration", "3",
+                     "--record", "run.mcap", "--report", "report"], "launch.py") == 0
+    (tmp_path / "torn.mcap").write_bytes((tmp_path / "run.mcap").read_bytes())
+    capsys.readouterr()
+    assert "left behind: nothing" in follow(capsys, "recordings")
+    assert (tmp_path / "run-ros2" / "metadata.yaml").exists()
+
+
+def test_doctor_is_the_first_thing_to_try(capsys):
+    assert "open files" in follow(capsys, "troubleshooting")
+
+
+def test_the_mechanism_for_a_lost_link_is_the_tested_one():
+    blocks = re.findall(r"^```toml\n(.*?)^```", HOW_TO["several-machines"],
+                        re.DOTALL | re.MULTILINE)
+    assert tomllib.loads(blocks[1]) == tomllib.loads(two_hosts.HOME_WHEN_LOST)
+
+
+def test_the_symptoms_are_words_of_the_code():
+    sources = "\n".join(file.read_text(encoding="utf-8")
+                        for top in ("actors", "cli", "sim", "files", "manager")
+                        for file in (ROOT / top).rglob("*")
+                        if file.suffix in {".py", ".js"})
+    code = re.sub(r"[^a-z]+", " ", re.sub(r'"\s*\n\s*f?"', "", sources.lower()))
+    rows = re.findall(r"^\| (.*?) \|", HOW_TO["troubleshooting"] + HOW_TO["credentials"].partition(
+        "## What a refused certificate looks like")[2], re.MULTILINE)
+    symptoms = [part for row in rows for part in re.findall(r"`([^`]+)`|\*([^*]+)\*", row)]
+    unknown = []
+    for symptom in filter(None, (" ".join(part).strip() for part in symptoms)):
+        found = re.sub(r"[^a-z]+", " ", symptom.lower()).split()
+        length = min(3, len(found) - 1)  # one word may be a name
+        runs = [" ".join(found[i:i + length]) for i in range(len(found) - length + 1)]
+        if not any(f" {run} " in f" {code} " for run in runs):
+            unknown.append(symptom)
+    assert unknown == []
