@@ -157,16 +157,6 @@ def test_the_authors_formats_load_as_an_airport_of_ones_own(tmp_path, image):
     assert airport.warnings == ("field.graph: lights: none: nothing will be measured",)
 
 
-def test_the_default_scale_of_an_image_is_the_authors(tmp_path):
-    write_foreign(tmp_path, {"nodes": [{"id": "N1", "x": -70, "y": 67}], "edges": []},
-                  "x=-70,y=67,taxi=1")  # fmt: skip
-    airport = load_airport(tmp_path)
-    west, south, east, north = airport.bounds_m
-    # columns 10 to 110 = 5.2 * (x + 80), rows 40 to 80 = 4.6 * (80 - y)
-    assert (west, east) == pytest.approx((10 / 5.2 - 80, 110 / 5.2 - 80), abs=0.3)
-    assert (south, north) == pytest.approx((80 - 80 / 4.6, 80 - 40 / 4.6), abs=0.3)
-
-
 def test_jpeg_ringing_beside_an_edge_does_not_widen_the_pavement(tmp_path):
     pixels = np.zeros((120, 120, 3), dtype=np.uint8)
     pixels[..., 0] = 255
@@ -261,7 +251,3 @@ def test_a_name_that_no_file_can_have_is_refused_like_one_that_is_not_there(name
     assert "cannot be read: File name too long" in refusal(load_airport, name)
     airport = load_airport("vallombre")
     assert name[:200] in refusal(load_mission, f"{name}.miss", airport)
-
-
-def test_a_scale_that_is_not_positive_is_refused():
-    assert "both must be positive" in refusal(MaskScale, 0.0)

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis.airport.checks import mission_problems, problems
-from rampart.actors.osmosis.airport.errors import AirportError
 from rampart.actors.osmosis.airport.model import (
     Airport,
     Light,
@@ -37,23 +36,6 @@ def findings(made: Airport) -> list[str]:
     return [f"{found.field}: {found.remedy}" for found in problems(made)]
 
 
-@pytest.mark.parametrize(
-    ("point", "distance_m"),
-    [
-        ((3, 10), 3.0),  # middle of the western corridor
-        ((1, 1), 1.0),
-        ((5.5, 10), 0.5),  # close to the island
-        ((10, 10), -4.0),  # middle of the island
-        ((-2, 10), -2.0),  # out in the grass
-        ((-3, -4), -5.0),  # nearest is the corner
-    ],
-)
-def test_distance_to_the_prohibited_area_is_positive_outside_it_and_negative_inside(
-    point, distance_m
-):
-    assert airport().prohibited_distance_m(*point) == pytest.approx(distance_m)
-
-
 @given(st.floats(-30, 50), st.floats(-30, 50))
 def test_distance_to_the_prohibited_area_agrees_with_geos(x, y):
     point = shapely.Point(x, y)
@@ -70,23 +52,8 @@ def test_a_footprint_is_in_the_prohibited_area_as_soon_as_one_corner_is():
     assert made.footprint_in_prohibited(rectangle(0.45, 10, 0.7, 0.72, 0.614))
 
 
-def test_the_prohibited_polygon_and_the_allowed_area_share_no_ground():
-    made = airport()
-    assert made.prohibited_polygon().intersection(made.allowed).area == pytest.approx(0)
-    assert made.prohibited_polygon(1.0).area == pytest.approx(22 * 22 - RING.area)
-
-
-def test_the_nearest_place_on_the_graph_may_be_in_the_middle_of_an_edge():
-    found = airport().nearest_on_graph(10, 4)
-    assert ({found.a, found.b}, found.point) == ({"SW", "SE"}, (10, 3))
-    assert found.distance_m == pytest.approx(1)
-
-
 def test_a_sound_airport_has_no_problems():
     assert findings(airport()) == []
-
-
-GOAL_FAR = Mission("M", (MissionGoal(10, 10, "taxi"),))
 
 
 @pytest.mark.parametrize(
@@ -138,9 +105,3 @@ def test_a_goal_on_a_part_of_the_graph_without_connection_is_found():
     made = airport(edges=(("SW", "SE"), ("NE", "NW")))
     mission = Mission("M", (MissionGoal(17, 3, "taxi"), MissionGoal(17, 17, "taxi")))
     assert [p.field for p in mission_problems(mission, made)] == ["missions.M.goals[1]"]
-
-
-def test_asking_for_a_mission_that_is_not_there_names_those_that_are():
-    made = airport(missions={"A": GOAL_FAR})
-    with pytest.raises(AirportError, match=r"^Ring: missions: 'B': no such mission, there are: A$"):
-        made.mission("B")

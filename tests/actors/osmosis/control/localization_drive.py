@@ -22,16 +22,28 @@ from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.runtime.injection import FaultGate, Outgoing
 from rampart.sim.faults.disturbance import Fault
 from rampart.sim.osmosis.simulator import Schedule
-from rampart.sim.osmosis.trial.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS, OsmosisFaults
 from rampart.sim.osmosis.world import World
 
 START_RAD = 0.7
 SOURCES = {"gps": topics.GPS, "imu": topics.IMU, "odom": topics.ODOMETRY,
            "absolute-pose": topics.ABSOLUTE_POSE, "encoders": topics.BASE_STATUS}
 
+STAMPED = (topics.GPS, topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE)
+
+
+def sensor_faults(*sensors: str) -> list[str]:
+    """Names of the faults of these sensors, and of their topics, by the names in `SOURCES`."""
+    named = [name for name in SENSOR_FAULTS if name.startswith(sensors)]
+    keys = [SOURCES[sensor].key for sensor in sensors]
+    ways = ("drop", "freeze", "delay", "corrupt")
+    return named + [f"{way}:{key}" for way in ways for key in keys]
+
+
 # Seconds, m/s, rad/s: standing, straight, a bend, on the spot, backwards, a fast bend, standing.
 LEGS = ((1.5, 0.0, 0.0), (4.0, 1.0, 0.0), (3.0, 0.8, 0.4), (3.0, 1.0, 0.0), (2.5, 0.0, 1.2),
         (3.0, 1.0, 0.0), (2.0, -0.5, 0.0), (3.0, 0.6, -0.9), (5.0, 1.0, 0.0), (2.0, 0.0, 0.0))
+END_S = sum(leg[0] for leg in LEGS)
 
 
 @dataclass(frozen=True)

@@ -215,25 +215,6 @@ def test_planner_control_and_pilot_may_die_in_the_middle_and_the_mission_goes_on
     play(scenario)
 
 
-def test_an_order_stops_at_once_and_its_end_lets_the_mission_go_on():
-    async def scenario(house):
-        house.request(TO_ROW)
-        await asyncio.sleep(5.0)
-        assert house.base.command.linear_mps > 0.5
-        order = m.PilotOrder(True, m.PilotMode.STOP, "stale command")
-        house.base.publish(topics.PILOT_ORDER, order, name="RM2")
-        await asyncio.sleep(0.02)
-        assert house.base.command == m.BaseCommand(0.0, 0.0)
-        assert house.base.pilot.mode is m.PilotMode.STOP
-        await asyncio.sleep(2.0)
-        assert house.base.command == m.BaseCommand(0.0, 0.0)
-        house.base.publish(topics.PILOT_ORDER, m.PilotOrder(False, m.PilotMode.STOP, ""),
-                           name="RM2")
-        assert await house.until(lambda: phase(house) is m.MissionPhase.SUCCEEDED, 90)
-
-    play(scenario)
-
-
 def test_the_joystick_pre_empts_and_hands_back():
     async def scenario(house):
         house.request(TO_ROW)
@@ -248,51 +229,11 @@ def test_the_joystick_pre_empts_and_hands_back():
     play(scenario)
 
 
-@pytest.mark.parametrize("protected", [True, False])
-def test_a_command_out_of_bounds_reaches_the_base_only_in_the_baseline(protected):
-    layers = {} if protected else {"safety_pilot_checks": False, "manager_watch": False,
-                                   "ftm": False}
-
-    async def scenario(house):
-        await house.kill("osmosis_control")
-        house.base.publish(topics.COMMAND, m.Twist(3.0, 0.0))
-        await asyncio.sleep(0.02)
-        assert house.base.command.linear_mps == (0.0 if protected else 3.0)
-        await asyncio.sleep(0.3)
-        assert house.base.command.linear_mps == (0.0 if protected else 3.0)
-        assert house.base.pilot.refused_commands == (1 if protected else 0)
-
-    play(scenario, **layers)
-
-
-def test_with_the_pose_frozen_control_goes_on_as_the_papers_does():
-    async def scenario(house):
-        house.request(TO_ROW)
-        await asyncio.sleep(8.0)
-        house.base.localized = False
-        moving = house.base.command.linear_mps
-        await asyncio.sleep(2.0)
-        assert moving > 0.5
-        assert house.base.command.linear_mps == pytest.approx(moving, abs=0.3)
-
-    play(scenario)
-
-
 def test_no_way_fails_the_mission_and_the_robot_stays():
     async def scenario(house):
         house.request(m.Goal(500.0, 0.0, Mode.TAXI))
         assert await house.until(lambda: phase(house) is m.MissionPhase.FAILED, 5)
         assert "from the graph" in house.base.status.reason
         assert house.base.command == m.BaseCommand(0.0, 0.0)
-
-    play(scenario)
-
-
-def test_without_a_mission_zero_is_commanded_twenty_times_a_second():
-    async def scenario(house):
-        before = house.base.commands
-        await asyncio.sleep(2.0)
-        assert house.base.command == m.BaseCommand(0.0, 0.0)
-        assert 38 <= house.base.commands - before <= 50
 
     play(scenario)

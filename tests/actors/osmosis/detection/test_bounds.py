@@ -58,13 +58,6 @@ def test_a_respawned_check_claims_nothing_before_it_knows(events, expected):
     assert play(check, command(check), events) == expected
 
 
-def test_the_reason_names_value_and_limit_of_the_first_bad_command():
-    check = checker()
-    check.note(beyond(2.5, 0.0, 1.0, 2.0), 0.0)
-    check.note(beyond(0.0, 9.0, 1.0, 2.0), 0.1)
-    assert check.reason == "commanded speed 2.50 m/s exceeds 1 m/s"
-
-
 @given(st.floats(), st.floats())
 def test_active_if_and_only_if_the_command_is_out_of_bounds(linear, angular):
     fault = beyond(linear, angular, 1.0, 2.0)

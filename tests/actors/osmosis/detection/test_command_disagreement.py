@@ -96,13 +96,6 @@ def test_a_command_from_the_future_is_not_compared_when_its_sender_is_silent(sta
     assert not bench.comparison.active
 
 
-def test_the_reason_names_both_commands():
-    bench = Bench()
-    bench.play("wwww")
-    assert bench.comparison.reason == (
-        "commands differ: 0.80 m/s 0.90 rad/s and 0.80 m/s 0.00 rad/s")
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.text("=~", min_size=1, max_size=40))
 def test_who_agrees_is_never_accused(events):

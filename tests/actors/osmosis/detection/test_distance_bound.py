@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import box
@@ -27,15 +25,6 @@ WALKS = st.tuples(PLACES, st.lists(st.tuples(
     st.floats(-3, 3), st.floats(-3, 3), st.floats(-2, 2), st.floats(-2, 2)), max_size=30))
 
 
-class Looked:
-    def __init__(self) -> None:
-        self.times = 0
-
-    def __call__(self, x_m: float, y_m: float) -> float:
-        self.times += 1
-        return AIRPORT.prohibited_distance_m(x_m, y_m)
-
-
 @settings(max_examples=200, deadline=None)
 @given(WALKS, st.floats(0, 6))
 def test_the_bound_says_what_the_exact_distance_says(walk, needed_m):
@@ -57,20 +46,3 @@ def test_a_robot_farther_away_than_its_reach_intrudes_nowhere(walk, extra_m):
         fix = GpsFix(x_m, y_m, vx_mps, vy_mps, 0.05)
         if bound.exceeds(x_m, y_m, reach_m(fix, LIMITS, extra_m)):
             assert not intrusion(fix, AIRPORT.prohibited_distance_m, LIMITS, extra_m)
-
-
-def test_a_robot_that_creeps_along_the_middle_is_looked_up_once():
-    looked = Looked()
-    bound = DistanceBound(looked)
-    for step in range(20):
-        assert bound.exceeds(-10 + 0.1 * step, 0.0, 1.0)
-    assert looked.times == 1
-
-
-def test_near_the_edge_every_fix_is_looked_up():
-    looked = Looked()
-    bound = DistanceBound(looked)
-    for step in range(20):
-        assert not bound.exceeds(0.01 * step, 3.5, 1.0)
-    assert looked.times == 20
-    assert math.isclose(AIRPORT.prohibited_distance_m(0.0, 3.5), 0.5)

@@ -8,20 +8,14 @@ import math
 import pytest
 
 from rampart.actors.detection.freshness import Freshness, FreshnessMonitor
-from rampart.actors.detection.module import EXCUSE_S, DetectionModule
-from rampart.actors.detection.stub import StubDetection
+from rampart.actors.detection.module import EXCUSE_S
 from rampart.actors.ftm import messages as fm
 from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.runtime.actor import Header, on
-from rampart.actors.runtime.run_plan import RunPlan
-from rampart.actors.system.layout import Layout
-from rampart.actors.system.members import heard
-from rampart.sim.virtual.virtual_loop import VirtualLoop
-from rampart.testing import Ear, play, run, table
+from rampart.testing import Ear, play, table
 from tests.actors.osmosis.detection.sources import Source
-from tests.osmosis_system import COMMAND, POSE, System, shipped_system
+from tests.osmosis_system import COMMAND, POSE, in_system
 
 # f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead,
 # i infinitely far ahead, n no number
@@ -79,218 +73,82 @@ def test_it_becomes_active_exactly_when_the_age_reaches_the_timeout():
     assert monitor.reason == "command not updated for 0.3 s"
 
 
-def test_the_actor_reports_at_once_and_repeats_what_has_not_changed_each_second():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            source = system.start("source", Source)
-            dm2 = system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
-            await asyncio.sleep(0.01)
-            assert ear.states == ["idle"]
-            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
-            sent_s = system.clock.now()
-            await asyncio.sleep(2.0)
-            first = next(at for at, report in ear.heard if report.state == "active")
-            assert first == pytest.approx(sent_s + 0.3, abs=1e-6)
-            assert len(ear.heard) == pytest.approx(2.0 + 1, abs=1)
-            for _ in range(10):
-                source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
-                await asyncio.sleep(0.05)
-            assert ear.states == ["idle", "active", "idle"]
-            assert dm2.state is fm.DetectionState.IDLE
-            assert ear.heard[-1][1].reason == ""
-
-    run(scenario)
+@in_system()
+async def test_the_actor_reports_at_once_and_repeats_what_has_not_changed_each_second(system):
+    ear = system.start("ear", Ear)
+    source = system.start("source", Source)
+    dm2 = system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
+    await asyncio.sleep(0.01)
+    assert ear.states == ["idle"]
+    source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+    sent_s = system.clock.now()
+    await asyncio.sleep(2.0)
+    first = next(at for at, report in ear.heard if report.state == "active")
+    assert first == pytest.approx(sent_s + 0.3, abs=1e-6)
+    assert len(ear.heard) == pytest.approx(2.0 + 1, abs=1)
+    for _ in range(10):
+        source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+        await asyncio.sleep(0.05)
+    assert ear.states == ["idle", "active", "idle"]
+    assert dm2.state is fm.DetectionState.IDLE
+    assert ear.heard[-1][1].reason == ""
 
 
-def test_a_respawned_module_is_silent_until_it_knows_that_the_topic_is_stale():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            system.start("DM6", Freshness, **POSE, timeout_s=0.5)
-            await asyncio.sleep(0.1)
-            await system.kill("DM6")
-            ear.heard.clear()
-            system.start("DM6", Freshness, **POSE, timeout_s=0.5)
-            await asyncio.sleep(0.45)
-            assert ear.heard == []
-            await asyncio.sleep(0.1)
-            assert ear.states == ["active"]
-
-    run(scenario)
+@in_system()
+async def test_a_respawned_module_is_silent_until_it_knows_that_the_topic_is_stale(system):
+    ear = system.start("ear", Ear)
+    system.start("DM6", Freshness, **POSE, timeout_s=0.5)
+    await asyncio.sleep(0.1)
+    await system.kill("DM6")
+    ear.heard.clear()
+    system.start("DM6", Freshness, **POSE, timeout_s=0.5)
+    await asyncio.sleep(0.45)
+    assert ear.heard == []
+    await asyncio.sleep(0.1)
+    assert ear.states == ["active"]
 
 
-def test_a_respawned_module_is_idle_as_soon_as_it_hears_a_fresh_sample():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            source = system.start("source", Source)
-            system.start("DM6", Freshness, **POSE, timeout_s=1.0)
-            await system.settle()
-            await system.kill("DM6")
-            ear.heard.clear()
-            system.start("DM6", Freshness, **POSE, timeout_s=1.0)
-            await system.settle()
-            source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
-            await system.settle()
-            assert ear.states == ["idle"]
-
-    run(scenario)
-
-
-def test_a_respawned_module_whose_first_sample_is_old_never_says_idle():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            source = system.start("source", Source)
-            system.start("DM6", Freshness, **POSE, timeout_s=0.5)
-            await asyncio.sleep(1.05)
-            await system.kill("DM6")
-            ear.heard.clear()
-            system.start("DM6", Freshness, **POSE, timeout_s=0.5)
-            await system.settle()
-            source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0), stamp=system.clock.now() - 0.9)
-            await asyncio.sleep(0.001)
-            assert ear.states == ["active"]
-
-    run(scenario)
+@in_system()
+async def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_judges(system):
+    ear, source = system.start("ear", Ear), system.start("source", Source)
+    system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
+    source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+    await asyncio.sleep(0.1)
+    loop = asyncio.get_running_loop()
+    loop.jump(2.0)  # all are late, and so are the messages; the first of its mail may be old
+    source.publish(topics.COMMAND, m.Twist(0.5, 0.0), stamp=system.clock.now() - 1.0)
+    await asyncio.sleep(EXCUSE_S / 2)
+    source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+    await asyncio.sleep(0.2)
+    assert ear.states == ["idle"]
+    loop.jump(2.0)  # the mail is read, but there was none
+    await asyncio.sleep(GRACE_S + 0.02)
+    assert ear.states == ["idle", "active"]
 
 
-def test_a_module_that_was_itself_stopped_may_find_an_old_sample_first_in_its_mail():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            source = system.start("source", Source)
-            system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
-            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
-            await asyncio.sleep(0.1)
-            loop = asyncio.get_running_loop()
-            assert isinstance(loop, VirtualLoop)
-            loop.jump(2.0)
-            source.publish(topics.COMMAND, m.Twist(0.5, 0.0), stamp=system.clock.now() - 1.0)
-            await asyncio.sleep(EXCUSE_S / 2)
-            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
-            await asyncio.sleep(0.2)
-            assert ear.states == ["idle"]
-
-    run(scenario)
+@pytest.mark.parametrize(("parameter", "value", "expected"), [
+    *(("timeout_s", value, "a number") for value in ("soon", -1.0, True, None)),
+    ("suspects", "x", "a list")])
+@in_system()
+async def test_a_parameter_that_makes_no_sense_is_refused_by_name(
+        system, parameter, value, expected):
+    with pytest.raises(ValueError, match=rf"parameters\.{parameter} = .*: expected {expected}"):
+        system.start("DM2", Freshness, **{**COMMAND, "timeout_s": 1.0, parameter: value})
 
 
-def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_judges():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            source = system.start("source", Source)
-            system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
-            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
-            await asyncio.sleep(0.1)
-            loop = asyncio.get_running_loop()
-            assert isinstance(loop, VirtualLoop)
-            loop.jump(2.0)  # all are late, and so are the messages
-            await asyncio.sleep(0.01)
-            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
-            await asyncio.sleep(0.2)
-            assert ear.states == ["idle"]
-            loop.jump(2.0)  # the mail is read, but there was none
-            await asyncio.sleep(GRACE_S + 0.02)
-            assert ear.states == ["idle", "active"]
-
-    run(scenario)
-
-
-def test_each_module_hears_its_own_topic_only():
-    members = Layout(RunPlan(), shipped_system()).members
-    assert list(heard(members["DM2"])) == ["control/command"]
-    assert list(heard(members["DM6"])) == ["localization/pose"]
-
-
-@pytest.mark.parametrize("value", ["soon", -1.0, True, None])
-def test_a_timeout_that_is_no_duration_is_refused_by_name(value):
-    async def scenario() -> None:
-        async with System() as system:
-            with pytest.raises(ValueError, match=r"parameters\.timeout_s = .*: expected a number"):
-                system.start("DM2", Freshness, **COMMAND, timeout_s=value)
-
-    run(scenario)
-
-
-class TooFast(DetectionModule):
-    """A module without a monitor, as somebody might write it."""
-
-    @on(topics.COMMAND)
-    def command(self, message: m.Twist, _header: Header) -> None:
-        if message.linear_mps > 1.0:
-            self.activate("too fast")
-        else:
-            self.know_idle()
-
-
-def test_a_respawned_module_without_a_monitor_is_silent_until_it_says_that_it_knows():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            source = system.start("source", Source)
-            system.start("D_FAST", TooFast)
-            await asyncio.sleep(0.3)
-            await system.kill("D_FAST")
-            ear.heard.clear()
-            system.start("D_FAST", TooFast)
-            await asyncio.sleep(1.0)
-            assert ear.heard == []
-            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
-            await asyncio.sleep(3.0)
-            assert ear.states == ["idle"]
-            assert len(ear.heard) == pytest.approx(3, abs=1)
-            source.publish(topics.COMMAND, m.Twist(1.5, 0.0))
-            await system.settle()
-            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
-            await system.settle()
-            assert ear.states == ["idle", "active", "idle"]
-
-    run(scenario)
-
-
-def test_a_respawned_stand_in_is_idle_and_not_silent_for_ever():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            system.start("D_LEVEL", StubDetection)
-            await asyncio.sleep(0.3)
-            await system.kill("D_LEVEL")
-            ear.heard.clear()
-            system.start("D_LEVEL", StubDetection)
-            await asyncio.sleep(4.5)
-            assert ear.states == ["idle"]
-            assert len(ear.heard) >= 4
-
-    run(scenario)
-
-
-def test_it_names_the_suspected_node_and_the_life_that_was_heard_last():
-    async def scenario() -> None:
-        async with System() as system:
-            ear = system.start("ear", Ear)
-            system.start("localization", Source)
-            await system.kill("localization")
-            source = system.start("localization", Source)
-            system.start("DM6", Freshness, **POSE, timeout_s=0.3, suspects=["localization"])
-            system.start("DM2", Freshness, **COMMAND, timeout_s=0.3, suspects=["osmosis_control"])
-            await system.settle()
-            for _ in range(5):
-                source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
-                await asyncio.sleep(0.1)
-            await asyncio.sleep(5.0)
-            named = {report.reason: report.nodes for _, report in ear.heard if report.reason}
-            assert named == {"localization not updated for 0.3 s": ("localization#2",),
-                             "command never heard": ("osmosis_control",)}
-
-    run(scenario)
-
-
-def test_suspects_that_are_no_names_are_refused():
-    async def scenario() -> None:
-        async with System() as system:
-            with pytest.raises(ValueError, match=r"parameters.suspects = 'x': expected a list"):
-                system.start("DM6", Freshness, **POSE, timeout_s=1.0, suspects="x")
-
-    run(scenario)
+@in_system()
+async def test_it_names_the_suspected_node_and_the_life_that_was_heard_last(system):
+    ear = system.start("ear", Ear)
+    system.start("localization", Source)
+    await system.kill("localization")
+    source = system.start("localization", Source)
+    system.start("DM6", Freshness, **POSE, timeout_s=0.3, suspects=["localization"])
+    system.start("DM2", Freshness, **COMMAND, timeout_s=0.3, suspects=["osmosis_control"])
+    await system.settle()
+    for _ in range(5):
+        source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+        await asyncio.sleep(0.1)
+    await asyncio.sleep(5.0)
+    named = {report.reason: report.nodes for _, report in ear.heard if report.reason}
+    assert named == {"localization not updated for 0.3 s": ("localization#2",),
+                     "command never heard": ("osmosis_control",)}

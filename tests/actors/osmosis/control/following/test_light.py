@@ -78,11 +78,6 @@ def test_an_obstacle_that_flickers_is_waited_for():
     assert world.least_clearance_m > 0.5
 
 
-def test_an_obstacle_beside_the_row_does_not_stop_the_robot():
-    world = World(circles=[Circle(10.0, 1.1, 0.4)])
-    assert drive(world, LightRow(ROW), 40).arrived
-
-
 def test_a_respawned_row_follower_resumes_in_the_middle():
     world = World()
     drive(world, LightRow(ROW), 10)
@@ -123,13 +118,6 @@ def test_a_light_whose_samples_are_missing_is_not_judged_until_passed_again():
     again = LightInspection(lights, judged=(m.light for m in first))
     second = inspect(lights, factors, inspection=again)
     assert [(m.light, m.verdict) for m in second] == [("L1", "ok")]
-
-
-def test_a_row_entered_in_the_middle_of_a_light_does_not_judge_that_one():
-    lights = light_row(4)
-    factors = dict.fromkeys((li.name for li in lights), 1.0)
-    found = inspect(lights, factors, start_m=4.6)  # the sensor starts beyond L1, at 5 m
-    assert sorted(m.light for m in found) == ["L2", "L3"]
 
 
 def test_with_a_frozen_pose_nothing_is_judged():

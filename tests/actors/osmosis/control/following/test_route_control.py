@@ -62,14 +62,6 @@ def test_without_a_route_zero_is_commanded_and_with_one_it_accelerates():
     assert not bench.core.report()
 
 
-def test_it_begins_once_when_route_pose_and_sweep_are_there():
-    bench = Bench()
-    bench.core.route(WAY)
-    assert not bench.core.begins()
-    bench.drive(PERIOD_S)
-    assert [bench.core.begins(), bench.core.begins()] == [True, False]
-
-
 def test_a_wrong_route_is_refused_and_looked_at_again_with_another_goal():
     bench = Bench(check=RouteCheck(AIRPORT))
     bench.drive(0.2)

@@ -19,9 +19,8 @@ from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserP
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.osmosis.messages import LaserScan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
-from rampart.testing import run
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
-from tests.osmosis_system import System, shipped_system
+from tests.osmosis_system import in_system, shipped_system
 
 RAYS, TOP_M, PERIOD_S = 5, 8.0, 0.05
 ANGLE_MIN = -0.2
@@ -60,21 +59,6 @@ def test_one_laser_alone_gives_every_view():
         assert bench.changes == i + 1
         assert (bench.view.stamp_s, bench.view.fault) == (i * PERIOD_S, "")
         assert distances(bench.view) == [3.0]
-
-
-def test_two_make_one_view_at_the_rate_of_one():
-    bench = Bench()
-    for i in range(20):
-        bench.feed(LOWER, healthy(i), i * PERIOD_S)
-        bench.feed(UPPER, healthy(i + 100), i * PERIOD_S)
-    assert bench.changes == 20
-
-
-def test_a_ray_is_as_short_as_the_shorter_of_the_two():
-    bench = Bench()
-    bench.feed(UPPER, healthy(1, (8, 2, 4, 8, 8)), 0.0)
-    bench.feed(LOWER, healthy(2, (1, 8, 5, 8, 8)), 0.0)
-    assert distances(bench.view) == [1.0, 2.0, 4.0]
 
 
 def broken(way, i):
@@ -147,22 +131,6 @@ def test_without_any_that_can_be_believed_there_is_no_view_and_a_reason(way):
     assert not len(bench.view.points)
 
 
-def test_if_both_are_silent_the_view_grows_old():
-    bench = Bench()
-    bench.feed(LOWER, healthy(1), 1.0)
-    assert bench.view.stamp_s == 1.0  # and no word since: its reader sees its age
-
-
-def test_one_that_comes_back_is_used_again():
-    bench = Bench()
-    for i in range(200):
-        now_s = i * PERIOD_S
-        bad = 20 <= i < 60
-        bench.feed(LOWER, sweep((8,) * 5, 0.1) if bad else healthy(i, (8, 8, 2, 8, 8)), now_s)
-        bench.feed(UPPER, healthy(i), now_s)
-    assert distances(bench.view) == [2.0]
-
-
 @pytest.mark.parametrize("other", [
     LaserScan(-0.3, 0.1, TOP_M, np.full(7, 4, "<f4").tobytes(), 0.1001),
     LaserScan(-0.2, 0.05, TOP_M, np.full(9, 4, "<f4").tobytes(), 0.1001),
@@ -224,13 +192,6 @@ def test_a_laser_that_proved_itself_and_does_so_no_more_is_not_believed():
     assert "reference" in bench.view.fault
 
 
-def test_a_number_that_is_none_hides_no_echo_of_the_other():
-    bench = Bench()
-    bench.feed(UPPER, healthy(1, (math.nan, 8, 3, 8, 8)), 0.0)
-    bench.feed(LOWER, healthy(2, (1, math.nan, math.nan, 8, 8)), 0.0)
-    assert distances(bench.view) == [1.0, 3.0]
-
-
 class Rest(Actor):
     """All that the pilot hears, and the base."""
 
@@ -246,23 +207,20 @@ class Rest(Actor):
 
 
 @pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
-def test_one_sweep_from_the_future_neither_blinds_the_safety_pilot_nor_stops_it_for_good(stamp_s):
-    async def scenario() -> None:
-        async with System(system=shipped_system()) as system:
-            rest = system.start("rest", Rest)
-            system.start("safety_pilot", SafetyPilot)
-            await system.settle()
-            for i in range(80):
-                rest.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus((), (), (), (), "", 0))
-                rest.publish(topics.COMMAND, m.Twist(0.8, 0.0))
-                rest.publish(topics.SCAN, full_sweep(8.0 if i < 60 else 0.6, i),
-                             stamp=stamp_s if i == 30 else None)
-                await asyncio.sleep(PERIOD_S)
-                if i == 58:
-                    assert set(rest.speeds[-20:]) == {0.8}
-            assert rest.speeds[-1] == 0.0, "there is something in the way"
-
-    run(scenario)
+@in_system(system=shipped_system())
+async def test_one_sweep_from_the_future_neither_blinds_the_pilot_nor_stops_it(system, stamp_s):
+    rest = system.start("rest", Rest)
+    system.start("safety_pilot", SafetyPilot)
+    await system.settle()
+    for i in range(80):
+        rest.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus((), (), (), (), "", 0))
+        rest.publish(topics.COMMAND, m.Twist(0.8, 0.0))
+        rest.publish(topics.SCAN, full_sweep(8.0 if i < 60 else 0.6, i),
+                     stamp=stamp_s if i == 30 else None)
+        await asyncio.sleep(PERIOD_S)
+        if i == 58:
+            assert set(rest.speeds[-20:]) == {0.8}
+    assert rest.speeds[-1] == 0.0, "there is something in the way"
 
 
 rays = st.lists(st.floats(0.25, 8.0, width=32), min_size=RAYS, max_size=RAYS)
