@@ -19,20 +19,17 @@ import rampart.sim.runs.record
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Header, encode
-from rampart.actors.bus.limits import REPORTS_PER_S, RateLimit, Remembered, ReportLimit
+from rampart.actors.bus.limits import REPORTS_PER_S
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.recording.views import OsmosisViews
-from rampart.actors.runtime.actor import Actor, Context, on
+from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.injection import MAX_DELAYED, MAX_IN_FORCE
-from rampart.actors.runtime.mailbox import COMMAND_CAPACITY, MESSAGE_SLOTS, Dispatcher
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
-from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
-from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock
@@ -135,23 +132,6 @@ def test_no_actor_remembers_more_names_than_it_has_room_for(name):
     assert flooded(system("osmosis"), name) == []
 
 
-def test_what_remembers_without_bound_is_found(monkeypatch):
-    class Hoarder(Actor):
-        def __init__(self, context):
-            super().__init__(context)
-            self.heard = {}
-
-        @on(ftm_topics.RESET)
-        def reset(self, message, _header):
-            self.heard[message.by] = message
-
-    of = system("osmosis")
-    monkeypatch.setattr(of.layout, "members", {
-        **of.layout.members, "DM1": type(of.layout.members["DM1"])(
-            "DM1", Hoarder, Hoarder.Parameters())})
-    assert flooded(of, "DM1") == [(".heard", FLOOD)]
-
-
 # -- what shows and records ---------------------------------------------------------------------
 
 
@@ -203,44 +183,6 @@ def test_a_flood_of_strangers_does_not_bring_a_superseded_node_back():
     assert refused == ["incarnation 1 of localization was superseded by 2"]
     assert len(taken) == 1 + 3 * STRANGERS
     assert len(crowded) == 2 * STRANGERS
-
-
-def test_strangers_in_the_mailbox_leave_room_for_the_nodes_of_the_system():
-    refused = []
-    mailbox = Dispatcher(True, refused.append, lambda call: call())
-    for room, slot in ((COMMAND_CAPACITY, lambda _: None), (MESSAGE_SLOTS, str)):
-        half = room // 2
-        strangers = [mailbox.put_message(slot(n), n, reserved=False) for n in range(half + 2)]
-        assert strangers == [True] * half + [False] * 2
-        nodes = [mailbox.put_message(slot(-1 - n), n) for n in range(half + 2)]
-        assert nodes == [True] * half + [False] * 2
-    assert mailbox.put_message("0", "the newest", reserved=False)
-    assert mailbox.overflowed == len(refused) == 8
-    mailbox.put("timer", "an item of its own always has room")
-    assert len(mailbox) == COMMAND_CAPACITY + MESSAGE_SLOTS + 1
-
-
-def test_remembered_forgets_what_was_put_in_first_and_counts():
-    kept = Remembered(2)
-    for name in ("a", "b", "a", "c", "d"):
-        kept[name] = name
-    assert (list(kept), kept.forgotten) == (["c", "d"], 2)
-
-
-def test_a_rate_limit_counts_what_does_not_pass_and_tells_it_when_its_second_is_over():
-    limit = RateLimit(2)
-    assert [limit.allows(0.1 * n) for n in range(5)] == [True, True, False, False, False]
-    assert limit.left_out(0.9) == 0
-    assert [limit.left_out(1.0), limit.left_out(1.0)] == [3, 0]
-    assert limit.allows(1.0)
-
-
-def test_error_reports_are_one_a_second_of_a_kind_and_few_in_all():
-    reports = ReportLimit()
-    assert [reports.stands_for("a", t) for t in (0.0, 0.5, 0.9, 1.0, 2.5)] == [1, 0, 0, 3, 1]
-    passed = sum(bool(reports.stands_for(f"{n}", 5.0)) for n in range(10_000))
-    assert passed == REPORTS_PER_S
-    assert reports.left_out(6.0) == 10_000 - REPORTS_PER_S
 
 
 def during(kind, act, seconds=1.5):
@@ -298,16 +240,3 @@ def test_injections_of_one_node_are_bounded_and_so_is_what_they_hold_back():
 
     reports = during(Quiet, act, seconds=0.1)
     assert any("one was dropped" in report["reason"] for report in reports)
-
-
-def test_actuator_faults_at_a_time_are_bounded():
-    faults = ActuatorFaults(Motor(1.0, 1.0, 1.0, 1.0))
-
-    def fault(number):
-        return m.ActuatorFault(f"{number}", m.ActuatorFaultKind.BRAKE_FAILURE, "", 0.5, 1.0)
-
-    for number in range(64):
-        faults.order(fault(number), 0.0)
-    with pytest.raises(WorldError, match="64 faults are in force"):
-        faults.order(fault(64), 0.0)
-    faults.order(fault(63), 0.0)  # known already

@@ -16,10 +16,9 @@ from random import Random
 import pytest
 
 from tests import ROOT
-from tests.fuzz import run as fuzz_run
 from tests.fuzz import targets
 from tests.fuzz.mutate import Mutator
-from tests.fuzz.target import CORPUS, MAX_INPUT
+from tests.fuzz.target import MAX_INPUT
 
 ALL = sorted(targets.ALL)
 KEPT = [(name, path) for name in ALL for path in sorted(targets.ALL[name].folder.glob("*"))]
@@ -43,19 +42,6 @@ def test_samples_are_read_or_refused_and_so_is_what_is_made_of_them(name):
         if outcome not in outcomes:
             outcomes.add(outcome)
             pool.append(data)
-
-
-def test_every_folder_of_the_corpus_belongs_to_a_target():
-    assert {path.name for path in CORPUS.iterdir() if path.is_dir()} <= set(ALL)
-
-
-def test_a_seed_gives_the_same_inputs_again():
-    one = targets.ALL["airport-toml"]
-    (data, other), mutated = one.samples(), Mutator(one.kind, one.words)
-    first, second = ([mutated(data, other, draw) for _ in range(50)]
-                     for draw in (Random(3), Random(3)))
-    assert first == second
-    assert len(set(first)) > 40
 
 
 # -- the harness itself ----------------------------------------------------------------------------
@@ -100,13 +86,3 @@ def test_what_a_decoder_must_not_do_is_found_and_kept(tmp_path, how, words):
     assert bool(result["findings"]) == bool(words)
     kept = {path.name for path in (tmp_path / "kept").rglob("sick/*")}
     assert kept == {Path(found["input"]).name for found in result["findings"]}
-
-
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["--target", "nobody"], "no target 'nobody'; there are: adaptation, "),
-    (["--runs", "0"], "--runs and --jobs must be 1 or more")])
-def test_bad_usage_is_one_line(arguments, words, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["fuzz", *arguments])
-    assert fuzz_run.main() == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line

@@ -46,20 +46,6 @@ def test_what_ends_an_actor_is_found_and_comes_again_with_the_seed(monkeypatch):
     assert fuzz_actor("paper", "localization", finding.seed) == finding
 
 
-def test_what_takes_too_long_is_found(monkeypatch):
-    class Slow(Actor):
-        @on(topics.POSE)
-        def pose(self, _message, _header):
-            while True:
-                pass
-
-    monkeypatch.setattr(handler_fuzz, "PATIENCE_S", 0.05)
-    member = system("paper").layout.members["localization"]
-    monkeypatch.setattr(system("paper").layout, "members", {
-        **system("paper").layout.members, "localization": type(member)("localization", Slow, {})})
-    assert "SlowError" in fuzz_actor("paper", "localization", 1).what
-
-
 def heard_by_the_supervisor(*bodies):
     """Return the contexts of what a supervisor reports when it is told of changed systems."""
     of = system("paper")

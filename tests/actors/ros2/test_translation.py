@@ -158,12 +158,6 @@ def test_what_a_sensor_says_it_does_not_know_is_none_and_the_rest_passes(kind, f
     assert {name for name in made.__struct_fields__ if getattr(made, name) is None} == unknown
 
 
-def test_no_echo_is_a_range_and_infinite_as_in_rep_117():
-    made, _ = heard(SCAN, message_of(Ros2Link(type=SCAN, subscribe="/x", to="x"), JAZZY))(
-        changed(SCAN, ranges=np.full(3, math.inf, "f4")))
-    assert made.nearest_m == math.inf
-
-
 def test_of_transforms_the_one_that_is_meant():
     there = JAZZY.decode(TF, said(TF, Pose, frame="map", child="odom")(Pose(1.0, 2.0, 0.3), 5))
     assert len(there.transforms) == 1
@@ -349,12 +343,6 @@ def test_a_definition_of_a_robot_replaces_the_one_that_ships(tmp_path):
                                 for part in ("Goal", "Result", "Feedback")}
 
 
-@pytest.mark.parametrize("name", sorted(set(DISTRIBUTIONS) - {"humble", "iron"}))
-def test_the_result_of_navigation_has_its_error_message(name):
-    assert [field for field, _ in Types(name).fields("nav2_msgs/action/NavigateToPose_Result")
-            ] == ["error_code", "error_msg"]
-
-
 @pytest.mark.parametrize("text", ["uint8 a\r\nstring b # c\r\n", "uint8 a\u2028string b\n",
                                   "# \u00e9\u2028uint8 a\n\x0cstring b"])
 def test_lines_of_a_definition_end_as_in_ros_2(tmp_path, text):
@@ -364,13 +352,6 @@ def test_lines_of_a_definition_end_as_in_ros_2(tmp_path, text):
     types = Types("jazzy", [tmp_path])
     for name in ("a/msg/A", "a/srv/A_Request"):
         assert [field for field, _ in types.fields(name)] == ["a", "b"]
-
-
-def test_a_message_without_fields_is_one_of_ros_2(tmp_path):
-    types = Types("kilted", [write(tmp_path, "std_msgs/msg/Empty.msg", "uint8 ONE=1\n")])
-    assert types.hash("std_msgs/msg/Empty") == Types("kilted").hash("std_msgs/msg/Empty")
-    assert types.encode("std_msgs/msg/Empty", types.blank("std_msgs/msg/Empty")).hex() == (
-        "0001000000")
 
 
 AS_RCLPY_SAYS = bytes.fromhex(  # JointState(name=["a"], position=[1.0]), by serialize_message
