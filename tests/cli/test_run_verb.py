@@ -13,7 +13,11 @@ from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
 from rampart.testing import free_port
 from tests import CELL, ROOT
+from tests.two_hosts import two_hosts
 from tests.whole.checkpoint_runs import write_short_mission
+
+SPECIFIED_TANK = (ROOT / "docs" / "specification.md").read_text(
+    encoding="utf-8").split("```toml\n")[1].split("```")[0]
 
 
 def short(tmp_path):
@@ -31,14 +35,6 @@ def test_messages_and_help_say_what_was_typed(capsys, start, name):
     told = capsys.readouterr().out
     assert told.startswith(f"usage: {name} ")
     assert f"  {name} --mission A --obstacles 2 " in told
-
-
-def test_a_rate_that_is_none_is_refused_in_one_line(capsys):
-    with pytest.raises(SystemExit) as ended:
-        launch.main(["--rate", "fast"])
-    assert ended.value.code == 2
-    assert capsys.readouterr().err.splitlines()[-1].endswith(
-        "argument --rate: invalid float value: 'fast'")
 
 
 def test_a_run_whose_page_would_have_another_program_s_port_is_refused(tmp_path, capsys):
@@ -74,3 +70,62 @@ def test_launch_py_writes_its_report_into_its_checkout(tmp_path):
     assert done.returncode == 0, done.stderr
     assert len([*(tmp_path / "checkout/reports").glob("*-SHORT/inspection-*.html")]) == 1
     assert not (tmp_path / "reports").exists()
+
+
+NO_OPTION = "no option of the launcher or of tank; --system tank.toml --help shows those there are"
+TANK, TWO = ["--system", "tank.toml"], ["--system", "two.toml"]
+GROUND = [*TWO, "--host", "ground"]
+REFUSED = [
+    (["--mission", "Z"], "'Z'"),
+    (["--mission", "far.miss"], "far.miss: missions.far.goals[1]: (500, 0)"),
+    (["--airport", "atlantis"], "atlantis"),
+    (["--airport", str(CELL)], "cell.toml: title: 'Pick and place behi"),
+    (["--strategy", "hope"], "hope"),
+    (["--shadow", "bold"], "--shadow bold: unknown strategy; known: "),
+    (["--system", "nowhere.toml"], "nowhere.toml"),
+    (["--system", "/tmp"], "--system /tmp: is a directory"),
+    (["--system", sys.executable], "not UTF-8 text"),
+    (["--rate", "0"], "--rate 0"),
+    (["--obstacles", "-1"], "--obstacles -1"),
+    (["--obstacles", "99"], "99"),
+    (["--port", "80"], "--port 80"),
+    (["--patience", "nan"], "nan"),
+    (["--duration", "5"], "--duration 5: a mission ends by itself"),
+    (["--report", "/proc/x"], "--report /proc/x: no directory that can be written"),
+    (["--report", __file__], f"--report {__file__}: no directory that can be written"),
+    (["--fault", "gps-bias@goal99"], "--fault gps-bias@goal99: mission AB has 5 goals"),
+    (["--host", "ground"], "--host ground: osmosis has no [[host]]; it runs on one machine"),
+    (["--no-keys"], "--no-keys: osmosis runs on one machine"),
+    ([*TANK, "--virtual"], "--virtual: in virtual time a run has to end: give --duration S"),
+    ([*TANK, "--fault", "kill:nobody"], "no node 'nobody'; there are: supervisor, pump_controller"),
+    ([*TANK, "--patience", "7"], "--patience 7: tank has no mission"),
+    ([*TANK, "--obstacles", "1"], f"--obstacles: {NO_OPTION}"),
+    ([*TANK, "--joystick"], f"--joystick: {NO_OPTION}"),
+    *(([*TANK, *page], "no node of tank serves an operator's page")
+      for page in (["--wait"], ["--hmi-port", "9000"], ["--hmi-host", "0.0.0.0"])),
+    ([*TWO, "--host", "moon", "--no-keys"], "--host moon: unknown; known: robot, ground"),
+    (GROUND, "osmosis runs on 2 hosts: say --keys DIR"),
+    (TWO, "osmosis runs on 2 hosts: say --keys DIR"),
+    ([*TWO, "--no-keys", "--keys", "keys"], "--no-keys: either that or --keys"),
+    ([*GROUND, "--virtual"], "--host ground: virtual time is on one machine"),
+    *(([*GROUND, "--no-keys", option, value], f"{option} {value}: on host ground the first host's "
+       "command line decides that")
+      for option, value in (("--seed", "7"), ("--mission", "A"), ("--record", "x.mcap"))),
+    ([*TWO, "--no-keys", "--hmi-port", "9000"],
+     "--hmi-port 9000: no node of osmosis on host the first serves an operator's page"),
+    ([*TWO, "--no-keys"], "cannot listen at 192.0.2.1 port 7462 for the other hosts"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), REFUSED, ids=[" ".join(a) for a, _ in REFUSED])
+def test_bad_usage_is_one_clear_line_and_exit_code_2(
+        tmp_path, monkeypatch, capfd, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tank.toml").write_text(SPECIFIED_TANK)
+    (tmp_path / "two.toml").write_text(two_hosts({"robot": "192.0.2.1", "ground": "192.0.2.2"}))
+    (tmp_path / "far.miss").write_text("x=-22,y=-18.5,taxi=1\nx=500,y=0,taxi=0\n")
+    report = [] if "--report" in arguments else ["--report", str(tmp_path / "report")]
+    assert launch.main([*arguments, *report]) == 2
+    told = capfd.readouterr()
+    assert (told.out, told.err.count("\n")) == ("", 1), told.err
+    assert words in told.err

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 import random
-import signal
 from pathlib import Path
 
 import msgspec
@@ -18,14 +17,13 @@ from rampart.actors.osmosis.control.following.path_follower import PathFollower
 from rampart.actors.osmosis.control.following.route_control import (
     CONTROL_STATE,
     ControlKept,
-    whole_row,
 )
 from rampart.actors.osmosis.control.mission.mission_state import (
     MISSION_STATE,
     MissionState,
     catch_up,
 )
-from rampart.actors.osmosis.control.polyline import NO_POINTS, Polyline
+from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.runtime.checkpoint import Loaded, MemoryCheckpoints, Record, StateError
 from rampart.actors.runtime.checkpoint_file import files_of, read
 from rampart.manager.arbitration.arbiter import build_arbiter
@@ -76,54 +74,30 @@ def test_a_mission_catches_up_with_the_step_that_others_were_given(state, heard,
     assert MISSION_STATE.objection(after) == ""
 
 
-@pytest.mark.parametrize(("state", "why"), [
-    (mission(9), "step 9 of 4 goals"),
-    (mission(-1, step_times_s=()), "step -1 of 4 goals"),
-    (mission(4), "running after the last goal"),
-    (mission(2, step_times_s=(1.0,)), "1 step times at step 2"),
-    (msgspec.structs.replace(mission(), mission_id=""), "running without a mission"),
-    (mission(lights=(m.LightMeasurement("A", 1.0, 1.0, m.LightVerdict.OK),) * 2),
-     "a light is in it twice"),
-    (msgspec.structs.replace(mission(), goals=(m.Goal(float("nan"), 0.0, m.Mode.TAXI),) * 4),
-     "a number is not finite"),
+@pytest.mark.parametrize("state", [
+    mission(9), mission(-1, step_times_s=()), mission(4), mission(2, step_times_s=(1.0,)),
+    msgspec.structs.replace(mission(), mission_id=""),
+    mission(lights=(m.LightMeasurement("A", 1.0, 1.0, m.LightVerdict.OK),) * 2),
+    msgspec.structs.replace(mission(), goals=(m.Goal(float("nan"), 0.0, m.Mode.TAXI),) * 4),
 ])
-def test_a_mission_that_makes_no_sense_is_refused(state, why):
-    with pytest.raises(StateError, match=why):
+def test_a_mission_that_makes_no_sense_is_refused(state):
+    with pytest.raises(StateError):
         MISSION_STATE.decode(1, MISSION_STATE.encode(state))
     assert MISSION_STATE.decode(1, MISSION_STATE.encode(mission())) == mission()
 
 
-@pytest.mark.parametrize(("kept", "why"), [
-    (ControlKept(LightsKept("x", (m.LightMeasurement("A", 1.0, 1.0, m.LightVerdict.OK),) * 2)),
-     "measured twice"),
-    (ControlKept(progress_m=float("nan")), "not finite"),
-    (ControlKept(row_start=(0.0, float("inf"))), "not finite"),
-    (ControlKept(LightsKept("x"), m.Route("y", 0, m.Mode.TAXI, True, (), "")), "mission 'x'"),
+@pytest.mark.parametrize("kept", [
+    ControlKept(LightsKept("x", (m.LightMeasurement("A", 1.0, 1.0, m.LightVerdict.OK),) * 2)),
+    ControlKept(progress_m=float("nan")), ControlKept(row_start=(0.0, float("inf"))),
+    ControlKept(LightsKept("x"), m.Route("y", 0, m.Mode.TAXI, True, (), "")),
 ])
-def test_a_state_of_osmosis_control_that_makes_no_sense_is_refused(kept, why):
-    with pytest.raises(StateError, match=why):
+def test_a_state_of_osmosis_control_that_makes_no_sense_is_refused(kept):
+    with pytest.raises(StateError):
         CONTROL_STATE.decode(1, CONTROL_STATE.encode(kept))
     assert CONTROL_STATE.decode(1, CONTROL_STATE.encode(ControlKept())) == ControlKept()
 
 
 # -- rows, again ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("start", "waypoints", "whole"), [
-    ((0.0, 0.0), ((5.0, 0.1), (20.0, 0.0)), ((0.0, 0.0), (5.0, 0.1), (20.0, 0.0))),
-    ((0.0, 3.0), ((5.0, 0.0), (20.0, 0.0)), ((5.0, 0.0), (20.0, 0.0))),  # beside it
-    ((9.0, 0.0), ((5.0, 0.0), (20.0, 0.0)), ((5.0, 0.0), (20.0, 0.0))),  # on it
-    (None, ((5.0, 0.0), (20.0, 0.0)), ((5.0, 0.0), (20.0, 0.0))),
-    ((0.0, 0.0), ((5.0, 0.0),), ((5.0, 0.0),)),
-])
-def test_a_row_that_is_joined_in_the_middle_begins_where_it_began(start, waypoints, whole):
-    assert whole_row(start, waypoints) == whole
-
-
-def test_a_part_of_a_line_runs_either_way():
-    line = Polyline([(0.0, 0.0), (4.0, 0.0), (4.0, 4.0)])
-    assert line.part(1.0, 6.0) == ((1.0, 0.0), (4.0, 0.0), (4.0, 2.0))
-    assert line.part(6.0, 1.0) == ((4.0, 2.0), (4.0, 0.0), (1.0, 0.0))
 
 
 def test_going_back_turns_round_passes_the_stretch_again_and_arrives():
@@ -278,17 +252,6 @@ def test_a_light_whose_pass_was_cut_is_gone_back_for(short):
     assert run.result.record.duration_s > 62  # 57 s without
 
 
-def test_the_papers_system_loses_its_mission(short):
-    run = fly(short, ["kill:mission_manager@8"], system=ROOT / "systems" / "paper.toml")
-    assert (run.result.record.mission, run.result.record.safety) == ("fail", "safe")
-    assert not any(run.shelves.values())
-
-
-def test_the_same_seed_gives_the_same_run_with_checkpoints(short):
-    faults = ["kill:osmosis_control@42", "kill:mission_manager@30"]
-    assert fly(short, faults).result.trace == fly(short, faults).result.trace
-
-
 def newest_corrupt(loaded: Loaded) -> Loaded:
     first, *others = loaded.records
     torn = first._replace(state=first.state[:-3])
@@ -399,26 +362,4 @@ def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path)
     assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story
     assert {node: result["restarts"].get(node) for node in nodes} == dict.fromkeys(nodes, 1)
     for node in nodes:
-        assert kept_of(files, node), node
-
-
-@pytest.mark.slow
-@pytest.mark.processes
-@pytest.mark.alone
-@pytest.mark.timeout(180)
-def test_real_control_nodes_are_killed_and_nothing_is_lost_or_doubled(tmp_path):
-    dice = random.Random(os.getpid())
-    moments = sorted(dice.uniform(2, 50) for _ in range(6))
-    with RealRun(tmp_path, with_checkpoints(tmp_path), "--mission",
-                 str(write_short_mission(tmp_path)), "--rate", "2") as run:
-        for index, moment in enumerate(moments):
-            run.sleep_until(moment)
-            run.kill(CONTROL[index % 3], dice.choice((signal.SIGKILL, signal.SIGSTOP)))
-        code, result = run.result(120)
-    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story
-    seen = {light["name"]: light["verdict"] for light in result["lights"]}
-    assert {name: seen[name] for name in SHORT_LIGHTS} == SHORT_LIGHTS, moments
-    assert sum(result["restarts"].get(node, 0) for node in CONTROL) >= 5, moments
-    files = tmp_path / "report" / "checkpoints"
-    for node in (*CONTROL, "ftm_manager"):
         assert kept_of(files, node), node

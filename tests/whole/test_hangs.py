@@ -58,15 +58,6 @@ class Loop(Actor):
             case "holds the lock":
                 ctypes.PyDLL(None).sleep(1000)
 
-
-class Reader(Actor):
-    def __init__(self, context):
-        super().__init__(context)
-        self.hear_topic("count", lambda _message, _header: None)
-
-    class Parameters(Actor.Parameters, frozen=True):
-        from rampart.actors.runtime.parameters import TopicHeard
-        topic: TopicHeard = "count"
 '''
 
 SYSTEM = '''

@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 
 import psutil
 import pytest
@@ -15,8 +14,7 @@ from rampart.actors.access import key_folder
 from rampart.actors.supervision.process_title import find_processes
 from rampart.cli.main import main
 from rampart.testing import RealRun
-from tests.actors.access.keyed import every_key, layout_of, make_keys, try_all
-from tests.other_user import needs_root
+from tests.actors.access.keyed import layout_of, make_keys
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
@@ -120,25 +118,6 @@ def test_a_node_whose_certificate_expires_is_told_with_its_file(tmp_path, keys):
         assert "`rampart keys rotate DM4` renews it" in run.story
 
 
-@pytest.mark.slow  # tests/actors/access/test_strangers.py has the same without a mission
-@needs_root
-def test_another_user_at_the_ports_of_a_run_hears_nothing_and_is_not_heard(tmp_path, keys):
-    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2", "--keys", str(keys)) as run:
-        run.wait_for("goal 1/3", 60)
-        ports = run.info.ports
-        assert len(ports) == 2
-        found = try_all(
-            [f"{kind}/127.0.0.1:{port}" for port in ports for kind in ("tls", "tcp")],
-            {"nothing": {}, "the authority": {"root_ca_certificate": str(keys / "ca.crt")}},
-            every_key(layout_of("osmosis")), becomes_nobody=True)
-        assert found["user"] == 65534
-        assert sum(one["heard"] for one in found["tried"].values()) == 0
-        assert not any(one["joined"] for one in found["tried"].values())
-        run.wait_for("goal 2/3", 90)
-        assert "payload rejected" not in run.story
-        assert "crashed" not in run.story
-
-
 @pytest.mark.parametrize(("spoil", "words"), [
     (lambda keys: (keys / "DM4.pem").unlink(), "DM4 has no certificate; `rampart keys issue`"),
     (lambda keys: key_folder.issue(keys, ["DM4"], "node", days=-1), "`rampart keys rotate` renews"),
@@ -157,19 +136,3 @@ def test_a_run_is_not_started_with_keys_that_are_no_good(keys, capsys, spoil, wo
 def test_there_are_no_links_in_virtual_time(keys, capsys):
     assert main(["run", "--virtual", "--keys", str(keys)]) == 2
     assert "in virtual time there are no links" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_the_full_mission_with_keys_and_kills(tmp_path):
-    keys = make_keys(tmp_path / "keys", layout_of("osmosis"))
-    with RealRun(tmp_path, "osmosis", "--keys", str(keys)) as run:
-        run.wait_for("goal 1/", 60)
-        for goal in range(2, 5):
-            for victim in ("osmosis_control", "safety_pilot", "DM4", "RM3", "supervisor",
-                           "router_a", "router_b"):
-                kill(run, victim)
-                time.sleep(1)  # each of them alone
-            run.wait_for(f"goal {goal}/", 120)
-        _, result = run.result(300)
-        assert (result["mission"], result["safety"]) == ("success", "safe"), run.story

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from rampart.cli import run as launch
 from rampart.testing import free_base_port
 from tests import ROOT
 
@@ -73,33 +74,6 @@ def test_a_robot_without_airport_and_mission_runs_until_its_time_is_over(tmp_pat
     assert result["duration_s"] >= 6
 
 
-BROKEN = {
-    "syntax": ("class Level(:\n", "SyntaxError: invalid syntax (own.py, line 1)"),
-    "raises": ("import os\n\nraise RuntimeError('no hardware')\n",
-               "RuntimeError: no hardware (HERE/own.py, line 3)"),
-    "absent": ("import no_such_thing\n", "No module named 'no_such_thing'"),
-}
-
-
-@pytest.mark.parametrize("how", ["--virtual", *(
-    pytest.param(how, marks=pytest.mark.slow)
-    for how in ("--rate=4", "--fault=drop:localization/pose"))])
-@pytest.mark.parametrize("what", BROKEN)
-def test_a_module_of_one_s_own_that_cannot_be_imported_is_one_line_with_file_path_and_cause(
-        tmp_path, what, how):
-    source, cause = BROKEN[what]
-    (tmp_path / "own.py").write_text(source)
-    (tmp_path / "own.toml").write_text(changed(
-        PAPER, ("rampart.actors.osmosis.detection.bounds:Bounds", "own:Level")))
-    done = launched(tmp_path, "--system", "own.toml", how, "--no-hmi", "--port",
-                    str(free_base_port()), "--report", str(tmp_path / "report"))
-    assert done.returncode == 2, done.stderr
-    assert len(done.stderr.splitlines()) == 1, done.stderr
-    assert f"{tmp_path}/own.toml: detection DM3: actor = 'own:Level': " in done.stderr
-    assert cause.replace("HERE", str(tmp_path)) in done.stderr
-    assert not (tmp_path / "report").exists()
-
-
 PLAIN = """
 from rampart.actors.detection.module import DetectionModule
 
@@ -109,7 +83,12 @@ DECLARED = f"""{PLAIN}
     class Parameters(DetectionModule.Parameters, frozen=True):
         highest_m: float = 2.0
 """
-SAID = {
+BROKEN = {
+    "syntax": ("class Level(:\n", "", "SyntaxError: invalid syntax (own.py, line 1)"),
+    "raises": ("import os\n\nraise RuntimeError('no hardware')\n", "",
+               "RuntimeError: no hardware (HERE/own.py, line 3)"),
+    "absent": ("import no_such_thing\n", "",
+               "No module named 'no_such_thing'"),
     "none declared": (f"{PLAIN}    pass\n", "highest_m = 1", "parameters.highest_m = 1: unknown "
                       "field; known: none"),
     "wrong type": (DECLARED, 'highest_m = "x"', "parameters.highest_m = 'x': expected a number"),
@@ -122,19 +101,20 @@ SAID = {
 
 
 @pytest.mark.parametrize("how", ["--rate=4", "--virtual", "--fault=drop:localization/pose"])
-@pytest.mark.parametrize("what", SAID)
-def test_a_parameter_that_an_actor_of_one_s_own_does_not_take_is_one_line_before_anything_starts(
-        tmp_path, what, how):
-    source, said, words = SAID[what]
+@pytest.mark.parametrize("what", BROKEN)
+def test_an_actor_of_one_s_own_that_is_broken_is_one_line_before_anything_starts(
+        tmp_path, monkeypatch, capsys, what, how):
+    source, parameters, words = BROKEN[what]
     (tmp_path / "own.py").write_text(source)
     bounds = 'actor = "rampart.actors.osmosis.detection.bounds:Bounds"\n'
     (tmp_path / "own.toml").write_text(changed(
-        PAPER, (bounds, f'actor = "own:Level"\nparameters = {{ {said} }}\n')))
-    done = launched(tmp_path, "--system", "own.toml", how, "--no-hmi", "--port",
-                    str(free_base_port()), "--report", str(tmp_path / "report"))
-    assert done.returncode == 2, done.stderr
-    assert len(done.stderr.splitlines()) == 1, done.stderr
-    assert f"{tmp_path}/own.toml: detection DM3: {words}" in done.stderr
+        PAPER, (bounds, f'actor = "own:Level"\nparameters = {{ {parameters} }}\n')))
+    monkeypatch.chdir(tmp_path)
+    assert launch.main(["--system", "own.toml", how, "--no-hmi", "--report", "report"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1, told
+    assert "own.toml: detection DM3: " in told
+    assert words.replace("HERE", str(tmp_path)) in told
     assert not (tmp_path / "report").exists()
 
 
@@ -183,47 +163,3 @@ def test_a_run_without_a_mission_tells_where_its_tracebacks_are(tmp_path):
                     str(free_base_port()), "--report", str(report))
     assert f"launch.py: tracebacks of what failed: {report / 'errors.log'}" in done.stderr
     assert f'File "{tmp_path}/own.py", line 8, in fail' in (report / "errors.log").read_text()
-
-
-NO_OPTION = ("{}: no option of the launcher or of tank; --system tank.toml --help shows those "
-             "there are")
-REFUSED = [
-    (["--virtual"],
-     "--virtual: in virtual time a run has to end: give --duration S, or tank an [end] with "
-     "after_s"),
-    (["--fault", "kill:nobody"],
-     "fault 'kill:nobody': no node 'nobody'; there are: supervisor, pump_controller, "
-     "tank_manager, D_LEVEL, D_CRASH, R_SHUT, R_RESTART"),
-    (["--patience", "7"],
-     "--patience 7: tank has no mission: its runs end after --duration S"),
-    (["--obstacles", "1"], NO_OPTION.format("--obstacles")),
-    (["--wait"], "--wait: no node of tank serves an operator's page"),
-    (["--hmi-port", "9000"], "--hmi-port 9000: no node of tank serves an operator's page"),
-    (["--hmi-host", "0.0.0.0"], "--hmi-host 0.0.0.0: no node of tank serves an operator's page"),
-    (["--joystick"], NO_OPTION.format("--joystick")),
-]
-
-
-@pytest.mark.parametrize(("arguments", "line"), REFUSED, ids=[a[0] for a, _ in REFUSED])
-def test_an_option_that_would_have_no_effect_is_refused(tmp_path, arguments, line):
-    (tmp_path / "tank.toml").write_text(TANK)
-    done = launched(tmp_path, "--system", "tank.toml", *arguments)
-    assert (done.returncode, done.stderr) == (2, f"launch.py: {line}\n")
-
-
-OSMOSIS = '[application]\nclass = "rampart.actors.osmosis.application:Osmosis"\n'
-HALF = [
-    ("", [], "--virtual: in virtual time a run has to end: give --duration S, or paper an [end] "
-     "with after_s"),
-    (OSMOSIS, ["--mission", "A"], "{file}: $.application: Object missing required field `airport`"),
-    (OSMOSIS, ["--airport", "vallombre"],
-     "{file}: $.application: Object missing required field `mission`"),
-]
-
-
-@pytest.mark.parametrize(("application", "arguments", "line"), HALF)
-def test_half_a_mission_is_none(tmp_path, application, arguments, line):
-    (tmp_path / "porter.toml").write_text(PORTER + application)
-    line = line.format(file=tmp_path / "porter.toml")
-    done = launched(tmp_path, "--system", "porter.toml", "--virtual", *arguments)
-    assert (done.returncode, done.stderr) == (2, f"launch.py: {line}\n")

@@ -9,17 +9,12 @@ import sys
 from dataclasses import replace
 
 import pytest
-from PIL import Image
 
 from tests import ROOT
-from tests.whole.chaos import WAYS, targets
-from tests.whole.chaos_pairs import LAUNCHER, PAUSE
-from tests.whole.chaos_runs import load
-from tests.whole.soak_growth import WARM_UP_S, Sample, growth, student
-from tests.whole.soak_page import write_page
-from tests.whole.soak_plan import EVERY_S, FIRST_S, LASTS_S, plan
-from tests.whole.soak_runs import Soak, main, usage
-from tests.whole.soak_summary import growths, summary, wrong
+from tests.whole.chaos_pairs import LAUNCHER
+from tests.whole.soak_growth import Sample, growth
+from tests.whole.soak_runs import Soak, main
+from tests.whole.soak_summary import summary, wrong
 
 
 def samples(slope: float, *, missions: int = 3, minutes: int = 20, noise: float = 1.0,
@@ -43,58 +38,12 @@ def test_a_slope_is_found_whatever_the_level_of_each_mission(slope, verdict):
     assert found.slope == pytest.approx(slope, abs=1.0)
 
 
-def test_of_a_hundred_figures_that_do_not_grow_few_seem_to():
-    seem = sum(growth("x", "", samples(0.0, seed=i), 0.0).low > 0 for i in range(100))
-    assert seem <= 8  # 2.5 of them are expected
-
-
 def test_what_becomes_a_process_s_own_in_its_first_minutes_is_no_growth():
     loading = [replace(s, value=s.value - max(0.0, 300 - s.into_s)) for s in samples(0.0)]
     assert growth("memory", "MB", loading, 1.0).verdict == "within noise"
 
 
-def test_of_little_nothing_is_said():
-    assert growth("x", "", [], 1.0).verdict == "too short to tell"
-    assert growth("x", "", samples(90.0, missions=1, minutes=4), 1.0).verdict == "too short to tell"
-
-
-@pytest.mark.parametrize(("free", "quantile"), [
-    (1, 12.706), (5, 2.571), (10, 2.228), (30, 2.042), (120, 1.980)])
-def test_the_quantiles_are_those_of_the_tables(free, quantile):
-    assert student(free) == pytest.approx(quantile, rel=0.006)
-
-
 # ---- what goes wrong ----------------------------------------------------------------------------
-
-
-def test_every_five_seconds_something_goes_wrong_by_seed_and_mission():
-    spec = load()
-    everybody = len(targets(spec).mortal)
-    plans = [plan(spec, seed, mission, 600.0) for seed in (1, 2) for mission in (0, 1)]
-    assert plans[0] == plan(spec, 1, 0, 600.0)
-    assert len({(p.blows, p.faults) for p in plans}) == 4
-    for one in plans:
-        moments = sorted([b.at_s for b in one.blows] + [f.at_s for f in one.faults])
-        assert moments == [FIRST_S + i * EVERY_S for i in range(118)]
-        assert sorted((b.name, b.way) for b in one.blows[:everybody]) == sorted(
-            (name, "KILL") for name in targets(spec).mortal)
-        assert one.blows[everybody - 1].at_s < WARM_UP_S  # before it counts what grows
-        later = len(one.blows) - everybody
-        assert 0.3 < later / (later + len(one.faults)) < 0.7
-        assert all(LASTS_S[0] <= f.duration_s <= LASTS_S[1] < EVERY_S for f in one.faults)
-    assert plan(spec, 1, 0, 300.0).blows == plans[0].blows[:len(plan(spec, 1, 0, 300.0).blows)]
-
-
-def test_everybody_is_among_the_victims_and_world_and_launcher_are_only_stopped_for_a_moment():
-    spec = load()
-    of = targets(spec)
-    blows = [b for mission in range(20) for b in plan(spec, 1, mission, 1800.0).blows]
-    assert {b.name for b in blows} == {*of.mortal, *of.world, LAUNCHER}
-    assert {b.way for b in blows} == {*WAYS, PAUSE}
-    assert {b.name for b in blows if b.way == PAUSE} == {*of.world, LAUNCHER}
-    kinds = {f.fault for mission in range(20) for f in plan(spec, 1, mission, 1800.0).faults}
-    assert "gps-bias" in kinds
-    assert any(name.startswith("delay:") for name in kinds)
 
 
 # ---- what is kept, and shown --------------------------------------------------------------------
@@ -150,14 +99,6 @@ def test_the_summary_says_what_was_and_what_is_wrong(file):
     assert "unsafe: hit a wall; kept in here" in found[0]
 
 
-def test_a_leak_of_one_process_is_wrong(file):
-    soak = Soak(file, 1)
-    for record in soak.of("sample"):
-        record["used"]["localization"][0] += int(record["at_s"] * 10)
-    assert [line.split(",")[1].split()[0] for line in wrong(soak.records)
-            if "its own" in line] == ["localization"]
-
-
 @pytest.mark.parametrize(("leak_kb_a_second", "found"), [(0, []), (10, ["routers"])])
 def test_routers_that_change_over_do_not_grow_and_a_leak_of_theirs_is_found(file, leak_kb_a_second,
                                                                             found):
@@ -170,42 +111,10 @@ def test_routers_that_change_over_do_not_grow_and_a_leak_of_theirs_is_found(file
             if "its own" in line] == found
 
 
-@pytest.mark.parametrize(("name", "verdict"), [
-    (LAUNCHER, "within noise"), ("router_a", "within noise"),
-    ("localization", "grows, less than counts")])
-def test_what_is_known_to_grow_hides_nothing(file, name, verdict):
-    soak = Soak(file, 1)
-    for record in soak.of("sample"):
-        for router in ("router_a", "router_b"):
-            record["used"].setdefault(router, [8_000, 8_000, 30, 9])
-        record["used"][name][0] += int(record["at_s"] * 3)
-    [others] = [one for one in growths(soak.records) if one.what.endswith("the others")]
-    assert others.verdict == verdict
-
-
-def test_the_page_has_the_plot_in_it_and_the_plot_is_a_picture(file):
-    soak = Soak(file, 1)
-    png, page = write_page(soak.records, ["1 < 2"], file)
-    with Image.open(png) as image:
-        assert image.size[0] == 1100
-        assert len(image.convert("RGB").getcolors(1 << 20)) > 10
-    assert "data:image/png;base64," in page.read_text()
-    assert "1 &lt; 2" in page.read_text()
-
-
 def test_the_summary_alone_needs_no_run(file, capsys):
     assert main(["--summary", "--file", str(file)]) == 0
     assert "1 of 1 safe" in capsys.readouterr().out
     assert file.with_suffix(".png").is_file()
-
-
-def test_what_a_process_uses_is_read_and_one_that_is_gone_uses_nothing():
-    import os
-    own, share, descriptors, threads = usage(os.getpid())
-    assert 1000 < own <= share + own
-    assert descriptors > 2
-    assert threads >= 1
-    assert usage(2**22 + 1) is None
 
 
 @pytest.mark.slow

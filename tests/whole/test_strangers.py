@@ -37,14 +37,8 @@ def test_a_stranger_hears_nothing_and_is_not_heard(tmp_path):
         assert set(found["named"].values()) == {" ".join(["PermissionError"] * 3)}
         assert any(str(run.port) in address for address in found["knocked"])
         assert "answered" not in found["knocked"].values()
+        pids = [run.process.pid, *(p.pid for p in find_processes(run.port))]
+        assert [c for pid in pids for c in psutil.Process(pid).net_connections("inet")] == []
         run.wait_for("goal 2/3", 60)
         assert "payload rejected" not in run.story
         assert "crashed" not in run.story
-
-
-def test_a_run_listens_on_no_port_but_its_page(tmp_path):
-    with RealRun(tmp_path, "paper", "--mission", "A") as run:
-        run.wait_for("goal 1/3")
-        pids = [run.process.pid, *(p.pid for p in find_processes(run.port))]
-        found = [c for pid in pids for c in psutil.Process(pid).net_connections("inet")]
-        assert found == []

@@ -51,11 +51,9 @@ def test_a_mission_without_a_fault_succeeds_without_a_decision():
     assert result.margins["prohibited_m"] > 0.3
 
 
-@pytest.mark.parametrize("network", ["measured", "lossy"])
-def test_the_same_seed_gives_the_same_run_to_the_byte_and_another_seed_another(network):
-    first = run_job(job(SHORT.text(), "gps-noise@1", network=network))
-    again = run_job(job(SHORT.text(), "gps-noise@1", network=network))
-    other = run_job(job(SHORT.text(), "gps-noise@1", network=network, seed=2))
+def test_the_same_seed_gives_the_same_run_to_the_byte_and_another_seed_another():
+    first, again, other = (
+        run_job(job(SHORT.text(), "gps-noise@1", network="lossy", seed=seed)) for seed in (1, 1, 2))
     assert first.trace == again.trace != other.trace
     assert len(first.trace) == 64
 
@@ -163,14 +161,6 @@ def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
     assert 0.9 < guarded.detected_after_s < 1.1
 
 
-@pytest.mark.parametrize("fault", [
-    "command-out-of-bounds@9+60", "prohibited-area@9+60",
-    pytest.param("localization-not-updated@9+60", marks=pytest.mark.slow),
-    pytest.param("wrong-graph@3+60", marks=pytest.mark.slow)])
-def test_without_fault_tolerance_the_papers_faults_are_unsafe(fault):
-    assert not run_job(job(fault, ftm=False, patience_s=35.0)).safe
-
-
 def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on(short):
     result = run_job(job("kill:osmosis_control@20", options=short))
     assert (result.success, result.safe) == (True, True)
@@ -179,26 +169,12 @@ def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on(short):
     assert result.detected_after_s < result.recovered_after_s < 0.5
 
 
-@pytest.mark.parametrize("what", ["stop", "wedge"])
-def test_a_stopped_or_wedged_process_is_detected_by_its_silence(what):
-    result = run_job(job(f"{what}:graph_planner@12", SHORT.text().replace("@6", "@20")))
+@pytest.mark.parametrize("fault", ["stop:graph_planner@12", "wedge:osmosis_control@12"])
+def test_a_stopped_or_wedged_process_is_detected_by_its_silence_and_replaced(short, fault):
+    result = run_job(job(fault, options=short))
     assert decisions(result)[0] == (("FTM4",), ("RM3",))
     assert 0.3 < result.detected_after_s < 0.6
-
-
-def test_a_node_that_hangs_is_found_by_its_silence_and_replaced_at_once(short):
-    result = run_job(job("wedge:osmosis_control@12", options=short))
-    assert decisions(result)[0] == (("FTM4",), ("RM3",))
-    assert 0.3 < result.detected_after_s < 0.6
-    assert result.recovered_after_s < result.detected_after_s + 0.1
-
-
-def test_a_slow_process_is_slow():
-    usual = run_job(job(SHORT.text()))
-    slow = run_job(job(SHORT.text(), "slow:osmosis_control:0.3@2"))
-    assert slow.outcomes[1].effective
-    assert slow.trace != usual.trace
-    assert len(slow.decisions) > len(usual.decisions)  # its heart beats too seldom
+    assert result.recovered_after_s < result.detected_after_s + 0.2
 
 
 def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_afterwards(short):
@@ -270,41 +246,20 @@ def test_a_supervisor_that_ends_too_often_waits_until_the_window_of_the_spec_has
     assert 14.5 < back_s[2] < 15.0  # ten seconds after the first restart, and the backoff
 
 
-def test_a_wedged_supervisor_is_replaced():
-    record = run_virtually(job("wedge:supervisor@8", SHORT.text().replace("@6", "@12"))).record
-    assert record.restarts == {"supervisor": 1, "mission_manager": 1}
-
-
-def test_a_fault_without_effect_says_so():
-    result = run_job(job("imu-bias@2", "kill:DM1@900", SHORT.text()))
+def test_a_fault_without_effect_says_so_and_one_may_be_planned_for_a_goal():
+    result = run_job(job("imu-bias@2", "kill:DM1@900", "kill:mission_manager@goal2:1"))
     assert [o.effective for o in result.outcomes] == [False, False, True]
     assert [o.reason for o in result.outcomes] == [
         "it changed nothing", "its moment never came", ""]
-
-
-def test_an_obstacle_appears_ahead_and_is_passed_or_waited_for():
-    result = run_job(job("obstacle-ahead:3@15"))
-    assert result.outcomes[0].effective
-    assert result.safe
-    assert 0 < result.margins["obstacle_m"] < 1
-
-
-def test_a_fault_can_be_planned_for_a_goal():
-    result = run_job(job("kill:mission_manager@goal2:1"))
-    assert 25 < result.injected_s < 50
     assert not result.success
+    assert result.duration_s > 25
 
 
 def test_the_baseline_has_no_fault_tolerance_at_all():
-    result = run_job(job("kill:localization@8", ftm=False))
-    assert result.decisions == ()
-    assert not result.success
-
-
-def test_a_fault_of_a_node_that_the_baseline_lacks_has_no_effect():
-    result = run_job(job("wedge:ftm_manager@2", SHORT.text(), ftm=False))
+    result = run_job(job("wedge:ftm_manager@2", "kill:localization@8", ftm=False))
     assert [o.effective for o in result.outcomes] == [False, True]
     assert result.outcomes[0].reason == "ftm_manager had no running process"
+    assert (result.success, result.decisions) == (False, ())
 
 
 def test_a_job_survives_the_way_to_another_process_and_back():

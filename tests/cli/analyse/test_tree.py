@@ -8,7 +8,6 @@ import random
 import re
 import shutil
 import subprocess
-from graphlib import CycleError
 from io import BytesIO, TextIOWrapper
 from xml.etree import ElementTree as ET
 
@@ -22,47 +21,13 @@ from rampart.cli.analyse.tree_svg import to_svg
 from rampart.cli.analyse.tree_text import quote, to_dot, to_text
 from rampart.cli.main import main
 from rampart.files.plain_text import one_line
-from rampart.manager.drawing.diagram import Box, Diagram, Situation, covers, draw
+from rampart.manager.drawing.diagram import Box, Diagram, covers
 from rampart.manager.drawing.placing import place
 from rampart.manager.model.order import PartialOrder
 from rampart.systems import SHIPPED
-from tests import CELL, ROOT
+from tests import ROOT
 
 SVG = "{http://www.w3.org/2000/svg}"
-
-OSMOSIS = """\
-Fault tree: Runway light inspection with a Summit XL
-‖ moving_inside_prohibited_area [or]  Moving inside a prohibited area  FTM1(DM1, RM1)
-├── erroneous_graph
-├── erroneous_command [or]
-│   ├── localization_error [or]
-│   │   ├── localization_estimation_error  Error in localization estimation
-│   │   └─‖ localization_not_updated [or]  FTM6(DM6, RM5)
-│   │       └─‖ localization_node_crash  FTM7(DM7, RM4)
-│   ├─‖ command_not_updated [or]  FTM2(DM2, RM2)
-│   │   ├─‖ control_node_crash  FTM4(DM4, RM3)
-│   │   └─‖ non_control_node_crash  FTM5(DM5, RM4)
-│   └─‖ command_calculation_error  FTM3(DM3, RM2)
-└── actuator_failure
-
-Tree of mechanisms: Runway light inspection with a Summit XL
-FTM1(DM1, RM1)  Prohibited area → Emergency stop
-├── FTM2(DM2, RM2)  Command not updated → Controlled stop
-│   ├── FTM4(DM4, RM3)  Control node crash → Respawn control nodes
-│   └── FTM5(DM5, RM4)  Non-control node crash → Respawn non-control nodes
-├── FTM3(DM3, RM2)  Wrong command value → Controlled stop
-└── FTM6(DM6, RM5)  Localization not updated → Switch to teleoperation
-    └── FTM7(DM7, RM4)  Localization node crash → Respawn non-control nodes
-
-Order of recoveries (safer): Runway light inspection with a Summit XL
-RM1  Emergency stop
-├── RM2  Controlled stop
-│   ├── RM3  Respawn control nodes
-│   └── RM4  Respawn non-control nodes
-└── RM5  Switch to teleoperation
-    ├── RM3 ↑
-    └── RM4 ↑
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -138,11 +103,6 @@ def tokens_of(dot: str) -> list[str]:
     return tokens
 
 
-def test_the_papers_system_as_text(capsys):
-    assert main(["tree"]) == 0
-    assert told(capsys) == OSMOSIS
-
-
 @pytest.mark.parametrize("form", ["text", "svg", "dot", "json"])
 @pytest.mark.parametrize("what", ["fault-tree", "ftm-tree", "order"])
 def test_every_name_appears_in_every_format(capsys, what, form):
@@ -194,17 +154,6 @@ def test_boxes_stay_apart_and_lines_go_from_box_to_box(diagram, square):
 
 
 @settings(max_examples=60, deadline=None)
-@given(fault_trees())
-def test_lines_of_different_origin_do_not_lie_on_each_other_across(diagram):
-    placing = place({box.name: (60.0, 50.0) for box in diagram.boxes}, diagram.edges, square=True)
-    across = [(upper, y, min(x, x2), max(x, x2))
-              for (upper, _), line in zip(diagram.edges, placing.lines, strict=True)
-              for (x, y), (x2, y2) in itertools.pairwise(line) if y == y2]
-    for (one, y, a, b), (other, y2, a2, b2) in itertools.combinations(across, 2):
-        assert one == other or y != y2 or b < a2 or b2 < a
-
-
-@settings(max_examples=60, deadline=None)
 @given(fault_trees(), st.booleans())
 def test_no_line_crosses_a_box(diagram, square):
     sizes = {box.name: (40.0 + 7 * len(box.title), 50.0) for box in diagram.boxes}
@@ -216,38 +165,6 @@ def test_no_line_crosses_a_box(diagram, square):
                 for inside in (high, low) if high < low else ():
                     at = x + (x2 - x) * (inside - y) / (y2 - y)
                     assert not box.left < at < box.left + box.width
-
-
-def test_what_is_above_stands_centred_over_what_is_below():
-    edges = [("t", "a"), ("t", "b"), ("a", "c"), ("a", "d"), ("d", "e")]
-    places = place(dict.fromkeys("tabcde", (60.0, 30.0)), edges, square=True).places
-    assert places["a"].x == pytest.approx((places["c"].x + places["d"].x) / 2, abs=0.02)
-    assert places["t"].x == pytest.approx((places["a"].x + places["b"].x) / 2, abs=0.02)
-    assert places["e"].x == places["d"].x
-
-
-def test_what_all_ways_lead_to_stands_centred_below_where_they_part():
-    edges = [("t", "a"), ("t", "b"), ("a", "s"), ("b", "c"), ("b", "s"), ("s", "d")]
-    places = place(dict.fromkeys("tabscd", (60.0, 30.0)), edges, square=True).places
-    assert places["s"].top == places["c"].top
-    assert places["s"].left >= places["c"].left + 60  # where the place is taken: beside
-    places = place(dict.fromkeys("tabsd", (60.0, 30.0)), [e for e in edges if e[1] != "c"],
-                   square=True).places
-    assert places["t"].x == places["s"].x == places["d"].x
-
-
-def test_a_tree_has_no_crossing_and_keeps_the_declared_sequence():
-    edges = [("t", "b"), ("t", "a"), ("b", "z"), ("a", "y"), ("a", "x")]
-    places = place(dict.fromkeys("abtxyz", (60.0, 30.0)), edges, square=True).places
-    rows = {}
-    for name, at in sorted(places.items(), key=lambda item: item[1].left):
-        rows.setdefault(at.top, []).append(name)
-    assert [rows[top] for top in sorted(rows)] == [["t"], ["b", "a"], ["z", "y", "x"]]
-
-
-def test_what_is_no_graph_of_layers_is_refused():
-    with pytest.raises(CycleError):
-        place(dict.fromkeys("ab", (60.0, 30.0)), [("a", "b"), ("b", "a")], square=True)
 
 
 def test_a_shared_event_is_drawn_once_and_referred_to():
@@ -273,15 +190,6 @@ def test_the_hasse_diagram_holds_neighbours_only_and_says_as_much_as_the_order(p
     found = covers(order)
     assert set(found) == expected
     assert len(found) == len(expected)
-
-
-def test_the_box_of_a_mechanism_keeps_the_logic_of_its_gates(capsys):
-    assert main(["tree", "--what", "ftm-tree", "--system", str(CELL)]) == 0
-    shown = told(capsys)
-    assert "Part not where it should be and not Force at the wrist too high → Retract" in shown
-    assert "along the last path or Hold position under control" in shown
-    assert "2 of (Joint encoder A disagrees with the model, Joint encoder B" in shown
-    assert "too high and Part not where it should be → Hold position under control and Op" in shown
 
 
 HOSTILE = '</text><script>alert("1")</script> & "quoted" \\N \\" \x1b[31m \u202e \x00 ]]> -->\n|{}'
@@ -313,19 +221,7 @@ def test_hostile_titles_are_shown_and_obeyed_by_nobody(capsys, tmp_path, form):
     elif form == "json":
         assert len(json.loads(out)) == 3
     else:
-        assert out.splitlines()[1:13] == [
-            line.replace("erroneous_graph", f"erroneous_graph  {one_line(HOSTILE)}")
-            for line in OSMOSIS.splitlines()[1:13]]
-
-
-@settings(deadline=None)
-@given(st.text())
-def test_a_cleaned_text_is_one_line_that_xml_can_hold(text):
-    cleaned = one_line(text)
-    assert len(cleaned.splitlines()) <= 1
-    svg = to_svg([graph([], a=Box("a", cleaned))])
-    assert ET.fromstring(svg) is not None
-    tokens_of(to_dot([graph([], a=Box("a", cleaned))]))
+        assert f"├── erroneous_graph  {one_line(HOSTILE)}" in out.splitlines()
 
 
 @pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
@@ -364,14 +260,6 @@ def test_a_thousand_events_are_drawn_by_every_renderer(edges):
     assert to_dot([diagram]).count("->") == len(edges) + sum(bool(b.gate) for b in diagram.boxes)
 
 
-def test_the_same_system_always_gives_the_same_picture(capsys):
-    pictures = set()
-    for _ in range(2):
-        main(["tree", "--format", "svg"])
-        pictures.add(told(capsys))
-    assert len(pictures) == 1
-
-
 @pytest.mark.parametrize(("active", "decided"), [
     (["FTM3", "FTM4"], ["FTM3"]),  # RM2 for FTM3; FTM2 has RM2 as well and is not active
     (["FTM2", "FTM6", "FTM5"], ["FTM1"]),  # block 4: nobody active asks for RM1
@@ -386,26 +274,6 @@ def test_active_mechanisms_are_lit_and_the_decision_is_marked(capsys, active, de
     assert all(f"({name})" in lines[1] for name in active)
     assert sum("● active" in line for line in lines) == len(active)
     assert sum("◀ decided" in line for line in lines) == 1
-
-
-def test_the_order_shows_what_was_asked_for_and_what_was_decided(capsys):
-    main(["tree", "--what", "order", "--active", "FTM3", "FTM4"])
-    lines = told(capsys).splitlines()
-    assert [line for line in lines if "asked for" in line] == [
-        "├── RM2  Controlled stop  ● asked for  ◀ decided",
-        "│   ├── RM3  Respawn control nodes  ● asked for"]
-
-
-def test_the_picture_tells_its_content_to_those_who_do_not_see_it(capsys):
-    main(["tree", "--what", "fault-tree", "--format", "svg", "--active", "FTM3"])
-    root = ET.fromstring(told(capsys))
-    assert root.get("role") == "img"
-    assert root.get("aria-labelledby") == "title desc"
-    description = root.find(f"{SVG}desc").text
-    assert "command_not_updated; Command not updated; gate: or; FTM2(DM2, RM2); above " \
-           "control_node_crash, non_control_node_crash." in description
-    assert "FTM3(DM3, RM2); active; decided" in description
-    assert "prefers-color-scheme: dark" in root.find(f"{SVG}style").text
 
 
 def test_the_picture_needs_nothing_from_outside(capsys):
@@ -434,33 +302,6 @@ def test_a_file_gets_the_format_of_its_ending(capsys, tmp_path, name, start):
     assert main(["tree", "--output", str(file)]) == 0
     assert file.read_text(encoding="utf-8").startswith(start)
     assert f"{file}: fault-tree, 12 boxes" in told(capsys)
-
-
-@pytest.mark.parametrize(("detect", "title"), [
-    ("DM3", "Wrong command value"),
-    ("DM3 and not (DM1 or DM6)",
-     "Wrong command value and (not Prohibited area and not Localization not updated)"),
-    ("2 of (DM2, DM3, DM6)",
-     "2 of (Command not updated, Wrong command value, Localization not updated)"),
-])
-def test_a_mechanism_is_titled_with_the_logic_of_its_gate(detect, title):
-    spec = systems.load("paper")
-    mechanisms = tuple(msgspec.structs.replace(m, detect=detect) if m.name == "FTM3" else m
-                       for m in spec.mechanisms)
-    diagram = draw(msgspec.structs.replace(spec, mechanisms=mechanisms), "ftm-tree",
-                   spec.build_order(), spec.criteria, Situation())
-    assert next(b.title for b in diagram.boxes if b.name == "FTM3") == f"{title} → Controlled stop"
-
-
-def test_two_orders_are_refined_and_shown_by_name(capsys, tmp_path):
-    file = tmp_path / "two.toml"
-    text = systems.DEFAULT.read_text(encoding="utf-8")
-    file.write_text(f"{text}\n[orders.milder]\nRM5 = ['RM2']\n", encoding="utf-8")
-    main(["tree", "--what", "order", "--system", str(file), "--order", "safer",
-          "--order", "milder"])
-    assert told(capsys).splitlines()[:4] == [
-        "Order of recoveries (safer, then milder): Runway light inspection with a Summit XL",
-        "RM1  Emergency stop", "└── RM5  Switch to teleoperation", "    └── RM2  Controlled stop"]
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -498,4 +339,3 @@ def test_the_json_is_the_diagram(capsys):
     diagrams = msgspec.json.decode(told(capsys), type=list[Diagram])
     assert [d.what for d in diagrams] == ["fault-tree", "ftm-tree", "order"]
     assert ("RM1", "RM2") in diagrams[2].edges
-    assert to_text(diagrams) == OSMOSIS

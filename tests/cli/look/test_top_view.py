@@ -107,13 +107,6 @@ def test_a_process_in_trouble_comes_first_and_the_busiest_next_if_asked():
     assert order(skip=99, height=13)[-1] == "hmi"
 
 
-def test_a_collision_is_told_in_words():
-    picture = busy()
-    told(picture, topics.TRUTH, msgspec.structs.replace(TRUTH, collisions=2, prohibited_s=1.5))
-    assert "UNSAFE: 2 collisions, 1.5 s in the prohibited area" in line_of(
-        screen(picture), "safety")
-
-
 def test_whoever_has_fallen_silent_is_named():
     shown = screen(busy(), time_s=20.0)
     assert "SILENT for 10 s; last: AB running" in line_of(shown, "mission")
@@ -147,15 +140,6 @@ def test_every_screen_fits(width, height, skip, words):
     assert all(cell_len(line) <= width for line in shown)
     if height >= 12:
         assert any("mission"[:width] in line for line in shown)
-
-
-def test_rates_are_in_messages_a_simulated_second():
-    picture = RunPicture(OsmosisLines())
-    for step in range(5):
-        picture.sample(step * 0.25)
-        for _ in range(5):
-            picture.count(topics.SCAN)
-    assert picture.rates() == {"summit_xl/scan": 20.0}
 
 
 def test_an_activity_is_counted_when_it_begins():

@@ -8,7 +8,7 @@ import pytest
 
 from rampart.actors.supervision.process_title import find_processes
 from rampart.cli.main import main
-from rampart.cli.operate.bench_verb import members_of, regular_topics, spread, usual
+from rampart.cli.operate.bench_verb import members_of, regular_topics, usual
 from rampart.testing import RealRun
 from tests import CELL
 
@@ -19,13 +19,6 @@ def test_all_nodes_are_killed_and_one_module_of_each_kind():
         "camera", "part_finder", "motion_planner", "arm_controller", "gripper", "valve",
         "conveyor", "hmi", "cell_manager", "D_CURTAIN", "R_SAFE_TORQUE_OFF"]
     assert [topic.key for topic in regular_topics(members["gripper"])][-1] == "heartbeat/{name}"
-
-
-def test_a_spread_is_the_median_between_two_percentiles():
-    assert spread([]) is None
-    one, hundred = spread([3.0]), spread([float(n) for n in range(101)])
-    assert (one.n, one.median, one.low, one.high) == (1, 3, 3, 3)
-    assert (hundred.n, hundred.median, hundred.low, hundred.high) == (101, 50, 5, 95)
 
 
 @pytest.mark.parametrize(("arguments", "told"), [

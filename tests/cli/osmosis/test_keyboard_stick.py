@@ -19,11 +19,6 @@ def test_a_key_counts_for_a_moment_and_its_repetition_prolongs_it():
     assert not stick.stick(2 * HOLD_S).dead_man
 
 
-def test_without_repetition_the_robot_stands_within_600_ms():
-    sending_s, repeating_s = 0.05, 0.03
-    assert HOLD_S + sending_s + repeating_s <= 0.6
-
-
 @pytest.mark.parametrize(("key", "forward", "left"), [
     ("up", 1, 0), ("down", -1, 0), ("left", 0, 1), ("right", 0, -1),
     ("u", 1, 1), ("i", 1, 0), ("o", 1, -1), ("j", 0, 1), ("l", 0, -1),
@@ -75,11 +70,6 @@ def test_no_key_leaves_the_range_or_holds_longer_than_it_may(presses):
     (b"\xff\xfe", ["\ufffd", "\ufffd"])])
 def test_a_terminals_bytes_are_keys(data, keys):
     assert KeyDecoder().feed(data) == keys
-
-
-def test_a_key_may_arrive_in_pieces():
-    decoder = KeyDecoder()
-    assert [decoder.feed(bytes([b])) for b in b"\x1b[A"] == [[], [], ["up"]]
 
 
 def test_an_escape_alone_is_nothing_and_does_not_swallow_what_follows():

@@ -6,7 +6,6 @@ import asyncio
 import itertools
 import json
 
-import msgspec
 import pytest
 
 from rampart.actors.bus.run_info import RunInfo
@@ -166,9 +165,3 @@ def test_the_status_offers_exactly_the_orders_that_are_then_obeyed():
     assert len(offered) > 10
     assert {phase for phase, _, obeyed in offered if not obeyed} == {
         MissionPhase.IDLE, MissionPhase.FAILED, MissionPhase.CANCELLED}
-
-
-def test_a_status_from_before_there_were_orders_in_it_offers_none():
-    old = msgspec.to_builtins(status(MissionState()))
-    del old["orders"]
-    assert msgspec.convert(old, m.MissionStatus).orders == ()
