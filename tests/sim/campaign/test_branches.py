@@ -17,7 +17,7 @@ import pytest
 
 from rampart.sim.campaign.branches import AT_MOST, Attempt, attempt, attempt_together, together
 from rampart.sim.campaign.execute import JobError, execute
-from rampart.sim.campaign.job import Job, RunResult, virtual_run
+from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import Store
 from rampart.sim.faults.scenario import parse_fault
 from tests import ROOT
@@ -94,44 +94,6 @@ def test_a_run_that_departs_from_others_is_the_same_as_from_the_start(tmp_path, 
     made = in_children(jobs)
     assert [untimed(each) for each in made] == [untimed(attempt(each)) for each in jobs]
     assert len({each.result.trace for each in made}) == len(jobs)
-
-
-def test_a_lossy_network_is_the_same_in_a_child():
-    jobs = [job(f"kill:mission_manager@{at_s}", network="lossy", seed=2) for at_s in (2, 3)]
-    assert list(map(untimed, in_children(jobs))) == list(map(untimed, map(attempt, jobs)))
-
-
-REPORT = """
-from pathlib import Path
-def result_of(result, begun_s):
-    run.trial.report(result.record, Path({directory!r}) / jobs_seen.pop().key)
-    return kept(result, begun_s)
-kept, branches.result_of = branches.result_of, result_of
-made_run = branches.virtual_run
-def virtual_run(job):
-    global run
-    run = made_run(job)
-    return run
-branches.virtual_run = virtual_run
-jobs_seen = []
-depart = branches._Beginning._depart
-def departed(self, number):
-    jobs_seen[:] = [jobs[number]]
-    return depart(self, number)
-branches._Beginning._depart = departed
-"""
-
-
-def test_its_report_is_the_same_file_but_for_the_name_of_the_run(tmp_path):
-    jobs = [job("kill:mission_manager@3"), job("gps-bias@2+1", "kill:mission_manager@4")]
-    in_children(jobs, REPORT.format(directory=str(tmp_path / "children")))
-    for each in jobs:
-        run = virtual_run(each)
-        run.trial.report(run.run().record, tmp_path / "start" / each.key)
-        pages = [sorted((tmp_path / where / each.key).iterdir()) for where in ("children", "start")]
-        assert len(pages[1]) == 2
-        assert [page.read_text().replace(jobs[0].key, each.key) for page in pages[0]] == [
-            page.read_text() for page in pages[1]]
 
 
 def test_where_there_are_threads_runs_are_made_from_the_start():

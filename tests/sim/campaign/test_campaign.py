@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 
 from rampart.cli import systems
 from rampart.cli.analyse import campaigning
-from rampart.cli.analyse.campaigning import ProgressLog
 from rampart.cli.main import main as rampart
 from rampart.sim.campaign import execute as execution
 from rampart.sim.campaign.content import with_content
@@ -33,8 +32,6 @@ from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.statistics import (
     badness,
     rate,
-    seeds_in_words,
-    spread,
     table,
     total,
     worst,
@@ -42,7 +39,6 @@ from rampart.sim.campaign.statistics import (
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
-from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.osmosis.trial.paper_tables import (
     AS_THE_PAPER,
     CONDITIONS,
@@ -55,7 +51,6 @@ from rampart.sim.osmosis.trial.paper_tables import (
     paper_jobs,
     table_iii,
 )
-from rampart.systems import SHIPPED
 from tests import CELL, ROOT
 from tests.porter_actors import write_porter_system
 
@@ -84,13 +79,6 @@ def runs_of(*results: RunResult, **job) -> list[Run]:
 # ---- which runs ------------------------------------------------------------------------------
 
 
-def test_the_cross_product_has_every_run_once():
-    faults = [(), (PlannedFault("gps-bias"),), (PlannedFault("kill:DM1"),)]
-    jobs = cross(BASES, faults, range(1, 4))
-    assert len(jobs) == len({job.key for job in jobs}) == 2 * 3 * 3
-    assert Counter(job.row for job in jobs) == {"none": 6, "gps-bias": 6, "kill:DM1": 6}
-
-
 def test_a_longer_sample_begins_with_the_shorter_one_and_another_seed_is_another_sample():
     assert sample(BASES, GROUPS, 30, seed=1)[:10] == sample(BASES, GROUPS, 10, seed=1)
     assert sample(BASES, GROUPS, 10, seed=1) != sample(BASES, GROUPS, 10, seed=2)
@@ -115,13 +103,6 @@ def test_a_sample_draws_each_kind_by_the_square_root_of_how_many_faults_it_has()
     assert len({job.seed for job in jobs}) > 2990
 
 
-def test_three_named_faults_are_not_half_of_the_runs_of_a_robot():
-    groups = {"own": ("a", "b", "c"), "topic": tuple(f"drop:t{i}" for i in range(100))}
-    names = Counter(job.faults[0].fault in groups["own"]
-                    for job in sample(BASES, groups, 1000, seed=1))
-    assert 80 < names[True] < 220  # 0.15 of 1,000 expected: 1.73 of 1.73 + 10
-
-
 def test_a_sample_has_few_seeds_that_take_turns_and_one_for_each_run_if_asked_for():
     own = sample(BASES, GROUPS, 50, seed=1, seeds=50)
     few = sample(BASES, GROUPS, 50, seed=1, seeds=8)
@@ -129,29 +110,6 @@ def test_a_sample_has_few_seeds_that_take_turns_and_one_for_each_run_if_asked_fo
     assert [msgspec.structs.replace(job, seed=0) for job in few] == [
         msgspec.structs.replace(job, seed=0) for job in own]
     assert len({job.seed for job in sample(BASES, GROUPS, 50, seed=1)}) == SEEDS
-
-
-def test_how_many_seeds_a_sample_has_is_told_with_what_that_means_for_its_intervals():
-    def told(seeds: int) -> str:
-        return seeds_in_words([Run(job, result()) for job in
-                               sample(BASES, GROUPS, 40, seed=1, seeds=seeds)])
-
-    assert told(40) == ""
-    assert told(20).startswith("40 runs, 20 seeds: ")
-    assert told(20).endswith("The intervals take all runs for independent.")
-    assert told(1).startswith("40 runs, 1 seed: ")
-    assert told(1).endswith(", which so few seeds do not bear out.")
-
-
-def test_faults_come_in_pairs_and_triples_when_asked_for():
-    for together in (2, 3):
-        assert {len(j.faults) for j in sample(BASES, GROUPS, 20, seed=1, together=together)} == {
-            together}
-
-
-def test_there_is_nothing_to_draw_from_nothing():
-    with pytest.raises(ValueError, match="nothing to choose from"):
-        sample(BASES, {"paper": ()}, 3, seed=1)
 
 
 # ---- each run once ---------------------------------------------------------------------------
@@ -171,20 +129,17 @@ def test_a_store_keeps_a_run_as_it_was_infinity_included(tmp_path):
     again.close()
 
 
-def test_a_file_that_is_no_store_is_refused_and_left_alone(tmp_path):
-    (tmp_path / "runs.sqlite").write_text("my shopping list\n" * 100)
-    with pytest.raises(StoreError, match="no store of campaign results"):
-        Store(tmp_path)
-    assert "shopping" in (tmp_path / "runs.sqlite").read_text()
-
-
-def test_a_store_of_another_format_is_refused(tmp_path):
+def test_a_file_that_is_no_store_or_one_of_another_format_is_refused_and_left_alone(tmp_path):
     Store(tmp_path).close()
     with sqlite3.connect(tmp_path / "runs.sqlite") as database:
         database.execute("update about set value = '99'")
     database.close()
     with pytest.raises(StoreError, match="format '99', this program reads 2"):
         Store(tmp_path)
+    (tmp_path / "runs.sqlite").write_text("my shopping list\n" * 100)
+    with pytest.raises(StoreError, match="no store of campaign results"):
+        Store(tmp_path)
+    assert "shopping" in (tmp_path / "runs.sqlite").read_text()
 
 
 def test_what_is_done_is_not_done_again(tmp_path):
@@ -196,17 +151,6 @@ def test_what_is_done_is_not_done_again(tmp_path):
     assert execute(jobs, store, workers=1) == 0
     assert Counter(made) == {job.key: 1 for job in jobs}
     store.close()
-
-
-def test_results_do_not_depend_on_how_many_workers_there_are(tmp_path):
-    jobs = cross(BASES[:1], [(SHORT,)], range(1, 5))
-    traces = []
-    for workers in (1, 2):
-        store = Store(tmp_path / str(workers))
-        execute(jobs, store, workers=workers)
-        traces.append({r.job.key: r.result.trace for r in store.runs()})
-        store.close()
-    assert traces[0] == traces[1] == {job.key: run_job(job).trace for job in jobs}
 
 
 def test_a_job_that_makes_no_sense_is_named_and_what_was_finished_is_kept(tmp_path):
@@ -252,44 +196,6 @@ def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
         "kill:mission_manager", 12, 12, 0)
     assert row["ineffective"] == 0
     assert (tmp_path / "report.html").read_text().startswith("<!")
-
-
-FULL_DISK = """
-import msgspec, resource, sys
-from functools import partial
-from pathlib import Path
-from pathlib import Path
-from rampart.sim.campaign.job import Job, RunResult
-from rampart.sim.campaign.store import Store, StoreError
-result = msgspec.json.decode(sys.argv[2], type=RunResult)
-store = Store(Path(sys.argv[1]))
-resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
-added = []
-try:
-    for seed in range(10_000):
-        job = Job(row="x", seed=seed)
-        store.add(job, result)
-        added.append(job.key)
-except StoreError as error:
-    print(error)
-assert store.keys() == set(added), "what was kept is there"
-resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-store.add(job, result)
-store.close()
-print(len(added))
-"""
-
-
-def test_a_disk_that_fills_up_costs_none_of_the_runs_before(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, str(tmp_path), msgspec.json.encode(result())], cwd=ROOT,
-        capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    error, added = done.stdout.splitlines()
-    assert error.startswith(f"{tmp_path / 'runs.sqlite'}: ")
-    store = Store(tmp_path)
-    assert 10 < int(added) == len(store.keys()) - 1
-    store.close()
 
 
 def test_a_campaign_whose_disk_fills_up_says_so_in_one_line_and_goes_on_from_there(tmp_path):
@@ -385,23 +291,13 @@ def test_the_interval_is_wilsons():
     assert (rate(2000, 2000).low, rate(2000, 2000).high) == pytest.approx((0.99808, 1.0), abs=1e-5)
 
 
-def test_a_spread_leaves_out_what_there_is_not():
-    assert spread([None, math.inf]) is None
-    found = spread([3.0, None, 1.0, 2.0])
-    assert (found.n, found.least, found.median, found.p95, found.most) == (3, 1.0, 2.0, 3.0, 3.0)
-    assert spread(range(1, 101)).p95 == 95
-
-
 def test_a_run_without_effect_is_not_counted_as_survived():
     nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
-    row, = table(runs_of(result(), result(outcomes=nothing), result(safe=False, success=False)))
-    assert (row.runs, row.ineffective) == (3, 1)
-    assert (row.safe.count, row.safe.of, row.success.count) == (1, 2, 1)
-    assert row.worst == "fail, unsafe"
-
-
-def test_a_row_of_nothing_but_ineffective_runs_says_so():
-    nothing = (FaultOutcome("x@5", None, 0, "its moment never came"),)
+    row, = table(runs_of(result(), result(outcomes=nothing), result(safe=False, success=False),
+                         result(success=False, detected_after_s=None)))
+    assert (row.runs, row.ineffective) == (4, 1)
+    assert (row.safe.count, row.safe.of, row.success.count) == (2, 3, 1)
+    assert (row.worst, row.undetected, row.stopped_for_good) == ("fail, unsafe", 1, 1)
     row, = table(runs_of(result(outcomes=nothing)))
     assert (row.worst, row.safe.of, row.ineffective) == ("no effect", 0, 1)
 
@@ -436,11 +332,6 @@ def test_conditions_are_rows_of_their_own():
         ({}, True, "", {}), ({"obstacles": 2}, True, "", {}), ({}, False, "", {}),
         ({}, True, "mission-first", {}), ({}, True, "", AS_THE_PAPER)]
     assert total(runs, "all").runs == 5
-
-
-def test_undetected_and_stopped_for_good_are_counted():
-    row, = table(runs_of(result(detected_after_s=None), result(success=False)))
-    assert (row.undetected, row.stopped_for_good) == (1, 1)
 
 
 # ---- the paper -------------------------------------------------------------------------------
@@ -537,37 +428,6 @@ def test_the_search_is_told_of_an_unsafe_run_though_its_fault_had_no_effect(monk
     assert told == [None, -1.0]
 
 
-def test_a_fault_without_effect_does_not_attract_the_search_whatever_the_unit_of_margins():
-    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
-
-    def fake(jobs):  # margins of tens of metres; one of the two faults has no effect
-        return [result(outcomes=nothing) if job.faults[0].fault == "gps-bias" else
-                result(margins={"obstacle_m": 50.0}) for job in jobs]
-
-    pytest.importorskip("optuna")
-    last = search_order(Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift")}), fake)
-    assert last.count("gps-drift") > 2 * last.count("gps-bias")
-
-
-def search_order(space: Space, fake) -> list[str]:
-    """Return the faults of the last 40 of 80 runs, in the order in which they were asked for."""
-    order: list[str] = []
-    search(space, 80, fake, seed=1, seen=lambda job, _result: order.append(job.faults[0].fault))
-    return order[-40:]
-
-
-def test_the_search_has_as_many_faults_and_seeds_as_are_asked_for():
-    pytest.importorskip("optuna")
-    space = Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift")}, together=2)
-    made = search(space, 6, lambda jobs: [result() for _ in jobs], seed=7, seeds=3)
-    assert {len(job.faults) for job, _ in made} == {2}
-    assert sorted(job.seed for job, _ in made) == [7, 7, 8, 8, 9, 9]
-
-def test_what_is_unsafe_for_longer_is_further_down():
-    assert margin(result(safe=False, severity=3.0)) < margin(
-        result(safe=False, severity=1.0)) < 0 < margin(result())
-
-
 def test_a_counterexample_is_shrunk_to_what_it_needs():
     needed = PlannedFault("laser-stuck", 37.42, duration_s=31.7, on_s=1.0, off_s=0.5, seed=77)
     job = Job(row="x", options={"obstacles": 2}, seed=99, faults=(
@@ -616,15 +476,6 @@ def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
     text = capsys.readouterr().err
     assert text.count("\n") == 1
     assert re.search(words, text), text
-
-
-def test_a_campaign_takes_a_mission(tmp_path, capsys):
-    text = (SHIPPED / "paper.toml").read_text(encoding="utf-8")
-    robot = tmp_path / "robot.toml"
-    robot.write_text(text.replace('airport = "vallombre"\n', ""))
-    assert rampart(["campaign", "--system", str(robot), "--fault", "none"]) == 2
-    assert capsys.readouterr().err == (
-        f"rampart: {robot}: $.application: Object missing required field `airport`\n")
 
 
 def test_a_run_is_replayed_by_its_key_and_recognised(tmp_path, capsys):
@@ -702,25 +553,6 @@ def test_the_papers_tables_are_of_its_system_and_full_of_the_full_one_unless_one
     assert ("Table III" in capsys.readouterr().out) == ("--full" not in chosen)
 
 
-def test_the_papers_conditions_are_rows_of_their_own_for_scripts_too(tmp_path, made_up, capsys):
-    assert rampart(["campaign", "--paper", "--json", "--out", str(tmp_path)]) == 0
-    rows = json.loads(capsys.readouterr().out)
-    assert len(rows) == len(CONDITIONS) * len(FAULTS) * 2
-    assert sum(row["runs"] for row in rows) == len(paper_jobs())
-    assert [(r["runs"], r["ftm"], r["retuned"]) for r in rows
-            if (r["fault"], r["obstacles"]) == ("command not updated", 0)] == [
-        (4, False, {}), (4, True, AS_THE_PAPER), (4, True, {})]
-
-
-def test_runs_without_a_fault_are_not_counted_as_survived_with_fault_tolerance(
-        tmp_path, made_up, capsys):
-    assert rampart(["campaign", "--fault", "none", "--fault", "gps-bias", "--seeds", "3",
-                    "--obstacles", "0", "--out", str(tmp_path)]) == 0
-    text = capsys.readouterr().out
-    assert "6 runs, 6 of them made now" in text
-    assert "with fault tolerance: 3 of 3 (" in text
-
-
 def test_a_row_of_the_full_system_that_is_not_as_expected_is_told_and_is_exit_code_1(
         tmp_path, made_up, capsys):
     arguments = ["campaign", "--paper", "--full", "--json", "--out"]
@@ -746,19 +578,3 @@ def test_a_row_of_the_full_system_that_is_not_as_expected_is_told_and_is_exit_co
     assert "goal 2 of 9 not reached" in text
     page = (tmp_path / "bad" / "report.html").read_text()
     assert "<h1>The paper&#39;s rows on the full system</h1>" in page
-
-
-def test_a_log_gets_a_line_a_minute_with_the_time_left_and_one_at_the_end():
-    log = ProgressLog(total=30, done=10)
-    lines = [log.made_one(now_s, unsafe=0) for now_s in range(100, 300, 10)]
-    assert lines[:6] == [""] * 6
-    assert lines[6] == "17 of 30 runs, 0 unsafe, 2 min left"  # 13 left, 10 s each
-    assert [i for i, line in enumerate(lines) if line] == [6, 12, 18, 19]
-    assert lines[-1] == "30 of 30 runs, 0 unsafe"
-    assert ProgressLog(total=1, done=0).made_one(5.0, unsafe=1) == "1 of 1 runs, 1 unsafe"
-
-
-def test_a_search_of_osmosis_goes_further_into_the_mission_than_a_sample():
-    spec = systems.load("osmosis")
-    assert MissionTrial.moments(spec) == (2.0, 120.0)
-    assert MissionTrial.moments(spec, searched=True) == (2.0, 150.0)

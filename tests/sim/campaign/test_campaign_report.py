@@ -28,23 +28,16 @@ from rampart.sim.campaign.report import (
 )
 from rampart.sim.campaign.statistics import (
     badness,
-    by_kind,
-    conditions,
-    in_common,
     interval,
-    kind_of,
     percent,
     rate,
-    seconds,
 )
 from rampart.sim.campaign.store import Run
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial import paper_tables
-from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.sim.osmosis.trial.paper_tables import Decided, section
 from rampart.sim.osmosis.trial.record import MissionRecord, ObstacleSeen, StepResult
 from rampart.sim.runs.judge import Verdict
-from rampart.sim.runs.report import margin_text
 from rampart.sim.runs.virtual_run import VirtualResult
 
 ABOUT = Campaign("A campaign", "rampart campaign --runs 3", 7)
@@ -141,30 +134,6 @@ def text_of(page: str) -> str:
 # -- the page ----------------------------------------------------------------------------------
 
 
-def test_a_campaign_without_runs_says_so_and_shows_no_table():
-    page = render(OUT, ABOUT, [])
-    assert "No run was made." in page
-    assert Tables(page).rows == []
-    assert "Distributions" not in page
-
-
-def test_a_baseline_alone_is_reported_without_figures_of_mechanisms_it_has_not():
-    page = render(OUT, ABOUT, [run("gps-bias", ftm=False, safe=False, obstacle_m=0.0)])
-    (row,) = rows(page, "gps-bias")
-    assert row[6:] == ["–", "–", "0.00 m", "0.80 m", "–", "0"]  # noqa: RUF001
-    assert "with FTM and a fault" not in page
-    assert headline([run(affected=0)]) == "In 1 run the fault had no effect."
-
-
-def test_a_single_run_has_its_figures_in_the_table_of_all_faults():
-    page = render(OUT, ABOUT, [run("kill:hmi", detected_after_s=0.25, recovered_after_s=1.5,
-                                   obstacle_m=0.4, prohibited_m=1.7, false_alarms=2)])
-    (row,) = rows(page, "kill:hmi")
-    assert [cell.split()[0] for cell in row[2:5]] == ["1", "1", "1"]
-    assert row[5].startswith("success, safe")
-    assert row[6:] == ["250 ms", "1.50 s", "0.40 m", "≥ 1 m", "2", "0"]
-
-
 def test_runs_without_effect_count_for_nothing_but_their_number():
     runs = [run("gps-bias", seed=1), run("gps-bias", seed=2, affected=0)]
     page = render(OUT, ABOUT, runs)
@@ -202,37 +171,6 @@ def test_the_headline_gives_the_upper_bound_of_the_interval_when_no_run_was_unsa
     assert "1,000 completed the mission" in headline(runs)
 
 
-def test_the_headline_tells_runs_with_from_runs_without_fault_tolerance():
-    runs = [run(seed=1), run(seed=2, safe=False), run(seed=3, ftm=False, safe=False),
-            run("", seed=4)]
-    assert "With fault tolerance 1 of 2 runs" in headline(runs)
-    assert "Without fault tolerance 1 of 1 run " in headline(runs)
-
-
-def test_conditions_that_differ_have_rows_of_their_own_and_others_are_told_once():
-    latched = {"RM2": {"latched": True}}
-    runs = [run(obstacles=0), run(obstacles=2), run(retuned=latched), run(ftm=False)]
-    page = render(OUT, ABOUT, runs)
-    shown = [row[0] for row in Tables(page).rows if len(row) == 1]
-    assert len(shown) == 4
-    assert shown[0] == "without FTM, no obstacles"
-    assert sum("retuned" in text for text in shown) == 1
-    assert "measured network" in in_common(runs)
-    assert not any("measured" in text for text in shown)
-
-
-def test_faults_are_shown_worst_first_and_the_long_tail_is_folded():
-    runs = [run(f"drop:topic/{n}", seed=n, prohibited_m=0.5 + n / 100) for n in range(20)]
-    runs.append(run("freeze:a/b", success=False))
-    runs.append(run("freeze:c/d", safe=False, unsafe_s=20.0))
-    page = render(OUT, ABOUT, runs)
-    names = [row[0].replace(" ", "") for row in Tables(page).rows
-             if "with FTM" in "".join(row[1:2])]
-    assert names == ["freeze:c/d", "freeze:a/b", *(f"drop:topic/{n}" for n in range(20))]
-    assert "10 faults more" in page.partition("<details>")[2]
-    assert "topic/<wbr>5" in page.partition("<details>")[0].rpartition("Every fault")[2]
-
-
 def test_text_from_outside_is_escaped():
     evil = "<script>alert('x')</script>\"&"
     made = run("gps-bias", row=evil, safe=False, unsafe_s=20.0, reasons=(evil,), failures=(evil,))
@@ -251,13 +189,6 @@ def test_the_page_needs_nothing_but_itself():
     targets = set(re.findall(r'(?:href="|url\()#([^")]*)', page))
     assert targets <= set(re.findall(r'id="([^"]*)"', page))
     assert len(re.findall(r'id="([^"]*)"', page)) == len(set(re.findall(r'id="([^"]*)"', page)))
-
-
-def test_errors_of_the_program_are_shown_with_their_run():
-    made = run(failures=("osmosis_control: KeyError: 'x'",))
-    text = text_of(render(OUT, ABOUT, [made, run("")]))
-    assert f"1 actor ended by an error: {made.job.key} osmosis_control: KeyError: 'x'" in text
-    assert "ended by an error" not in render(OUT, ABOUT, [run("")])
 
 
 def test_the_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -307,40 +238,6 @@ def test_the_papers_runs_are_shown_as_its_tables_beside_its_verdicts():
     assert "Where the verdicts differ" not in page
 
 
-def test_the_papers_tables_tell_how_many_of_their_runs_had_no_effect():
-    runs = paper_runs()
-    at = next(i for i, r in enumerate(runs) if r.job.row == "control node crash")
-    runs[at] = Run(runs[at].job, run("gps-bias", affected=0).result)
-    iv = next(row for row in rows(paper_page(runs), "controlnodecrash") if len(row) == 7)
-    several = len(paper_tables.FAULTS["control node crash"])
-    assert iv[3] == f"{several} 1 no effect, 0 success, 0 safe"
-
-
-def test_the_papers_rows_on_the_full_system_are_a_table_of_their_own():
-    runs = [Run(job, run("gps-bias").result) for job in paper_tables.full_jobs()]
-    text = text_of(page := paper_page(runs))
-    assert "The paper's rows on the full system" in text
-    assert "12 of 12 rows of table V end in success, safe on the full system." in text
-    assert "12 of 12 verdicts are as expected." in text
-    assert "the paper's. A verdict is" not in text
-    (crash,) = [row for row in rows(page, "controlnodecrash") if len(row) == 7]
-    several = len(paper_tables.FAULTS["control node crash"])
-    assert crash[1:] == [
-        "fail, safe", "✓ success, safe", f"{several} {several} success, {several} safe"] * 2
-    assert "Where the verdicts differ" not in page
-    assert "Table IV:" not in page
-
-
-def test_a_row_that_the_full_system_loses_is_told_even_if_the_paper_loses_it_too():
-    runs = [Run(job, run("gps-bias", success=job.row != "command not updated").result)
-            for job in paper_tables.full_jobs()]
-    page = paper_page(runs)
-    assert "10 of 12 rows of table V end in success, safe" in text_of(page)
-    assert [row[2] for row in rows(page, "commandnotupdated") if len(row) == 7] == [
-        "✗ fail, safe why"]
-    assert "the paper has fail, safe, our worst run fail, safe" in text_of(page)
-
-
 def test_where_a_verdict_differs_the_story_of_the_worst_run_is_told():
     runs = paper_runs()
     at = next(i for i, r in enumerate(runs)
@@ -373,11 +270,6 @@ def test_the_worst_runs_are_shown_worst_first_each_with_another_fault():
     assert [r.job.seed for r in worth_showing(runs)] == [5, 2, 3]
     assert [r.job.seed for r in worth_showing(runs, most=2)] == [5, 2]
     assert worth_showing([]) == []
-
-
-def test_a_run_without_a_fault_is_shown_when_it_went_wrong():
-    golden = [run("", seed=1), run("", seed=2, safe=False)]
-    assert [r.job.seed for r in worth_showing(golden)] == [2]
 
 
 def test_unprotected_runs_do_not_crowd_out_those_with_fault_tolerance():
@@ -421,49 +313,7 @@ def test_a_track_is_shown_with_its_moments_in_order_and_the_command_to_repeat_it
     assert page.count("<section") == 1
 
 
-def test_the_close_up_of_a_safe_run_shows_where_it_was_narrowest():
-    made = run("kill:hmi", detected_after_s=1.0, prohibited_m=0.25)
-    record = msgspec.structs.replace(record_of(made), narrowest_s=20.0)
-    page = render(OUT, ABOUT, [made], made_again(record))
-    card = page[page.index("<section"):page.index("</section>") + len("</section>")]
-    moments = [(row[0], row[2]) for row in Tables(card).rows]
-    assert ("0:20.0", "smallest margin") in moments
-    assert 'class="map close" viewBox="-0.5 -7.5 9.0 9.0"' in card  # round (4, 3)
-    unsafe = run("kill:hmi", safe=False, unsafe_s=12.0)
-    page = render(OUT, ABOUT, [unsafe], {unsafe.job.key: made_again(record)[made.job.key]})
-    assert ">smallest margin<" not in page
-
-
-def test_a_run_that_has_no_track_is_shown_without_a_map():
-    made = run("kill:hmi", success=False)
-    page = render(OUT, ABOUT, [made], made_again(record_of(made, track=())))
-    assert f'id="run-{made.job.key}"' in page
-    assert "Close-up of the track" not in page
-
-
 # -- grouping, charts, words -------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("fault", "kind"), [
-    ("", "none"), ("wrong-graph", "paper"), ("gps-bias", "sensor"), ("drop:a/b", "topic"),
-    ("kill:hmi", "process"), ("stuck-wheel:rear-left", "actuator"), ("brake-failure:0", "actuator"),
-    ("obstacle-ahead:2", "world")])
-def test_a_fault_is_of_its_kind(fault, kind):
-    assert kind_of(run(fault).job) == OsmosisFaults.kinds[kind]
-    assert list(by_kind([run(fault)])) == [OsmosisFaults.kinds[kind]]
-
-
-def test_several_faults_are_a_kind_of_their_own():
-    job = Job(row="x", faults=(PlannedFault("gps-bias"), PlannedFault("drop:a/b")))
-    assert kind_of(job) == "several at once"
-
-
-def test_every_run_is_in_exactly_one_condition():
-    runs = [run(seed=s, ftm=s % 2 == 0, obstacles=s % 3, strategy=f"s{s % 5}") for s in range(60)]
-    found = conditions(runs)
-    assert sorted(r.job.seed for c in found for r in c.runs) == list(range(60))
-    assert all(r.job.ftm == c.ftm for c in found for r in c.runs)
-    assert len({c.text for c in found}) == len(found)
 
 
 @given(st.lists(st.floats(0, 1e4), min_size=1), st.booleans())
@@ -485,43 +335,8 @@ def test_every_value_is_counted_once_in_a_chart_however_far_out(values, on_margi
     assert places == sorted(set(places))
 
 
-@given(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=50))
-def test_a_bar_stands_where_its_values_are(values):
-    axis = charts.time_axis(values)
-    (lane,) = charts.chart("t", "w", axis, [("", [charts.Value(v) for v in values], "")]).lanes
-    for value in values:
-        at = axis.place(value)
-        assert any(bar.x - 1 <= at <= bar.x + bar.width + 1 for bar in lane.bars)
-
-
-def test_what_lies_beyond_the_axis_of_margins_is_in_the_outermost_bars():
-    axis = charts.margin_axis([0.0], 1.0, "m")
-    values = [charts.Value(-40.0, unsafe=True), charts.Value(0.5), charts.Value(30.0)]
-    (lane,) = charts.chart("t", "w", axis, [("", values, "")]).lanes
-    assert [bar.title for bar in lane.bars] == [
-        "1 run, below 0.00 m, 1 unsafe", "1 run, 0.50 m to 0.55 m", "1 run, 1.00 m or more"]
-
-
-def test_kinds_that_were_never_detected_are_said_not_drawn():
-    page = render(OUT, ABOUT, [run("kill:hmi", detected_after_s=0.2), run("gps-bias")])
-    assert "Never detected: sensors (1 run)." in text_of(page)
-
-
 @pytest.mark.parametrize(("share", "text"), [
     (0.0, "0"), (1.0, "100"), (0.9996, "99.96"), (0.999999, "> 99.99"), (0.00001, "< 0.01"),
     (0.0004, "0.04"), (0.345, "34.5"), (math.nan, "–")])  # noqa: RUF001
 def test_a_share_never_reads_as_all_or_nothing_unless_it_is(share, text):
     assert percent(share) == text
-
-
-@pytest.mark.parametrize(("value", "text"), [
-    (None, "–"), (0.0, "0 ms"), (0.0314, "31 ms"), (0.9996, "1.00 s"), (9.996, "10.0 s"),  # noqa: RUF001
-    (99.96, "100 s"), (1234.5, "1234 s")])
-def test_a_time_has_three_digits(value, text):
-    assert seconds(value) == text
-
-
-@pytest.mark.parametrize(("value", "text"), [
-    (None, "–"), (math.inf, "–"), (1.0, "≥ 1 m"), (0.123, "0.12 m"), (-0.5, "−0.50 m")])  # noqa: RUF001
-def test_a_clearance_is_a_bound_where_the_simulator_knows_no_more(value, text):
-    assert margin_text(value, "m", 1.0) == text

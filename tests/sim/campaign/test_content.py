@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from rampart.sim.campaign import content, job
-from rampart.sim.campaign.content import content_of, with_content
+from rampart.sim.campaign.content import content_of
 from rampart.sim.campaign.job import Job
 from rampart.systems import SHIPPED
 
@@ -109,18 +109,6 @@ def test_the_files_of_the_application_are_part_of_it(tmp_path):
     airport.write_text(shipped + "# more\n")
     assert content_of(one) != before
     assert content_of(msgspec.structs.replace(one, options={})) != before
-
-
-def test_each_system_and_choice_of_options_is_looked_at_once(folder, monkeypatch):
-    asked = []
-    monkeypatch.setattr(content, "content_of", lambda one: asked.append(one) or f"d{len(asked)}")
-    jobs = [Job(row="", seed=seed, options=options) for seed in (1, 2, 3)
-            for options in ({}, {"mission": "A"})]
-    made = with_content(jobs)
-    assert len(asked) == 2
-    assert [one.content for one in made] == ["d1", "d2"] * 3
-    assert len({one.key for one in made}) == 6
-    assert not {one.key for one in made} & {one.key for one in jobs}
 
 
 def test_an_edited_specification_makes_its_runs_anew(folder):

@@ -20,16 +20,12 @@ from rampart.actors.osmosis import topics
 from rampart.actors.runtime.corruption import corrupt
 from rampart.actors.runtime.injection import MODES, FaultGate, flaw
 from rampart.actors.system.layout import published_keys
-from rampart.cli.look.topic_catalogue import resolve, uses
+from rampart.cli.look.topic_catalogue import resolve
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
-from rampart.sim.faults.topic_faults import DELAY_S, NONSENSE, modes_of, systematic_faults
+from rampart.sim.faults.topic_faults import modes_of, systematic_faults
 from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
-from rampart.sim.osmosis.sensors import Gps
 from rampart.sim.osmosis.trial.faults import (
-    LEFT_OUT,
     PAPER_FAULTS,
-    SENSOR_FAULTS,
-    SENSORS,
     OsmosisFaults,
 )
 from tests.osmosis_system import shipped_system
@@ -128,22 +124,6 @@ def test_every_published_topic_has_all_modes_that_make_sense(key):
         assert set(MODES) - set(modes_of(key, topics.ALL)) <= {"corrupt"}
 
 
-def test_the_published_keys_are_those_of_the_topic_list_with_families_spelt_out():
-    nodes = {node.name for node in shipped_system().actors()} | {"supervisor"}
-    by_topic: dict[str, set[str]] = {}
-    for key in KEYS:
-        topic, _ = resolve(key, topics.ALL)
-        head, _, tail = topic.key.partition("{name}")
-        by_topic.setdefault(topic.key, set()).add(
-            key[len(head):len(key) - len(tail)] if topic.is_family else "")
-    expected = {u.topic.key for u in uses(shipped_system())
-                if set(u.publishers) - {"tools", "observer"}}
-    assert set(by_topic) == expected
-    assert by_topic["heartbeat/{name}"] == nodes
-    assert by_topic["recovery/{name}/command"] == {"RM1", "RM2", "RM3", "RM4", "RM5"}
-    assert by_topic["detection/{name}"] == {f"DM{i}" for i in range(1, 8)}
-
-
 # -- generic corruption --------------------------------------------------------------------------
 
 
@@ -189,13 +169,6 @@ def words_of(value: Any) -> Any:
     return value if isinstance(value, str | bool) else None
 
 
-def test_the_numbers_of_a_corruption_come_from_its_seed():
-    first = find_fault("corrupt:plan/route", seed=3)
-    assert first == find_fault("corrupt:plan/route", seed=3)
-    assert (first.disturbances[0].add_fields
-            != find_fault("corrupt:plan/route", seed=4).disturbances[0].add_fields)
-
-
 def test_an_odd_seed_corrupts_one_number_and_all_have_their_turn():
     every = set(topic_fault("corrupt", "summit_xl/scan").disturbances[0].add_fields)
     alone = [topic_fault("corrupt", "summit_xl/scan", seed) for seed in range(1, 200, 2)]
@@ -204,27 +177,6 @@ def test_an_odd_seed_corrupts_one_number_and_all_have_their_turn():
     for fault in alone:
         (path,) = fault.disturbances[0].add_fields
         assert fault.title == f"{path} on summit_xl/scan is wrong by a constant"
-
-
-@pytest.mark.parametrize("seed", range(0, 40, 2))
-def test_offsets_stay_within_what_their_unit_makes_plausible(seed):
-    offsets = topic_fault("corrupt", "mission/status", seed).disturbances[0].add_fields
-    assert offsets["step"] in (1, 2, 3)
-    assert 0.5 <= abs(offsets["goals.x_m"]) <= 3.0
-    assert 50.0 <= offsets["lights.intensity_cd"] <= 150.0
-    assert 1.0 <= offsets["step_times_s"] <= 10.0
-    assert 0.1 <= abs(offsets["lights.ratio"]) <= 0.5
-
-
-@pytest.mark.parametrize("mode", NONSENSE)
-def test_nonsense_of_a_laser_is_of_all_rays_or_of_one_number(mode):
-    (all_rays,) = topic_fault(mode, "summit_xl/scan").disturbances
-    assert {*all_rays.set_fields, *all_rays.keep_ends} == {"ranges_f32"}
-    drawn = {path for seed in range(1, 60, 2)
-             for d in topic_fault(mode, "summit_xl/scan", seed).disturbances
-             for path in (*d.set_fields, *d.keep_ends)}
-    assert drawn == {"ranges_f32"} if mode in {"tiny", "single", "short"} else (
-        drawn > {"ranges_f32", "range_max_m", "angle_min_rad", "reference_m"})
 
 
 def test_nonsense_comes_from_what_measures_and_not_from_what_decides():
@@ -262,17 +214,6 @@ def test_a_wrong_stamp_comes_from_its_seed_ahead_as_often_as_behind_small_as_oft
 # -- sensors ---------------------------------------------------------------------------------------
 
 
-def test_every_sensor_fails_in_every_way_but_those_left_out_for_a_reason():
-    ways = ("bias", "drift", "noise", "dropout", "stuck")
-    everything = {f"{sensor.name}-{way}" for sensor in SENSORS for way in ways}
-    drifts = {name for name in SENSOR_FAULTS if name.endswith("-drift")}
-    more = {f"{sensor.name}-stuck-noise" for sensor in SENSORS} | {
-        f"{name.removesuffix('drift')}{way}" for name in drifts & everything
-        for way in ("slow-drift", "creep")}
-    assert set(SENSOR_FAULTS) | set(LEFT_OUT) == everything | more
-    assert not set(SENSOR_FAULTS) & set(LEFT_OUT)
-
-
 def published(name: str, *bodies: Any) -> list[Any]:
     """Return what leaves a gate when a reading is published each second of a fault."""
     disturbances = find_fault(name, seed=1).disturbances
@@ -286,32 +227,14 @@ def published(name: str, *bodies: Any) -> list[Any]:
 FIX = m.GpsFix(10.0, 20.0, 0.5, 0.0, 0.02)
 
 
-def test_a_receiver_that_is_stuck_with_noise_does_not_repeat_itself_and_stays_where_it_was():
-    moving = (msgspec.structs.replace(FIX, x_m=FIX.x_m + t) for t in range(9))
-    told = [out.body for out in published("gps-stuck-noise", *moving)]
-    assert len({body.x_m for body in told}) == 9
-    assert all(abs(body.x_m - FIX.x_m) < 0.1 for body in told)
-
-
-def test_a_receiver_that_creeps_drifts_by_a_centimetre_and_a_half_a_second():
-    body = published("gps-creep", *[FIX] * 9)[-1].body
-    assert math.hypot(body.x_m - FIX.x_m, body.y_m - FIX.y_m) == pytest.approx(8 * 0.015, rel=0.01)
-
-
-def test_a_biased_receiver_is_off_by_the_same_at_once_and_does_not_know_it():
-    assert {out.body for out in published("gps-bias", *[FIX] * 9)} == {
-        m.GpsFix(11.5, 21.5, 0.5, 0.0, 0.02)}
-
-
-def test_a_drifting_receiver_is_right_at_first_and_worse_each_second():
-    drift = [out.body.x_m - FIX.x_m for out in published("gps-drift", *[FIX] * 11)]
-    assert drift == pytest.approx([0.1 * t for t in range(11)])
-
-
-def test_a_noisy_receiver_is_much_noisier_than_a_healthy_one_and_right_on_average():
-    errors = [out.body.y_m - FIX.y_m for out in published("gps-noise", *[FIX] * 2000)]
-    assert np.std(errors) > 10 * Gps.POSITION_SIGMA_M
-    assert np.mean(errors) == pytest.approx(0.0, abs=4 * 1.5 / math.sqrt(2000))
+@pytest.mark.parametrize(("name", "at_first_m", "in_the_end_m"), [
+    ("gps-bias", 2.12, 2.12), ("gps-drift", 0.0, 0.8 * math.sqrt(2)), ("gps-creep", 0.0, 0.12)])
+def test_how_far_off_a_receiver_is(name, at_first_m, in_the_end_m):
+    told = [out.body for out in published(name, *[FIX] * 9)]
+    off_m = [math.hypot(body.x_m - FIX.x_m, body.y_m - FIX.y_m) for body in told]
+    assert off_m[0] == pytest.approx(at_first_m, abs=0.01)
+    assert off_m[-1] == pytest.approx(in_the_end_m, rel=0.02)
+    assert off_m == sorted(off_m)
 
 
 def test_a_stuck_sensor_has_fresh_stamps_and_a_frozen_one_has_not():
@@ -328,12 +251,6 @@ def test_a_biased_laser_sees_obstacles_farther_away_and_still_no_echo_where_ther
     ranges = np.frombuffer(out.body.ranges_f32, dtype="<f4")
     assert ranges == pytest.approx([0.9, 3.5, 8.5])
     assert ranges[2] >= body.range_max_m
-
-
-def test_a_noisy_heading_stays_an_angle():
-    outs = published("absolute-pose-noise", *[m.Pose(0.0, 0.0, math.pi)] * 200)
-    assert all(-math.pi < out.body.yaw_rad <= math.pi for out in outs)
-    assert min(out.body.yaw_rad for out in outs) < 0 < max(out.body.yaw_rad for out in outs)
 
 
 # -- finding and varying ---------------------------------------------------------------------------
@@ -357,11 +274,6 @@ def test_a_fault_is_found_by_its_name_and_makes_sense(name):
         assert flaw(order, resolve(order.topic, topics.ALL)[0].type) == ""
 
 
-def test_catalogue_names_detection_modules_that_exist():
-    modules = {f"DM{i}" for i in range(1, 8)}
-    assert {dm for fault in CATALOGUE.values() for dm in fault.detected_by} <= modules
-
-
 @pytest.mark.parametrize(("name", "words"), [
     ("gremlins", "`rampart inject --list`"), ("", "`rampart inject --list`"),
     ("gps-biass", "did you mean gps-bias?"), ("laser-drift", "quartz"),
@@ -377,16 +289,6 @@ def test_a_fault_that_is_none_is_refused_in_one_line_that_says_why(name, words):
     assert words in str(caught.value)
     assert repr(name) in str(caught.value)
     assert len(str(caught.value)) < 200
-
-
-def test_a_topic_may_be_written_with_the_root_of_all_keys():
-    assert find_fault("drop:rampart/plan/route") == find_fault("drop:plan/route")
-
-
-def test_a_delay_is_longer_than_any_freshness_timeout_of_the_shipped_system():
-    timing = shipped_system().timing
-    assert timing.command_timeout_s < DELAY_S
-    assert timing.localization_timeout_s < DELAY_S
 
 
 def test_a_varied_fault_differs_in_what_was_said_and_each_disturbance_has_a_seed_of_its_own():

@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.clock import Clock
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, Motor
-from rampart.sim.osmosis.robot import WHEEL_NAMES, Drive, DriveLimits
+from rampart.sim.osmosis.robot import WHEEL_NAMES
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.osmosis.world import World
@@ -102,23 +101,6 @@ def test_a_stuck_wheel_stands_and_pulls_the_robot_to_its_side(wheel):
     assert 0.4 < sim.truth().twist.linear_mps < 0.9
 
 
-def test_one_stuck_wheel_on_each_side_slows_the_robot_and_turns_it_little():
-    sim = driving()
-    sim.order_fault(fault(STUCK, "front left", injection="a"))
-    sim.order_fault(fault(STUCK, "rear right", injection="b"))
-    assert abs(turned(sim, 2.0)) < 0.3
-    assert 0.4 < sim.truth().twist.linear_mps < 0.6
-    assert affected(sim, "a") == affected(sim, "b") == 200
-
-
-def test_two_stuck_wheels_on_one_side_pull_harder_than_one():
-    one, two = driving(), driving()
-    one.order_fault(fault(STUCK))
-    for wheel in LEFT:
-        two.order_fault(fault(STUCK, wheel, injection=wheel))
-    assert turned(two, 1.5) > 1.4 * turned(one, 1.5) > 0.5
-
-
 # ---- weak wheel ---------------------------------------------------------------------
 
 
@@ -131,63 +113,19 @@ def test_a_weak_wheel_pulls_to_its_side_and_less_than_a_stuck_one(wheel):
     assert 0.1 < side * turned(weak, 2.0) < 0.6 * side * turned(stuck, 2.0)
 
 
-def test_a_weak_motor_slows_the_turning_of_the_robot_the_more_the_weaker_it_is():
-    rates = []
-    for strength in (1.0, 0.3, 0.1, 0.0):
-        sim = world()
-        sim.order_fault(fault(WEAK, strength=strength))
-        sim.command(0.0, 1.5)
-        after(sim, 2.0)
-        rates.append(turned(sim, 1.0))
-    assert rates == sorted(rates, reverse=True)
-    assert rates[0] - rates[-1] > 0.2
-
-
-def test_the_speed_loop_masks_a_weak_motor_of_which_nothing_more_is_asked():
-    weak, healthy = driving(0.5), driving(0.5)
-    weak.order_fault(fault(WEAK, strength=0.5))
-    after(weak, 2.0), after(healthy, 2.0)
-    assert weak.truth() == healthy.truth()
-    assert affected(weak) == 0
-
-
-def test_a_dead_motor_rolls_along():
-    sim = driving()
-    sim.order_fault(fault(WEAK, strength=0.0))
-    after(sim, 1.0)
-    assert sim.base_status().wheel_speeds_radps[0] * 0.1175 == pytest.approx(1.0, abs=0.05)
-
-
 # ---- brake failure ------------------------------------------------------------------
 
 
-def test_with_a_failed_brake_the_robot_coasts_many_times_as_far():
-    healthy, failed = driving(), driving()
-    failed.order_fault(fault(BRAKE, wheel=""))
-    shortest, way = way_to_stop(healthy), way_to_stop(failed)
-    assert way > 10 * shortest
-    # Bearings only: 0.1 N m s/rad a wheel on 84 kg, wheels' inertia included, at 1 m/s.
-    assert way == pytest.approx(84 * 0.1175**2 / (4 * 0.1), rel=0.1)
-
-
 def test_the_less_of_the_brake_is_left_the_longer_the_way():
-    ways = []
-    for strength in (0.75, 0.5, 0.25, 0.1, 0.02, 0.0):
+    ways = [way_to_stop(driving())]
+    for strength in (0.5, 0.1, 0.0):
         sim = driving()
-        sim.order_fault(fault(BRAKE, strength=strength))
+        sim.order_fault(fault(BRAKE, wheel="", strength=strength))
         ways.append(way_to_stop(sim))
-    healthy = way_to_stop(driving())
-    assert [healthy, *ways] == sorted([healthy, *ways])
-    assert ways[1] > 1.4 * healthy
-
-
-def test_a_failed_brake_does_not_lock_the_wheels_and_a_healthy_one_does():
-    sim = world()
-    sim.brake(True)
-    locked = model_of(after(sim, 0.1))
-    sim.order_fault(fault(BRAKE, duration_s=1.0))
-    assert model_of(after(sim, 0.5))[0] == model_of(world())[0] != locked[0]
-    assert model_of(after(sim, 1.0)) == locked
+    assert ways == sorted(ways)
+    assert ways[1] > 1.4 * ways[0]
+    # Bearings only: 0.1 N m s/rad a wheel on 84 kg, wheels' inertia included, at 1 m/s.
+    assert ways[-1] == pytest.approx(84 * 0.1175**2 / (4 * 0.1), rel=0.1)
 
 
 def test_the_dead_man_brakes_in_vain_as_well_but_a_controlled_stop_does_not_need_the_brake():
@@ -205,18 +143,6 @@ def test_the_dead_man_brakes_in_vain_as_well_but_a_controlled_stop_does_not_need
     assert abs(sim.truth().twist.linear_mps) < 0.01
 
 
-def test_when_the_brake_comes_back_it_brakes_from_the_speed_that_is_left():
-    sim = driving()
-    sim.order_fault(fault(BRAKE, duration_s=1.0))
-    sim.brake(True)
-    speed = after(sim, 1.0).truth().twist.linear_mps
-    assert 0.6 < speed < 0.8
-    start = sim.pose[0]
-    after(sim, 1.0)
-    assert abs(sim.truth().twist.linear_mps) < 0.005
-    assert sim.pose[0] - start < 0.15
-
-
 def test_when_the_brake_is_released_the_drive_goes_on_from_the_speed_that_is_left():
     sim = driving()
     sim.order_fault(fault(BRAKE))
@@ -226,17 +152,6 @@ def test_when_the_brake_is_released_the_drive_goes_on_from_the_speed_that_is_lef
     sim.brake(False)
     assert after(sim, 0.1).truth().twist.linear_mps < speed + 0.2  # 1.5 m/s^2, and no jerk to 1 m/s
     assert after(sim, 2.0).truth().twist.linear_mps == pytest.approx(1.0, abs=0.01)
-
-
-def test_the_ramps_give_way_to_the_measured_speed_and_never_change_sign():
-    drive = Drive(DriveLimits(), None)
-    drive.command(1.0, -1.0, 0.0)
-    for _ in range(200):
-        drive.update(0.0, 0.01)
-    drive.give_way(2.0, -2.0)
-    assert (drive._linear, drive._angular) == (1.0, -1.0)
-    drive.give_way(0.5, 0.3)
-    assert (drive._linear, drive._angular) == (0.5, 0.0)
 
 
 # ---- several, and their ends --------------------------------------------------------
@@ -260,15 +175,6 @@ def test_a_fault_ends_by_its_duration_and_the_robot_drives_straight_again(orders
     assert sim.truth().twist.linear_mps == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_fault_lasts_to_the_tick():
-    sim = driving()
-    sim.order_fault(fault(STUCK, duration_s=0.5))
-    after(sim, 2.0)
-    assert sim.fault_news() == [
-        FaultNews("f", 0, finished=False), FaultNews("f", 1, finished=False),
-        FaultNews("f", 50, finished=True)]  # fmt: skip
-
-
 def test_a_duration_of_0_ends_one_fault_and_leaves_the_other():
     sim = driving()
     sim.order_fault(fault(STUCK, "front left", injection="a"))
@@ -281,13 +187,6 @@ def test_a_duration_of_0_ends_one_fault_and_leaves_the_other():
     assert abs(speeds[2]) < 0.2
     assert affected(sim, "b") == 50
     assert model_of(after(sim, 0.01)) == model_of(world())
-
-
-def test_to_end_a_fault_twice_repeats_the_news_of_its_end():
-    sim = driving()
-    sim.order_fault(fault(STUCK))
-    after(sim, 0.1)
-    assert affected(sim) == affected(sim) == 10
 
 
 def test_a_fault_ordered_again_is_replaced_lasts_anew_and_goes_on_counting():
@@ -328,14 +227,6 @@ def test_on_a_robot_that_stands_braked_no_fault_has_an_effect(order):
     assert affected(sim) == 0
 
 
-def test_a_failed_brake_that_nobody_uses_has_no_effect():
-    failed, healthy = driving(), driving()
-    failed.order_fault(fault(BRAKE))
-    after(failed, 1.0), after(healthy, 1.0)
-    assert failed.truth() == healthy.truth()
-    assert affected(failed) == 0
-
-
 @pytest.mark.parametrize("kind", [WEAK, BRAKE])
 def test_a_fault_that_leaves_everything_changes_no_bit(kind):
     def states(*orders: m.ActuatorFault) -> list[bytes]:
@@ -350,21 +241,6 @@ def test_a_fault_that_leaves_everything_changes_no_bit(kind):
         return seen
 
     assert states() == states(fault(kind, strength=1.0))
-
-
-def test_the_same_faults_give_the_same_world_bit_for_bit():
-    def states() -> list[bytes]:
-        sim = driving(1.0, 0.2)
-        sim.order_fault(fault(WEAK, "rear left", 0.15, 1.0, "a"))
-        sim.order_fault(fault(STUCK, "front right", 0.0, 0.5, "b"))
-        sim.order_fault(fault(BRAKE, "", 0.3, 2.0, "c"))
-        seen = []
-        for step in range(30):
-            sim.brake(step > 7)
-            seen.append(after(sim, 0.1)._data.qpos.tobytes())
-        return seen
-
-    assert states() == states()
 
 
 # ---- bad input ----------------------------------------------------------------------
@@ -434,22 +310,6 @@ def test_no_wheel_gets_more_than_a_healthy_one_and_only_faulty_wheels_get_less(
                 assert actuation.targets_radps[i] == targets[i]
 
 
-def test_a_stuck_wheels_motor_does_not_strain_against_the_seizure():
-    subject = ActuatorFaults(MOTOR)
-    subject.order(fault(STUCK, "rear left"), 0.0)
-    actuation = subject.actuate((8.0,) * 4, (8.0, 8.0, 0.0, 8.0), braking=False)
-    assert actuation.targets_radps == (8.0, 8.0, 0.0, 8.0)
-
-
-def test_a_weak_motor_under_a_failed_brake_keeps_to_the_ramp_with_the_lesser_torque():
-    subject = ActuatorFaults(MOTOR)
-    subject.order(fault(WEAK, "front left", 0.2, injection="motor"), 0.0)
-    subject.order(fault(BRAKE, "", 0.75, injection="brake"), 0.0)
-    actuation = subject.actuate((8.0,) * 4, (9.0,) * 4, braking=True)
-    assert actuation.targets_radps == (8.0,) * 4  # and not the 5.0 that it could be driven to
-    assert actuation.torques_nm == ((-6.0, 0.0), *((-9.0, 0.0),) * 3)
-
-
 @settings(deadline=None)
 @given(st.lists(orders, max_size=4))
 def test_every_fault_ends_in_time_and_with_the_last_one_all_is_healthy(faults):
@@ -513,14 +373,6 @@ def test_the_simulator_reports_when_a_fault_is_taken_when_it_bites_and_when_it_i
     assert bench.complaints == []
 
 
-def test_the_simulator_reports_a_fault_without_effect_as_such():
-    bench = Bench()
-    bench.run(1.0, linear=0.0)
-    bench.order(fault(STUCK, duration_s=0.5))
-    bench.run(1.0, linear=0.0)
-    assert bench.reports == [("f", 0, False, ""), ("f", 0, True, "")]
-
-
 def test_a_fault_that_is_over_while_the_simulator_is_held_up_is_reported_all_the_same():
     bench = Bench()
     bench.run(1.0)
@@ -540,8 +392,3 @@ def test_the_simulator_refuses_what_is_impossible_and_says_why(order, reason):
     assert (injection, count, finished) == ("f", 0, True)
     assert reason in why
     assert bench.complaints == [("actuator fault", why, "tester")]
-
-
-def test_the_topic_carries_what_the_simulator_hears():
-    assert topics.ACTUATOR_FAULT.type is m.ActuatorFault
-    assert topics.ACTUATOR_FAULT in Simulator.inputs()

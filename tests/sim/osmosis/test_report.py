@@ -19,8 +19,8 @@ from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
-from rampart.sim.osmosis.trial.report import clearance, render
-from rampart.sim.runs.report import clock, try_report
+from rampart.sim.osmosis.trial.report import render
+from rampart.sim.runs.report import try_report
 
 AIRPORT = load_airport("vallombre")
 MISSION = AIRPORT.mission("AB")
@@ -71,18 +71,6 @@ def test_the_track_and_its_length_are_the_truth_not_what_localization_believes()
     assert run.distance_m == pytest.approx(10.0, abs=0.3)
     assert all(y == 0 for _, _, y in run.track)
     assert run.believed[-1][2] == pytest.approx(5.0, abs=0.2)
-
-
-def test_all_lights_of_the_airport_are_listed_measured_or_not():
-    story = Story()
-    light = m.LightMeasurement("A04", 76.0, 0.38, m.LightVerdict.DIM)
-    story.tell(1.0, topics.MISSION_STATUS, m.MissionStatus(
-        "1", "AB", m.MissionPhase.RUNNING, 1, (), (12.5,), (light,), ""))
-    run = story.end()
-    verdicts = {light.name: light.verdict for light in run.lights}
-    assert len(verdicts) == len(AIRPORT.lights)
-    assert verdicts["A04"] == "dim"
-    assert set(verdicts.values()) == {"dim", "not measured"}
 
 
 def test_what_was_measured_and_reached_outlives_a_mission_manager_that_forgets():
@@ -136,14 +124,6 @@ def test_repeated_states_make_one_bar_and_one_that_never_ends_lasts_to_the_end()
         ("detection", "DM2", 1.0, 2.0), ("detection", "DM1", 90.0, 100.0)]
 
 
-def test_recoveries_follow_what_the_manager_says():
-    story = Story()
-    for t_s, activated in ((1.0, ("RM3",)), (1.1, ("RM3", "RM2")), (2.0, ("RM2",)), (3.0, ())):
-        story.tell(t_s, ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
-            (), (), activated, (), "safety-first", 1))
-    assert bars(story.end()) == [("recovery", "RM3", 1.0, 2.0), ("recovery", "RM2", 1.1, 3.0)]
-
-
 def test_an_injection_is_told_with_its_effect_whether_or_not_its_order_was_heard():
     story = Story()
     story.tell(4.0, bus_topics.INJECT, bm.Injection("i1", "localization/pose", "freeze", 2.0))
@@ -167,21 +147,6 @@ def test_closest_approaches_are_the_smallest_and_none_when_there_was_nothing():
     run = story.end()
     assert (run.obstacle_clearance_m, run.prohibited_clearance_m) == (0.4, -0.2)
     assert (run.collisions, run.prohibited_s) == (1, 0.5)
-
-
-@pytest.mark.parametrize(("value", "text"), [
-    (None, "\N{EN DASH}"), (-0.2, "-0.20 m"), (0.994, "0.99 m"), (1.0, "1 m or more"),
-    (3.2, "1 m or more"),
-])
-def test_a_clearance_beyond_the_exact_range_is_given_as_a_bound(value, text):
-    assert clearance(value) == text
-
-
-def test_messages_of_other_topics_and_corrupt_poses_do_no_harm():
-    story = Story()
-    story.tell(1.0, topics.LIGHT, m.LightSample(1.0))
-    story.tell(1.0, topics.POSE, m.Pose(math.nan, math.inf, 0.0))
-    assert story.end().believed == ()
 
 
 def full_story() -> Story:
@@ -214,29 +179,6 @@ def test_the_page_is_self_contained_escaped_and_shows_everything():
     assert "gone" not in html
 
 
-def test_the_tags_of_the_page_are_balanced():
-    html = render(full_story().end())
-    for tag in ("div", "table", "tr", "svg", "g", "ul", "ol", "dl", "main", "p", "i", "span"):
-        opened = re.findall(rf"<{tag}(?:\s[^>]*)?(?<!/)>", html)
-        assert len(opened) == html.count(f"</{tag}>"), tag
-
-
-def test_a_run_in_which_nothing_happened_can_be_reported():
-    html = render(Story().end(0.0, mission="fail", reasons=("no mission was accepted",)))
-    assert "No fault was seen." in html
-    assert "nothing to decide" in html
-    assert "0 of 22" in html
-
-
-def test_the_headline_names_the_lights_that_need_attention():
-    story = Story()
-    for light in AIRPORT.lights[:-1]:
-        verdict = m.LightVerdict.OUT if light.name == "A09" else m.LightVerdict.OK
-        story.tell(9.0, topics.LIGHT_MEASURED, m.LightMeasurement(light.name, 1.0, 1.0, verdict))
-    assert ("1 of 22 lights need attention: A09; 1 was not on the way"
-            in render(story.end()))
-
-
 def test_both_files_are_written_whole_and_the_json_reads_back(tmp_path):
     run = full_story().end()
     html, data = write_report(run, tmp_path / "deep" / "er")
@@ -262,15 +204,6 @@ def test_an_interrupted_write_leaves_the_old_report(tmp_path, monkeypatch):
     assert "No space" in try_report(full_story().end(), render, tmp_path).problem
     assert html.read_text() == before
     assert len(list(tmp_path.iterdir())) == 2
-
-
-@pytest.mark.parametrize(("seconds", "text"), [
-    (0.0, "0:00.0"), (61.26, "1:01.3"), (59.96, "1:00.0"), (3600.0, "60:00.0"),
-    (None, "\N{EN DASH}"),
-    (math.nan, "\N{EN DASH}"),
-])
-def test_times_are_written_as_minutes_and_seconds(seconds, text):
-    assert clock(seconds) == text
 
 
 # ---- a run that is resumed ------------------------------------------------------------
@@ -325,8 +258,3 @@ def test_the_judge_knows_what_it_saw_before_and_judges_the_cut_in_the_mode_of_be
     later.truth(9.0, 0.0, 0.0, collisions=0)
     verdict = later.recorder.judge.verdict()
     assert (verdict.safe, verdict.unsafe_s) == (False, 5.0)
-
-
-def test_a_memory_of_another_kind_is_refused():
-    with pytest.raises(msgspec.DecodeError):
-        Story().recorder.recall(b"\x93\x01\x02\x03")

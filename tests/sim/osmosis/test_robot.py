@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from rampart.actors.osmosis.airport.model import Airport, StartPose
-from rampart.sim.osmosis.robot import Drive, DriveLimits, twist_from_wheels, wheel_speeds
+from rampart.sim.osmosis.robot import Drive, DriveLimits, twist_from_wheels
 from rampart.sim.osmosis.world import World
 
 FIELD = Airport(
@@ -43,32 +43,6 @@ def steady_rates(sim: World, seconds: float = 1.0) -> tuple[float, float]:
 # ---- drive --------------------------------------------------------------------------
 
 
-def test_wheel_speeds_and_the_twist_they_stand_for_are_inverse():
-    assert twist_from_wheels(wheel_speeds(0.7, -0.4)) == pytest.approx((0.7, -0.4))
-
-
-def test_turning_left_runs_the_right_wheels_forward():
-    fl, fr, rl, rr = wheel_speeds(0, 1)
-    assert fl == rl == -fr == -rr
-    assert fr > 0
-
-
-def test_the_drive_ramps_up_at_its_acceleration_and_down_at_its_deceleration():
-    drive = Drive(DriveLimits(acceleration_mps2=1.0, deceleration_mps2=2.0), None)
-
-    def after(seconds: float) -> float:
-        for _ in range(round(seconds / 0.01)):
-            speeds = drive.update(0.0, 0.01)
-        return twist_from_wheels(speeds)[0]
-
-    drive.command(1.0, 0.0, 0.0)
-    assert after(0.5) == pytest.approx(0.5)
-    assert after(0.6) == pytest.approx(1.0)
-    drive.command(0.0, 0.0, 0.0)
-    assert after(0.25) == pytest.approx(0.5)
-    assert after(0.30) == 0.0
-
-
 def test_commands_beyond_the_hardware_are_clipped_and_those_not_finite_refused():
     drive = Drive(DriveLimits(), None)
     assert drive.command(99.0, -99.0, 0.0)
@@ -91,14 +65,6 @@ def test_dead_man_timeline():
     drive.command(1.0, 0.0, 1.5)  # commands are back: it lets go by itself
     drive.update(1.5, 0.01)
     assert not drive.braking
-
-
-def test_without_dead_man_the_last_command_is_kept_for_ever():
-    drive = Drive(DriveLimits(), None)
-    drive.command(0.5, 0.0, 0.0)
-    for _ in range(100):
-        speeds = drive.update(1e6, 0.01)
-    assert twist_from_wheels(speeds)[0] == pytest.approx(0.5)
 
 
 # ---- in MuJoCo ----------------------------------------------------------------------
@@ -144,14 +110,6 @@ def test_the_brake_stops_in_a_shorter_way_whatever_is_commanded():
     assert 0.05 < sim.pose[0] - x0 < 0.18
     assert abs(sim.truth().twist.linear_mps) < 0.005
     assert sim.base_status().brake_engaged
-
-
-def test_the_brake_stops_in_a_curve_as_well():
-    sim = run(world(), 1.0, 1.0, 3)
-    start = sim.pose
-    sim.brake(True)
-    sim.step_to(sim.time_s + 2)
-    assert math.dist(sim.pose[:2], start[:2]) < 0.25
 
 
 def test_a_braked_robot_stands_still_and_drives_again_when_released():

@@ -15,7 +15,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.clock import Clock
-from rampart.sim.osmosis.simulator import Schedule, Simulator
+from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from tests.osmosis_system import run_context
 
@@ -74,15 +74,6 @@ def test_a_robot_with_one_laser_has_one_and_with_two_both_see_the_same_with_nois
     assert np.array_equal(upper >= 8.0, lower >= 8.0)
 
 
-def test_each_message_is_of_its_topics_type_and_stamped_with_its_own_due_time():
-    bench = Bench()
-    bench.run(0.5)
-    types = {topic.key: topic.type for topic in Simulator.outputs}
-    assert all(type(body) is types[key] for key, body, _ in bench.sent)
-    stamps = [stamp for key, _, stamp in bench.sent if key == topics.IMU.key]
-    assert np.diff(stamps) == pytest.approx(0.02)
-
-
 def test_commands_move_the_robot_and_the_brake_holds_it():
     bench = Bench()
     start = bench.actor._world.pose
@@ -106,15 +97,6 @@ def test_the_brake_is_released_when_the_last_who_holds_it_lets_go():
         bench.actor.brake(m.BrakeCommand(engaged, "test"), Header(source, 1, 1, bench.now_s))
         bench.run(0.2, m.BaseCommand(0.0, 0.0))
         assert bench.last(topics.BASE_STATUS).brake_engaged is brakes
-
-
-@pytest.mark.parametrize(("parameters", "stands"), [({}, True), ({"dead_man": False}, False)])
-def test_the_dead_man_can_be_switched_off(parameters, stands):
-    bench = Bench(**parameters)
-    bench.run(1.0, m.BaseCommand(0.5, 0.0))
-    bench.run(2.0)
-    assert bench.last(topics.BASE_STATUS).dead_man_tripped is stands
-    assert (abs(bench.last(topics.TRUTH).twist.linear_mps) < 0.01) is stands
 
 
 def test_an_old_command_does_not_keep_the_dead_man_quiet():
@@ -150,16 +132,6 @@ def test_an_impossible_order_is_reported_and_changes_nothing():
     assert bench.actor._world.obstacles == ()
 
 
-def test_the_scan_message_describes_itself():
-    bench = Bench(laser_rays=91, laser_range_m=6.0)
-    bench.run(0.2)
-    scan = bench.last(topics.SCAN)
-    ranges = np.frombuffer(scan.ranges_f32, dtype="<f4")
-    assert len(ranges) == 91
-    assert ranges.max() <= scan.range_max_m == 6.0
-    assert scan.angle_min_rad == pytest.approx(-scan.angle_increment_rad * 45)
-
-
 def test_held_up_it_publishes_fresh_readings_and_owns_up_to_the_loss():
     bench = Bench()
     bench.run(1.1)
@@ -171,16 +143,6 @@ def test_held_up_it_publishes_fresh_readings_and_owns_up_to_the_loss():
     bench.run(1.1)
     assert bench.last(topics.TRUTH).real_time_factor < 1.0 + 1e-9
     assert any(b.real_time_factor < 0.2 for k, b, _ in bench.sent if k == topics.TRUTH.key)
-
-
-def test_a_schedule_keeps_its_grid_and_drops_what_is_too_old():
-    schedule = Schedule({"a": 10, "b": 5}, start_s=0.0, keep_s=1.0)
-    assert list(schedule.due(0.2)) == [
-        (0.0, "a"), (0.0, "b"), (pytest.approx(0.1), "a"), (pytest.approx(0.2), "a"),
-        (pytest.approx(0.2), "b")]  # fmt: skip
-    assert list(schedule.due(0.25)) == []
-    late = [name for _, name in schedule.due(10.0)]
-    assert Counter(late) == pytest.approx({"a": 10, "b": 5}, abs=1)
 
 
 @pytest.mark.parametrize("bad", [

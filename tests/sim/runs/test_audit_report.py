@@ -36,17 +36,6 @@ def test_what_was_done_is_in_both_reports_and_its_text_is_no_markup(tmp_path):
         ("anna", "accepted"), ("", "refused")]
 
 
-def test_a_long_audit_is_cut_on_the_page_and_whole_as_data(tmp_path):
-    run = record(*(line(i) for i in range(1200)))
-    page = render(run, "Tank")
-    assert "The last 1000 of 1200 lines" in page
-    assert page.count("anna<br>") == 1000
-
-
-def test_without_a_page_there_is_no_section():
-    assert "operator's page" not in render(record(), "Tank")
-
-
 def test_a_run_reads_what_its_page_has_written_down(tmp_path):
     file = tmp_path / "audit-r1.jsonl"
     log = AuditLog(file, lambda: 3.0, lambda _: None, lambda: 0.0)

@@ -11,7 +11,6 @@ from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable, ProcessE
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.sim.runs.record import Interval, RunRecorder
-from rampart.sim.runs.report import clock
 
 
 def recorder_with(*told: tuple[float, str]) -> RunRecorder:
@@ -46,14 +45,6 @@ def test_what_was_shown_before_it_failed_or_shows_that_it_has_ends_nothing(at_s,
     assert recorder.record(9.0).intervals == (Interval("down", "pump", 5.0, 9.0, "crashed"),)
 
 
-def test_a_return_that_was_heard_is_told_once():
-    recorder = recorder_with((5.0, "crashed"), (5.02, "respawned"))
-    show(recorder, 5.5, NodeState.RUNNING)
-    record = recorder.record(9.0)
-    assert record.intervals == (Interval("down", "pump", 5.0, 5.02, "crashed"),)
-    assert len(record.events) == 2
-
-
 def test_the_bar_of_a_fault_whose_end_nothing_reported_is_as_long_as_the_fault():
     recorder = RunRecorder(RunPlan())
     order = bm.Injection("gps-bias", "summit_xl/gps", "drop", 5.0)
@@ -62,11 +53,6 @@ def test_the_bar_of_a_fault_whose_end_nothing_reported_is_as_long_as_the_fault()
                   Header("base", 1, 1, 10.1))
     (bar,) = recorder.fields(100.0)["intervals"]
     assert (bar.name, bar.from_s, round(bar.to_s, 3)) == ("gps-bias", 10.1, 15.1)
-
-
-def test_what_came_before_the_start_has_a_sign():
-    assert clock(-1.8) == "\N{MINUS SIGN}0:01.8"
-    assert clock(61.8) == "1:01.8"
 
 
 def test_the_record_names_the_nodes_that_were_failing_at_the_end():

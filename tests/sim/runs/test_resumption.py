@@ -85,11 +85,6 @@ def test_what_cannot_be_resumed_is_refused_in_one_line(tmp_path, system, change,
     assert "\n" not in str(refused.value)
 
 
-def test_without_reports_there_is_nothing_to_resume(tmp_path):
-    with pytest.raises(ResumptionError, match="no run that did not end"):
-        find(tmp_path / "reports", "")
-
-
 def test_any_cut_or_wrong_byte_of_a_manifest_is_one_line_or_harmless(tmp_path, system):
     files = begun(tmp_path / "reports", "a", system)
     whole = (files.directory / MANIFEST).read_bytes()
@@ -162,11 +157,6 @@ def test_of_two_memories_the_newest_sound_one_is_recalled(tmp_path):
     before.write_bytes(b"")
     time_s, problems = files.recall("r", recall)
     assert (time_s, len(problems)) == (0.0, 2)
-
-
-def test_a_memory_of_another_run_in_the_same_directory_is_not_recalled(tmp_path):
-    RunFiles(tmp_path).keep_memory("r", b"memory")
-    assert RunFiles(tmp_path).recall("s", lambda _memory: 7.0) == (0.0, [])
 
 
 def test_a_run_that_has_ended_leaves_no_memory_and_keeps_its_manifest(tmp_path, system):

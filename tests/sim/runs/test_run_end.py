@@ -34,15 +34,6 @@ def going(distance_m: float) -> ControlStatus:
     return ControlStatus("m1", 0, ControlPhase.FOLLOWING, 0, distance_m)
 
 
-def test_what_nobody_could_hear_does_not_count_as_silence():
-    end = RunEnd(patience_s=60.0, waits=True)
-    end.truth(Twist(0.0, 0.0), 10.0)
-    end.excuse(40.0)
-    assert end.world_gone(49.9 + WORLD_LATE_S) == ""
-    assert end.world_gone(50.1 + WORLD_LATE_S) == (
-        "the world is gone: no ground truth from the simulator")
-
-
 def test_a_mission_that_succeeded_ends_the_run_once_the_robot_has_settled():
     end = RunEnd(60.0)
     end.mission(mission(MissionPhase.RUNNING), 1.0)

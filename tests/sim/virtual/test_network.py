@@ -15,8 +15,6 @@ from rampart.sim.virtual.network import (
     SeededNetwork,
     Timing,
     drawer,
-    find_network,
-    measured,
 )
 
 EVEN = Timing((0.0, 10.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
@@ -44,10 +42,6 @@ def test_over_one_link_nothing_is_lost_nothing_comes_twice_and_nothing_overtakes
 def test_no_message_arrives_before_it_was_sent():
     for model in NETWORKS.values():
         assert all(at >= sent for sent, found in ways(SeededNetwork(model, 4)) for at in found)
-
-
-def test_the_ideal_network_takes_no_time():
-    assert all(found == (sent,) for sent, found in ways(SeededNetwork(NETWORKS["ideal"], 1)))
 
 
 def test_delays_are_drawn_from_the_measured_distribution():
@@ -78,31 +72,11 @@ def test_the_observer_hears_all_at_once_whatever_the_network_does():
     assert network.link("a", "b")(5.0) == ()
 
 
-def test_between_two_nodes_there_is_one_link_however_often_it_is_asked_for():
-    for model in NETWORKS.values():
-        network = SeededNetwork(model, 1)
-        assert network.link("a", "b") is network.link("a", "b")
-        assert network.link("a", "b") is not network.link("b", "a")
-
-
 @pytest.mark.parametrize(("field", "value"), [
     ("loss", 1.5), ("duplication", -0.1), ("reordering", float("nan")), ("extra_s", -1.0)])
 def test_an_impossible_network_is_refused(field, value):
     with pytest.raises(ValueError, match=field):
         NetworkModel("x", "", **{field: value})
-
-
-def test_an_unknown_network_is_refused_with_those_that_there_are():
-    with pytest.raises(ValueError, match="unknown network 'wet'; known: measured, ideal"):
-        find_network("wet")
-
-
-def test_what_was_measured_is_plausible_and_complete():
-    timing = measured()
-    for name in timing.__struct_fields__:
-        assert len(getattr(timing, name)) == 21, name
-    assert 0.05 < timing.message_ms[10] < 5
-    assert timing.exit_ms[10] < timing.death_ms[10] < timing.start_ms[10]
 
 
 def test_drawing_follows_the_quantiles():
