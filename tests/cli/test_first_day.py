@@ -11,7 +11,7 @@ import pytest
 from rampart.cli import output
 from rampart.cli.main import main
 from rampart.testing import RealRun
-from tests import CELL, ROOT
+from tests import CELL, TANK
 
 
 def refused(capsys, *arguments: str, code: int = 2) -> str:
@@ -126,8 +126,7 @@ class Sick(Actor):
 @pytest.mark.processes
 @pytest.mark.alone
 def test_a_real_run_with_a_node_that_never_comes_up_ends_with_1_and_names_it(tmp_path):
-    head = (ROOT / "docs/reference/specification.md").read_text(encoding="utf-8").split(
-        "```toml\n")[1].split("[[node]]")[0]
+    head = TANK.split("[[node]]")[0]
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "first_day_parts.py").write_text(PARTS)
     (tmp_path / "run" / "day.toml").write_text(

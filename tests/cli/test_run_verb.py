@@ -12,12 +12,9 @@ import pytest
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
 from rampart.testing import free_port
-from tests import CELL, ROOT
+from tests import CELL, ROOT, TANK
 from tests.two_hosts import two_hosts
 from tests.whole.checkpoint_runs import write_short_mission
-
-SPECIFIED_TANK = (ROOT / "docs" / "specification.md").read_text(
-    encoding="utf-8").split("```toml\n")[1].split("```")[0]
 
 
 def short(tmp_path):
@@ -73,7 +70,7 @@ def test_launch_py_writes_its_report_into_its_checkout(tmp_path):
 
 
 NO_OPTION = "no option of the launcher or of tank; --system tank.toml --help shows those there are"
-TANK, TWO = ["--system", "tank.toml"], ["--system", "two.toml"]
+OF_TANK, TWO = ["--system", "tank.toml"], ["--system", "two.toml"]
 GROUND = [*TWO, "--host", "ground"]
 REFUSED = [
     (["--mission", "Z"], "'Z'"),
@@ -96,12 +93,12 @@ REFUSED = [
     (["--fault", "gps-bias@goal99"], "--fault gps-bias@goal99: mission AB has 5 goals"),
     (["--host", "ground"], "--host ground: osmosis has no [[host]]; it runs on one machine"),
     (["--no-keys"], "--no-keys: osmosis runs on one machine"),
-    ([*TANK, "--virtual"], "--virtual: in virtual time a run has to end: give --duration S"),
-    ([*TANK, "--fault", "kill:nobody"], "no node 'nobody'; there are: supervisor, pump_controller"),
-    ([*TANK, "--patience", "7"], "--patience 7: tank has no mission"),
-    ([*TANK, "--obstacles", "1"], f"--obstacles: {NO_OPTION}"),
-    ([*TANK, "--joystick"], f"--joystick: {NO_OPTION}"),
-    *(([*TANK, *page], "no node of tank serves an operator's page")
+    ([*OF_TANK, "--virtual"], "--virtual: in virtual time a run has to end: give --duration S"),
+    ([*OF_TANK, "--fault", "kill:nobody"], "no node 'nobody'; there are: supervisor, pump_contr"),
+    ([*OF_TANK, "--patience", "7"], "--patience 7: tank has no mission"),
+    ([*OF_TANK, "--obstacles", "1"], f"--obstacles: {NO_OPTION}"),
+    ([*OF_TANK, "--joystick"], f"--joystick: {NO_OPTION}"),
+    *(([*OF_TANK, *page], "no node of tank serves an operator's page")
       for page in (["--wait"], ["--hmi-port", "9000"], ["--hmi-host", "0.0.0.0"])),
     ([*TWO, "--host", "moon", "--no-keys"], "--host moon: unknown; known: robot, ground"),
     (GROUND, "osmosis runs on 2 hosts: say --keys DIR"),
@@ -121,7 +118,7 @@ REFUSED = [
 def test_bad_usage_is_one_clear_line_and_exit_code_2(
         tmp_path, monkeypatch, capfd, arguments, words):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "tank.toml").write_text(SPECIFIED_TANK)
+    (tmp_path / "tank.toml").write_text(TANK)
     (tmp_path / "two.toml").write_text(two_hosts({"robot": "192.0.2.1", "ground": "192.0.2.2"}))
     (tmp_path / "far.miss").write_text("x=-22,y=-18.5,taxi=1\nx=500,y=0,taxi=0\n")
     report = [] if "--report" in arguments else ["--report", str(tmp_path / "report")]

@@ -12,7 +12,7 @@ import pytest
 
 from rampart.cli import run as launch
 from rampart.testing import free_base_port
-from tests import ROOT
+from tests import ROOT, TANK
 
 PAPER = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
 WORLD = ('[[node]]\nname = "simulator"\nactor = "rampart.sim.osmosis.simulator:Simulator"\n'
@@ -33,8 +33,6 @@ def application_of(text: str) -> str:
     return text[text.index("[application]"):text.index("\n\n", text.index("[application]"))]
 
 
-TANK = (ROOT / "docs/reference/specification.md").read_text(
-    encoding="utf-8").split("```toml\n")[1].split("```")[0]
 PORTER = changed(PAPER, (application_of(PAPER), ""), (WORLD, ""))
 
 

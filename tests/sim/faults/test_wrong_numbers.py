@@ -14,7 +14,7 @@ from rampart.manager.spec.specification import SpecificationError, parse_specifi
 from rampart.sim.campaign.plan import fault_groups
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.wrong_numbers import Sizes, plausible_offsets
-from tests import ROOT
+from tests import TANK
 
 
 class Joint(Message, frozen=True):
@@ -67,8 +67,6 @@ def test_a_number_stays_within_its_range_and_is_wrong_all_the_same(field, by, wr
     assert getattr(corrupt(JOINT, order, 0.0, Random(1)), field) == wrong
 
 
-TANK = (ROOT / "docs/reference/specification.md").read_text(
-    encoding="utf-8").split("```toml\n")[1].split("```")[0]
 FAULT = """
 [[fault]]
 name = "trigger-lost"
