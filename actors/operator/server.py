@@ -107,7 +107,8 @@ def page_files(robot: Path | None) -> dict[str, _File]:
              for file in sorted(folder.iterdir()) if file.suffix in _TYPES}
     links = "".join(
         f'<link rel="{"stylesheet" if file.kind.endswith("css") else "modulepreload"}" '
-        f'href="{html.escape(path[1:])}">\n' for path, file in found.items())
+        f'href="{html.escape(path[1:])}">\n' for path, file in found.items()
+        if not path.endswith(".min.js"))  # of uPlot, a script and not a module
     index = (_PAGE / "index.html").read_text(encoding="utf-8").replace(_LINKS, links)
     return {_INDEX: _File(index.encode(), "text/html"), **found}
 
@@ -179,7 +180,6 @@ class PageServer:
     def stop(self) -> None:
         """Stop listening and say goodbye to the pages."""
         self._server.stop()
-        self._audit.close()
 
     def drove(self, number: int, panel: str, held: bool, why: str) -> None:
         """Write down that a page has taken the stick of a panel, or let go of it."""
