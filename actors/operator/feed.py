@@ -1,12 +1,12 @@
 """Pushes the picture to the open pages: what changed, at most 25 times a second, encoded once.
 
-A change that matters is on its way in the same turn of the event loop, unless the last frame is
-younger than `FRAME_GAP_S`; what is not urgent rides along. Pages at the same version share a frame.
+A change is on its way in the same turn of the event loop, unless the last frame is younger than
+`FRAME_GAP_S`. Pages at the same version share a frame.
 
 *No backlog.* The buffers between here and a browser hold minutes of frames, so that a page that
-cannot keep up would show the past. A page therefore says which frame it has drawn, and has at most
-`IN_FLIGHT` frames that it has not; when it answers it gets the newest. A client that never answers
-(a script) is bounded by its socket alone. One that takes nothing for `SEND_TIMEOUT_S` is
+cannot keep up would show the past. A page therefore reports which frame it has drawn, and has at
+most `IN_FLIGHT` frames that it has not; with its answer it gets the newest. A client that never
+answers (a script) is bounded by its socket alone. A page that takes nothing for `SEND_TIMEOUT_S` is
 disconnected; it may come back and is given everything.
 
 Nothing here costs anything while no page is open.
@@ -27,11 +27,8 @@ from rampart.actors.operator.state import HmiState
 FRAME_GAP_S = 0.04
 """Real seconds between two frames at least: 20 Hz, with room for jitter."""
 
-RIDE_S = 0.1
-"""What is not urgent waits so long for company at most."""
-
 LOOK_S = 1.0
-"""Between two looks at what no message says: who has fallen silent, what the processes use."""
+"""Between two looks at what no message carries: silent publishers, what the processes use."""
 
 SEND_TIMEOUT_S = 5.0
 IN_FLIGHT = 2
@@ -40,39 +37,33 @@ _SEEN = re.compile(rb'\{"type":"seen","version":(\d{1,33})\}')
 
 
 class PageFeed:
-    """What the feed knows of one open page."""
+    """An open page: which versions it was sent, and which of them it has drawn.
+
+    Attributes:
+        version: the newest that it was sent.
+    """
 
     def __init__(self) -> None:
         self.version = 0
-        self.due = False
-        self._sent: list[int] = []
+        self.news = asyncio.Event()
+        self.drawn = asyncio.Event()
+        self._on_the_way: list[int] = []
         self._answers = False
-        self._wake = asyncio.Event()
-
-    def may_have_more(self) -> bool:
-        """Tell whether it has drawn enough of what it was sent to be sent more."""
-        return not self._answers or len(self._sent) < IN_FLIGHT
+        self.drawn.set()
 
     def sends(self, version: int) -> None:
         """Take note of what it is being sent."""
-        self.version, self.due = version, False
-        self._sent = [*self._sent, version][-2 * IN_FLIGHT:]  # bounded: it may never answer
+        self.version = version
+        self.news.clear()
+        self._on_the_way = [*self._on_the_way, version][-IN_FLIGHT:]  # it may never answer
+        if self._answers and len(self._on_the_way) == IN_FLIGHT:
+            self.drawn.clear()
 
     def seen(self, version: int) -> None:
-        """Hear that it has drawn a frame, and with it all before."""
+        """Take note that it has drawn a frame, and with it all before."""
         self._answers = True
-        self._sent = [v for v in self._sent if v > version]
-        self._wake.set()
-
-    def tell(self) -> None:
-        """Tell it that there is news."""
-        self.due = True
-        self._wake.set()
-
-    async def wait(self) -> None:
-        """Wait until it was told something, or has answered."""
-        self._wake.clear()
-        await self._wake.wait()
+        self._on_the_way = [v for v in self._on_the_way if v > version]
+        self.drawn.set()
 
 
 class Feed:
@@ -100,17 +91,19 @@ class Feed:
 
     @contextlib.contextmanager
     def page(self) -> Iterator[PageFeed]:
-        """Have a page among those that are told of news."""
+        """Have a page among those that are sent news."""
         page = PageFeed()
         self._pages.add(page)
         if self._looker is None:
-            self._look_round()
+            self._look_around()
         try:
             yield page
         finally:
             self._pages.discard(page)
             if not self._pages:
-                self._rest()
+                for timer in filter(None, (self._timer, self._looker)):
+                    timer.cancel()
+                self._timer = self._looker = None
 
     async def push(self, page: PageFeed, send: Callable[[str], Awaitable[None]]) -> None:
         """Send a page what it should show, until cancelled.
@@ -122,16 +115,14 @@ class Feed:
             await send(_encode(self._hello()))
         while True:
             async with asyncio.timeout(SEND_TIMEOUT_S):
-                while not page.may_have_more():
-                    await page.wait()
+                await page.drawn.wait()
                 text = self.frame(page.version)
                 page.sends(self._state.picture.version)
                 await send(text)
-            while not page.due:
-                await page.wait()
+            await page.news.wait()
 
     def heard(self, page: PageFeed, text: str | bytes | None) -> bool:
-        """Take note if a message says that a frame was drawn; tell whether it was such a one."""
+        """Take note if a message reports a frame as drawn; return whether it does."""
         raw = text.encode(errors="replace") if isinstance(text, str) else text or b""
         if found := _SEEN.fullmatch(raw):
             page.seen(int(found[1]))
@@ -146,38 +137,24 @@ class Feed:
                 **picture.changes(since)})
         return self._frames[since]
 
-    # -- when -----------------------------------------------------------------------------------
-
-    def _changed(self, urgent: bool) -> None:
+    def _changed(self) -> None:
         self._frames.clear()
-        if not self._pages:
-            return
-        loop = asyncio.get_running_loop()
-        due = self._last_s + (FRAME_GAP_S if urgent else RIDE_S)
-        if self._timer is not None:
-            if self._timer.when() <= due:
-                return
-            self._timer.cancel()
-        self._timer = loop.call_at(max(due, loop.time()), self._tell)
+        if self._pages and self._timer is None:
+            loop = asyncio.get_running_loop()
+            self._timer = loop.call_at(max(self._last_s + FRAME_GAP_S, loop.time()), self._tell)
 
     def _tell(self) -> None:
         self._timer = None
         self._last_s = asyncio.get_running_loop().time()
         for page in self._pages:
-            page.tell()
+            page.news.set()
 
-    def _look_round(self) -> None:
+    def _look_around(self) -> None:
         self._look()
         self._state.grow_old(self._now())
         self._frames.clear()  # the time has gone on
         self._tell()
-        self._looker = asyncio.get_running_loop().call_later(LOOK_S, self._look_round)
-
-    def _rest(self) -> None:
-        for timer in (self._timer, self._looker):
-            if timer is not None:
-                timer.cancel()
-        self._timer = self._looker = None
+        self._looker = asyncio.get_running_loop().call_later(LOOK_S, self._look_around)
 
 
 def _encode(data: Any) -> str:

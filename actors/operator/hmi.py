@@ -8,6 +8,7 @@ is derived from it. What is shown is collected in `state`, the page is served by
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import os
 import pwd
@@ -20,12 +21,15 @@ from typing import Any, ClassVar
 
 import msgspec
 
+from rampart.actors.access.register import KeysError
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.keeping_up import LINE_S, KeepingUp
 from rampart.actors.operator.bounds import Bounds
 from rampart.actors.operator.camera_eye import CameraEye
 from rampart.actors.operator.feed import Feed
@@ -52,6 +56,7 @@ from rampart.actors.web.gate import Gate
 from rampart.actors.web.tls import Tls, TlsError
 from rampart.actors.web.visitors import Register, Role, Visitor, digest
 from rampart.files.plain_text import one_line
+from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.specification import SystemSpec, check_document
 
 REPEAT_S = 0.5
@@ -165,7 +170,11 @@ class Hmi(Actor):
         self._camera = self._make_camera()
         self._table: fm.NodeTable | None = None
         self._server: PageServer | None = None
+        self._tls: Tls | None = None
         self._observer = ProcessObserver(plan.base_port, plan.launcher_pid, plan.host)
+        worlds = sorted(n.name for n in run.system.nodes if n.kind is Kind.WORLD)
+        self._keeping_up = KeepingUp(run.system.timing, worlds, plan.rate, plan.begins_s)
+        self._behind_until_s = 0.0
         self._version = -1
         self._is_seen = False
         self._unheard: list[str] = []
@@ -189,8 +198,23 @@ class Hmi(Actor):
         return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
                 "badge": self.badge,
                 "system": one_line(self.context.run.system.name),
-                "camera": self._camera is not None, "tables": self._state.picture.tables,
+                "expires": self._expires(), "camera": self._camera is not None,
+                "tables": self._state.picture.tables,
                 "panels": _PANELS.fit(self._panels)[0], "past": self._state.past()}
+
+    def _expires(self) -> tuple[str, float] | None:
+        """Return which certificate of the run expires first, and when (Unix time)."""
+        plan, ends = self.context.run.plan, {}
+        if self._tls is not None:
+            ends["page"] = self._tls.says.until_s
+        if plan.keys:
+            with contextlib.suppress(ImportError, KeysError, OSError):
+                from rampart.actors.access import key_folder  # noqa: PLC0415 of an extra
+
+                names = (*ROUTERS, *(actor.name for actor in self.context.run.system.actors()))
+                ends |= {name: until.timestamp() for name, until
+                         in key_folder.lifetimes(Path(plan.keys), names).items()}
+        return min(ends.items(), key=lambda end: end[1], default=None)
 
     def _fulfil(self, request: Request, page: int) -> str | dict[str, Any]:
         """Act on a request of a page, known by its number, and return what to tell it.
@@ -256,7 +280,9 @@ class Hmi(Actor):
 
     def _serve(self) -> PageServer:
         page, complain = self.context.run.plan.page, self._complain
-        tls = Tls(Path(page.cert), Path(page.key), complain) if page.cert else None
+        if page.cert:
+            self._tls = Tls(Path(page.cert), Path(page.key), complain)
+        tls = self._tls
         asks = bool(page.token or page.token_file)
         owner = None if asks else Visitor(_user(), Role.INJECT)
         holder = Visitor(TOKEN_HOLDER, Role.INJECT, digest(page.token))
@@ -294,7 +320,9 @@ class Hmi(Actor):
             for topic, method in self._handlers:
                 if topic in self.drawn:
                     self.hear_after_all(topic, getattr(self, method))
-        self._state.picture.put("usage", self._observer.look(self._table), urgent=False)
+        if self.clock.now() > self._behind_until_s:
+            self._state.picture.put("behind", "")
+        self._state.picture.put("usage", self._observer.look(self._table))
 
     def _show_system(self, system: SystemSpec, version: int) -> None:
         if self._port and system is not NO_SYSTEM and version > self._version:
@@ -325,6 +353,9 @@ class Hmi(Actor):
     def _nodes(self, message: fm.NodeTable, _header: Header) -> None:
         self._operating.nodes(message)
         self._table = message
+        if line := self._keeping_up.take(message, self.clock.now()):
+            self._behind_until_s = self.clock.now() + 2 * LINE_S * self.clock.rate
+            self._state.picture.put("behind", line)
         self._state.keep("nodes", message, self.clock.now())
 
     @on(ftm_topics.DECISION)

@@ -111,13 +111,12 @@ class Picture:
 
     Attributes:
         version: Grows with each change.
-        on_change: Called after each change with whether somebody should see it at once; what is
-            not urgent may wait for the next urgent change, or a tenth of a second.
+        on_change: Called after each change.
     """
 
     def __init__(self) -> None:
         self.version = 1  # 0 is what a page has seen that has seen nothing
-        self.on_change: Callable[[bool], None] = lambda _urgent: None
+        self.on_change: Callable[[], None] = lambda: None
         self._sections: dict[str, Section] = {}
         self._tables: dict[str, Table] = {}
         self._journals: dict[str, Journal] = {}
@@ -141,14 +140,14 @@ class Picture:
         """Return the present value of a section."""
         return self._sections[name].value
 
-    def put(self, name: str, value: Any, *, urgent: bool = True) -> None:
+    def put(self, name: str, value: Any) -> None:
         """Set a section; the same value again is no change."""
         section = self._sections[name]
         if section.value == value:
             return
         section.value = value
         self.version = section.version = self.version + 1
-        self.on_change(urgent)
+        self.on_change()
 
     def rows(self, name: str) -> dict[str, Any]:
         """Return the rows of a table."""
@@ -163,13 +162,13 @@ class Picture:
         """Set a row of a table, None removes it; the same again is no change."""
         if self._tables[name].set(row, value, self.version + 1):
             self.version += 1
-            self.on_change(True)
+            self.on_change()
 
     def add(self, name: str, line: Any) -> None:
         """Add a line to a journal."""
         self.version += 1
         self._journals[name].add(line, self.version)
-        self.on_change(True)
+        self.on_change()
 
     def changes(self, since: int) -> dict[str, Any]:
         """Return what changed after a version, each value as JSON already; since 0, everything.

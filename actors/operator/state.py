@@ -97,6 +97,7 @@ class HmiState:
         self.aged("manager", "nodes")
         picture.section("detections", [])
         picture.section("usage", {})
+        picture.section("behind", "")
         picture.journal("decisions")
         picture.journal("events")
 
@@ -114,11 +115,11 @@ class HmiState:
         self.aged(name, show=_timed if kept_s else as_heard)
 
     def field(self, name: str, value: Any, stamp_s: float, now_s: float) -> None:
-        """Keep the value of a declared field; it may wait for what is urgent."""
+        """Keep the value of a declared field; its past too if a panel shows it."""
         trace = self._traces.get(name)
         if trace is not None:
             trace.add(stamp_s, value)
-        self.put(name, Heard(value, t=stamp_s if trace is not None else 0.0), now_s, urgent=False)
+        self.put(name, Heard(value, t=stamp_s if trace is not None else 0.0), now_s)
 
     def past(self) -> dict[str, list[tuple[float, Any]]]:
         """Return of each field that is plotted what it was: simulated seconds, and its value."""
@@ -145,10 +146,10 @@ class HmiState:
         """Keep the latest message of a kind."""
         self.put(what, Heard(message), now_s)
 
-    def put(self, what: str, heard: Heard, now_s: float, *, urgent: bool = True) -> None:
+    def put(self, what: str, heard: Heard, now_s: float) -> None:
         """Keep something for a section that grows old."""
         self._heard_s[what] = now_s
-        self.picture.put(what, heard, urgent=urgent)
+        self.picture.put(what, heard)
 
     def manager(self, status: fm.ManagerStatus, now_s: float) -> None:
         """Keep the manager's view, and log which detections have come and gone."""

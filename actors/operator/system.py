@@ -19,7 +19,7 @@ from rampart.manager.spec.schema import SystemSpec
 MAX_BOXES = 300
 """A larger tree is not drawn: it could not be read, and the layout would keep the node busy."""
 
-LETTERS = 23
+LETTERS = 22
 """In a line of a box."""
 LINES = 3
 LINE = 14.0

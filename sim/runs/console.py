@@ -67,8 +67,6 @@ class Console:
         self.say(f"Rampart: {what}, {mode}, {time_is}")
         if virtual:
             return
-        if plan.page.port:
-            self.say(f"Operator's page: {plan.page.invitation}")
         if comes_back := [node.name for node in spec.nodes if node.respawn != SUPERVISOR]:
             example = self.example if self.example in comes_back else comes_back[0]
             self.say(f"Try from another shell: kill-node {example}")

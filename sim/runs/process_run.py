@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.actors.supervision.kill_node import SignalError, signal_node
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.unseen import watch
+from rampart.actors.web.access import ANY
 from rampart.sim.faults.injector import SIGNALS, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.record import RunRecord
@@ -29,6 +31,9 @@ _STALL_S = 0.5
 
 _KEEP_S = 1.0
 """Wall seconds between two memories of the record, if nothing happens."""
+
+_PAGE_S = 20.0
+"""Wall seconds within which the operator's page answers."""
 
 _KEYS_S = 5.0
 """Wall seconds between two looks at the certificates."""
@@ -132,8 +137,9 @@ class ProcessRun:
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):
             watch(task, f"the launcher's {actor.name}", launcher.failed)
-        if trial.console:
-            trial.console.banner(trial.about, plan, spec)
+        if console:
+            console.banner(trial.about, plan, spec)
+            tasks.append(asyncio.create_task(self._announce_page(console.say)))
         if plan.keys:
             tasks.append(asyncio.create_task(self._watch_keys()))
         try:
@@ -174,6 +180,21 @@ class ProcessRun:
         except (OSError, RuntimeError) as error:  # no disk, no thread
             self._keep = None
             self.launcher.report(f"the run cannot be resumed any more: {error}")
+
+    async def _announce_page(self, say: Callable[[str], None]) -> None:
+        """Print the address of the operator's page as soon as it answers."""
+        page = self.launcher.plan.page
+        if not page.port:
+            return
+        host = "127.0.0.1" if page.host in ANY else page.host
+        for _ in range(round(_PAGE_S / _LOOK_S)):
+            with contextlib.suppress(OSError):
+                _, writer = await asyncio.open_connection(host, page.port)
+                writer.close()
+                say(f"Operator's page: {page.invitation}")
+                return
+            await asyncio.sleep(_LOOK_S)
+        say(f"Operator's page: no answer at {page.url} for {_PAGE_S:g} s")
 
     async def _watch_keys(self) -> None:
         """Tell of each certificate that expires: without it a process is only gone, then hung."""

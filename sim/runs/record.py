@@ -15,13 +15,13 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.keeping_up import KeptUp
 from rampart.actors.ftm.narrator import Narrator
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.web.audit import AuditLine
 from rampart.manager.strategies.registry import decision_in_words
 from rampart.sim.faults.scenario import FaultOutcome
-from rampart.sim.runs.keeping_up import KeptUp
 
 KEPT = 10_000
 """Most events, intervals, decisions or names of a kind that are kept of a run."""

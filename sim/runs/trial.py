@@ -19,6 +19,7 @@ import msgspec
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
+from rampart.actors.ftm.keeping_up import KeepingUp
 from rampart.actors.ftm.messages import NodeTable, ProcessEvent
 from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.clock import Clock
@@ -39,7 +40,6 @@ from rampart.sim.faults.injector import INJECTOR, Injector, ProcessControl
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.console import Console
 from rampart.sim.runs.judge import UNSTABLE, Judge, Verdict
-from rampart.sim.runs.keeping_up import KeepingUp
 from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord, RunRecorder, Safety
 from rampart.sim.runs.report import Written, margin_text, render, try_report

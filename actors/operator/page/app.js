@@ -36,9 +36,11 @@ let retryMs = 500;
 let retry = 0;
 let lastHeard = 0;
 let toastTimer = 0;
+let expires = null;          // the certificate of the run that expires first, and when
 let badge = "";              // what the HMI calls this connection: live, or replay
 
-const SILENT_MS = 4000;      // the HMI speaks once a second at least
+const OLD_MS = 1700;         // the HMI sends a frame once a second at least
+const SILENT_MS = 4000;
 const OPENING_MS = 10000;
 
 // ---- connection: reconnects by itself, and notices a server that only hangs -------------------
@@ -74,15 +76,18 @@ function lost(why) {
 
 setInterval(() => {
   if (!socket) return;
-  const patience = socket.readyState === WebSocket.OPEN ? SILENT_MS : OPENING_MS;
-  if (Date.now() - lastHeard > patience) lost("HMI silent, reconnecting");
-}, 1000);
+  const silent = Date.now() - lastHeard;
+  if (silent > (connected() ? SILENT_MS : OPENING_MS)) lost("HMI silent, reconnecting");
+  else if (connected() && silent > OLD_MS) link("bad", "HMI silent");
+}, 250);
 
 const connected = () => socket !== null && socket.readyState === WebSocket.OPEN;
 
 function link(kind, text) {
   pill("link", kind, text);
   document.body.classList.toggle("offline", kind === "bad");
+  $("cut").hidden = kind !== "bad" || picture.time_s === undefined;
+  say($("cut"), `Not connected. Every value below is old: it is of ${clock(picture.time_s)}.`);
 }
 
 function send(wish) {
@@ -165,6 +170,7 @@ async function hello(message) {
   tooMuch = message.left_out || {};
   leftOut({});
   say($("system"), message.system);
+  expires = message.expires;
   $("rate").textContent = message.rate === 1 ? "" : `× ${message.rate}`;
   await panels.begin(message);
   if (socket !== from) return;  // lost meanwhile
@@ -186,6 +192,11 @@ const PARTS = [
     order.show(s.manager);
   }],
   [["nodes", "usage"], (s) => processes.show(s.nodes, s.usage)],
+  [["usage"], credentials],
+  [["behind"], (s) => {
+    $("behind").hidden = !s.behind;
+    say($("behind"), s.behind);
+  }],
 ];
 
 /** Show what changed. A part that fails, on values that nobody foresaw, does not take the others along. */
@@ -213,6 +224,15 @@ function leftOut(counts) {
   say($("left-out"), `Too much to show: ${missing.map(([what, n]) => `${n} of the ${what}`).join(", ")} left out.`);
 }
 
+/** Say for how many days the credentials of the run are still valid. */
+function credentials() {
+  $("credentials").hidden = !expires;
+  if (!expires) return;
+  const days = (expires[1] - Date.now() / 1000) / 86400;
+  pill("credentials", days < 3 ? "bad" : days < 7 ? "warn" : "", `credentials: ${days < 0 ? "expired" : `${days.toFixed(days < 10 ? 1 : 0)} days left`}`);
+  $("credentials").title = `The certificate of ${expires[0]} expires first, at ${new Date(1000 * expires[1]).toISOString()}.`;
+}
+
 function told(outcome) {
   if (memory.shown.order !== undefined && memory.shown.order !== outcome.number) toast(outcome.text);
   memory.shown.order = outcome.number;
@@ -231,9 +251,10 @@ function system(drawn) {
 function safety(s) {
   manager(s.manager);
   $("detections").replaceChildren(...s.detections.map((d) => {
-    const chip = element("li", d.active ? "active" : d.stale ? "stale" : "", d.active ? `▲ ${d.name}` : d.name);
+    const silent = d.stale || s.manager?.value.silent.includes(d.name);
+    const chip = element("li", d.active ? "active" : silent ? "stale" : "", `${d.active ? "▲ " : silent ? "? " : ""}${d.name}`);
     const nodes = d.nodes.length ? ` (${d.nodes.join(", ")})` : "";
-    const state = d.active ? `${d.reason}${nodes}` : d.stale ? "silent" : "idle";
+    const state = d.active ? `${d.reason}${nodes}` : silent ? "not heard" : "idle";
     chip.title = `${named(d.name)}: ${state}`;
     chip.append(element("span", "unseen", `: ${state}`));
     return chip;

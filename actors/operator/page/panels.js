@@ -36,12 +36,13 @@ export class Panels {
   }
 
   frame(panel, i) {
-    const section = element("section", "panel");
-    const title = element("h2", "", panel.title);
-    title.id = `own-${i}`;
+    const section = Object.assign(element("details", "panel"), { open: true });
+    const title = Object.assign(element("h2", "", panel.title), { id: `own-${i}` });
+    const summary = element("summary");
     section.setAttribute("aria-labelledby", title.id);
     section.dataset.name = panel.title;
-    section.append(title);
+    summary.append(title);
+    section.append(summary, element("div", "inside"));
     this.arrangement.adopt(section);
     return section;
   }

@@ -5,7 +5,7 @@
 import { svg, say } from "./dom.js";
 
 const LINE = 14;
-const STEM = 78;  // as in hmi_system.py: the line on which a barrier stands
+const STEM = 78;  // as BARRIER in system.py: the line on which a barrier stands
 const PAD = 10;
 const path = (points) => `M${points.map(([x, y]) => `${x} ${y}`).join("L")}`;
 
@@ -22,6 +22,7 @@ function begin(canvas, drawing) {
   const [width, height] = [drawing.width + 2 * PAD, drawing.height + 2 * PAD];
   canvas.setAttribute("viewBox", `${-PAD} ${-PAD} ${width} ${height}`);
   canvas.style.setProperty("--natural", `${Math.round(width)}px`);
+  canvas.closest(".panel").dataset.columns = Math.min(3, Math.ceil(width / 420));
   svg("title", {}, canvas, drawing.title);
   svg("desc", {}, canvas, drawing.words);
 }
@@ -31,7 +32,6 @@ export class FaultTree {
     this.canvas = canvas;
     this.events = new Map();
     this.lines = [];
-    this.lit = new Set();
   }
 
   begin(drawing) {
@@ -70,7 +70,7 @@ export class FaultTree {
       svg("path", { class: "bar", d: `M${x - 4} ${middle - 11}v22M${x + 4} ${middle - 11}v22` }, barrier);
       svg("text", { class: "ftm", x, y: middle - 15 }, barrier, shape.mechanism);
       const short = `${shape.detect} → ${shape.recover}`;
-      svg("text", { class: "modules", x, y: middle + 22 }, barrier, short.length > 14 ? `${short.slice(0, 13)}…` : short);
+      svg("text", { class: "modules", x, y: middle + 22 }, barrier, short.length > 12 ? `${short.slice(0, 11)}…` : short);
     }
     this.events.set(shape.name, { shape, group, title, tag, barrier });
   }
@@ -83,16 +83,6 @@ export class FaultTree {
       : `M${left + 24} ${y - 11}Q${left + 8} ${y - 11} ${left} ${y}Q${left + 8} ${y + 11} ${left + 24} ${y + 11}Q${left + 18} ${y} ${left + 24} ${y - 11}Z`;
     svg("path", { class: "gate", d }, group);
     svg("text", { class: "qualifier", x: left + 13, y: y + 3.5 }, group, qualifier);
-  }
-
-  /** Where the tree is wider than its room, bring what has just been lit into view. */
-  reveal(shape) {
-    const room = this.canvas.parentElement;
-    const scale = this.canvas.clientWidth / this.canvas.viewBox.baseVal.width;
-    const [left, right] = [(shape.x - STEM) * scale, (shape.x + shape.width) * scale];
-    if (left < room.scrollLeft || right > room.scrollLeft + room.clientWidth) {
-      room.scrollLeft = right - room.clientWidth + PAD;
-    }
   }
 
   /** Show what is detected, how it would go on, and the barrier that stands in its way. */
@@ -121,10 +111,8 @@ export class FaultTree {
       const why = detected.map((name) => `${name}: ${reasons.get(name).reason}`).join("; ");
       say(title, [shape.title, barrier && `${shape.mechanism}(${shape.detect}, ${shape.recover})`, tag.textContent, why]
         .filter(Boolean).join(" – "));
-      if (lit && !this.lit.has(shape.name)) this.reveal(shape);
       if (lit) words.push(`${shape.mechanism}, ${shape.title}: ${tag.textContent}${why ? ` (${why})` : ""}`);
     }
-    this.lit = occurred;
     for (const line of this.lines) {
       const on = led.has(line.upper) && (occurred.has(line.lower) || (led.has(line.lower) && !this.events.get(line.lower).shape.mechanism));
       line.drawn.classList.toggle("lit", on);

@@ -1,8 +1,9 @@
 // What panels can show of fields of topics, and a stick that says them. A field's section of the picture is named as the field,
 // "topic:field", and has its value, whether that is stale, and where the past is shown its time.
 
-import { element, figure, say, svg } from "./dom.js";
+import { clock, element, figure, say, svg } from "./dom.js";
 import { Stick } from "./stick.js";
+import { View } from "./view.js";
 
 const label = (field) => field.slice(field.indexOf(":") + 1);
 
@@ -18,6 +19,7 @@ class Widget {
   constructor(room, page) {
     this.body = room.body;
     this.section = room.section;
+    this.title = room.title;
     this.declared = page.declared;
     this.fields = [].concat(this.declared[this.constructor.kind]);
     this.build();
@@ -146,20 +148,15 @@ class Past {
     this.points = [];
   }
 
-  begin(points) { this.points = points ? [...points] : []; }
+  begin(points) { this.points = [...points || []]; }
 
   add({ t, value }) {
-    if (!Number.isFinite(t)) return;
-    const last = this.points[this.points.length - 1];
-    if (last && t < last[0]) this.points = [];
-    if (last && t - last[0] < this.seconds / POINTS) return;
-    this.points.push([t, typeof value === "boolean" ? Number(value) : Number.isFinite(value) && Math.abs(value) < 1e15 ? value : null]);
-    if (this.points.length > 2 * POINTS) this.points.splice(0, POINTS);
-  }
-
-  since(t) {
-    const first = this.points.findIndex((point) => point[0] >= t);
-    return first < 0 ? [] : this.points.slice(Math.max(first - 1, 0));
+    const last = this.points.at(-1)?.[0] ?? -Infinity;
+    if (!Number.isFinite(t) || (t >= last && t - last < this.seconds / POINTS)) return;
+    if (t < last) this.points = [];  // another run
+    const number = Number(value);
+    this.points.push([t, value !== null && Math.abs(number) < 1e15 ? number : null]);
+    if (this.points.length > 2 * POINTS) this.points = this.points.slice(-POINTS);
   }
 }
 
@@ -178,8 +175,9 @@ class Remembering extends Widget {
   }
 }
 
-const [WIDE, HIGH] = [600, 150];
 const REDRAW_MS = 500;  // also without a new value: time goes on
+const HEIGHT = 180;
+const DASHES = [[], [7, 3], [2, 3], [9, 3, 2, 3], [14, 2], [4, 4], [12, 4], [1, 4]];
 
 class Plot extends Remembering {
   static kind = "plot";
@@ -189,29 +187,36 @@ class Plot extends Remembering {
   build() {
     super.build();
     this.drawn = 0;
-    const frame = element("div", "plot-frame");
-    this.high = element("span", "high quiet");
-    this.low = element("span", "low quiet");
-    this.canvas = svg("svg", { class: "plot", viewBox: `0 0 ${WIDE} ${HIGH}`, preserveAspectRatio: "none", role: "img",
-      "aria-label": `${this.declared.title}, the last ${this.keptSeconds()} seconds; the latest values are listed below` });
-    for (const share of [0, .5, 1]) svg("path", { class: "grid", d: `M0 ${share * HIGH}h${WIDE}` }, this.canvas);
-    this.lines = this.fields.map((_, i) => svg("path", { class: `series s${i}` }, this.canvas));
-    frame.append(this.high, this.low, this.canvas);
-    const ends = element("p", "ends quiet");
-    ends.append(element("span", "", `−${this.keptSeconds()} s`), element("span", "", "now"));
+    this.end = 0;
+    const frame = element("div", "plot");
+    frame.setAttribute("role", "img");
+    frame.setAttribute("aria-label", `${this.declared.title}, the last ${this.keptSeconds()} seconds; the latest values are listed below`);
     const legend = element("ul", "legend");
     legend.setAttribute("aria-label", `${this.declared.title}: latest values`);
     this.values = this.fields.map((field, i) => {
-      const line = element("li");
-      const sign = svg("svg", { class: "sign", viewBox: "0 0 24 8", "aria-hidden": "true" }, line);
-      svg("path", { class: `series s${i}`, d: "M0 4h24" }, sign);
+      const line = Object.assign(element("li"), { title: field });
+      const sign = svg("svg", { width: 24, height: 4, "aria-hidden": "true" }, line);
+      svg("path", { d: "M0 2h24", stroke: `var(--s${i})`, "stroke-width": 2.5, "stroke-dasharray": DASHES[i].join(" ") }, sign);
       const value = element("b");
       line.append(element("span", "", label(field)), value);
-      line.title = field;
       legend.append(line);
       return value;
     });
-    this.body.append(frame, ends, legend);
+    this.body.append(frame, legend);
+    const colour = (name) => () => getComputedStyle(frame).getPropertyValue(name);
+    const axis = { stroke: colour("--quiet"), grid: { stroke: colour("--rule"), width: 1 }, ticks: { show: false }, font: "11px system-ui, sans-serif" };
+    this.chart = new uPlot({
+      width: 300, height: HEIGHT, legend: { show: false }, cursor: { show: false },
+      scales: { x: { time: false, range: () => [this.end - this.keptSeconds(), this.end] }, y: { range: (_, low, high) => this.range(low, high) } },
+      axes: [{ ...axis, size: 26, values: (_, ticks) => ticks.map((t) => (t < 0 ? "" : clock(t).replace(".0", ""))) }, { ...axis, size: 52, values: (_, ticks) => ticks.map(figure) }],
+      series: [{}, ...this.fields.map((_, i) => ({ stroke: colour(`--s${i}`), width: 1.8, dash: DASHES[i], points: { show: false } }))],
+    }, [[], ...this.fields.map(() => [])], frame);
+    new ResizeObserver(() => this.chart.setSize({ width: frame.clientWidth, height: HEIGHT })).observe(frame);
+  }
+
+  range(low, high) {
+    const [least, most] = [this.declared.min ?? low ?? 0, this.declared.max ?? high ?? 1];
+    return least < most ? [least, most] : [least - 1, least + 1];
   }
 
   show(picture, changed) {
@@ -220,27 +225,9 @@ class Plot extends Remembering {
 
   draw(picture) {
     this.drawn = performance.now();
-    const seconds = this.keptSeconds();
-    const series = [...this.past.values()];
-    const end = Math.max(picture.time_s ?? -Infinity, ...series.map((past) => past.points[past.points.length - 1]?.[0] ?? -Infinity));
-    const shown = series.map((past) => past.since(end - seconds));
-    const numbers = shown.flat().map((point) => point[1]).filter((value) => value !== null);
-    let low = this.declared.min ?? numbers.reduce((a, b) => Math.min(a, b), Infinity);
-    let high = this.declared.max ?? numbers.reduce((a, b) => Math.max(a, b), -Infinity);
-    if (!(low < high)) [low, high] = Number.isFinite(low) ? [low - 1, low + 1] : [0, 1];
-    const [x, y] = [WIDE / seconds, HIGH / (high - low)];
-    shown.forEach((points, i) => {
-      let [d, pen] = ["", "M"];
-      for (const [t, value] of points) {
-        if (value === null) { pen = "M"; continue; }
-        d += `${pen}${((t - end + seconds) * x).toFixed(1)} ${((high - value) * y).toFixed(1)}`;
-        pen = "L";
-      }
-      this.lines[i].setAttribute("d", d || "M0 0");
-    });
-    const unit = this.declared.unit ? ` ${this.declared.unit}` : "";
-    say(this.high, numbers.length ? figure(high) + unit : "");
-    say(this.low, numbers.length ? figure(low) + unit : "");
+    const series = [...this.past.values()].map(({ points }) => points);
+    this.end = Math.max(picture.time_s ?? 0, ...series.map((points) => points.at(-1)?.[0] ?? 0));
+    this.chart.setData(uPlot.join(series.map((points) => [points.map(([t]) => t), points.map(([, value]) => value)])));
     this.fields.forEach((field, i) => say(this.values[i], now(picture, field, this.declared.unit)));
   }
 }
@@ -255,13 +242,14 @@ class Place extends Remembering {
 
   build() {
     super.build();
-    this.section.dataset.columns = "2";
-    this.section.dataset.grows = "380";
-    this.canvas = svg("svg", { class: "place", role: "img", "aria-label": `${this.declared.title}: a map, x to the right and y upwards` });
+    this.section.dataset.columns = 2;
+    this.canvas = svg("svg", { class: "place", role: "img", "aria-label": `${this.declared.title}: a map, x to the right and y upwards; arrows move it, plus and minus zoom, 0 shows all` });
     this.grid = svg("path", { class: "grid" }, this.canvas);
     this.track = svg("path", { class: "way" }, this.canvas);
     this.robot = svg("path", { class: "robot-mark" }, this.canvas);
     this.words = element("p", "where quiet");
+    this.view = new View(this.canvas, (width) => this.scale(width));
+    this.title.append(element("span", "grow"), ...this.view.buttons());
     this.body.append(this.canvas, this.words);
   }
 
@@ -272,47 +260,42 @@ class Place extends Remembering {
     const [x, y, heading] = this.fields.map((field) => picture[field]?.value);
     const known = Number.isFinite(x) && Number.isFinite(y);
     if (known) way.push([x, y]);
-    this.look(way);
     this.track.setAttribute("d", way.length ? `M${way.map(([a, b]) => `${a.toFixed(3)} ${(-b).toFixed(3)}`).join("L")}` : "M0 0");
     this.robot.setAttribute("visibility", known ? "visible" : "hidden");
-    if (known) {
-      const size = this.size / 40;
-      const turned = Number.isFinite(heading);
-      this.robot.setAttribute("d", turned ? "M1.4 0L-1 .9L-.5 0L-1 -.9Z" : "M1 0A1 1 0 1 1 -1 0A1 1 0 1 1 1 0Z");
-      this.robot.setAttribute("transform", `translate(${x} ${-y}) scale(${size}) rotate(${turned ? -heading * 180 / Math.PI : 0})`);
-    }
-    this.robot.classList.toggle("stale", Boolean(picture[this.fields[0]]?.stale));
-    const turn = Number.isFinite(heading) ? `, heading ${(heading * 180 / Math.PI).toFixed(0)}°` : "";
-    say(this.words, !known ? "The position is not known."
-      : `x ${x.toFixed(2)} m, y ${y.toFixed(2)} m${turn}${picture[this.fields[0]].stale ? " (stale)" : ""}; a square is ${this.step} m wide.`);
+    const turned = Number.isFinite(heading);
+    const degrees = turned ? heading * 180 / Math.PI : 0;
+    this.robot.setAttribute("d", turned ? "M1.4 0L-1 .9L-.5 0L-1 -.9Z" : "M1 0A1 1 0 1 1 -1 0A1 1 0 1 1 1 0Z");
+    this.mark = known ? `translate(${x} ${-y}) rotate(${-degrees})` : "";
+    const stale = Boolean(picture[this.fields[0]]?.stale);
+    this.robot.classList.toggle("stale", stale);
+    this.view.bounds = this.declared.extent_m || extent(way);
+    this.view.look();
+    say(this.words, known ? `x ${x.toFixed(2)} m, y ${y.toFixed(2)} m${turned ? `, heading ${degrees.toFixed(0)}°` : ""}${stale ? " (stale)" : ""}; a square is ${this.step} m wide.`
+      : "The position is not known.");
   }
 
-  /** Show the extent that was declared, or what holds the way. */
-  look(way) {
-    let [x0, y0, x1, y1] = this.declared.extent_m || [Infinity, Infinity, -Infinity, -Infinity];
-    if (!this.declared.extent_m) {
-      for (const [x, y] of way) {
-        [x0, y0, x1, y1] = [Math.min(x0, x - MARGIN_M), Math.min(y0, y - MARGIN_M), Math.max(x1, x + MARGIN_M), Math.max(y1, y + MARGIN_M)];
-      }
-      if (!way.length) [x0, y0, x1, y1] = [-5, -5, 5, 5];
-      const short = (x1 - x0) / 2 - (y1 - y0);  // at most twice as wide as high, and never higher than wide
-      if (short > 0) [y0, y1] = [y0 - short / 2, y1 + short / 2];
-      const thin = (y1 - y0) - (x1 - x0);
-      if (thin > 0) [x0, x1] = [x0 - thin / 2, x1 + thin / 2];
-    }
-    const box = [x0, -y1, x1 - x0, y1 - y0].map((v) => v.toFixed(3)).join(" ");
-    this.size = Math.max(x1 - x0, y1 - y0);
-    if (box === this.box) return;
-    this.box = box;
-    this.step = STEPS_M.find((step) => this.size / step <= 16) || Math.ceil(this.size / 16);
-    this.canvas.setAttribute("viewBox", box);
-    let d = "";
-    const over = this.size;  // beyond the extent: the panel may have another shape
-    [x0, y0, x1, y1] = [x0 - over, y0 - over, x1 + over, y1 + over];
-    for (let x = Math.ceil(x0 / this.step); x * this.step <= x1; x += 1) d += `M${x * this.step} ${-y1}V${-y0}`;
-    for (let y = Math.ceil(y0 / this.step); y * this.step <= y1; y += 1) d += `M${x0} ${-y * this.step}H${x1}`;
-    this.grid.setAttribute("d", d || "M0 0");
+  /** Draw the grid, and the robot in the same size, for what is shown of the map. */
+  scale(width) {
+    const { x, y } = this.view.shown();
+    const step = STEPS_M.find((one) => width / one <= 16) || Math.ceil(width / 16);
+    const lines = [...Array(2 * Math.ceil(width / step) + 1).keys()].map((i) => i * step - width);
+    const [left, top] = [Math.floor(x / step) * step, Math.floor(y / step) * step];
+    this.step = step;
+    this.robot.setAttribute("transform", `${this.mark} scale(${width / 40})`);
+    this.grid.setAttribute("d", lines.map((d) => `M${left + d} ${-top - width}v${2 * width}M${left - width} ${-top + d}h${2 * width}`).join(""));
   }
+}
+
+/** Return what holds a way: at most twice as wide as high, and never higher than wide. */
+function extent(way) {
+  if (!way.length) return [-5, -5, 5, 5];
+  const [xs, ys] = [0, 1].map((axis) => way.map((point) => point[axis]));
+  const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+  const [across, up] = [x1 - x0 + 2 * MARGIN_M, y1 - y0 + 2 * MARGIN_M];
+  const height = Math.max(up, across / 2) / 2;
+  const width = Math.max(across, 2 * height) / 2;
+  const [x, y] = [(x0 + x1) / 2, (y0 + y1) / 2];
+  return [x - width, y - height, x + width, y + height];
 }
 
 export const WIDGETS = Object.fromEntries([Gauge, Plot, Table, States, Text, Place, Stick].map((kind) => [kind.kind, kind]));

@@ -54,7 +54,7 @@ class OsmosisState(HmiState):
 
     def laser(self, which: str, scan: m.LaserScan, now_s: float) -> None:
         """Keep a sweep of "laser" or "upper_laser"; it may wait for the next pose."""
-        self.put(which, Heard(scan), now_s, urgent=False)
+        self.put(which, Heard(scan), now_s)
 
     def route(self, route: m.Route) -> None:
         """Keep the way to the goal; none while there is no goal."""

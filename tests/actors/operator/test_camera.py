@@ -15,7 +15,7 @@ import shapely
 from PIL import Image
 
 from rampart.actors.operator import camera_eye
-from rampart.actors.operator.camera_eye import CameraError, CameraEye, renderer
+from rampart.actors.operator.camera_eye import CameraError, CameraEye
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, Building, StartPose, Surface
@@ -213,8 +213,3 @@ async def test_the_renderer_starts_when_somebody_looks_and_the_page_says_what_is
         await tab.until(f"{words}.startsWith('No picture: this machine cannot render: ')")
         assert "No module named 'nobody'" in await tab.value(words)
         assert await tab.value("document.getElementById('camera').hidden") is True
-
-
-def test_the_command_of_a_renderer_is_this_python():
-    module = "rampart.sim.osmosis.camera"
-    assert renderer(module) == (sys.executable, "-m", module)

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import dataclasses
 import json
-import socket
 
 import httpx
 import msgspec
@@ -17,16 +16,16 @@ from hypothesis import strategies as st
 
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as fm
-from rampart.actors.operator.bounds import SHOWN, Bounds
+from rampart.actors.operator.bounds import Bounds
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Light, Mission
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
-from rampart.actors.osmosis.page.map import MAX_GRAPH, MAX_LIGHTS, MAX_PATHS_BYTES, page_map
+from rampart.actors.osmosis.page.map import MAX_GRAPH, MAX_LIGHTS, page_map
 from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser
-from tests.actors.operator.extremes import DOCUMENTS, LONG, MARKUP, messages
+from tests.actors.operator.extremes import DOCUMENTS, MARKUP, messages
 from tests.actors.operator.page import LIVE, SPEC
 from tests.actors.operator.test_operating import open_page
 from tests.actors.operator.world import AIRPORT, hear, served
@@ -147,18 +146,6 @@ async def test_the_page_draws_so_many_lights_and_says_how_many_it_leaves_out(wor
             assert tab.errors == []
 
 
-def test_lights_that_no_airport_has_are_not_kept():
-    state = OsmosisState({"A01"})
-    for i in range(10_000):
-        state.light(m.LightMeasurement(f"forged {i}", 1.0, 1.0, m.LightVerdict.OK))
-    state.light(m.LightMeasurement("A01", 1.0, 1.0, m.LightVerdict.OK))
-    assert set(state.picture.rows("lights")) == {"A01"}
-    anywhere = OsmosisState()
-    for i in range(10_000):
-        anywhere.light(m.LightMeasurement(f"forged {i}", 1.0, 1.0, m.LightVerdict.OK))
-    assert len(anywhere.picture.rows("lights")) == MAX_LIGHTS
-
-
 def test_a_page_that_missed_a_new_mission_is_told_which_lights_are_unmeasured_again():
     state = OsmosisState()
     state.light(m.LightMeasurement("A01", 1.0, 1.0, m.LightVerdict.OK))
@@ -174,38 +161,6 @@ def test_a_map_with_more_in_it_than_can_be_seen_says_what_is_missing():
         with_lights(MAX_LIGHTS + 1), nodes=crowd, edges=(("n0", "n1"),) * (MAX_GRAPH + 7)))
     assert found.left_out == {"nodes of the graph": 5, "edges of the graph": 7, "lights": 1}
     assert page_map(AIRPORT).left_out == {}
-
-
-def test_an_outline_with_too_many_corners_is_drawn_with_fewer():
-    import shapely
-
-    teeth = [(i / 100, (i % 2) / 10) for i in range(20_000)]
-    jagged = shapely.Polygon([*teeth, (200, -9), (0, -9)])
-    found = page_map(dataclasses.replace(AIRPORT, allowed=jagged.buffer(0)))
-    assert 0 < len(json.loads(bytes(found.encoded))["prohibited"]) < MAX_PATHS_BYTES
-    assert found.left_out == {}
-
-
-def test_what_is_too_long_is_cut_and_what_is_missing_is_counted():
-    bounds = Bounds(text=8, items=3, room=100)
-    assert bounds.fit({"a": "abcdefghi", "b": [1, 2, 3, 4, 5]}) == (
-        {"a": "a ... hi", "b": [1, 2, 3]}, 2)
-    assert bounds.fit(m.Pose(1.0, 2.0, 3.0)) == ({"x_m": 1.0, "y_m": 2.0, "yaw_rad": 3.0}, 0)
-
-
-def test_a_long_list_takes_nothing_from_the_one_beside_it():
-    status = fm.ManagerStatus((LONG,) * 5000, (), (), ("RM1",), "x", 1)
-    shown, left_out = SHOWN.fit(status)
-    assert shown["latched"] == ["RM1"]
-    assert left_out > 4000
-
-
-@pytest.mark.parametrize(("said", "shown"), [
-    ("plain text, ünïcode ≥ 7 →", "plain text, ünïcode ≥ 7 →"), ("a\nb", "a b"),
-    ("\x1b[2J", "\\u001b[2J"), ("\u202etxt", "\\u202etxt")])
-def test_a_text_is_one_line_of_what_can_be_printed(said, shown):
-    assert SHOWN.fit(said)[0] == shown
-    assert len(SHOWN.fit("x" * 600)[0]) == SHOWN.text
 
 
 SCALARS = st.none() | st.booleans() | st.integers(-2**63, 2**63 - 1) | st.floats() | st.text()
@@ -276,36 +231,6 @@ async def shout(at: str, raw: bytes) -> None:
     writer.close()
     with contextlib.suppress(ConnectionError):
         await writer.wait_closed()
-
-
-@settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
-          deadline=None, max_examples=20)
-@given(st.lists(st.binary(max_size=300), max_size=5))
-def test_random_bytes_in_an_open_websocket_raise_nothing(chunks):
-    async def one() -> None:
-        from tests.actors.operator.world import World
-
-        world = World()
-        complaints: list[object] = []
-        asyncio.get_running_loop().set_exception_handler(lambda _, c: complaints.append(c))
-        async with world.running(world.others), world.hmi(hmi_port=free_port()) as hmi:
-            at = await served(hmi)
-            shake = (f"GET /ws HTTP/1.1\r\nHost: {at}\r\nUpgrade: websocket\r\nConnection: Upgrade"
-                     "\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: "
-                     "AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n").encode()
-            host, port = at.split(":")
-            with socket.socket() as raw:
-                raw.setblocking(False)
-                loop = asyncio.get_running_loop()
-                await loop.sock_connect(raw, (host, int(port)))
-                for chunk in (shake, *chunks):
-                    with contextlib.suppress(ConnectionError):
-                        await loop.sock_sendall(raw, chunk)
-                    await asyncio.sleep(0)
-            await eventually(lambda: hmi._server.pages == 0)
-        assert complaints == []
-
-    asyncio.run(one())
 
 
 # ---- text is text -----------------------------------------------------------------------------

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.adaptation import GIVE_UP_S, StrategyChoice
 from rampart.actors.operator.injection import (
@@ -24,7 +23,7 @@ from rampart.actors.operator.injection import (
 from rampart.actors.operator.requests import RefusedError
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S, Order
+from rampart.actors.runtime.fault_watch import Order
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.cli import systems
@@ -83,14 +82,6 @@ def test_a_fault_that_nobody_takes_says_so():
     assert faults.due(TAKE_HOLD_S + 0.2) == []
 
 
-def test_a_fault_that_a_publisher_refuses_gives_its_reason():
-    faults = injections()
-    faults.order("gps-bias", 0.0, None, 0.0)
-    (order,) = faults.due(0.0)
-    told = faults.hear(report(order, finished=True, reason="field 'x' is unknown"))
-    assert told == "fault gps-bias: no effect: field 'x' is unknown"
-
-
 def test_a_fault_whose_publisher_is_restarted_ends_all_the_same():
     faults = injections()
     faults.order("gps-bias", 0.0, 3.0, 0.0)
@@ -115,17 +106,6 @@ def test_a_planned_fault_waits_for_its_time_and_can_be_withdrawn():
     assert order.injection.startswith(ordered.injection)
 
 
-def test_a_fault_ended_before_its_first_report_is_over_only_when_its_publisher_says_so():
-    faults = injections()
-    ordered = faults.order("drop:localization/pose", 0.0, math.inf, 0.0)
-    (order,) = faults.due(0.0)
-    faults.end(ordered.injection, 1.0)
-    assert not faults.view(1.0)[0]["ended"]
-    (again,) = faults.due(1.5)
-    assert again.message.duration_s == 0.0
-    assert "over, 4 messages" in faults.hear(report(order, 4, finished=True))
-
-
 def test_a_permanent_fault_is_ended_on_request_and_the_order_repeated_until_that_is_reported():
     faults = injections()
     ordered = faults.order("drop:localization/pose", 0.0, math.inf, 0.0)
@@ -138,27 +118,6 @@ def test_a_permanent_fault_is_ended_on_request_and_the_order_repeated_until_that
     (again,) = faults.due(50.5)
     assert (again.injection, again.message.duration_s) == (order.injection, 0.0)
     assert "over, 12 messages" in faults.hear(report(again, 12, finished=True))
-
-
-def test_a_permanent_fault_without_effect_is_told_and_stays():
-    faults = injections()
-    faults.order("drop:localization/pose", 0.0, math.inf, 0.0)
-    (order,) = faults.due(0.0)
-    faults.hear(report(order))
-    (told,) = faults.expire(FIRST_EFFECT_S + 0.1)
-    assert "no effect for 10 s; it stays" in told
-    assert faults.expire(FIRST_EFFECT_S + 1) == []
-
-
-def test_a_fault_of_the_base_counts_its_ticks():
-    faults = injections()
-    faults.order("stuck-wheel:rear-left", 0.0, 4.0, 0.0)
-    (order,) = faults.due(0.0)
-    assert order.topic is topics.ACTUATOR_FAULT
-    assert isinstance(order.message, m.ActuatorFault)
-    assert (order.message.wheel, order.message.duration_s) == ("rear left", 4.0)
-    told = faults.hear(report(order, 400, finished=True, node="simulator"))
-    assert told == "fault stuck-wheel:rear-left: over, 400 ticks changed"
 
 
 @pytest.mark.parametrize(("fault", "why"), [
@@ -239,15 +198,6 @@ def test_the_topics_of_the_robot_s_own_are_offered_after_the_common_ones(tmp_pat
     assert not [key for key in shipped if key.startswith("porter/")]
 
 
-def test_every_mode_that_is_offered_can_be_ordered_as_it_stands():
-    faults = injections()
-    for mode in faults.choice()["modes"]:
-        (order,) = faults.order(f"{mode}:localization/pose", 0.0, None, 0.0).orders
-        sent = order.message
-        assert (sent.mode, sent.delay_s > 0, sent.stamp_s > AHEAD_S) == (
-            mode, mode == "delay", mode == "restamp")
-
-
 @BUSY
 @given(st.lists(st.tuples(st.sampled_from(["report", "order", "expire", "end"]),
                           st.integers(0, 5), st.floats(0, 5)), max_size=30))
@@ -279,43 +229,9 @@ def test_each_fault_is_concluded_once_whatever_is_reported(events):
 NAMES = ("safety-first", "mission-first")
 
 
-def answer(request: fm.AdaptationRequest, reason: str = "") -> fm.AdaptationAnswer:
-    return fm.AdaptationAnswer(request.request, not reason, reason, 3)
-
-
-def test_a_strategy_is_asked_for_until_the_manager_answers():
-    choice = StrategyChoice("r1/hmi.1", "operator", NAMES)
-    request = choice.ask("mission-first", "safety-first", 0.0)
-    assert (request.action, request.name, request.values) == (
-        "set", "strategy", '{"value":"mission-first"}')
-    assert choice.pending is request
-    with pytest.raises(RefusedError, match="waits for its answer"):
-        choice.ask("mission-first", "safety-first", 0.1)
-    assert choice.answer(fm.AdaptationAnswer("another's", True, "", 1)) == ""
-    told = choice.answer(answer(request))
-    assert told == "strategy mission-first is in force, change 3 of the run"
-    assert choice.answer(answer(request)) == ""
-
-
-def test_a_refused_strategy_gives_the_managers_reason():
-    choice = StrategyChoice("p", "operator", NAMES)
-    request = choice.ask("mission-first", "", 0.0)
-    assert choice.answer(answer(request, "not in the middle of a recovery: RM2")) == (
-        "strategy mission-first refused: not in the middle of a recovery: RM2")
-    assert choice.ask("mission-first", "", 1.0).request != request.request
-
-
 def test_a_strategy_that_nobody_sets_is_withdrawn():
     choice = StrategyChoice("p", "operator", NAMES)
     choice.ask("mission-first", "", 0.0)
     assert choice.expire(GIVE_UP_S - 0.1) == ""
     assert "the FTM Manager does not answer" in choice.expire(GIVE_UP_S)
     assert choice.pending is None
-
-
-@pytest.mark.parametrize(("name", "why"), [
-    ("safety-first", "is in force already"), ("luck", "there are: safety-first, mission-first"),
-    ("x" * 500, "no strategy 'x{40}'")])
-def test_a_strategy_that_makes_no_sense_is_refused(name, why):
-    with pytest.raises(RefusedError, match=why):
-        StrategyChoice("p", "operator", NAMES).ask(name, "safety-first", 0.0)

@@ -44,14 +44,6 @@ async def test_the_fault_tree_is_lit_when_a_detection_comes_and_dark_when_it_goe
             assert await tab.value("document.querySelectorAll('#order .running').length") == 0
 
 
-async def test_the_way_to_the_next_barrier_leads_through_events_without_one(world):
-    async with page(world) as tab, repeated(lambda: world.others.manager("FTM9")):
-        await tab.until(f"{events('active')} === 'FTM9'")
-        # Two events without a barrier lie between it and the top.
-        assert await tab.value(events("ahead")) == "FTM1"
-        assert await tab.value("document.querySelectorAll('#tree .line.lit').length") == 3
-
-
 async def test_the_laser_is_drawn_in_the_robots_frame_and_vanishes_when_it_is_not_heard(world):
     area = "(document.querySelector('.sweep.lower .sweep-area').getAttribute('d') || '')"
     echoes = "(document.querySelector('.sweep.lower .sweep-echoes').getAttribute('d') || '')"
@@ -123,3 +115,36 @@ async def test_the_map_follows_the_robot_on_request(world):
         await tab.until(f"{box}.width < 30")
         assert await tab.value(f"Math.abs({box}.x + {box}.width / 2 + 10) < 0.1") is True
         assert await tab.value("document.getElementById('follow').ariaPressed") == "true"
+
+
+async def test_values_of_a_connection_that_is_cut_are_marked_as_old_within_two_seconds(world):
+    async with world.hmi(hmi_port=free_port(), system=SPEC) as hmi, browser() as tab:
+        await tab.show(f"http://{await served(hmi)}/")
+        async with repeated(world.others.busy):
+            await tab.until(f"{LIVE} && {events('active')} === 'FTM4'")
+            old = "document.body.classList.contains('offline')"
+            assert await tab.value(old) is False
+            hmi._server._feed._pages.clear()  # as a cable that is pulled: nothing arrives
+            await tab.until(old, 2.5)  # with half a second for this test itself
+            assert "every value" in (await tab.value(
+                "document.getElementById('cut').textContent")).lower()
+
+
+async def test_a_module_that_is_not_heard_is_shown_apart_from_one_that_is_idle(world):
+    chips = "[...document.querySelectorAll('#detections li')].map((c) => c.textContent)"
+    status = m.ManagerStatus((), ("DM3",), (), (), "guarded-repair", 1, tuple(
+        m.DetectionView(name, False, "", ()) for name in ("DM2", "DM3")))
+    async with page(world) as tab:
+        assert "not heard" in await tab.value("document.getElementById('manager').textContent")
+        async with repeated(lambda: world.others.publish(topics.MANAGER_STATUS, status)):
+            await tab.until(f"{chips}.join() === 'DM2: idle,? DM3: not heard'")
+
+
+async def test_a_machine_that_does_not_keep_up_with_the_rate_is_a_banner(world):
+    late = m.NodeTable((m.NodeInfo("hmi", "non-control", 1, m.NodeState.RUNNING, 1, 0,
+                                   late_s=5.0),))
+    async with page(world) as tab:
+        async with repeated(lambda: world.others.publish(topics.NODES, late)):
+            await tab.until("!document.getElementById('behind').hidden", 30)
+        words = await tab.value("document.getElementById('behind').textContent")
+        assert words.startswith("this machine keeps up with rate ")

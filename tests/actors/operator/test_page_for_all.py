@@ -147,8 +147,8 @@ async def test_a_robot_that_offers_nothing_has_a_page_without_map_stick_and_miss
         await tab.until("document.querySelectorAll('#nodes tr').length > 0")
         shown = await tab.value("[...document.querySelectorAll('.panel h2')]"
                                 ".filter((e) => e.checkVisibility()).map((e) => e.id).join()")
-        assert shown.split(",") == ["safety-title", "tree-title", "decisions-title", "order-title",
-                                    "nodes-title", "fault-heading", "events-title"]
+        assert shown.split(",") == ["safety-title", "tree-title", "decisions-title", "events-title",
+                                    "order-title", "nodes-title", "fault-heading"]
         assert tab.errors == []
 
 

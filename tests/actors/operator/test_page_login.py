@@ -65,6 +65,8 @@ async def test_one_logs_in_stays_in_over_a_reload_and_logs_out(tmp_path):
         assert await tab.value("document.getElementById('visitor').textContent") == (
             "operator · inject")
         assert await tab.value(notes()) == 0
+        await tab.until("document.getElementById('credentials').textContent"
+                        ".includes('days left')")  # the page's certificate expires first
         await tab.value("window.before = true")
         await tab.call("Page.reload")
         await tab.until(f"window.before === undefined && {LIVE}")

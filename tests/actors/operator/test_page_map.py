@@ -56,7 +56,7 @@ async def test_an_airport_of_8_km_is_drawn_and_its_marks_are_seen_at_every_zoom(
             assert await tab.value(ring) == pytest.approx(sizes[0], rel=0.05)
             if folder:
                 await tab.screenshot(f"{folder}/map-close.png")
-            await tab.value("document.querySelector('#map-fit').click()")
+            await tab.value("document.querySelector('[title=\"Show the whole map\"]').click()")
             await tab.until(f"{BOX}.width > {WIDE_M}")
             assert await tab.value("document.getElementById('follow').ariaPressed") == "false"
 

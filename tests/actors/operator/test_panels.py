@@ -14,14 +14,14 @@ import pytest
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.panels import MAX_KEPT, MAX_PANELS, Panel
 from rampart.actors.operator.server import page_files
-from rampart.actors.operator.state import STALE_S, TRACE_POINTS, HmiState
+from rampart.actors.operator.state import HmiState
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.system.layout import Layout
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import eventually, free_port
-from tests import CELL, ROOT
+from tests import ROOT
 from tests.actors.operator.extremes import LONG, MARKUP, messages
 from tests.actors.operator.world import Others
 from tests.tank import GAUGE, LEVEL, PUMP, TOPICS, VALVE, Level, Phase, Pump
@@ -123,16 +123,6 @@ def test_a_page_without_panels_plots_the_numbers_of_what_comes_regularly():
         ("tank/level m", ("tank/level:height_m",)),
         ("tank/level rad", ("tank/level:heading_rad",)),
         ("tank/pump s", ("tank/pump:busy_until_s",)), ("tank/valve", ("tank/valve:opening",))]
-
-
-def test_the_cell_s_page_has_nothing_to_plot_and_that_is_no_panel():
-    spec = parse_specification(CELL.read_text("utf-8"), "cell.toml")
-    assert Layout(RunPlan(), spec).members["hmi"].parameters.panels == ()
-
-
-def test_what_the_page_hears_anyway_can_be_shown_as_well():
-    found = layout(panel("Rule", 'text = "manager/status:strategy"'))
-    assert shown(found) == [("Rule", "text")]
 
 
 def test_the_examples_of_the_document_are_sound(tmp_path):
@@ -287,21 +277,6 @@ async def test_a_field_that_is_not_known_is_said_and_the_rest_is_shown(world):
         await eventually(lambda: any(d.context == "panel" for d in world.others.diagnostics))
         assert "hmi: no topic 'no/topic'" in {d.reason for d in world.others.diagnostics}
         assert page._hello()["panels"][0]["title"] == "Strange"
-
-
-def test_the_past_is_thinned_ends_and_begins_anew_when_time_goes_back():
-    state = HmiState()
-    state.show_field("a:b", 60.0, STALE_S)
-    for i in range(10_000):
-        state.field("a:b", float(i), i / 100, i / 100)
-    points = state.past()["a:b"]
-    assert len(points) == TRACE_POINTS
-    assert points[-1][0] - points[0][0] == pytest.approx(60.0, rel=0.1)
-    state.field("a:b", 7.0, 1.0, 1.0)
-    assert state.past()["a:b"] == [(1.0, 7.0)]
-    for t, value in ((2.0, math.nan), (3.0, 1e300), (4.0, "x"), (math.nan, 1.0)):
-        state.field("a:b", value, t, t)
-    assert state.past()["a:b"] == [(1.0, 7.0), (2.0, None), (3.0, None), (4.0, None)]
 
 
 def test_a_field_is_stale_by_the_rate_of_its_topic():

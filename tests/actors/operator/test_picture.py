@@ -53,37 +53,6 @@ def test_only_what_changed_since_a_version_is_sent():
     assert as_json(picture.changes(0)) == {"pose": 1, "pilot": "auto"}
 
 
-def test_the_same_again_is_no_change_and_tells_nobody():
-    picture = Picture()
-    picture.section("pilot")
-    told = []
-    picture.on_change = told.append
-    picture.put("pilot", m.PilotStatus(m.PilotMode.AUTO, False, "", 0))
-    picture.put("pilot", m.PilotStatus(m.PilotMode.AUTO, False, "", 0))
-    assert told == [True]
-
-
-def test_a_section_is_encoded_once_for_all_pages():
-    encoded = []
-    picture = Picture()
-    picture.section("laser", show=lambda v: encoded.append(v) or v)
-    picture.put("laser", 7)
-    for _ in range(10):
-        picture.changes(0)
-    assert encoded == [7]
-
-
-def test_of_a_journal_the_new_lines_are_sent_and_the_oldest_forgotten():
-    picture = Picture()
-    picture.journal("events")
-    for i in range(JOURNAL_LINES + 5):
-        picture.add("events", i)
-    assert as_json(picture.changes(0))["events"][0] == 5
-    seen = picture.version
-    picture.add("events", "new")
-    assert as_json(picture.changes(seen)) == {"events": ["new"]}
-
-
 @given(st.lists(st.one_of(
     st.tuples(st.just("put"), st.sampled_from(("pose", "pilot")), st.integers(0, 3)),
     st.tuples(st.just("log"), st.just("events"), st.integers(0, 3)),
@@ -124,11 +93,6 @@ def scan(ranges: list[float], **changed: float) -> m.LaserScan:
     return m.LaserScan(**values, ranges_f32=np.array(ranges, dtype="<f4").tobytes())
 
 
-def test_ranges_beyond_all_measure_are_no_echoes():
-    thinned = thin(scan([3e38, float("nan"), -1.0, 2.5, 1e30, 5.0], range_max_m=1e308))
-    assert thinned["cm"] == [-1, -1, -1, 250, -1, 500]
-
-
 def test_an_obstacle_that_a_single_ray_has_hit_stays_in_the_thinned_sweep():
     for hit in range(181):
         ranges = [8.0] * 181
@@ -138,11 +102,6 @@ def test_an_obstacle_that_a_single_ray_has_hit_stays_in_the_thinned_sweep():
         assert thinned["cm"].count(250) == 1
         angle = thinned["from_rad"] + thinned["cm"].index(250) * thinned["step_rad"]
         assert abs(angle - (-1.0 + 0.01 * hit)) < 0.0101
-
-
-def test_no_echo_is_none_of_the_ranges():
-    thinned = thin(scan([8.0, 8.0, 3.0, math.nan, -1.0, math.inf]))
-    assert thinned["cm"] == [-1, -1, 300, -1, -1, -1]
 
 
 @pytest.mark.parametrize("broken", [
@@ -230,17 +189,6 @@ async def test_a_page_that_answers_has_few_frames_on_the_way_and_then_the_newest
         assert len(p.line.frames) - 1 == on_the_way + 1
 
 
-async def test_an_answer_alone_brings_no_frame():
-    async with Pushing() as p:
-        await p.line.until(lambda frames: len(frames) >= 2)
-        await asyncio.sleep(hmi_feed.FRAME_GAP_S)
-        before = len(p.line.frames)
-        for _ in range(20):
-            p.feed.heard(p.page, f'{{"type":"seen","version":{p.state.picture.version}}}')
-            await asyncio.sleep(0)
-        assert len(p.line.frames) == before
-
-
 async def test_a_page_that_takes_nothing_is_given_up(monkeypatch):
     monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.05)
     async with Pushing() as p:
@@ -273,17 +221,6 @@ async def test_a_flood_of_changes_becomes_few_frames():
             await asyncio.sleep(0.001)
         most = (loop.time() - start) / hmi_feed.FRAME_GAP_S + 2
         assert 1 < len(p.line.frames) - before <= most
-
-
-async def test_with_no_page_nothing_is_looked_at_and_no_timer_is_left():
-    pushing = Pushing()
-    async with pushing as p:
-        await p.line.until(lambda frames: len(frames) >= 2)
-    looks = pushing.looks
-    pushing.state.log(1.0, "note", "nobody listens")
-    assert pushing.feed._timer is None
-    assert pushing.feed._looker is None
-    assert pushing.looks == looks == 1
 
 
 @pytest.mark.parametrize("text", [

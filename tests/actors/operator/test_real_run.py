@@ -47,6 +47,7 @@ async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed
         async with browser() as tab:
             await tab.show(f"http://127.0.0.1:{port}/")
             await tab.until(f"{STICK} === 'free'", 60)
+            run.wait_for(f"Operator's page: http://127.0.0.1:{port}/")
             assert await tab.value(f"{text('mission-phase')}") == "idle"
             await tab.until("document.getElementById('mission-name').value === 'SHORT'")
             await tab.value("document.getElementById('start').requestSubmit()")

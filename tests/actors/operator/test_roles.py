@@ -5,9 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from rampart.actors.operator import requests
-from rampart.actors.operator.requests import REQUESTS, Request
-from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS
+from rampart.actors.operator.requests import Request
 from rampart.actors.web.visitors import Role, issue
 from rampart.testing import free_port
 from tests.actors.operator.test_operating import ask, open_page
@@ -27,15 +25,6 @@ SAMPLES = {
 
 def tag(kind: type[Request]) -> str:
     return str(kind.__struct_config__.tag)
-
-
-def test_every_kind_of_request_has_its_role():
-    assert {tag(kind): kind.role for kind in OSMOSIS_REQUESTS} == NEEDS
-    assert set(REQUESTS) <= set(OSMOSIS_REQUESTS)
-    declared = {k for k in vars(requests).values()
-                if isinstance(k, type) and issubclass(k, Request) and k is not Request}
-    assert declared == set(REQUESTS)
-    assert set(SAMPLES) == set(NEEDS)
 
 
 def test_a_request_of_ones_own_is_for_those_who_may_do_everything_unless_it_says_otherwise():
@@ -76,12 +65,3 @@ async def test_what_a_role_lacks_the_server_refuses_and_nothing_happens(
     if not role.may(NEEDS[kind]):
         assert [*world.others.requests, *world.others.orders, *world.others.resets,
                 *world.others.adaptations, *world.others.injections] == []
-
-
-async def test_the_tests_would_be_nothing_if_all_were_refused(world):
-    """The same requests, by who may: those that can be met now are."""
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            kinds = {kind: (await ask(page, type=kind, **SAMPLES[kind]))["type"] for kind in NEEDS}
-    assert kinds == {"reset": "error", "strategy": "done", "signal": "error", "inject": "error",
-                     "end-fault": "error", "stick": "stick", "mission": "done", "order": "error"}

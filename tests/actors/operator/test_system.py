@@ -9,7 +9,7 @@ import pytest
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.machine.process_usage import ProcessCount, UsageMeter
-from rampart.actors.operator.processes import SEARCH_EVERY, ProcessObserver
+from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.operator.system import BARRIER, MAX_BOXES, draw_system
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.manager.spec.schema import EventSpec
@@ -60,12 +60,6 @@ def test_the_way_of_an_event_ends_at_the_first_barrier_above():
 def test_an_event_with_several_parents_leads_all_their_ways():
     way = {box.name: box.way for box in draw_system(system("cell"))["tree"].boxes}
     assert {"encoder_a_lost", "encoder_b_lost", "vision_node_crash"} <= set(way["power_dip"])
-
-
-def test_who_cannot_see_the_drawing_is_told_the_same():
-    words = draw_system(system("osmosis"))["tree"].words
-    assert "Control node crash; barrier FTM4(DM4, RM3)." in words
-    assert "Command not updated; barrier FTM2(DM2, RM3); or of " in words
 
 
 def test_a_tree_that_nobody_could_read_is_not_drawn_and_the_page_says_so():
@@ -131,14 +125,6 @@ def test_a_process_that_died_has_no_figures_and_its_row_stays():
     kernel.alive = {20}
     kernel.now_s += 1
     assert set(observer.look(table(hmi=10, never=0))["nodes"]) == {"pool"}
-
-
-def test_all_of_proc_is_searched_now_and_then_only():
-    kernel = Kernel()
-    observer = kernel.observer()
-    for _ in range(2 * SEARCH_EVERY):
-        observer.look(table(hmi=10))
-    assert kernel.searches == 2
 
 
 def test_without_a_table_nobody_is_taken_for_a_guard_by_mistake():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from itsdangerous import TimestampSigner
 
 from rampart.actors.web.gate import LASTS_S, Gate
-from rampart.actors.web.visitors import Register, Role, Visitor, digest, issue, revoke
+from rampart.actors.web.visitors import Register, Role, Visitor, digest
 
 TOKEN = "secret-of-the-hangar-7"
 ANNA = Visitor("anna", Role.DRIVE, digest(TOKEN))
@@ -36,16 +36,6 @@ def cookie(gate: Gate, token: str = TOKEN) -> str:
     return told.partition(";")[0]
 
 
-def test_a_token_opens_as_a_header_and_the_cookie_that_it_gets_opens_too(clock):
-    gate = made()
-    assert gate.visitor(f"Bearer {TOKEN}", None) == ANNA
-    assert gate.visitor(f"bearer  {TOKEN} ", None) == ANNA
-    assert gate.visitor(None, cookie(gate)) == ANNA
-    assert gate.visitor(None, f"a=b; {cookie(gate)}; c") == ANNA
-    for nothing in (None, "", "Bearer", "Bearer ", f"Basic {TOKEN}", TOKEN, f"Bearer {TOKEN[:-1]}"):
-        assert gate.visitor(nothing, None) is None
-
-
 def test_a_cookie_is_hidden_from_scripts_and_other_sites_and_over_tls_sent_over_tls_alone(clock):
     _, over_tls = made().log_in(TOKEN)
     name, *attributes = over_tls.split("; ")
@@ -57,13 +47,6 @@ def test_a_cookie_is_hidden_from_scripts_and_other_sites_and_over_tls_sent_over_
     assert TOKEN not in over_tls + plain
     assert digest(TOKEN) not in over_tls + plain
     assert "Max-Age=0;" in made().log_out()
-
-
-def test_a_successor_of_the_node_knows_its_visitors_and_another_run_or_page_does_not(clock):
-    shown = cookie(made())
-    assert made().visitor(None, shown) == ANNA
-    assert made(secret="of another").visitor(None, shown) is None
-    assert made(port=8081).visitor(None, shown) is None
 
 
 def test_a_cookie_ends_after_hours_and_is_none_from_the_future(clock):
@@ -94,26 +77,3 @@ def test_no_header_whatever_is_in_it_raises_or_opens(authorization, cookies):
     gate = made()
     assert gate.visitor(authorization, cookies) is None
     assert gate.visitor(f"Bearer {authorization}", f"__Host-rampart-8080={cookies}") is None
-
-
-def test_with_the_token_the_cookie_goes_and_with_another_role_who_it_was(clock, tmp_path):
-    file = tmp_path / "page.tokens"
-    gate = made(register=Register((), file))
-    shown = cookie(gate, issue(file, "anna", Role.DRIVE))
-    visitor = gate.visitor(None, shown)
-    assert visitor.role is Role.DRIVE
-    file.write_text(file.read_text().replace("anna drive", "anna look"))
-    assert not gate.still(visitor)
-    assert gate.visitor(None, shown).role is Role.LOOK
-    revoke(file, "anna")
-    assert gate.visitor(None, shown) is None
-    issue(file, "anna", Role.DRIVE)  # a new one: the cookie was of the one before
-    assert gate.visitor(None, shown) is None
-
-
-def test_where_nothing_is_asked_everybody_is_the_owner(clock):
-    owner = Visitor("root", Role.INJECT)
-    gate = Gate(Register(), SECRET, 8080, tls=False, owner=owner)
-    assert not gate.asks
-    assert gate.visitor(None, None) == owner
-    assert gate.still(owner)

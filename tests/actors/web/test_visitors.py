@@ -15,7 +15,6 @@ from rampart.actors.web.visitors import (
     Role,
     Visitor,
     VisitorError,
-    check_role,
     digest,
     issue,
     lists_visitors,
@@ -26,14 +25,6 @@ from rampart.actors.web.visitors import (
 from rampart.cli.main import main
 
 ANNA = f"anna drive {'a' * 64}"
-
-
-@pytest.mark.parametrize(("has", "needs", "may"), [
-    ("look", "look", True), ("look", "drive", False), ("look", "inject", False),
-    ("drive", "look", True), ("drive", "drive", True), ("drive", "inject", False),
-    ("inject", "look", True), ("inject", "drive", True), ("inject", "inject", True)])
-def test_each_role_may_do_what_those_before_it_may(has, needs, may):
-    assert Role(has).may(Role(needs)) is may
 
 
 def test_a_file_is_read_with_comments_and_blank_lines():
@@ -124,12 +115,6 @@ def test_a_file_that_changes_is_read_anew_and_one_that_breaks_lets_nobody_in(tmp
                         f"{file}: mode 0644: others may get at it; chmod 600 it; it lets nobody in"]
 
 
-def test_of_a_fixed_visitor_the_token_opens_and_an_empty_one_never():
-    register = Register([Visitor("operator", Role.INJECT, digest("secret-of-the-hangar-7"))])
-    assert register.by_token("secret-of-the-hangar-7").name == "operator"
-    assert Register([Visitor("root", Role.INJECT)]).by_token("") is None
-
-
 # ---- the verbs ----------------------------------------------------------------------------------
 
 
@@ -167,11 +152,6 @@ def test_what_a_verb_cannot_do_is_one_line_and_code_2(tmp_path, monkeypatch, cap
     assert told.out == ""
     assert told.err.startswith(f"rampart: {words}")
     assert len(told.err.splitlines()) == 1
-
-
-def test_an_unknown_role_is_refused_by_name():
-    with pytest.raises(VisitorError, match="role 'LOOK': unknown"):
-        check_role("LOOK")
 
 
 def test_a_file_that_others_can_get_at_is_no_list(tmp_path):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from rampart.actors.bus.messages import ON_TIME
+from rampart.actors.ftm.keeping_up import LINE_S, WINDOW_S, KeepingUp, KeptUp
 from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable
 from rampart.manager.spec.budget import allowed_late_s
 from rampart.manager.spec.tables import Timing
-from rampart.sim.runs.keeping_up import LINE_S, WINDOW_S, KeepingUp, KeptUp
 
 TIMING = Timing(
     heartbeat_period_s=0.1, heartbeat_timeout_s=0.4, command_timeout_s=1.0,

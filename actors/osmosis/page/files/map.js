@@ -6,10 +6,9 @@
 // smaller where many of them lie close together.
 
 import { Memory, element, say, svg as make } from "../dom.js";
+import { View } from "../view.js";
 
 const FOLLOW_M = 22;  // what is shown around the robot when the map begins to follow it
-const MIN_M = 4;      // width of the closest look
-const STEP = 1.5;     // of a zoom button or key
 const MARK_PX = 9;   // a mark's unit on the screen
 const DOT = .25;      // least size of a dot, of its full size
 const TRACK_STEP_M = .25;
@@ -27,96 +26,8 @@ class AirportMap {
     this.lights = new Map();
     this.track = [];
     this.memory = new Memory();
-    this.at = null;
-    this.following = false;
-    this.view = null;  // centre and width of what is shown, m; null for the whole airport
     this.onLook = () => {};
-    this.pointers = new Map();
-    this.listen();
-    new ResizeObserver(() => this.look()).observe(svg);
-  }
-
-  /** Zoom with wheel and two fingers, move by dragging, both with keys. */
-  listen() {
-    this.svg.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.zoom(Math.exp(event.deltaY * (event.deltaMode ? .05 : .0015)), this.place(event));
-    }, { passive: false });
-    this.svg.addEventListener("pointerdown", (event) => {
-      if (event.button) return;
-      this.pointers.set(event.pointerId, this.place(event));
-    });
-    this.svg.addEventListener("pointermove", (event) => this.drag(event));
-    for (const end of ["pointerup", "pointercancel"]) {
-      this.svg.addEventListener(end, (event) => this.pointers.delete(event.pointerId));
-    }
-    this.svg.addEventListener("keydown", (event) => {
-      const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
-      if (by) this.move(by[0] * this.shown().width / 8, by[1] * this.shown().width / 8);
-      else if (event.key === "+" || event.key === "=") this.zoom(1 / STEP);
-      else if (event.key === "-") this.zoom(STEP);
-      else if (event.key === "0") this.fit();
-      else return;
-      event.preventDefault();
-    });
-  }
-
-  /** Return the place on the map of an event, m east and north. */
-  place(event) {
-    const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
-    return [at.x, -at.y];
-  }
-
-  drag(event) {
-    const from = this.pointers.get(event.pointerId);
-    if (!from) return;
-    if (this.pointers.size === 1 && !this.view && event.pointerType === "touch") return;  // the page scrolls
-    this.svg.setPointerCapture(event.pointerId);
-    const to = this.place(event);
-    const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
-    if (other) {
-      const apart = (one) => Math.hypot(one[0] - other[0], one[1] - other[1]);
-      if (apart(to) > 0) this.zoom(apart(from) / apart(to), other);
-    } else {
-      this.move(from[0] - to[0], from[1] - to[1]);
-    }
-    this.pointers.set(event.pointerId, this.place(event));
-  }
-
-  /** Return centre and width of what is shown, m. */
-  shown() {
-    const [x0, y0, x1, y1] = this.bounds;
-    const view = this.view || { x: (x0 + x1) / 2, y: (y0 + y1) / 2, width: x1 - x0 };
-    return this.following && this.at ? { ...view, x: this.at[0], y: this.at[1] } : view;
-  }
-
-  /** Show more (above 1) or less, and leave a place where it is on the screen. */
-  zoom(factor, [x, y] = [this.shown().x, this.shown().y]) {
-    const view = this.shown();
-    const whole = this.bounds[2] - this.bounds[0];
-    const width = Math.max(Math.min(MIN_M, whole), view.width * factor);
-    if (width >= whole && !this.following) {
-      this.fit();
-      return;
-    }
-    const by = Math.min(width, whole) / view.width;
-    this.view = { x: x + (view.x - x) * by, y: y + (view.y - y) * by, width: view.width * by };
-    this.look();
-  }
-
-  move(x, y) {
-    const view = this.shown();
-    const [x0, y0, x1, y1] = this.bounds;
-    this.following = false;
-    this.view = { x: Math.min(Math.max(view.x + x, x0), x1), y: Math.min(Math.max(view.y + y, y0), y1), width: view.width };
-    this.look();
-  }
-
-  /** Show the whole airport. */
-  fit() {
-    this.view = null;
-    this.following = false;
-    this.look();
+    this.view = new View(svg, (width, height) => this.scale(width, height));
   }
 
   /** Draw what does not move; `map` is an AirportDrawing or null, `track` the way driven so far,
@@ -125,10 +36,10 @@ class AirportMap {
     this.svg.replaceChildren();
     this.lights.clear();
     this.memory.forget();
-    this.at = null;
+    this.view.at = null;
     const bounds = map ? map.bounds_m : [-50, -50, 50, 50];
-    if (String(bounds) !== String(this.bounds)) this.view = null;  // else a connection has come back
-    this.bounds = bounds;
+    if (String(bounds) !== String(this.view.bounds)) this.view.seen = null;  // else a connection has come back
+    this.view.bounds = bounds;
     const hatch = this.hatch = make("pattern", { id: "hatch", width: 1, height: 1,
       patternUnits: "userSpaceOnUse" }, make("defs", {}, this.svg));
     make("rect", { class: "hatch-ground", width: 1, height: 1 }, hatch);
@@ -156,7 +67,7 @@ class AirportMap {
     const [length, width] = footprint || [.72, .614];
     make("rect", { class: "robot-body", x: -length / 2, y: -width / 2, width: length, height: width, rx: .1 }, this.robot);
     make("path", { class: "robot-front", d: `M${length / 2 - .2} ${-width / 2 + .1}L${length / 2 - .05} 0L${length / 2 - .2} ${width / 2 - .1}Z` }, this.robot);
-    this.look();
+    this.view.look();
     this.track = track.filter((p) => p.every(Number.isFinite));
     this.trackLine.setAttribute("points", points(this.track));
   }
@@ -188,25 +99,13 @@ class AirportMap {
     return { area: make("path", { class: "sweep-area" }, group), echoes: make("path", { class: "sweep-echoes" }, group) };
   }
 
-  /** Show what the view says: the whole airport, a part of it, or what is around the robot. */
-  look() {
-    if (!this.bounds) return;
-    const [x0, y0, x1, y1] = this.bounds;
-    const { x, y, width } = this.shown();
-    const height = width * (y1 - y0) / (x1 - x0);
-    this.svg.setAttribute("viewBox", `${x - width / 2} ${-y - height / 2} ${width} ${height}`);
+  /** Give marks and lines their size on the screen. */
+  scale(width, height) {
     const mark = MARK_PX * Math.max(width / (this.svg.clientWidth || 1), height / (this.svg.clientHeight || 1));
     this.svg.style.setProperty("--mark", mark);
     this.svg.style.setProperty("--dot", Math.min(mark, Math.max(mark * DOT, 1)));
-    this.svg.style.touchAction = this.view || this.following ? "none" : "pan-y";
     this.hatch?.setAttribute("patternTransform", `rotate(45) scale(${mark})`);
     this.onLook();
-  }
-
-  follow(on) {
-    this.following = on;
-    this.view = on ? { x: 0, y: 0, ...this.shown(), width: Math.min(FOLLOW_M, this.shown().width) } : null;
-    this.look();
   }
 
   /** Show what changed of a picture; `changed` is the set of the names of its sections. */
@@ -253,8 +152,8 @@ class AirportMap {
       return;
     }
     const { x_m: x, y_m: y, yaw_rad: yaw } = pose.value;
-    this.at = [x, y];
-    if (this.following) this.look();
+    this.view.at = [x, y];
+    if (this.view.following) this.view.look();
     this.svg.dataset.t = pose.t;  // which moment is shown
     this.robot.setAttribute("visibility", "visible");
     this.robot.setAttribute("transform", `translate(${x} ${-y}) rotate(${-yaw * 180 / Math.PI})`);
@@ -312,19 +211,11 @@ const SIGNS = [["mark ok", "ok"], ["mark dim", "dim"], ["mark out", "out", "✕"
 /** The panel: the map, a button to follow the robot, where it is, and what the signs mean. */
 export default class MapPanel {
   constructor(room) {
-    room.section.dataset.columns = "most";
+    room.section.dataset.columns = 2;
     this.name = Object.assign(element("span", "quiet"), { id: "airport" });
     this.button = Object.assign(element("button", "small", "Follow robot"), { id: "follow", type: "button" });
     this.button.setAttribute("aria-pressed", "false");
-    const zooms = [["−", "out", "Zoom out", (map) => map.zoom(STEP)], ["+", "in", "Zoom in", (map) => map.zoom(1 / STEP)],
-      ["Fit", "fit", "Show the whole airport", (map) => map.fit()]].map(([text, id, label, act]) => {
-      const button = Object.assign(element("button", "small", text), { id: `map-${id}`, type: "button", title: label });
-      button.setAttribute("aria-label", label);
-      button.addEventListener("click", () => act(this.map));
-      return button;
-    });
-    room.title.append(" ", this.name, element("span", "grow"), ...zooms, this.button);
-    const canvas = make("svg", { id: "map", role: "img", tabindex: 0,
+    const canvas = make("svg", { id: "map", role: "img",
       "aria-label": "Map of the airport with the robot, its track, the laser and the lights; arrows move it, plus and minus zoom, 0 shows all" });
     this.where = element("p", "quiet where");
     this.where.id = "where";
@@ -337,8 +228,10 @@ export default class MapPanel {
     }
     room.body.append(canvas, this.where, legend);
     this.map = new AirportMap(canvas);
-    this.map.onLook = () => this.button.setAttribute("aria-pressed", String(this.map.following));
-    this.button.addEventListener("click", () => this.map.follow(!this.map.following));
+    const { view } = this.map;
+    this.map.onLook = () => this.button.setAttribute("aria-pressed", String(view.following));
+    this.button.addEventListener("click", () => view.follow(!view.following, FOLLOW_M));
+    room.title.append(" ", this.name, element("span", "grow"), ...view.buttons(), this.button);
   }
 
   begin(hello) {
