@@ -47,47 +47,52 @@ _GROUPS = {
 
 _HELP = """usage: rampart VERB ...
 
-Start a fault-tolerant robot controller, look at it, disturb it, prove what it decides.
+Start a fault-tolerant robot controller, inspect it, inject faults, verify decisions.
 
 {groups}
 examples:
-  rampart run --virtual --seed 7          a whole mission in seconds
-  rampart run                             on real processes; then, in another shell:
-  rampart top                             processes, topics, decisions
-  kill-node localization                  a process crashes, and is back
-`rampart VERB --help` shows more.
+  rampart run --virtual --seed 7      # a mission in virtual time, in seconds
+  rampart run                         # on processes; then, in another shell:
+  rampart top                         # watch processes, topics and decisions
+  kill-node localization              # crash a process; it is restarted
+`rampart VERB --help` shows options and examples.
 """
 
 
-class _Parser(argparse.ArgumentParser):
+class RampartParser(argparse.ArgumentParser):
     """Lists its verbs in groups."""
 
     verbs: Any = None
 
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Names of the verbs, those of other packages included, by the title of their group."""
+        grouped = {name for names in _GROUPS.values() for name in names}
+        return {**_GROUPS, "robots": tuple(sorted(
+            action.dest for action in self.verbs._choices_actions if action.dest not in grouped))}
+
     def format_help(self) -> str:
         """Return the help of `rampart` itself."""
         texts = {action.dest: action.help for action in self.verbs._choices_actions}
-        grouped = {name for names in _GROUPS.values() for name in names}
-        groups = {**_GROUPS, "robots": tuple(sorted(texts.keys() - grouped))}
         return _HELP.format(groups="".join(
             f"{group if name == names[0] else '':<12}{name:<10}{texts[name]}\n"
-            for group, names in groups.items() for name in names))
+            for group, names in self.groups.items() for name in names))
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> RampartParser:
     """Return the parser with all verbs; each sets `run`, a function of the options.
 
     A package adds verbs of its own by entry points of the group `rampart.verbs`: functions of the
     verbs' subparsers, the formatter class, and a parent parser with `--port`.
     """
-    parser = _Parser(prog="rampart")
+    parser = RampartParser(prog="rampart")
     verbs = parser.verbs = parser.add_subparsers(
         dest="verb", required=True, metavar="VERB", parser_class=argparse.ArgumentParser)
     new.add(verbs)
-    verbs.add_parser("run", add_help=False, help="start a system: the same as launch.py")
+    verbs.add_parser("run", add_help=False, help="start a system, as launch.py does")
     for module in _MODULES:
         module.add(verbs)
-    verbs.add_parser("campaign", add_help=False, help="run many missions with faults in them")
+    verbs.add_parser("campaign", add_help=False, help="run many missions with injected faults")
     common = argparse.ArgumentParser(add_help=False)
     PORT(common)
     of_packages = {verb.name: verb for verb in entry_points(group="rampart.verbs")}

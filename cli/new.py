@@ -28,21 +28,21 @@ PLACES = {
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    add_verb(verbs, "new", "a folder with a robot of your own that runs", new,
-             option("name", metavar="NAME", help="of the robot, of its folder and of its package: "
-                    "small letters, digits and _"))
+    add_verb(verbs, "new", "create a folder with a new robot", new,
+             option("name", metavar="NAME", help="name of robot, folder and package: small "
+                    "letters, digits and _, at most 31 characters"))
 
 
 def new(options: argparse.Namespace) -> int:
     """Make the folder.
 
-    Make a folder NAME with a robot that runs: two nodes, a simulated world, a
+    Create a folder NAME with a robot that runs: two nodes, a simulated world, a
     judge, three mechanisms, tests, a README and a Makefile.
 
     Examples:
       rampart new courier
-      cd courier; make run                           on processes
-      make test                                      its tests, most of them in virtual time
+      cd courier; make run        # run it on processes
+      make test                   # run its tests
     """
     name = options.name
     check(name)

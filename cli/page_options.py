@@ -34,20 +34,18 @@ _SOON_DAYS = 7.0
 OPTIONS = (
     whole("--hmi-port", "PORT", "port of the operator's page (default: 8080)", 8080),
     word("--hmi-host", "HOST", "address of the operator's page (default: 127.0.0.1, this machine "
-         "only). Any other needs a certificate, and makes the page ask for a token, which is "
-         "printed with the page's address when the run starts", "127.0.0.1"),
-    word("--hmi-cert", "FILE", "certificate (PEM) with which the page is encrypted, and those that "
-         "lead to its authority", ""),
-    word("--hmi-key", "FILE", "its key (PEM), a file of yours, of mode 0600 (default: in the file "
-         "of the certificate)", ""),
-    flag("--hmi-unencrypted", "serve the page to other machines without a certificate: whoever "
-         "hears that network may then read the token and everything else"),
-    word("--hmi-behind", "ORIGIN", "where a reverse proxy on this machine serves the page, as "
-         "https://robot.example; the page asks for a token", ""),
-    word("--hmi-token-file", "FILE", "a file of yours, of mode 0600: a token, 16 characters or "
-         "more, to keep it over several runs; or the names, roles and tokens that `rampart tokens` "
-         f"keeps. Or set {TOKEN_VARIABLE} to a token (default: a random one; for yourself on this "
-         "machine none is needed)", ""),
+         "only). Any other address needs a certificate. The page then asks for the token that is "
+         "printed at the start of the run", "127.0.0.1"),
+    word("--hmi-cert", "FILE", "certificate chain of the page (PEM)", ""),
+    word("--hmi-key", "FILE", "private key of the certificate (PEM, mode 0600; default: in the "
+         "file of the certificate)", ""),
+    flag("--hmi-unencrypted", "serve the page to other machines without encryption: anyone on "
+         "that network can read the token and all data"),
+    word("--hmi-behind", "ORIGIN", "origin at which a reverse proxy on this machine serves the "
+         "page, as https://robot.example; the page asks for a token", ""),
+    word("--hmi-token-file", "FILE", "file of mode 0600 with a token of 16 characters or more, or "
+         f"the file of `rampart tokens`. The variable {TOKEN_VARIABLE} can hold a token, too "
+         "(default: a random token; none on this machine)", ""),
     option("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS))  # refused
 
 

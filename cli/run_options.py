@@ -1,17 +1,15 @@
-"""What can be said on the command line when a system is started, and the plan that follows.
+"""Options of the command line that starts a system, and the plan that follows from them.
 
-Start a system from its spec, run it, judge it, report on it.
+Start a system from its specification, run it, and write a report with a verdict.
+`launch.py` takes the same options.
 
 Examples:
-while it runs, from another shell:
-  kill-node NODE                                    kill a node and watch it come back
-  rampart inject --list                             the faults that can be injected
-  rampart status                                    what the robot and its nodes are doing
-exit code: 0 success and safe, 1 mission failed but safe, or a node was given up or kept failing,
-2 bad usage or spec, 3 unsafe, 4 safety not known: no ground truth, or
-physics unstable. A report that cannot
-be written and output that nobody reads change none of them; with --json, "report_error" says why
-there is no "report"
+While it runs, use `kill-node`, `rampart inject` and `rampart status` in another shell.
+
+exit code: 0 success and safe; 1 mission failed but safe, or a node was given up or
+kept failing; 2 bad usage or unsound system; 3 unsafe; 4 safety not known. Causes of 4
+are a missing ground truth, unstable physics, and a killed process `run`. A report that
+cannot be written does not change the code; "report_error" of --json has the reason.
 """
 
 from __future__ import annotations
@@ -65,63 +63,64 @@ SOON = dt.timedelta(days=1)
 
 
 _EXAMPLES = (
-    ("", "the shipped system, as its spec says"),
-    ("--rate 4 --no-hmi --json", "four times real time, result as JSON"),
-    ("--hmi-host 0.0.0.0 --hmi-cert FILE --hmi-key FILE", "the page for other machines too"),
-    ("--hmi-token-file FILE", "the page for others, with tokens of yours"),
-    ("--record run.mcap", "keep everything that is said; `rampart replay`"),
-    ("--no-ftm", "the baseline, without fault tolerance"),
-    ("--virtual --seed 7", "in seconds, and every time the same"),
+    ("", "the default system"),
+    ("--virtual --seed 7", "in virtual time, in seconds; repeatable"),
     ("--virtual --fault kill:NODE@30 --fault drop:TOPIC@goal2+5", "with faults"),
-    *((f"--system {name}", "another one that is shipped") for name in systems.names().split(", ")),
+    ("--rate 4 --no-hmi --json", "four times real time, result as JSON"),
+    ("--record run.mcap", "record all messages"),
+    ("--no-ftm", "without fault tolerance"),
+    ("--hmi-token-file FILE", "with tokens for the page"),
+    ("--hmi-host 0.0.0.0 --hmi-cert FILE --hmi-key FILE", "page for other machines"),
+    *((f"--system {name}", "a shipped system") for name in systems.names().split(", ")),
 )
 
 _OPTIONS = (
-    flag("--wait", "let the operator start the mission from the page"),
-    word("--system", "FILE", f"system spec, or name of a shipped one: {systems.names()} (default: "
-         "osmosis)", str(systems.DEFAULT)),
-    word("--strategy", "NAME", f"one of {', '.join(STRATEGIES)} (default: the system's)", ""),
-    word("--shadow", "NAME", "a second strategy that decides without effect; where it differs, it "
-         "says so (default: the system's)", ""),
-    flag("--no-ftm", "run the paper's unprotected baseline: last command kept, no dead man, no "
-         "respawn"),
-    number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
-    whole("--seed", "N", "for sensor noise (default: 1)", 1),
-    flag("--no-hmi", "no operator's page (its node still runs)"),
+    flag("--wait", "start the mission from the operator's page"),
+    word("--system", "FILE", f"system file, or name of a shipped system: {systems.names()} "
+         "(default: osmosis)", str(systems.DEFAULT)),
+    word("--strategy", "NAME", f"strategy: {', '.join(STRATEGIES)} (default: the system's)", ""),
+    word("--shadow", "NAME", "second strategy that decides without effect; differing decisions are "
+         "recorded (default: the system's)", ""),
+    flag("--no-ftm", "run the unprotected baseline: the base keeps the last command, and no "
+         "node is restarted"),
+    number("--rate", "R",
+           f"simulated seconds per second, {LEAST_RATE:g} to {MOST_RATE} (default: 1)", 1.0),
+    whole("--seed", "N", "seed of sensor noise and faults (default: 1)", 1),
+    flag("--no-hmi", "serve no operator's page; its node runs"),
     *page_options.OPTIONS,
-    port_option("--port", "number that tells runs on this machine apart; no port is opened "
-                f"(default: that of {PORT_VARIABLE}, else {DEFAULT_PORT})", DEFAULT_PORT,
+    port_option("--port", "base port, which identifies the run on this machine; with --keys, "
+                "the routers use free ports from it upwards "
+                f"(default: the variable {PORT_VARIABLE}, else {DEFAULT_PORT})", DEFAULT_PORT,
                 metavar="PORT"),
-    word("--keys", "DIR", "a folder of keys, as `rampart keys` makes it: every link is mutual TLS, "
-         "and a router lets through what the owner of a certificate declares and no more (default: "
-         "none; the kernel keeps other users out)", ""),
+    word("--keys", "DIR", "folder of credentials from `rampart keys`: links use mutual TLS, and "
+         "routers accept only messages that a certificate permits (default: "
+         "none; file permissions exclude other users)", ""),
     number("--patience", "S", "simulated seconds without progress after which the mission counts "
            "as failed (default: 60)", 60.0),
     number("--duration", "S", "simulated seconds after which a system without a mission ends "
-           "(default: when it is interrupted)"),
-    word("--record", "FILE", "keep everything that is sent in an MCAP file, for `rampart bag "
-         "info`, `rampart replay` and Foxglove-compatible viewers"),
-    flag("--overwrite", "--record may replace an existing file"),
-    flag("--no-keys", "run on several hosts without --keys: whoever is on that network may do "
-         "everything"),
-    word("--host", "NAME", "which of the system's [[host]]s this machine is; each runs its own "
-         "part, and all start when all are there (default: the first)"),
-    word("--report", "DIR", f"where the report goes, checkpoints, and in {ERROR_LOG} the "
-         "tracebacks of nodes that failed (default: reports/TIME-MISSION, without a mission "
+           "(default: that of [end], else on interruption)"),
+    word("--record", "FILE", "record all messages to an MCAP file"),
+    flag("--overwrite", "let --record replace an existing file"),
+    flag("--no-keys", "run on several hosts without --keys: every client on the network has "
+         "full control"),
+    word("--host", "NAME", "the [[host]] that this machine is; the run starts when all hosts "
+         "are connected (default: the first)"),
+    word("--report", "DIR", f"directory of the report, of checkpoints, and of {ERROR_LOG} with "
+         "tracebacks (default: reports/TIME-MISSION, without a mission "
          "reports/TIME-SYSTEM)"),
-    option("--resume", nargs="?", const="", metavar="RUN", help="go on with a run whose launcher "
-           "was killed, or whose machine lost its power: from its checkpoints, with its options; "
-           "RUN is the directory of its report or its id (default: the newest that did not end); "
-           "runs on the processes of one machine only, not with --virtual"),
-    flag("--virtual", "run a mission in virtual time: all actors in this process, many times "
-         "faster than real; the same --seed gives the same run, to the byte"),
-    word("--network", "NAME", "with --virtual, what lies between the nodes: "
+    option("--resume", nargs="?", const="", metavar="RUN", help="continue a run whose root was "
+           "killed or whose machine lost power, from its checkpoints and with its options. "
+           "RUN is the directory of its report, or its id (default: the newest that did not end); "
+           "not with --virtual or several hosts"),
+    flag("--virtual", "run in virtual time: all actors in one process, many times faster than "
+         "real time; the same --seed gives the same run, to the byte"),
+    word("--network", "NAME", "with --virtual: network model "
          f"{', '.join(NETWORKS)} (default: measured)", "measured"),
-    several("--fault", "FAULT[@WHEN][+S]", "a fault to inject into a mission (repeatable): one of "
+    several("--fault", "FAULT[@WHEN][+S]", "fault to inject; repeatable. FAULT is a name from "
             "`rampart inject --list`, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, "
-            "hang:NODE, slow:all, stop:all, or of the robot's; WHEN is simulated seconds or goalN "
-            "(default: 10), S how long it lasts"),
-    flag("--json", "last line of stdout is one JSON object with the result"))
+            "hang:NODE, slow:all or stop:all; WHEN is simulated seconds, or goalN "
+            "(default: 10); S is the duration"),
+    flag("--json", "print the result as a JSON object in the last line of stdout"))
 
 
 def parser(program: str = "", kind: type[Application] = Application,
@@ -133,10 +132,10 @@ def parser(program: str = "", kind: type[Application] = Application,
         kind: the application of the system that is started, which adds options.
         said: what the system's spec says of them.
     """
-    examples = "".join(f"  {program} {how:<40} {what}\n" for how, what in (
+    examples = "".join(f"  {program} {how:<40} # {what}\n" for how, what in (
         *_EXAMPLES, *kind.examples))
     shown = help_of(__doc__)  # the examples themselves depend on program and system
-    shown["epilog"] = shown["epilog"].replace("examples:\n", f"examples:\n{examples}", 1)
+    shown["epilog"] = shown["epilog"].replace("examples:\n", f"examples:\n{examples}\n", 1)
     p = argparse.ArgumentParser(prog=program, **shown)
     add_options(p, _OPTIONS)
     application_options.add(p, kind, said or {})

@@ -29,7 +29,7 @@ from rampart.sim.runs.trial import trial_class
 DEFAULT = systems.DEFAULT
 
 
-def choice(dest: str = "system", what: str = "", default: str = "the shipped one") -> Option:
+def choice(dest: str = "system", what: str = "", default: str = DEFAULT.stem) -> Option:
     """Return what lets a verb be told its system with or without `--system`.
 
     Args:
@@ -39,8 +39,8 @@ def choice(dest: str = "system", what: str = "", default: str = "the shipped one
     """
     return either(
         option(dest, nargs="?", metavar="SPEC", default=argparse.SUPPRESS,
-               help=f"file, or name of a shipped system{what}; default {default}"),
-        option("--system", dest=dest, metavar="SPEC", help="the same"))
+               help=f"system file, or name of a shipped system{what} (default: {default})"),
+        option("--system", dest=dest, metavar="SPEC", help="same as SPEC"))
 
 
 @refusing(ValueError)

@@ -90,8 +90,8 @@ def add_options(parser: argparse._ActionsContainer, options: Iterable[Option]) -
 
 PORT_VARIABLE = "RAMPART_PORT"
 _PORT_DIGITS = 5
-_WHICH_RUN = ("base port of the run, if there are several on this machine (default: what "
-              f"{PORT_VARIABLE} of the environment says)")
+_WHICH_RUN = ("base port of the run, if this machine has several (default: the variable "
+              f"{PORT_VARIABLE})")
 
 
 def port_of_environment() -> int | None:
@@ -118,7 +118,7 @@ def port_option(name: str, text: str, otherwise: int | None = None, **fields: An
 PORT = port_option("--port", _WHICH_RUN, metavar="N")
 JSON = flag("--json", "print JSON")
 JSON_FORMAT = option("--json", action="store_const", dest="format", const="json",
-                     help="the same as --format json")
+                     help="same as --format json")
 
 
 def served(port: int, what: str) -> tuple[Option, ...]:
@@ -129,9 +129,9 @@ def served(port: int, what: str) -> tuple[Option, ...]:
         what: can be done by whoever reaches it.
     """
     return (
-        whole("--port", "N", f"port to serve on (default {port})", port),
-        word("--host", "ADDRESS", "address to serve on (default 127.0.0.1; whoever reaches it may "
-             f"{what})", "127.0.0.1"),
+        whole("--port", "N", f"port to serve on (default: {port})", port),
+        word("--host", "ADDRESS", "address to serve on (default: 127.0.0.1); any client that "
+             f"reaches it may {what}", "127.0.0.1"),
         port_option("--run", _WHICH_RUN, dest="of", metavar="N"))
 
 

@@ -28,7 +28,7 @@ ROOMS = (
     "actors.access", "actors.supervision", "actors.hosts", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
     "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse",
-    "cli.host", "cli.run", "cli.new", "cli.main",
+    "cli.host", "cli.run", "cli.new", "cli.main", "cli.commands_page",
     "testing",
 )
 """The rooms of the engine, from the bottom to the top: each may import those before it."""

@@ -24,37 +24,37 @@ from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.virtual.network import NETWORKS
 
 _CHOICE = (
-    whole("--runs", "N", "N random faults of all kinds"),
+    whole("--runs", "N", "inject N random faults of all kinds, one per run"),
     several("--fault", "FAULT[@WHEN][+S]",
-            "this fault; may be repeated, and be a pattern of names: 'kill:*'"),
-    whole("--together", "K", "K faults in each run (default 1); with --fault: every combination of "
-          "K of those on different topics", 1),
-    word("--kinds", "K,...", "with --runs or --search: only these kinds of faults, of those that "
-         "--list shows"),
-    whole("--search", "N", "N runs of an optimiser that looks for the smallest safety margin"),
-    word("--replay", "RUN", "repeat a run of --out by its key"),
-    flag("--list", "list the faults that there are"))
+            "inject this fault, or all that match a pattern such as 'kill:*'; repeatable"),
+    whole("--together", "K", "K faults in each run (default: 1); with --fault: every combination "
+          "of K on different topics", 1),
+    word("--kinds", "K,...", "with --runs or --search: only these kinds of faults of --list"),
+    whole("--search", "N", "search the smallest safety margin in N runs"),
+    word("--replay", "RUN", "repeat a run of --out by its key, with a report"),
+    flag("--list", "list the faults of the system"))
 
 _CONDITIONS = (
     option("--ftm", choices=("on", "off", "both"), default="on",
-           help="fault tolerance, the unprotected baseline, or both (default: on)"),
-    several("--strategy", "NAME", "of the manager; may be repeated (default: the system's)"),
-    word("--network", "NAME", f"{', '.join(NETWORKS)} (default: measured)", "measured"),
-    whole("--seed", "N", "default: 1", 1),
-    whole("--seeds", "N", "with --fault: so many runs of each, from --seed on (default: 1); with "
-          "--search: so many among the runs (default: 1); with "
-          f"--runs: so many seeds among them (default: {SEEDS})"),
-    number("--patience", "S", "simulated seconds without progress that end a run "
+           help="run with fault tolerance, without, or both (default: on)"),
+    several("--strategy", "NAME", "strategy; repeatable (default: the system's)"),
+    word("--network", "NAME", f"network model: {', '.join(NETWORKS)} (default: measured)",
+         "measured"),
+    whole("--seed", "N", "first seed (default: 1)", 1),
+    whole("--seeds", "N", "number of seeds: with --fault, runs of each fault (default: 1); with "
+          "--search (default: 1) and "
+          f"--runs (default: {SEEDS}), seeds among all runs"),
+    number("--patience", "S", "simulated seconds without progress after which a run fails "
            f"(default: {PATIENCE_S:g})", PATIENCE_S),
-    number("--duration", "S", "simulated seconds that a run of a system without a mission takes "
-           "(default: what the system's [end] says)"))
+    number("--duration", "S", "simulated seconds of a run of a system without a mission "
+           "(default: that of [end])"))
 
 _PLACE = (
-    word("--out", "DIR", "default: reports/campaign-NAME, by what is run"),
-    whole("--jobs", "N", "processes (default: one per core)", 0),
+    word("--out", "DIR", "directory of results and report (default: reports/campaign-NAME)"),
+    whole("--jobs", "N", "parallel processes (default: one per core)", 0),
     option("--backend", default="loky", choices=BACKENDS,
-           help="loky is this machine; dask and ray are existing clusters"),
-    word("--address", "A", "of the cluster's scheduler", ""))
+           help="loky: this machine; dask, ray: an existing cluster (default: loky)"),
+    word("--address", "A", "address of the cluster's scheduler", ""))
 
 
 def parser(program: str, system: str, campaigns: Sequence[type[NamedCampaign]]
@@ -71,19 +71,25 @@ def parser(program: str, system: str, campaigns: Sequence[type[NamedCampaign]]
     """
     which = "".join(f"; with {each.flag} alone: {each.system}" for each in campaigns)
     made = argparse.ArgumentParser(prog=program, **help_of(run.__doc__ or ""))
-    what = made.add_argument_group("what is run")
+    what = made.add_argument_group("faults and runs")
     for each in campaigns:
         each.add(what)
     add_options(what, _CHOICE)
     add_options(made, (
-        group("under which conditions",
-              word("--system", "SPEC", "file, or name of a shipped system (default: "
-                   f"{systems.DEFAULT.stem}{which}); its options, below, take several values, "
-                   "which are crossed, or drawn from with --runs"), *_CONDITIONS),
-        group("where", *_PLACE), flag("--json", "print the rows as JSON")))
+        group("conditions",
+              word("--system", "SPEC", "system file, or name of a shipped system (default: "
+                   f"{systems.DEFAULT.stem}{which}). Its options, below, take several values; "
+                   "--fault crosses them, --runs draws from them"), *_CONDITIONS),
+        group("results and processes", *_PLACE), flag("--json", "print the rows as JSON")))
     spec = systems.load(system)
     application_options.add(made, application_class(spec), spec.application, crossed=True)
     return made
+
+
+def named_campaigns() -> list[type[NamedCampaign]]:
+    """Return the campaigns that packages bring by entry points."""
+    return [found.load() for found in sorted(
+        entry_points(group="rampart.campaigns"), key=lambda campaign: campaign.name)]
 
 
 def parse(arguments: Sequence[str], program: str = "rampart campaign") -> argparse.Namespace:
@@ -92,8 +98,7 @@ def parse(arguments: Sequence[str], program: str = "rampart campaign") -> argpar
     Raises:
         UsageError: there is no such system, or the options make no sense together.
     """
-    campaigns = [found.load() for found in sorted(
-        entry_points(group="rampart.campaigns"), key=lambda campaign: campaign.name)]
+    campaigns = named_campaigns()
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     what = first.add_argument_group()
     for each in campaigns:
@@ -111,26 +116,25 @@ def parse(arguments: Sequence[str], program: str = "rampart campaign") -> argpar
 def run(options: argparse.Namespace) -> int:
     """Run the campaign, or what else was asked for.
 
-    Run missions in virtual time with faults injected, on all cores, and say how
-    often the robot succeeded and whether it was always safe.
+    Run missions in virtual time with injected faults, on all cores, and report how
+    often the robot succeeded and whether it was safe. Results and report are in
+    --out. An interrupted campaign continues with the same command.
 
     Examples:
-      rampart campaign --paper                       the paper's tables, beside the paper's verdicts
-      rampart campaign --paper --full                ... their rows on the full system
-      rampart campaign --runs 200                    200 random single faults, 20 seeds
-      rampart campaign --runs 200 --seeds 200        ... each with a seed of its own: slower
-      rampart campaign --runs 200 --together 2       ... pairs of faults
-      rampart campaign --fault 'kill:*' --seeds 5    every process killed, five seeds each
+      rampart campaign --runs 200                    # random single faults, 20 seeds
+      rampart campaign --runs 200 --seeds 200        # one seed per run; slower
+      rampart campaign --runs 200 --together 2       # random pairs of faults
+      rampart campaign --fault 'kill:*' --seeds 5    # kill each process, five seeds
       rampart campaign --fault gps-bias@20+5 --obstacles 0,2 --ftm both
-      rampart campaign --fault 'gps-*@30+inf' --fault 'imu-*@30+inf' --together 2   every pair
-      rampart campaign --list                        the faults that there are
-      rampart campaign --replay 3f2a --out DIR       repeat one run of DIR and write its report
-      rampart campaign --search 200                  look for the fault with the smallest margin
-    The same command goes on where it was interrupted; each run is made once. Results, with a
-    report, are in --out.
+      rampart campaign --fault 'gps-*@30+inf' --fault 'imu-*@30+inf' --together 2
+      rampart campaign --list                        # the faults of the system
+      rampart campaign --replay 3f2a --out DIR       # repeat one run of DIR
+      rampart campaign --search 200                  # search the smallest margin
+      rampart campaign --paper                       # the paper's tables
+      rampart campaign --paper --full                # its rows on the full system
 
-    exit code: 0 no unsafe run with fault tolerance, 1 there was one, or with --full one that
-    failed, 2 bad usage, or it could not be finished, as on a full disk
+    exit code: 0 no unsafe run with fault tolerance; 1 an unsafe run, or a failed run
+    with --full; 2 bad usage, or not completed, for example on a full disk
     """
     from rampart.cli.analyse.campaigning import campaign  # noqa: PLC0415 physics and all: help needs none
 

@@ -89,25 +89,26 @@ class Explanation(msgspec.Struct, frozen=True):
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    add_verb(verbs, "check", "is a system sound? All that is known without running it", check,
+    add_verb(verbs, "check", "check a system without running it", check,
              systems.choice(), JSON)
-    add_verb(verbs, "explain", "what is started, who talks to whom, what a fault leads to", run,
+    add_verb(verbs, "explain", "list processes, topics and consequences of detections", run,
              systems.choice(), JSON)
 
 
 def run(options: argparse.Namespace) -> int:
     """Explain a system.
 
-    Say what a system is: which processes are started and what is in them, who talks
-    to whom, who guards whom, and what each detection leads to: mechanisms, the
-    recovery that is decided when nothing else is active, what follows if it fails.
+    Describe a system: its processes and their actors, publishers and readers of
+    each topic, which part watches and restarts which, and the consequence of each
+    detection. That is: its mechanisms, the recovery that is chosen if nothing else
+    is active, and the next one if that fails.
 
     Examples:
       rampart explain
       rampart explain my_system.toml
       rampart explain paper --json
 
-    exit code: 0, 2 a system that `rampart check` refuses, or bad usage
+    exit code: 0 described, 2 `rampart check` refuses the system, or bad usage
     """
     found = explain(systems.check(options.system))
     if options.json:
@@ -228,16 +229,16 @@ def _decided(found: Consequence) -> str:
 def check(options: argparse.Namespace) -> int:
     """Check a system, and say what is wrong with it, or how large it is.
 
-    Check all of a system that can be checked before it runs, as a start does: the
-    specification, the time budget, classes and parameters of all actors, application
-    and judge, and that what each node hears is published by somebody.
+    Check everything that can be checked before a run, as a start does:
+    specification, time budgets, classes and parameters of all actors, application
+    and judge, and that each topic with a reader has a publisher.
 
     Examples:
       rampart check
       rampart check my_system.toml && rampart run --system my_system.toml
       rampart check paper --json
 
-    exit code: 0 sound, 2 not sound (one line says where) or bad usage
+    exit code: 0 sound, 2 not sound (one line shows where) or bad usage
     """
     try:
         layout = systems.check(options.system)

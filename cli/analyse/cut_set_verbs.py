@@ -39,34 +39,35 @@ _WAIT_S = 1.0
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    add_verb(verbs, "cut-sets", "minimal cut sets of a fault tree, and the barriers on them", run,
-             PORT, systems.choice("file", ", or Open-PSA .xml"), flag("--count", "only count"),
+    add_verb(verbs, "cut-sets", "find minimal cut sets and their barriers", run,
+             PORT, systems.choice("file", ", or Open-PSA file .xml"),
+             flag("--count", "print only the number of sets"),
              word("--top", "GATE", "top gate of an Open-PSA file", ""),
-             whole("--max-order", "K", "neither make nor count sets with more events"),
-             flag("--strict", "refuse an Open-PSA file of which there is a warning"),
-             whole("--limit", "N", f"list no more than N sets (default {_LIMIT})", _LIMIT),
+             whole("--max-order", "K", "leave out sets with more than K events"),
+             flag("--strict", "refuse an Open-PSA file that causes a warning"),
+             whole("--limit", "N", f"list at most N sets (default: {_LIMIT})", _LIMIT),
              option("--active", nargs="+", default=[], metavar="FTM",
-                    help="what is left before the top if these mechanisms are active"),
-             flag("--live", "what is left before the top in the running system, now"),
-             word("--export", "FILE", "write the fault tree as Open-PSA"), JSON)
+                    help="show what is left before the top if these mechanisms are active"),
+             flag("--live", "show what is left before the top in the run, now"),
+             word("--export", "FILE", "write the fault tree in Open-PSA format"), JSON)
 
 
 def run(options: argparse.Namespace) -> int:
     """Do what the options ask for.
 
-    Find the minimal sets of events that make the top event of a fault tree
-    occur. For a system spec also the mechanisms that are barriers on each, and
-    what single event is left before the top. Sets are counted without listing
-    them, so millions are no problem. docs/explanation/fault-trees.md says how.
+    Find the minimal sets of events that cause the top event of a fault tree. For
+    a system, also show the mechanisms that are barriers on each set, and the single
+    events that are left before the top. Sets are counted without listing them, so
+    the count may be in the millions. docs/explanation/fault-trees.md explains it.
 
     Examples:
-      rampart cut-sets                              the shipped system
+      rampart cut-sets                              # the default system
       rampart cut-sets paper
-      rampart cut-sets plant.xml --count --json     an Open-PSA file
+      rampart cut-sets plant.xml --count --json     # an Open-PSA file
       rampart cut-sets plant.xml --top g12 --max-order 2
-      rampart cut-sets --active FTM2                what is left if DM2 is active
-      rampart cut-sets --live                       what is left in the run, now
-      rampart cut-sets --export osmosis.xml         for other tools
+      rampart cut-sets --active FTM2                # what is left if FTM2 is active
+      rampart cut-sets --live                       # what is left in the run, now
+      rampart cut-sets --export osmosis.xml         # for other tools
     """
     for name in ("limit", "max_order"):
         if (getattr(options, name) or 0) < 0:

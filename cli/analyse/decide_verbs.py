@@ -22,25 +22,27 @@ def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     of_table = (
         option("--strategy", metavar="NAME", action="append",
-               help="default the spec's; without FTM several are compared"),
-        flag("--differing", "without FTM: only the sets in which the strategies run different "
+               help="strategy (default: the system's); without FTM several can be compared"),
+        flag("--differing", "without FTM: show only sets in which the strategies choose different "
              "recoveries"),
         option("--format", choices=("table", "csv", "json"), default="table",
-               help="without FTM: default table"), JSON_FORMAT)
-    add_verb(verbs, "decide", "what the manager decides for active mechanisms", show_decision,
-             option("ftm", nargs="*", metavar="FTM", help="active mechanisms, e.g. FTM3; without "
-                    "one the table of all sets"), *of_table,
-             word("--system", "SPEC", "file, or name of a shipped system; default the shipped one"))
+               help="without FTM: format of the table (default: table)"), JSON_FORMAT)
+    add_verb(verbs, "decide", "show what the manager decides", show_decision,
+             option("ftm", nargs="*", metavar="FTM", help="active mechanisms, for example FTM3; "
+                    "without one, the table of all sets"), *of_table,
+             word("--system", "SPEC",
+                  "system file, or name of a shipped system (default: osmosis)"))
     add_verb(verbs, "table", "", show_table, *of_table, systems.choice(), hidden=True)
 
 
 def show_decision(options: argparse.Namespace) -> int:
     """Print one decision, or the table of all.
 
-    Show the decision for a set of active mechanisms, with its certificate: the
-    block (rule) that applies, the path of dominance, what was rejected and why. What
-    one of them explains does not act, and is named as such. Without a mechanism: the
-    decision for every set of them; with several strategies, side by side.
+    Show the decision for a set of active mechanisms with its certificate: the rule
+    that applies (block), the path of dominance, and each rejected recovery with the
+    reason. A mechanism that another one explains does not act, and is listed as
+    explained. Without FTM, show the decision for every set, for several strategies
+    side by side.
 
     Examples:
       rampart decide FTM3 FTM4

@@ -36,23 +36,24 @@ def add(verbs: Any) -> None:
     """Add the verb to the parser."""
     add_verb(verbs, "tree", "draw fault tree, FTMTree and order of recoveries", show_tree,
              systems.choice(),
-             option("--what", choices=(*WHATS, "all"), default="all", help="default all"),
+             option("--what", choices=(*WHATS, "all"), default="all",
+                    help="which diagrams (default: all)"),
              option("--format", choices=tuple(FORMATS),
-                    help="default by the ending of --output, else text"), JSON_FORMAT,
-             word("--output", "FILE", "write there instead of to stdout"),
+                    help="format (default: by the ending of --output, else text)"), JSON_FORMAT,
+             word("--output", "FILE", "write to FILE instead of standard output"),
              option("--order", metavar="NAME", action="append",
-                    help="order of recoveries; several: the next decides what the one before "
-                         "leaves open; default the spec's"),
+                    help="order of recoveries; repeatable: each decides what those before "
+                         "leave open (default: the system's)"),
              option("--active", metavar="FTM", nargs="+", default=[],
-                    help="active mechanisms; they are lit, and the decision is marked"),
-             word("--strategy", "NAME", "that decides; default the spec's"))
+                    help="active mechanisms, which are highlighted with the decision"),
+             word("--strategy", "NAME", "strategy that decides (default: the system's)"))
 
 
 def show_tree(options: argparse.Namespace) -> int:
     """Print or write the diagrams.
 
     Draw the fault tree with the mechanisms as barriers (‖), the FTMTree that
-    follows from it, and the order of the recoveries, the safer above.
+    follows from it, and the order of the recoveries with the safer ones above.
 
     Examples:
       rampart tree

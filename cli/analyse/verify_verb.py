@@ -16,30 +16,31 @@ from rampart.manager.strategies.registry import UnknownStrategyError
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    add_verb(verbs, "verify", "check every property of the arbitration", run, systems.choice(),
-             several("--strategy", "NAME", "only this strategy; repeat for several (default: all)"),
-             whole("--together", "K", "explore K recoveries at a time (default 2, which suffices; "
-                   "the number of recoveries of the system explores all, in minutes)", 2),
-             flag("--strict", "exit 1 if a property fails"), JSON)
+    add_verb(verbs, "verify", "verify the arbitration exhaustively", run, systems.choice(),
+             several("--strategy", "NAME", "verify only this strategy; repeatable (default: all)"),
+             whole("--together", "K", "explore K recoveries at a time (default: 2, which is "
+                   "sufficient; all recoveries of the system take minutes)", 2),
+             flag("--strict", "exit with 1 if a property fails"), JSON)
 
 
 def run(options: argparse.Namespace) -> int:
     """Verify, and show what was found.
 
-    Check a system as `rampart check` does, and its arbitration exhaustively:
-    what each strategy decides for every set of active mechanisms, and every state
-    of the arbiter that carries it out, from when it has heard every module. A property holds, or
-    the shortest counterexamples are shown. docs/explanation/arbitration.md explains the
-    properties, and what is not looked at.
+    Check a system as `rampart check` does. Then explore its arbitration
+    exhaustively: the decision of each strategy for every set of active mechanisms,
+    and every state of the arbiter after it has received a report of each module.
+    Each property holds, or the shortest counterexample is shown.
+    docs/explanation/arbitration.md explains the properties and what is left out.
 
     Examples:
       rampart verify
       rampart verify my_system.toml --strategy safety-first
       rampart verify paper --json
-      rampart verify --strict && python launch.py     only if all holds
+      rampart verify --strict && rampart run     # run only if all properties hold
 
-    exit code: 0 verified, whatever was found; with --strict 1 if a property of the
-    system's strategy (or of one given by --strategy) fails; 2 bad usage or bad spec
+    exit code: 0 verified, whether properties hold or not; 1 with --strict, if a
+    property of the system's strategy (or of one given by --strategy) fails; 2 bad
+    usage or unsound system
     """
     spec = systems.check(options.system).spec
     if options.together < 1:

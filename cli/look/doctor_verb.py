@@ -57,19 +57,20 @@ class Finding(msgspec.Struct, frozen=True):
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    add_verb(verbs, "doctor", "what this machine has of what a run uses", doctor, JSON)
+    add_verb(verbs, "doctor", "check this machine for what a run needs", doctor, JSON)
 
 
 def doctor(options: argparse.Namespace) -> int:
     """Look at the machine.
 
-    Look at what a run uses of this machine: Python, kernel, processors, memory,
-    limits, libraries, Chromium, ROS 2. What is missing is listed with what it
-    costs. Exit code 1 if no run can start.
+    Check what a run uses of this machine: Python, kernel, processors, memory,
+    limits, libraries, Chromium, ROS 2. List what is missing, and the consequence.
 
     Examples:
       rampart doctor
       rampart doctor --json
+
+    exit code: 0 a run can start, 1 none can
     """
     findings = [finding for look in LOOKS for finding in look()]
     if options.json:

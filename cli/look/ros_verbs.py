@@ -1,8 +1,9 @@
 """`rampart ros2`: whether a system and the ROS 2 beside it fit.
 
-`rampart topic list|echo|hz --ros` looks at topics of ROS 2. Neither needs a ROS
-installation; pip install 'rampart-robot[ros2]'. ROS_DOMAIN_ID and ROS_DISTRO say
-which domain and distribution is meant, as they do to ROS 2.
+Check a system against ROS 2. `rampart topic list`, `echo` and `hz` show topics of
+ROS 2 with --ros. These verbs need no installation of ROS, but the extra:
+pip install 'rampart-robot[ros2]'. The variables ROS_DOMAIN_ID and ROS_DISTRO
+select domain and distribution, as in ROS 2.
 
 Examples:
   rampart ros2 check --system warehouse.toml
@@ -22,22 +23,23 @@ from rampart.cli.verbs import JSON, add_family, add_verb, extra
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    ros2 = add_family(verbs, "ros2", "whether a system and the ROS 2 beside it fit", __doc__)
-    add_verb(ros2, "check", "router, types, hashes, who is missing", check, systems.choice(), JSON)
+    ros2 = add_family(verbs, "ros2", "check a system against ROS 2", __doc__)
+    add_verb(ros2, "check", "check routers, types and publishers", check, systems.choice(), JSON)
 
 
 def check(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     """Check a system against the graph of ROS 2 that is there now.
 
-    Say of each [[ros2]] of a system who is on the other side, and why one cannot
-    be heard: no router, nobody there, another type, another definition of it, a
-    quality of service that cannot meet, somebody who publishes past the gateway.
-    Nothing is published, and the system need not run. Exit code 1 if something
-    does not fit.
+    List for each [[ros2]] of a system the nodes on the other side, or the problem.
+    Problems are: no router, no node, another type, another definition of the type,
+    an incompatible quality of service, and a publisher that bypasses the gateway.
+    Nothing is published, and the system need not run.
 
     Examples:
       rampart ros2 check --system warehouse.toml
       rampart ros2 check --system osmosis-ros2 --json
+
+    exit code: 0 all fit, 1 one does not, 2 bad usage
     """
     return look(options).check(options)  # type: ignore[no-any-return]
 

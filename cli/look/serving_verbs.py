@@ -1,7 +1,7 @@
 """`rampart live`: serve the run to other programs, while it goes on.
 
-Show the run in a viewer for robots, with a log in words, or serve its figures.
-Waits for a run, and for the next when one ends.
+Serve the run to viewers of Foxglove's protocol, or its figures to Prometheus. Wait
+for a run, and for the next one after each run.
 
 Examples:
   rampart live foxglove
@@ -28,7 +28,7 @@ def add(verbs: Any) -> None:
     viewers = add_family(verbs, "live", "serve the run to Foxglove or Prometheus", __doc__,
                          metavar="VIEWER")
     add_verb(viewers, "foxglove", "serve Foxglove's WebSocket protocol", foxglove,
-             *served(FOXGLOVE_PORT, "look on"))
+             *served(FOXGLOVE_PORT, "watch the run"))
     for family, hidden in ((viewers, False), (verbs, True)):
         add_verb(family, "metrics", "serve the run's figures to Prometheus", metrics,
                  *served(METRICS_PORT, "read the figures"), hidden=hidden)
@@ -37,14 +37,15 @@ def add(verbs: Any) -> None:
 def foxglove(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     """Serve viewers until interrupted.
 
-    Serve viewers that speak Foxglove's WebSocket protocol. They only read:
-    nothing that they send reaches the robot. Needs the extra:
+    Serve viewers that use Foxglove's WebSocket protocol. They can only read;
+    nothing that they send reaches the robot. This needs the extra:
     pip install 'rampart-robot[foxglove]'.
 
     Examples:
       rampart live foxglove
       rampart live foxglove --port 9000
-    then open ws://127.0.0.1:8765 in the viewer; set the 3D panel's frame to map
+
+    Open ws://127.0.0.1:8765 in the viewer, and set the frame of the 3D panel to map.
     """
     extra("foxglove", "foxglove")
     from rampart.cli.look import live_foxglove  # noqa: PLC0415 of the extra
@@ -56,10 +57,10 @@ def metrics(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     """Serve figures until interrupted.
 
     Serve http://HOST:PORT/metrics in Prometheus' text format, or in OpenMetrics
-    for who asks for it: nodes, heartbeats, detections, recoveries, decisions,
-    message counts and rates, processes, what the robot adds. Waits for a run,
-    and for the next when one ends; meanwhile rampart_up is 0.
-    Needs the extra: pip install 'rampart-robot[prometheus]'.
+    if the client asks for it: nodes, heartbeats, detections, recoveries,
+    decisions, message counts and rates, processes, and figures of the robot.
+    Wait for a run, and for the next one after each run; meanwhile rampart_up
+    is 0. This needs the extra: pip install 'rampart-robot[prometheus]'.
 
     Examples:
       rampart live metrics

@@ -1,7 +1,7 @@
 """`rampart topic`: what travels on the keys.
 
-List, print and measure topics. A key is given as in `rampart topic list`;
-a family as detection/DM1 for one member or 'detection/*' for all.
+List, print and measure topics. KEY is a key as `rampart topic list` shows it. For
+a family use detection/DM1 for one member, or 'detection/*' for all.
 
 Examples:
   rampart topic list
@@ -48,29 +48,29 @@ _HZ_REPORT_S = 1.0
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    topic = add_family(verbs, "topic", "what travels on the keys", __doc__)
-    key = option("key", metavar="KEY", completer=completion.topics)
+    topic = add_family(verbs, "topic", "list, print and measure topics", __doc__)
+    key = option("key", metavar="KEY", completer=completion.topics, help="key of a topic")
     ros = option("--ros", nargs="?", const=ROUTER, metavar="ENDPOINT",
-                 help=f"of ROS 2, by the router there (default {ROUTER})")
-    add_verb(topic, "list", "all topics (needs no run)", topic_list,
-             systems.choice(default="that of the run, else the shipped one"),
-             either(JSON, flag("--markdown", "print topics.md")), ros)
-    add_verb(topic, "info", "the contract of one topic (needs no run)", topic_info, key,
-             word("--system", "FILE", "system spec; default that of the run, else the shipped one"),
+                 help=f"use topics of ROS 2, by the router at ENDPOINT (default: {ROUTER})")
+    add_verb(topic, "list", "list all topics; needs no run", topic_list,
+             systems.choice(default="that of the run, else osmosis"),
+             either(JSON, flag("--markdown", "print the reference page of topics")), ros)
+    add_verb(topic, "info", "show the contract of one topic; needs no run", topic_info, key,
+             word("--system", "FILE", "system file (default: that of the run, else osmosis)"),
              JSON)
-    add_verb(topic, "echo", "print messages as they come", topic_echo, PORT, key,
+    add_verb(topic, "echo", "print messages as they arrive", topic_echo, PORT, key,
              option("-n", "--count", type=int, metavar="N", help="end after N messages"),
              number("--duration", "S", "end after S real seconds"),
-             flag("--json", "one JSON object per line"), ros)
+             flag("--json", "print one JSON object per line"), ros)
     add_verb(topic, "hz", "measure the rate of a topic", topic_hz, PORT, key,
-             number("--duration", "S", "end after S real seconds (with --json 3 if not given)"),
+             number("--duration", "S", "end after S real seconds (default with --json: 3)"),
              flag("--json", "print JSON at the end"), ros)
 
 
 def topic_list(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     """Print all topics.
 
-    List all topics with message, QoS and nominal rate.
+    List all topics with message type, quality of service, nominal rate and frame.
 
     Examples:
       rampart topic list
@@ -96,7 +96,8 @@ def topic_list(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
 def topic_info(options: argparse.Namespace) -> int:
     """Print the contract of one topic.
 
-    Show type, fields, QoS, publishers and readers of a topic.
+    Show message type, fields, quality of service, rate, publishers and readers of
+    a topic.
 
     Examples:
       rampart topic info control/command
@@ -126,7 +127,7 @@ async def topic_echo(options: argparse.Namespace) -> int:
     """Print messages as they come.
 
     Print one line per message: stamp (simulated seconds), source#incarnation,
-    key, message. A payload that is no message is shown with the reason.
+    key, message. A payload that does not decode is shown with the reason.
 
     Examples:
       rampart topic echo localization/pose
@@ -183,8 +184,9 @@ async def topic_echo(options: argparse.Namespace) -> int:
 async def topic_hz(options: argparse.Namespace) -> int:
     """Measure rates.
 
-    Measure how often messages arrive, in simulated time like the nominal rate,
-    each second over a window of the last 500, until interrupted or the run ends.
+    Measure how often messages arrive, in simulated time like the nominal rate.
+    Print the rate of the last 500 messages each second, until the run ends or
+    Ctrl-C.
 
     Examples:
       rampart topic hz control/command

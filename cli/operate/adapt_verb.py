@@ -1,9 +1,9 @@
 """`rampart adapt`: change mechanisms and strategy of a running system.
 
-Change a detection module, a recovery module, a mechanism or the strategy of
-a running system. The changed system is checked like a fresh spec: names,
-trees, orders, time budgets. It is applied whole or refused with the reason,
-never in the middle of a recovery. The spec file stays as it is.
+Change a detection module, a recovery module, a mechanism or the strategy of a
+running system. The changed system is checked like a fresh specification: names,
+trees, orders, time budgets. The change is applied as a whole or refused with the
+reason. It is refused while a recovery is in force. The file is not changed.
 
 Examples:
   rampart adapt set strategy guarded-repair
@@ -11,11 +11,11 @@ Examples:
   rampart adapt disable FTM7
   rampart adapt enable FTM7
   rampart adapt retune RM3 deadline_s=2.5
-  rampart adapt retune DM1 margin_m=0.7        a parameter of the module
+  rampart adapt retune DM1 margin_m=0.7            # a parameter of the module
   rampart adapt retune FTM2 detect='DM2 or DM6'
-  rampart adapt replace FTM7 ftm7.toml         the new table, without the name
+  rampart adapt replace FTM7 ftm7.toml             # the new table, without its name
 
-exit code: 0 changed; 1 refused, or nobody answered; 2 bad usage
+exit code: 0 changed, 1 refused or no answer, 2 bad usage
 """
 
 from __future__ import annotations
@@ -44,24 +44,25 @@ _WAIT_S = 2.0
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    actions = add_family(verbs, "adapt", "change mechanisms or strategy while it runs", __doc__,
+    actions = add_family(verbs, "adapt", "change mechanisms or strategy of the run", __doc__,
                          dest="action", metavar="ACTION")
-    name = option("name", metavar="NAME")
+    name = option("name", metavar="NAME", help="a module or mechanism")
     for action, text, examples, *options in (
         (Action.ENABLE, "enable a module or a mechanism", ("enable FTM7",), name),
         (Action.DISABLE, "disable a module or a mechanism",
-         ("disable FTM7", "disable DM7   and what uses it"), name),
+         ("disable FTM7", "disable DM7     # and each mechanism that uses it"), name),
         (Action.RETUNE, "change fields or parameters",
          ("retune RM3 deadline_s=2.5", "retune DM1 margin_m=0.7",
           "retune FTM2 detect='DM2 or DM6'"),
-         name, option("values", nargs="+", metavar="FIELD=VALUE", help="value as in TOML")),
+         name, option("values", nargs="+", metavar="FIELD=VALUE",
+                      help="a field or parameter, and its new value in TOML")),
         (Action.REPLACE, "replace a whole table", ("replace FTM7 ftm7.toml",), name,
-         option("file", metavar="FILE", help="TOML with the fields of the new table")),
+         option("file", metavar="FILE", help="TOML file with the fields of the new table")),
         (Action.SET, f"set {', '.join(SETTINGS)}",
          ("set strategy guarded-repair", "set order safer autonomy"),
-         option("name", choices=SETTINGS),
+         option("name", choices=SETTINGS, help="the setting"),
          option("values", nargs="+", metavar="VALUE",
-                help="name of a strategy or order; several orders: the first comes first")),
+                help="a strategy or order; for several orders the first decides first")),
     ):
         shown = "\n".join(f"  rampart adapt {example}" for example in examples)
         add_verb(actions, action.value, text, change, PORT, JSON, *options,

@@ -85,19 +85,19 @@ class Row(msgspec.Struct):
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    add_verb(verbs, "bench", "how soon each node works again after a SIGKILL", bench, PORT,
-             several("--node", "NAME", "kill only this node; may be repeated (default: all nodes, "
-                     "one detection and one recovery module)", completion.nodes),
-             whole("--kills", "N", "kills of each node (default 5)", 5), JSON)
+    add_verb(verbs, "bench", "measure how soon killed nodes work again", bench, PORT,
+             several("--node", "NAME", "kill only this node; repeatable (default: all nodes, one "
+                     "detection and one recovery module)", completion.nodes),
+             whole("--kills", "N", "kills of each node (default: 5)", 5), JSON)
 
 
 async def bench(options: argparse.Namespace) -> int:
     """Measure restarts.
 
-    Kill each node of the running system with SIGKILL, one after the other, and measure
-    how long it takes until a detection module or the supervisor reports it, and until
-    its replacement publishes. Kills go in rounds, so a slow moment of the machine
-    affects all nodes. The system should not do anything that matters meanwhile.
+    Kill the nodes of the run with SIGKILL, one after the other. Measure the time
+    until a detection module or the supervisor reports each death, and until the
+    replacement publishes. Kills go in rounds, so that a slow moment of the machine
+    affects all nodes. Do not use it on a robot in service.
 
     Examples:
       rampart bench

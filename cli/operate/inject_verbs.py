@@ -45,67 +45,68 @@ def add(verbs: Any) -> None:
         option("fault", nargs="?", metavar="FAULT", completer=completion.faults,
                help="a name from --list, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE or "
                "trigger:MODULE"),
-        flag("--list", "list the catalogue (needs no run)"),
-        word("--system", "FILE", "for --list: system spec; default that of the run, else the "
-             "shipped one"),
-        number("--duration", "S", "simulated seconds, inf for permanent; default the fault's own, "
-               f"else {_DEFAULT_DURATION_S:g}"),
-        flag("--at-once", "return as soon as the fault is in force; do not wait for its end"),
+        flag("--list", "list the faults of the system; needs no run"),
+        word("--system", "FILE", "for --list: system file (default: that of the run, else "
+             "osmosis)"),
+        number("--duration", "S", "duration in simulated seconds, inf for permanent (default: that "
+               f"of the fault, else {_DEFAULT_DURATION_S:g})"),
+        flag("--at-once", "return when the fault is in force, instead of at its end"),
         JSON,
         group("which messages",
-              number("--share", "P", "probability that a message is affected, up to 1 (default)"),
-              number("--on", "S", "intermittent: in force for S ..."),
-              number("--off", "S", "... and away for S, repeating"),
-              option("--seed", type=int, metavar="N", help="of share, noise and what "
-                     "restamp:TOPIC and corrupt:TOPIC draw; default 0")),
-        group("a fault of your own, instead of FAULT",
-              word("--topic", "KEY", "e.g. control/command or detection/DM2"),
-              word("--mode", "MODE", ", ".join(MODES)),
-              number("--delay", "S", "for delay: simulated seconds"),
-              number("--stamp", "S", "for restamp: added to each stamp, simulated seconds; above 0 "
-                     "is ahead"),
+              number("--share", "P", "probability that a message is affected (default: 1)"),
+              number("--on", "S", "with --off: in force for S, repeatedly"),
+              number("--off", "S", "with --on: then absent for S"),
+              option("--seed", type=int, metavar="N", help="seed of random choices: share, "
+                     "noise, and values of restamp:TOPIC and corrupt:TOPIC (default: 0)")),
+        group("a fault by its parts, instead of FAULT",
+              word("--topic", "KEY", "key of the topic, for example control/command"),
+              word("--mode", "MODE", f"one of {', '.join(MODES)}"),
+              number("--delay", "S", "for delay: by simulated seconds"),
+              number("--stamp", "S", "for restamp: add simulated seconds to each stamp; above 0 is "
+                     "ahead"),
               several("--set", "FIELD=VALUE",
-                      "for corrupt: overwrite a field; may be repeated, as all below"),
+                      "for corrupt: overwrite a field; repeatable, as all below"),
               several("--add", "FIELD=BIAS",
-                      "for corrupt: add BIAS to a number, or to each of an array"),
+                      "for corrupt: add BIAS to a number, or to each number of an array"),
               several("--ramp", "FIELD=RATE", "for corrupt: add RATE per simulated second"),
               several("--noise", "FIELD=SIGMA",
                       "for corrupt: add Gaussian noise of this standard deviation"),
               several("--keep-ends", "FIELD",
-                      "for corrupt: keep only first and last element of a list")))
+                      "for corrupt: keep only the first and last element of a list")))
 
 
 def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     r"""List the catalogue, or inject a fault.
 
-    Inject a fault of the catalogue, or disturb any topic, for a while. It
-    acts in the node that publishes the topic, one of the robot's own (a rotor, a wheel)
-    in the node that carries it out. The verb waits for its end and
-    says how many messages were affected; if none was, it says so and exits 1.
-    For a permanent fault it waits until the first message was affected.
-    Ctrl-C ends the fault at once. Durations are simulated seconds.
+    Inject a fault by name, or disturb any topic, for some time. The node that
+    publishes the topic carries the fault out; faults of the robot, such as a weak
+    rotor, are carried out by the world. The verb waits for the end of the fault,
+    or for the first effect of a permanent one, and prints how many messages were
+    affected. Ctrl-C ends the fault at once.
 
     Examples:
-      rampart inject --list                           what there is in the system at hand
-      rampart inject FAULT --duration 3               one that has a name
+      rampart inject --list                           # the faults of the system
+      rampart inject FAULT --duration 3
       rampart inject FAULT --at-once
-      rampart inject stuck:TOPIC --duration inf       permanent: until the node's process ends
+      rampart inject stuck:TOPIC --duration inf       # until the node's process ends
       rampart inject drop:TOPIC --on 1 --off 4 --duration 30
-                                                      intermittent: 1 s without, 4 s with
-      rampart inject corrupt:TOPIC --seed 7           one of its numbers: odd seeds, one each
-      rampart inject drop:TOPIC --share 0.3           three messages in ten are lost
-      rampart inject kill:NODE                        a process: it is gone at once ...
-      rampart inject stop:NODE --duration 2           ... or stands still, and then goes on
-      rampart inject trigger:MODULE                   the stand-in of a detection module detects
-    your own:
+                                                      # 1 s without messages, 4 s with
+      rampart inject corrupt:TOPIC --seed 7           # odd seeds: one number; even: all
+      rampart inject drop:TOPIC --share 0.3           # lose three messages in ten
+      rampart inject kill:NODE                        # end a process
+      rampart inject stop:NODE --duration 2           # freeze a process for 2 s
+      rampart inject trigger:MODULE                   # a stand-in detection module detects
       rampart inject --topic KEY --mode delay --delay 0.8
       rampart inject --topic KEY --mode restamp --stamp=-0.2
-                                                      stamped 0.2 s before the truth
+                                                      # stamps 0.2 s too early
       rampart inject --topic KEY --mode corrupt --ramp x_m=0.25
       rampart inject --topic KEY --mode corrupt --set angular_radps=2.5
       rampart inject --topic KEY --mode corrupt --add ranges_f32=0.4 \
                      --noise ranges_f32=0.2
-    Fields are those of `rampart topic info TOPIC`; one inside another is written pose.x_m.
+
+    `rampart topic info TOPIC` lists the fields; a field of a field is written pose.x_m.
+
+    exit code: 0 it had an effect, 1 it had none, 2 bad usage
     """
     if options.list:
         _print_catalogue(systems.at_hand(options.system, options.port), as_json=options.json)

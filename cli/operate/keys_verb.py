@@ -1,21 +1,20 @@
 """`rampart keys`: who has a certificate, and so may join a run with keys.
 
-Issue and revoke the certificates of a run with keys.
+Issue and revoke the credentials of a run.
 
-A folder of keys has an authority and a private key and certificate of each
-process and of each person. `rampart run --keys DIR` starts a run in which
-every link is mutual TLS, and in which a router lets through what the owner of
-a certificate declares and no more. Needs the extra:
-pip install 'rampart-robot[keys]'.
+A folder of keys contains an authority, and a private key and certificate of each
+process and person. In a run with --keys all links use mutual TLS, and routers
+accept from each certificate only the messages that its owner declares. This needs
+the extra: pip install 'rampart-robot[keys]'.
 
 Examples:
-  rampart keys init                               an authority, in keys/
-  rampart keys issue --system osmosis             for all that runs
-  rampart keys issue --operator ada --viewer bob  for people
+  rampart keys init                               # create an authority in keys/
+  rampart keys issue --system osmosis             # for all processes
+  rampart keys issue --operator ada --viewer bob  # for people
   rampart run --keys keys
-  rampart keys show                               who, until when
-  rampart keys rotate                             new keys for all
-  rampart keys revoke ada                         no longer
+  rampart keys show                               # list certificates and expiry
+  rampart keys rotate                             # replace all
+  rampart keys revoke ada
 """
 
 from __future__ import annotations
@@ -70,43 +69,43 @@ def _names(text: str) -> Option:
     return option("names", nargs="*", metavar="NAME", help=text)
 
 
-_FOLDER = word("--keys", "DIR", f"the folder of keys (default: {DEFAULT})", DEFAULT)
-_DAYS = number("--days", "N", "days until it expires (default: 30 for what runs, 7 for people)")
+_FOLDER = word("--keys", "DIR", f"folder of keys (default: {DEFAULT})", DEFAULT)
+_DAYS = number("--days", "N", "days until expiry (default: 30 for processes, 7 for people)")
 
 
 def add(verbs: Any) -> None:
     """Add the family to the parser."""
-    family = add_family(verbs, "keys", "issue and revoke certificates", __doc__ or "")
-    add_verb(family, "init", "make a folder of keys with an authority", init, _FOLDER,
+    family = add_family(verbs, "keys", "issue and revoke credentials", __doc__ or "")
+    add_verb(family, "init", "create a folder of keys with an authority", init, _FOLDER,
              number("--days", "N", "days until the authority expires (default: 1826)", 1826.0))
     add_verb(family, "issue", "issue certificates", issue,
-             _names("of processes: nodes, modules, supervisor, observer, routers"), _FOLDER,
-             word("--system", "SPEC", "to all processes of this system, a file or the name of a "
-                  "shipped one"),
-             several("--operator", "NAME", "to somebody who may inject, adapt, reset and order; "
+             _names("processes: nodes, modules, supervisor, observer, routers"), _FOLDER,
+             word("--system", "SPEC", "issue to all processes of a system: a file, or the name of "
+                  "a shipped one"),
+             several("--operator", "NAME", "a person who may inject, adapt, reset and order; "
                      "repeatable"),
-             several("--viewer", "NAME", "to somebody who may only look; repeatable"),
+             several("--viewer", "NAME", "a person who may only watch; repeatable"),
              several("--address", "ADDRESS", "IP address or name at which other hosts reach the "
-                     "routers, besides the loopback; repeatable"), _DAYS)
-    add_verb(family, "rotate", "issue new keys to who has some", rotate,
-             _names("of whom (default: all)"), _FOLDER, _DAYS)
-    add_verb(family, "revoke", "let somebody in no more", revoke, _names("of whom"), _FOLDER)
-    add_verb(family, "share", "copy what a host needs", share,
+                     "routers; repeatable"), _DAYS)
+    add_verb(family, "rotate", "replace certificates", rotate,
+             _names("names (default: all)"), _FOLDER, _DAYS)
+    add_verb(family, "revoke", "revoke certificates", revoke, _names("names"), _FOLDER)
+    add_verb(family, "share", "copy the credentials of a host", share,
              option("host", metavar="HOST", help="name of the host"), _FOLDER,
-             option("--system", metavar="SPEC", required=True, help="the system"),
-             option("--to", metavar="DIR", required=True, help="the new folder"),
-             several("--person", "NAME", "the key of an operator or viewer who uses tools there, "
-                     "too; repeatable"))
-    add_verb(family, "show", "who has a certificate, and until when", show,
-             _names("of whom (default: all)"), _FOLDER, JSON)
+             option("--system", metavar="SPEC", required=True,
+                    help="system file, or name of a shipped system"),
+             option("--to", metavar="DIR", required=True, help="new folder"),
+             several("--person", "NAME", "also an operator or viewer who uses tools there; "
+                     "repeatable"))
+    add_verb(family, "show", "list certificates", show,
+             _names("names (default: all)"), _FOLDER, JSON)
 
 
 def init(options: argparse.Namespace) -> int:
     """Make a folder of keys.
 
-    Make a folder of keys, mode 0700, with a new authority. Its private key,
-    authority.key, issues certificates and is needed by no run: keep it where no
-    robot is.
+    Create a folder of keys, mode 0700, with a new authority. Its private key
+    authority.key signs certificates. No run needs it: keep it off the robots.
 
     Examples:
       rampart keys init
@@ -124,8 +123,9 @@ def init(options: argparse.Namespace) -> int:
 def issue(options: argparse.Namespace) -> int:
     """Issue certificates.
 
-    Issue a private key and a certificate to processes and people. Who has one
-    gets another; the one before is good until it expires, or is revoked.
+    Issue a private key and a certificate to processes and people. A new certificate
+    of the same name replaces the old one in the folder, which stays valid until it
+    expires or is revoked.
 
     Examples:
       rampart keys issue --system osmosis
@@ -167,9 +167,10 @@ def issue(options: argparse.Namespace) -> int:
 def rotate(options: argparse.Namespace) -> int:
     """Issue new keys.
 
-    Issue a new private key and certificate to who has some, of all kinds and
-    with the same addresses. A process takes them when it starts the next time:
-    kill-node each, one after the other. The old ones are good until they expire.
+    Issue a new private key and certificate for each name that has some, with the
+    same kind and addresses. A process uses them from its next start: restart the
+    nodes one after the other with `kill-node`. Old certificates stay valid until
+    they expire.
 
     Examples:
       rampart keys rotate
@@ -186,14 +187,14 @@ def rotate(options: argparse.Namespace) -> int:
 def revoke(options: argparse.Namespace) -> int:
     """Let somebody in no more.
 
-    Revoke all certificates of a name. It is in force on a host when
-    register.json is there and its routers were restarted, one after the other:
-    kill-node router_a; kill-node router_b. A name that is issued to again
-    afterwards is another identity to the routers; they are to be restarted for
-    it, too.
+    Revoke all certificates of a name. Then copy register.json to each host, and
+    restart its routers one after the other: this puts the revocation in force. A
+    certificate that is issued to the name later is a new identity, for which the
+    routers must be restarted, too.
 
     Examples:
       rampart keys revoke ada
+      kill-node router_a; kill-node router_b
     """
     if not options.names:
         raise UsageError("revoke: whom? a name is right; `rampart keys show` lists them")
@@ -208,15 +209,14 @@ def revoke(options: argparse.Namespace) -> int:
 def show(options: argparse.Namespace) -> int:
     """Show who has a certificate.
 
-    Show each identity of a folder of keys: its kind, the name in its
-    certificate, until when that is valid, its fingerprint (SHA-256), and what is
-    wrong with it.
+    List each identity of a folder of keys: kind, name in the certificate, expiry,
+    fingerprint (SHA-256), and its problem if it has one.
 
     Examples:
       rampart keys show
       rampart keys show router_a --json
 
-    exit code: 0 all that are shown are valid; 1 one is not; 2 bad usage
+    exit code: 0 all that are listed are valid, 1 one is not, 2 bad usage
     """
     folder, keys = Path(options.keys), _keys()
     with refusing(KeysError), using(folder):
@@ -261,10 +261,10 @@ def _row(entry: Entry, now: dt.datetime) -> dict[str, Any]:
 def share(options: argparse.Namespace) -> int:
     """Copy what a host needs.
 
-    Copy the keys of what may run on a host of a system, the register and the
-    certificate of the authority into a new folder, to be taken there. The first
-    host's has the keys of what others run, too: it takes over from them. The
-    authority's private key stays here.
+    Copy into a new folder the credentials of the processes that may run on a host,
+    the register, and the certificate of the authority. Then copy that folder to the
+    host. The first host gets the credentials of all, because it takes over from
+    others. The authority's private key is not copied.
 
     Examples:
       rampart keys share ground --system my.toml --to ground-keys

@@ -34,18 +34,18 @@ from rampart.files.plain_text import one_line
 
 _EPILOG = """\
 signals:
-  KILL   the process is gone at once (default)
-  STOP   the process stands still, as under a debugger; CONT lets it go on
-  TERM   the process ends in order; its supervisor takes that for a crash all the same
-  SEGV   as if it had touched memory that is not there
-  WEDGE  the process stays, its event loop turns no more (SIGUSR2)
+  KILL   end the process at once (default)
+  STOP   freeze the process; CONT continues it
+  TERM   end the process in order; the supervisor treats this as a crash, too
+  SEGV   crash the process as a memory error does
+  WEDGE  hang the process: it exists, and its event loop is blocked (SIGUSR2)
 
 examples:
-  kill-node osmosis_control                  kill it and watch it come back
-  kill-node localization --signal STOP       only its heartbeat shows that it is gone
-  kill-node --list                           what there is to kill
-In a system of several hosts it reaches, and lists, the nodes of all of them.
-A plain `kill -9 PID` or `pkill -9 -f osmosis_control` does the same.
+  kill-node osmosis_control                  # it is restarted
+  kill-node localization --signal STOP       # it is detected as stopped, and replaced
+  kill-node --list                           # list the nodes
+In a system of several hosts it signals and lists the nodes of all hosts.
+`kill -9 PID` and `pkill -9 -f osmosis_control` also work.
 """
 
 _TABLE_S = 2.0
@@ -113,7 +113,7 @@ async def signal_anywhere(node: str, name: str, port: int | None) -> Signalled:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
     streams.secure()
-    parser = _parser()
+    parser = build_parser()
     completion.complete(parser)
     options = parser.parse_args(arguments)
     act = _list_nodes if options.list else _signal_node
@@ -126,19 +126,20 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog="kill-node", description="Kill, stop or wedge a node of a running robot.",
+        prog="kill-node", description="Kill, stop or hang a node of a running robot.",
         epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
     node: Any = parser.add_argument("node", nargs="?",
-                                    help="name of the node, e.g. osmosis_control")
+                                    help="name of the node, for example osmosis_control")
     node.completer = completion.nodes
     parser.add_argument("--signal", default="KILL", type=str.upper, metavar="SIG",
                         help="KILL (default), STOP, CONT, TERM, SEGV or WEDGE")
     parser.add_argument("--port", type=int, default=os.environ.get("RAMPART_PORT") or None,
-                        help="base port of the run, if there are several (default: RAMPART_PORT "
-                             "of the environment)")
-    parser.add_argument("--list", action="store_true", help="list the nodes of the run(s)")
+                        help="base port of the run, if this machine has several (default: the "
+                             "variable RAMPART_PORT)")
+    parser.add_argument("--list", action="store_true", help="list the nodes of all runs")
     parser.add_argument("--json", action="store_true", help="print JSON")
     return parser
 

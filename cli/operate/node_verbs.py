@@ -1,6 +1,6 @@
 """`rampart status`, `rampart node` and `rampart top`: what runs, and how it is.
 
-Look at the nodes of the run.
+Show the nodes of the run.
 
 Examples:
   rampart node list
@@ -56,24 +56,24 @@ _WAIT_S = 1.5
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    add_verb(verbs, "status", "the run at a glance", status, PORT, JSON)
-    node = add_family(verbs, "node", "the nodes of the run", __doc__)
-    add_verb(node, "list", "all nodes", node_list, PORT, JSON)
-    add_verb(node, "log", "what the command of a node has printed", node_log, PORT,
-             option("name", metavar="NODE", help="a node that is a command",
+    add_verb(verbs, "status", "show robot, manager and nodes in a few lines", status, PORT, JSON)
+    node = add_family(verbs, "node", "show the nodes of the run", __doc__)
+    add_verb(node, "list", "list all nodes", node_list, PORT, JSON)
+    add_verb(node, "log", "print the output of a node's command", node_log, PORT,
+             option("name", metavar="NODE", help="a node with a command",
                     completer=completion.nodes),
-             whole("--lines", "N", "so many lines from its end (default 50)", 50),
-             flag("--follow", "and what it prints from now on, until the run ends"))
-    add_verb(verbs, "top", "the run in the terminal, refreshed four times a second", top, PORT,
+             whole("--lines", "N", "print the last N lines (default: 50)", 50),
+             flag("--follow", "then print new lines until the run ends"))
+    add_verb(verbs, "top", "watch processes, topics and decisions", top, PORT,
              flag("--once", "print one picture and end"),
              flag("--json", "print one picture as JSON and end"),
-             flag("--follow", "wait for a run if there is none, and for the next when one ends"))
+             flag("--follow", "wait for a run, and for the next one after each run"))
 
 
 async def node_list(options: argparse.Namespace) -> int:
     """Print the supervisor's table.
 
-    List the nodes with process id, state, incarnation and restarts.
+    List each node with kind, process id, state, incarnation and number of restarts.
 
     Examples:
       rampart node list
@@ -97,8 +97,8 @@ print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"
 def node_log(options: argparse.Namespace) -> int:
     """Print the output of a command.
 
-    Show what the command of a node has printed, of all its incarnations.
-    Lines that begin with --- are of the process that keeps it.
+    Print the output of a node that is a command, over all its incarnations.
+    Lines that begin with --- come from the process that runs the command.
 
     Examples:
       rampart node log estimator
@@ -161,8 +161,8 @@ def _shown(line: bytes) -> str:
 async def status(options: argparse.Namespace) -> int:
     """Print the state of the run.
 
-    Show the robot, the FTM Manager and the nodes of the run.
-    Whatever the system has and does not answer is shown as silent.
+    Show the robot, the FTM Manager and the nodes of the run. Parts of the system
+    that do not answer are shown as silent.
 
     Examples:
       rampart status
@@ -217,13 +217,14 @@ async def status(options: argparse.Namespace) -> int:
 def top(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     """Show the run.
 
-    Show the robot, mechanisms, decisions, processes and topic rates
-    of the run. Keys: q or Ctrl-C quits, c sorts by CPU, arrows scroll.
-    Processor time is in percent of one core; memory is resident, most of it shared.
+    Show the robot, mechanisms, decisions, processes and topic rates of the run,
+    four times a second. Keys: q or Ctrl-C quits, c sorts by processor time, the
+    arrows scroll. Processor time is in percent of one core. Memory is resident
+    memory, most of which is shared.
 
     Examples:
       rampart top
-      rampart top --follow          stay for the next run
+      rampart top --follow          # stay for the next run
       rampart top --once | less
       NO_COLOR=1 rampart top
       rampart top --json | python3 -m json.tool

@@ -30,8 +30,9 @@ _NODES = 16
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    add_verb(verbs, "reset", "release a latched recovery, e.g. the emergency stop", reset, PORT,
-             option("recovery", metavar="NAME", help="e.g. RM1"))
+    add_verb(verbs, "reset", "release a latched recovery", reset, PORT,
+             option("recovery", metavar="NAME",
+                    help="a recovery module, for example RM1, or another holder"))
     add_verb(verbs, "trigger", "", trigger, PORT,
              option("module", metavar="NAME", help="detection module, e.g. D_LEVEL"),
              option("--for", dest="duration", type=float, default=2.0, metavar="S",
@@ -41,10 +42,10 @@ def add(verbs: Any) -> None:
 async def reset(options: argparse.Namespace) -> int:
     """Release a latched recovery.
 
-    Release a recovery that stays in force until an operator resets it. Nothing
-    happens while its cause is still there; the verb then says so and exits 1.
-    Also lets go of what somebody holds, such as the brake, who is no recovery
-    module of the system; rampart status says who.
+    Release a recovery that stays in force until an operator resets it. While its
+    cause persists it is not released, and the exit code is 1. The verb also ends
+    the hold of a client that is not a recovery module, for example on the brake;
+    `rampart status` lists such holders.
 
     Examples:
       rampart reset RM1

@@ -1,16 +1,16 @@
 """`rampart tokens`: who may use the operator's page, and as what.
 
-Give people tokens of their own for the operator's page, each with a role:
-look sees everything, drive may drive, order missions and reset recoveries,
-inject may also inject faults, kill processes and change the strategy. The file
-keeps who has which role, and of each token a digest alone; a run takes it with
---hmi-token-file, and notices within a second that it has changed.
+Issue personal tokens for the operator's page, each with a role. Role look can only
+watch. Role drive can also drive, order missions and reset recoveries. Role inject
+can also inject faults, kill processes and change the strategy. The file contains
+names, roles and a digest of each token. `rampart run --hmi-token-file` uses it, and
+notices a change within a second.
 
 Examples:
   rampart tokens issue anna --role drive
   rampart tokens show
   rampart tokens revoke anna
-  launch.py --hmi-token-file page.tokens
+  rampart run --hmi-token-file page.tokens
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from rampart.cli.verbs import JSON, add_family, add_verb, option, word
 
 FILE = "page.tokens"
 
-_FILE = word("--file", "FILE", f"where they are kept (default: {FILE})", FILE)
-_NAME = option("name", metavar="NAME", help="who it is: letters, digits, and _ . @ -")
+_FILE = word("--file", "FILE", f"file of the tokens (default: {FILE})", FILE)
+_NAME = option("name", metavar="NAME", help="name of the person: letters, digits, and _ . @ -")
 
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    tokens = add_family(verbs, "tokens", "who may use the operator's page", __doc__)
-    add_verb(tokens, "issue", "make a token for somebody", issue_token, _NAME,
+    tokens = add_family(verbs, "tokens", "issue and revoke tokens for the page", __doc__)
+    add_verb(tokens, "issue", "issue a token", issue_token, _NAME,
              option("--role", metavar="ROLE", required=True, help=", ".join(Role)), _FILE)
-    add_verb(tokens, "show", "who has one", show_tokens, _FILE, JSON)
-    add_verb(tokens, "revoke", "withdraw somebody's token", revoke_token, _NAME, _FILE)
+    add_verb(tokens, "show", "list names and roles", show_tokens, _FILE, JSON)
+    add_verb(tokens, "revoke", "revoke a token", revoke_token, _NAME, _FILE)
 
 
 def issue_token(options: argparse.Namespace) -> int:
     """Print a new token.
 
-    Print a new token for somebody, once: it is kept nowhere. Standard output is
-    the token alone.
+    Issue a token and print it. It is stored nowhere, so it is shown only once.
+    Standard output is the token alone.
 
     Examples:
       rampart tokens issue anna --role drive
@@ -76,7 +76,7 @@ def issue_token(options: argparse.Namespace) -> int:
 def show_tokens(options: argparse.Namespace) -> int:
     """Print who has a token.
 
-    List who has a token, and their roles.
+    List the names that have a token, and their roles.
 
     Examples:
       rampart tokens show
@@ -93,8 +93,8 @@ def show_tokens(options: argparse.Namespace) -> int:
 def revoke_token(options: argparse.Namespace) -> int:
     """Withdraw a token.
 
-    Withdraw somebody's token. A run that takes the file closes their pages
-    within a second.
+    Revoke the token of a name. A run that uses the file closes that person's
+    pages within a second.
 
     Examples:
       rampart tokens revoke anna

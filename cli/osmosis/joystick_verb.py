@@ -46,41 +46,42 @@ _GRANT_S = 3.0
 
 def add(verbs: Any, _formatter: Any, _common: Any) -> None:
     """Add the verb to the parser."""
-    add_verb(verbs, "joystick", "drive from the keyboard, or with a joystick", joystick, PORT,
-             number("--speed", "SHARE", "share of full speed to begin with, 0.1 to 1 (default 0.5)",
+    add_verb(verbs, "joystick", "drive the robot by hand", joystick, PORT,
+             number("--speed", "SHARE", "initial share of full speed, 0.1 to 1 (default: 0.5)",
                     0.5),
              option("--way-out", metavar="REASON",
-                    help="drive a robot that stands in a prohibited area out of it; why"),
+                    help="drive the robot out of a prohibited area, for this reason"),
              option("--device", nargs="?", const=AUTO, metavar="DEVICE",
-                    help="a joystick instead of the keyboard; hold its dead-man button"))
+                    help="use a joystick instead of the keyboard (without DEVICE: the first one)"))
 
 
 async def joystick(options: argparse.Namespace) -> int:
     """Drive by hand until told to stop, or until run or joystick end.
 
-    Drive the robot by the arrow keys, or by u i o j l m , . as ROS users know.
-    Space or k lets go, + and - change the speed, q or Ctrl-C quits.
+    Drive the robot with the arrow keys, or with u i o j l m , . as in ROS. Space
+    or k releases, + and - change the speed, q or Ctrl-C quits.
 
-    The dead man: hold the key. A terminal tells no letting go, so the robot
-    drives while the key repeats and stops within 0.6 s when it does not. If the
-    robot stops once after the first moment, make the keyboard repeat sooner
-    (X11: xset r rate 250).
+    Hold the key to drive. A terminal does not report the release of a key, so the
+    robot stops within 0.6 s after the last repetition. If it stops once after the
+    first moment, shorten the repeat delay of the keyboard (X11: xset r rate 250).
+    With a joystick, hold its dead-man button.
 
-    One stick is followed at a time: who holds first, drives; others are told.
+    The robot obeys one joystick at a time: the first that is held. The others get
+    a notice.
 
-    A robot that stands in a prohibited area keeps its emergency stop. With
-    --way-out it can be driven out of it, at 0.2 m/s at most and only where that
-    leads out. Letting go ends that, and so does the robot when it is out: then
-    rampart reset RM1 releases it. Reason and name are recorded.
+    In a prohibited area the emergency stop stays in force. With --way-out the robot
+    can be driven out, at 0.2 m/s at most and only in directions that lead out. This
+    ends on release, and when the robot is out; `rampart reset RM1` then releases the
+    brake. Reason and name are recorded.
 
     Examples:
       rampart joystick
       rampart joystick --speed 0.2
-      rampart joystick --device            the first joystick plugged in here
+      rampart joystick --device                 # the first joystick of this machine
       rampart joystick --device /dev/input/js1
       rampart joystick --way-out "localization was wrong, the grass is dry"
 
-    exit code: 1 no effect, way out refused, or the robot is not out
+    exit code: 0 driven, 1 no effect, way out refused, or the robot is not out
     """
     if not 0.1 <= options.speed <= 1.0:
         raise UsageError(f"--speed {options.speed:g}: must be between 0.1 and 1")

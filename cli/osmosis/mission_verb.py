@@ -30,36 +30,37 @@ _STATUS_S = 1.0
 def add(verbs: Any, _formatter: Any, _common: Any) -> None:
     """Add the verb to the parser."""
     orders = [action.value for action in m.MissionAction]
-    add_verb(verbs, "mission", "pause, resume, replan, skip, cancel, or drive home", mission, PORT,
-             option("action", metavar="ORDER", choices=orders, help=", ".join(orders)),
-             word("--reason", "TEXT", "why; it is kept and shown with the mission",
+    add_verb(verbs, "mission", "pause, resume or change the mission", mission, PORT,
+             option("action", metavar="ORDER", choices=orders, help="one of the orders below"),
+             word("--reason", "TEXT", "reason, kept and shown with the mission",
                   "no reason given"), JSON)
 
 
 async def mission(options: argparse.Namespace) -> int:
     """Give an order and say what came of it.
 
-    Give the Mission Manager an order, wait for its answer, and say what became
+    Send an order to the Mission Manager, wait for its answer, and print the state
     of the mission.
 
     orders:
       pause   stop, and keep the goal
-      resume  go on with the goal it was paused at
-      replan  drive on, by a way that is planned anew
-      skip    leave the present goal out; the mission cannot succeed any more
-      cancel  give the mission up where the robot is
-      home    give the mission up and drive to where it began
+      resume  continue with the goal
+      replan  continue on a newly planned route
+      skip    leave out the present goal; the mission can no longer succeed
+      cancel  end the mission where the robot is
+      home    end the mission and drive to its start
 
     Examples:
       rampart mission pause --reason "runway in use"
       rampart mission resume
       rampart mission skip --reason "goal 2 is closed"
       rampart mission home --json
-      rampart status                                  what the mission does now
-    An order that makes no sense now is refused, with the reason, e.g. to resume what is not paused.
-    A robot that a recovery holds is not released by `resume`: see rampart reset.
+      rampart status                # show the state of the mission
 
-    exit code: 0 obeyed, 1 refused or not answered, 2 bad usage or no run
+    An order that does not fit the state of the mission is refused with the reason.
+    `resume` does not release a robot that a recovery stops; see `rampart reset`.
+
+    exit code: 0 obeyed, 1 refused or no answer, 2 bad usage or no run
     """
     order = m.MissionOrder(f"rampart-{uuid.uuid4().hex[:10]}", m.MissionAction(options.action),
                          checked_reason(options.reason), OPERATOR)

@@ -1,6 +1,6 @@
 """`rampart obstacle`: what the world does to a run.
 
-Put an obstacle into the simulated world, move it, or take it away.
+Place an obstacle in the simulated world, move it, or remove it.
 
 Examples:
   rampart obstacle list
@@ -31,20 +31,20 @@ _OBSTACLES_PERIOD_S = 1.5
 
 def add(verbs: Any, _formatter: Any, _common: Any) -> None:
     """Add the verbs to the parser."""
-    family = add_family(verbs, "obstacle", "put obstacles in the robot's way", __doc__)
-    name = option("name", metavar="NAME")
-    add_verb(family, "add", "make an obstacle appear", obstacle_add, PORT, name,
+    family = add_family(verbs, "obstacle", "place obstacles in the simulated world", __doc__)
+    name = option("name", metavar="NAME", help="name of the obstacle")
+    add_verb(family, "add", "place or move an obstacle", obstacle_add, PORT, name,
              option("x", type=float, metavar="X", help="east, m"),
              option("y", type=float, metavar="Y", help="north, m"),
-             number("--radius", "M", "default 0.4 m", 0.4))
-    add_verb(family, "remove", "take an obstacle away", obstacle_remove, PORT, name)
-    add_verb(family, "list", "the obstacles there are", obstacle_list, PORT, JSON)
+             number("--radius", "M", "radius, m (default: 0.4)", 0.4))
+    add_verb(family, "remove", "remove an obstacle", obstacle_remove, PORT, name)
+    add_verb(family, "list", "list the obstacles", obstacle_list, PORT, JSON)
 
 
 async def obstacle_list(options: argparse.Namespace) -> int:
     """Print the obstacles.
 
-    List the obstacles that are there now.
+    List the obstacles with place and radius.
 
     Examples:
       rampart obstacle list --json
@@ -63,7 +63,7 @@ async def obstacle_list(options: argparse.Namespace) -> int:
 async def obstacle_add(options: argparse.Namespace) -> int:
     """Make an obstacle appear, or move it.
 
-    Make an obstacle appear at (X, Y) of the map frame, metres, or move it there.
+    Place an obstacle at (X, Y) of the map frame, in metres, or move it there.
 
     Examples:
       rampart obstacle add crate 5 -18.5 --radius 0.4
@@ -90,7 +90,7 @@ async def obstacle_add(options: argparse.Namespace) -> int:
 async def obstacle_remove(options: argparse.Namespace) -> int:
     """Take an obstacle away.
 
-    Take an obstacle away.
+    Remove an obstacle from the world.
 
     Examples:
       rampart obstacle remove crate

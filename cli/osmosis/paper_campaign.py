@@ -35,10 +35,10 @@ class PaperCampaign(NamedCampaign):
     def add(cls, group: Any) -> None:
         """Add `--paper` and `--full`."""
         group.add_argument("--paper", action="store_true",
-                           help="tables III, IV and V of the paper")
+                           help="make tables III, IV and V of the paper")
         group.add_argument("--full", action="store_true",
-                           help="with --paper: the runs of table V on the full system instead, "
-                           "each of which is to end in success, safe")
+                           help="with --paper: make the runs of table V on the full system, "
+                           "and expect each to succeed and be safe")
 
     @classmethod
     def chosen(cls, options: argparse.Namespace) -> Self | None:

@@ -1,7 +1,7 @@
 """`rampart record`, `rampart replay` and `rampart bag`: recordings, and how to mend a torn one.
 
-Look at recordings: MCAP files of `launch.py --record`, `rampart record`, or
-others.
+Inspect recordings: MCAP files of `rampart run --record`, of `rampart record`, or
+of other programs.
 
 Examples:
   rampart bag info run.mcap
@@ -68,49 +68,54 @@ _PORTS = (1024, 65535)
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     topics: dict[str, Any] = {"metavar": "GLOB", "nargs": "+", "action": "extend", "default": []}
-    add_verb(verbs, "record", "record a run that is there", record, PORT,
+    add_verb(verbs, "record", "record the run", record, PORT,
              option("file", metavar="FILE", nargs="?",
                     help="MCAP file (default: rampart-TIME.mcap)"),
              option("--topics", **topics,
-                    help="only keys that match one, as in `rampart topic list`"),
+                    help="record only keys that match a pattern"),
              number("--duration", "S", "end after S real seconds"),
-             flag("--overwrite", "FILE may exist"))
-    add_verb(verbs, "replay", "play a recording back", replay, option("file", metavar="FILE"),
+             flag("--overwrite", "replace FILE if it exists"))
+    add_verb(verbs, "replay", "play back a recording", replay,
+             option("file", metavar="FILE", help="MCAP file"),
              number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
-             flag("--loop", "begin anew at the end; each lap is a later life of every node"),
-             option("--topics", **topics, help="only keys that match one"),
-             number("--start", "S", "begin at simulated second S of the run"),
-             number("--delay", "S", "real seconds before the first message, for readers to come",
-                    0.0),
-             whole("--hmi-port", "PORT", "show the operator's page, on this port of loopback", 0),
-             whole("--port", "N", f"Zenoh port of the replay (default: {DEFAULT_PORT})",
+             flag("--loop", "start again at the end; each pass has higher incarnations"),
+             option("--topics", **topics, help="play only keys that match a pattern"),
+             number("--start", "S", "start at simulated second S of the run"),
+             number("--delay", "S",
+                    "real seconds before the first message, so that readers can connect", 0.0),
+             whole("--hmi-port", "PORT", "serve the operator's page on this port of 127.0.0.1", 0),
+             whole("--port", "N", f"base port of the replay (default: {DEFAULT_PORT})",
                    DEFAULT_PORT))
-    bag = add_family(verbs, "bag", "what is in a recording (needs no run)", __doc__)
-    add_verb(bag, "info", "duration, run, channels, whether it is whole", bag_info,
-             option("file", metavar="FILE"), JSON)
-    add_verb(bag, "repair", "write what can be read into a whole file", bag_repair,
-             option("file", metavar="IN"), option("out", metavar="OUT"),
-             flag("--overwrite", "OUT may exist"))
-    add_verb(bag, "export", "write it as tables, CSV or Parquet", bag_export,
-             option("file", metavar="IN"),
-             option("out", metavar="FOLDER", nargs="?", help="default: IN without its suffix"),
-             option("--to", choices=("csv", "parquet"), default="csv", help="default: csv"),
-             option("--topics", **topics, help="only channels that match one"), JSON)
-    add_verb(bag, "ros2", "write it as a bag of ROS 2", bag_ros2,
-             option("file", metavar="IN"), option("out", metavar="FOLDER"),
-             option("--system", metavar="SPEC", help="file, or name of a shipped system, whose "
-                    "actors and definitions count (default: what the recording has of its own)"),
-             option("--distribution", metavar="NAME", help="of ROS 2 (default: the gateway's, or "
-                    "jazzy)"),
+    bag = add_family(verbs, "bag", "inspect a recording; needs no run", __doc__)
+    add_verb(bag, "info", "show run, duration, channels and damage", bag_info,
+             option("file", metavar="FILE", help="MCAP file"), JSON)
+    add_verb(bag, "repair", "copy the readable part into a new file", bag_repair,
+             option("file", metavar="IN", help="MCAP file"),
+             option("out", metavar="OUT", help="new file"),
+             flag("--overwrite", "replace OUT if it exists"))
+    add_verb(bag, "export", "write tables in CSV or Parquet", bag_export,
+             option("file", metavar="IN", help="MCAP file"),
+             option("out", metavar="FOLDER", nargs="?",
+                    help="new folder (default: IN without its suffix)"),
+             option("--to", choices=("csv", "parquet"), default="csv",
+                    help="format (default: csv)"),
+             option("--topics", **topics, help="write only channels that match a pattern"), JSON)
+    add_verb(bag, "ros2", "convert to a bag of ROS 2", bag_ros2,
+             option("file", metavar="IN", help="MCAP file"),
+             option("out", metavar="FOLDER", help="new folder"),
+             option("--system", metavar="SPEC", help="system file, or name of a shipped system, "
+                    "with actors and definitions (default: those in the recording)"),
+             option("--distribution", metavar="NAME", help="distribution of ROS 2 (default: the "
+                    "gateway's, or jazzy)"),
              JSON)
 
 
 def record(options: argparse.Namespace) -> int:
     """Record a run.
 
-    Record everything that is sent in a run, from now until ctrl-C, the end of
-    the run, or --duration. `launch.py --record FILE` records from the first
-    message on. The robot does not wait for the recorder, whatever becomes of it.
+    Record all messages of a run from now until Ctrl-C, the end of the run, or
+    --duration. `rampart run --record FILE` records from the first message on.
+    The robot never waits for the recorder.
 
     Examples:
       rampart record
@@ -141,9 +146,9 @@ def record(options: argparse.Namespace) -> int:
 async def replay(options: argparse.Namespace) -> int:
     """Play a recording back.
 
-    Play a recording back onto a bus of its own. Tools find it like a run
-    (`rampart topic echo`, `rampart status`), with --port if a robot runs too;
-    orders are refused, and nothing of it reaches a robot.
+    Play back a recording on a separate bus. Tools such as `rampart topic echo` and
+    `rampart status` find it like a run; use --port if a robot runs, too. Orders
+    are refused, and no message of the recording reaches a robot.
 
     Examples:
       rampart replay run.mcap --hmi-port 8090
@@ -240,13 +245,14 @@ def _check(options: argparse.Namespace) -> None:
 def bag_info(options: argparse.Namespace) -> int:
     """Print what is in a file.
 
-    Show duration, size, what was run, and each channel with messages and rate.
-    A file that was never closed, or is cut off, is read as far as it goes. The
-    exit code is 1 if something in it cannot be read.
+    Show size, run and duration, and each channel with its messages and rate. An
+    incomplete file is read as far as possible.
 
     Examples:
       rampart bag info run.mcap
       rampart bag info run.mcap --json
+
+    exit code: 0 all was read, 1 a part cannot be read, 2 bad usage
     """
     with refusing(BagError):
         summary = Summary(BagReader(Path(options.file)))
@@ -303,12 +309,13 @@ def _lines(summary: Summary) -> Iterator[tuple[str, str]]:
 def bag_repair(options: argparse.Namespace) -> int:
     """Write a whole file.
 
-    Copy everything that can be read of a torn file into a new one with an
-    index, for viewers that insist on it. The old one stays as it is. The exit
-    code is 1 if something was left behind.
+    Copy the readable part of an incomplete file into a new file with an index,
+    which some viewers require. The old file is not changed.
 
     Examples:
       rampart bag repair torn.mcap whole.mcap
+
+    exit code: 0 all was copied, 1 a part was lost, 2 bad usage
     """
     with refusing(BagError):
         reader = BagReader(Path(options.file))
@@ -322,15 +329,16 @@ def bag_repair(options: argparse.Namespace) -> int:
 def bag_export(options: argparse.Namespace) -> int:
     """Write a recording as tables.
 
-    One file per topic in a new folder, one row per message: CSV, or Parquet with
-    the extra `export`. The first column is simulated time; the others are the
-    fields of the message, such as body.x_m. Without --topics the channels for
-    viewers (view/…) are left out. The exit code is 1 if the recording is damaged
-    and something of it was left behind.
+    Write one file per topic into a new folder, with one row per message. Format is
+    CSV, or Parquet with the extra: pip install 'rampart-robot[export]'. The first
+    column is simulated time; the others are the fields of the message, such as
+    body.x_m. Channels for viewers (view/…) are written only with --topics.
 
     Examples:
       rampart bag export run.mcap
       rampart bag export run.mcap tables --to parquet --topics 'localization/*'
+
+    exit code: 0 all was written, 1 a damaged part was left out, 2 bad usage
     """
     path = Path(options.file)
     folder = Path(options.out or path.with_suffix(""))
@@ -347,15 +355,16 @@ def bag_export(options: argparse.Namespace) -> int:
 def bag_ros2(options: argparse.Namespace) -> int:
     """Write a recording as a bag of ROS 2.
 
-    A new folder with MCAP, cdr and ros2msg, as `ros2 bag record` makes it: for
-    `ros2 bag play`, RViz, PlotJuggler. It has what passed a gateway to ROS 2, byte
-    for byte; every topic of the run below /rampart, in types of their own; and
-    what viewers see: /tf, /rosout, /view/scan, /view/map. The exit code is 1 if
-    the recording is damaged and something of it was left behind.
+    Write a recording as a bag folder (MCAP, cdr, ros2msg) for `ros2 bag play`,
+    RViz and PlotJuggler. It contains the messages that passed a gateway, byte for
+    byte; all topics of the run below /rampart, with generated types; and topics
+    for viewers: /tf, /rosout, /view/scan, /view/map.
 
     Examples:
       rampart bag ros2 run.mcap run-ros2
       rampart bag ros2 run.mcap run-ros2 --system warehouse.toml
+
+    exit code: 0 all was written, 1 a damaged part was left out, 2 bad usage
     """
     extra("ros2", "rosbags")
     extra("ros2", "xxhash")
