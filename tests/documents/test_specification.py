@@ -59,40 +59,47 @@ def test_every_field_is_described(table):
 
 
 def toml(value: object) -> str:
-    """A default as the document writes it; "" if it is none, or derived."""
+    """A default as the document writes it; "" if it has no value, is derived, or a table."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):
         return "" if math.isnan(value) else f"{value:g}"
     if isinstance(value, str):
         return json.dumps(value)
-    return "" if value is None else "{}" if value == {} else "[]"
+    if value is None or isinstance(value, msgspec.Struct):
+        return ""
+    return "{}" if value == {} else "[]"
 
 
-@pytest.mark.parametrize(("heading", "table", "also"), [
-    ("Top level", SystemSpec, set()), ("`[robot]`", Robot, set()),
-    ("`[timing]`", Timing, set()), ("`[end]`", End, set()),
-    ("`[layers]`", Layers, set()), ("`[supervision]`", Supervision, set()),
-    ("`[[host]]`", HostSpec, set()), ("`[link]`", Link, set()), ("`[[node]]`", NodeSpec, set()),
-    ("`[[detection]]`", DetectionSpec, {"within_s"}), ("`[[recovery]]`", RecoverySpec, set()),
-    ("`[[mechanism]]`", MechanismSpec, set()), ("`[[event]]`", EventSpec, {"gate"}),
-    ("`[[fault]]`", FaultSpec, set())])
-def test_what_is_required_and_what_is_the_default_are_as_in_the_code(heading, table, also):
-    section = DOCUMENT.partition("### What has to be there\n")[2].partition("\n### ")[0]
-    text = " ".join(re.findall(rf"^- {re.escape(heading)}: (.*?)(?=^- |\Z)", section,
-                               re.DOTALL | re.MULTILINE)[0].split())
-    required, _, other = text.partition(" Else: ")
-    fields = {f.encode_name: f for f in msgspec.structs.fields(table)}
-    assert set(re.findall(r"`(\w+)`", required)) - {"of"} == {
-        name for name, field in fields.items() if field.required} | also
-    for name in fields.keys() - also:
-        field = fields[name]
+def section_of(heading: str) -> str:
+    """The text below a heading, up to the next one of its level or above."""
+    return re.split(r"^###? ", DOCUMENT.partition(f"### {heading}\n")[2], maxsplit=1,
+                    flags=re.MULTILINE)[0]
+
+
+@pytest.mark.parametrize(("heading", "tables"), [
+    ("Top level", (SystemSpec,)), ("`[end]`", (End,)), ("`[robot]`", (Robot,)),
+    ("`[timing]`", (Timing,)), ("`[layers]`", (Layers,)), ("`[supervision]`", (Supervision,)),
+    ("`[[host]]` and `[link]` (optional)", (HostSpec, Link)), ("`[[node]]`", (NodeSpec,)),
+    ("`[[detection]]`", (DetectionSpec,)), ("`[[recovery]]`", (RecoverySpec,)),
+    ("`[[mechanism]]`", (MechanismSpec,)), ("`[[event]]`", (EventSpec,)),
+    ("`[[fault]]`", (FaultSpec,)), ("`[[ros2]]`", (Ros2Link,))])
+def test_the_table_has_every_field_with_its_default(heading, tables):
+    rows = {name: default
+            for names, default in re.findall(r"^\| (`\w+`(?:, `\w+`)*) \| ([^|]+) \| ",
+                                             section_of(heading), re.MULTILINE)
+            for name in re.findall(r"\w+", names)}
+    fields = {f.encode_name: f for table in tables for f in msgspec.structs.fields(table)}
+    assert rows.keys() == fields.keys()
+    for name, field in fields.items():
         if field.required:
+            assert rows[name] == "required", name
             continue
         default = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
-        written = "" if isinstance(default, msgspec.Struct) else toml(default)
-        listed = isinstance(default, tuple | dict) and table is SystemSpec  # arrays of tables
-        assert (f"`{name}`" if listed or not written else f"`{name} = {written}`") in other
+        written = toml(default)
+        if tables == (SystemSpec,) and isinstance(default, tuple | dict):  # tables
+            written = ""
+        assert rows[name] == f"`{written}`" if written else "`" not in rows[name], name
 
 
 def test_the_least_that_is_a_system_is_what_the_document_says():
