@@ -38,7 +38,7 @@ def words(line: str) -> list[str]:
 def test_a_command_is_accepted(page, line):
     program, *arguments = words(line)
     if program == "kill-node":
-        kill_node._parser().parse_args(arguments)
+        kill_node.build_parser().parse_args(arguments)
     elif program == "rampart":
         build_parser().parse_args(arguments)
     elif program == "python":
