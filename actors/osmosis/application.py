@@ -51,6 +51,7 @@ class Osmosis(Application):
     topics = topics.ROBOT
     views = "rampart.actors.osmosis.recording.views:OsmosisViews"
     lines = "rampart.cli.osmosis.lines:OsmosisLines"
+    model = "rampart.sim.osmosis.camera:AirportModel"
     faults = "rampart.sim.osmosis.trial.faults:OsmosisFaults"
     observer = "rampart.sim.osmosis.trial.injector:OsmosisObserver"
     trial = "rampart.sim.osmosis.trial.mission_trial:MissionTrial"

@@ -30,6 +30,7 @@ class Application:
         topics: what its actors publish and hear besides the engine's topics.
         views: class that translates them for viewers, as `module:Class`, derived from this one.
         lines: class that tells of them in `rampart status`, `top` and `metrics`, likewise.
+        model: class path of its `RobotModel`, which replays show; "" if it has none in MuJoCo.
         faults: class path of its `Faults`; "" if it has none of its own.
         observer: class path of who hears a run for judge and report.
         examples: of the command line, for its help: options, and what they do.
@@ -54,6 +55,7 @@ class Application:
     topics: ClassVar[tuple[Topic[Any], ...]] = ()
     views: ClassVar[str] = ROLES["views"]
     lines: ClassVar[str] = ROLES["lines"]
+    model: ClassVar[str] = ""
     faults: ClassVar[str] = ""
     observer: ClassVar[str] = ROLES["observer"]
     trial: ClassVar[str] = ""

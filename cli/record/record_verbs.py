@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import fnmatch
 import shutil
 import time
@@ -42,11 +43,13 @@ from rampart.cli.output import (
     positive,
     print_json,
     print_table,
+    progress,
     refusing,
     say,
 )
 from rampart.cli.record.export import Export
-from rampart.cli.record.replaying import DEFAULT_PORT, Replay
+from rampart.cli.record.film import FRAMES_HZ, Stage, Viewer, film
+from rampart.cli.record.replaying import DEFAULT_PORT, RecordedRun, Replay
 from rampart.cli.session import tools_credentials
 from rampart.cli.verbs import (
     JSON,
@@ -58,6 +61,7 @@ from rampart.cli.verbs import (
     number,
     option,
     whole,
+    word,
 )
 from rampart.files import working_folder
 from rampart.files.plain_text import one_line
@@ -84,6 +88,9 @@ def add(verbs: Any) -> None:
              number("--delay", "S",
                     "real seconds before the first message, so that readers can connect", 0.0),
              whole("--hmi-port", "PORT", "serve the operator's page on this port of 127.0.0.1", 0),
+             flag("--viewer", "show the robot in MuJoCo's viewer"),
+             word("--video", "FILE.mp4", "write a video of the robot in MuJoCo instead of playing; "
+                  "needs the extra `video`"),
              whole("--port", "N", f"base port of the replay (default: {DEFAULT_PORT})",
                    DEFAULT_PORT))
     bag = add_family(verbs, "bag", "inspect a recording; needs no run", __doc__)
@@ -149,31 +156,56 @@ async def replay(options: argparse.Namespace) -> int:
     Play back a recording on a separate bus. Tools such as `rampart topic echo` and
     `rampart status` find it like a run; use --port if a robot runs, too. Orders
     are refused, and no message of the recording reaches a robot.
+    A robot with a model in MuJoCo is shown in its viewer, or filmed without a bus:
+    --rate is the simulated seconds per second of the video.
 
     Examples:
       rampart replay run.mcap --hmi-port 8090
+      rampart replay run.mcap --viewer
+      rampart replay run.mcap --video run.mp4 --rate 4
       rampart replay run.mcap --rate 4 --start 60 --loop
       rampart replay run.mcap --topics 'manager/*' --delay 2
     """
     _check(options)
-    with refusing(BagError):
+    stop = asyncio.Event()
+    with refusing(BagError), stopped_by_signals(stop):
         path = Path(options.file)
         known = Summary(BagReader(path)).keys if options.topics else ()
-        player = Replay(path, port=options.port, rate=options.rate, loop=options.loop,
-                        start_s=options.start, hmi_port=options.hmi_port, said=say,
-                        wants=matcher(options.topics, known))
-    stop = asyncio.Event()
-    with stopped_by_signals(stop):
+        chosen: dict[str, Any] = {"start_s": options.start, "loop": options.loop,
+                                  "wants": matcher(options.topics, known)}
+        if options.video:
+            return await _film(RecordedRun(path, **chosen), options, stop)
+        player = Replay(path, port=options.port, rate=options.rate, hmi_port=options.hmi_port,
+                        said=say, **chosen)
         if player.summary.reader.damage:
             say(f"{options.file}: damaged ({player.summary.reader.damage}); playing what is left")
-        page = f", page http://127.0.0.1:{options.hmi_port}/" if options.hmi_port else ""
-        say(f"playing {options.file} on port {options.port} at rate {options.rate:g}{page}; "
-            "ctrl-C ends it")
-        await player.run(stop, options.delay)
+        with contextlib.ExitStack() as stack:
+            if options.viewer:
+                viewer = stack.enter_context(contextlib.closing(Viewer(Stage(player))))
+                player.viewer = viewer.take
+            page = f", page http://127.0.0.1:{options.hmi_port}/" if options.hmi_port else ""
+            say(f"playing {options.file} on port {options.port} at rate {options.rate:g}{page}; "
+                "ctrl-C ends it")
+            await player.run(stop, options.delay)
     refused = f", {player.refused} of another version left out" if player.refused else ""
     say(f"played {player.played} messages{refused}")
     if not player.played:
         raise NoEffectError("nothing was played")
+    return 0
+
+
+async def _film(run: RecordedRun, options: argparse.Namespace, stop: asyncio.Event) -> int:
+    """Write a video of a recording, and return the exit code."""
+    frames = 0
+    with progress() as show, contextlib.closing(
+            film(run, Path(options.video), options.rate)) as written:
+        for at_s in written:
+            frames += 1
+            show(f"{options.video}: {at_s:.1f} s of simulated time")
+            await asyncio.sleep(0)
+            if stop.is_set():
+                raise NoEffectError(f"{options.video}: interrupted, not written")
+    say(f"{options.video}: {frames} frames, {frames / FRAMES_HZ:.1f} s")
     return 0
 
 
@@ -235,6 +267,9 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError(f"--delay {options.delay:g}: must not be negative")
     if options.start is not None and not -1e9 < options.start < 1e9:
         raise UsageError(f"--start {options.start:g}: must be a time of the run in seconds")
+    if options.video and (options.loop or options.viewer or options.hmi_port):
+        raise UsageError(f"--video {options.video}: plays nothing; expected no --loop, --viewer or "
+                         "--hmi-port")
     between("--port", options.port, *_PORTS)
     between("--hmi-port", options.hmi_port or _PORTS[0], *_PORTS)
     if options.hmi_port == options.port:

@@ -16,8 +16,9 @@ import tempfile
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import tomli_w
@@ -56,12 +57,18 @@ GAP_S = 0.1
 """Simulated seconds between two laps."""
 
 _STRANGE: Topic[Any] = Topic("", Message, Qos.SENSOR, 0, "", "What was recorded on no topic's key.")
-_Due = tuple[int, float, str, bytes]
-"""Lap, simulated time, key, and payload as it was recorded."""
-
 _BEFORE_0_7 = re.compile(r"0\.[0-6]\b")
 _YIELD_EVERY = 50
 _LINGER_S = 0.3
+
+
+class Due(NamedTuple):
+    """A message to be played: in which lap, at which simulated time, and as it was recorded."""
+
+    lap: int
+    at_s: float
+    key: str
+    payload: bytes
 
 
 class ReplayPage(Hmi):
@@ -74,55 +81,98 @@ class ReplayPage(Hmi):
         """Measure nothing: the recorded process numbers may be anybody's today."""
 
 
-class Replay:
-    """One recording played back. Use: `run`, once.
+class RecordedRun:
+    """A recording of a run, as far as it is to be played.
 
     Args:
         path: of the recording.
-        port: number under which tools find it.
-        rate: simulated seconds per second.
-        loop: begin anew at the end.
+        loop: begin again at the end.
         start_s: simulated time at which to begin; None for the beginning.
-        wants: says of a full key whether it is played.
-        hmi_port: port of an operator's page; 0 for none.
-        said: told, in a line, what happens.
+        wants: whether a full key is played.
+
+    Attributes:
+        summary: of the recording.
+        known: its system.
+        refused: messages of another version, which are not played.
 
     Raises:
         BagError: the file cannot be read.
-        UsageError: it is no recording of a run, or there is nothing to play.
+        UsageError: it is not a recording of a run, or there is nothing to play.
     """
 
-    def __init__(self, path: Path, *, port: int = DEFAULT_PORT, rate: float = 1.0,
-                 loop: bool = False, start_s: float | None = None,
-                 wants: Callable[[str], bool] = lambda _key: True, hmi_port: int = 0,
-                 said: Callable[[str], None] = lambda _line: None) -> None:
+    def __init__(self, path: Path, *, loop: bool = False, start_s: float | None = None,
+                 wants: Callable[[str], bool] = lambda _key: True) -> None:
         self.summary = summary = Summary(BagReader(path))
-        self._document, self._known = recorded_system(summary)
-        self._forms = Forms(self._known.topics)
-        self.played = 0
+        self.document, self.known = recorded_system(summary)
+        self.forms = Forms(self.known.topics)
         self.refused = 0
         self._path = path
-        self._port = port
-        self._rate = rate
         self._loop = loop
         self._wants = wants
-        self._hmi_port = hmi_port
-        self._said = said
-        self._sockets = ""
-        self._lives: dict[str, int] = {}
         if not summary.reader.is_recording:
             raise UsageError(f"{path}: an MCAP file of {summary.reader.library or 'others'}, not a "
                              "recording of a run: nothing in it can be played onto the bus")
         if not any(wants(key) for key in summary.keys) or summary.first_ns is None:
             raise UsageError(f"{path}: no message to play")
-        zero_s = summary.time_zero_s
-        self._first_s = summary.first_ns / 1e9 + zero_s
-        self._last_s = summary.last_ns / 1e9 + zero_s
-        self._lap_s = self._last_s - self._first_s + GAP_S
-        self._start_s = self._first_s if start_s is None else max(start_s, self._first_s)
-        if self._start_s > self._last_s:
-            raise UsageError(f"--start {start_s:g}: the recording goes from {self._first_s:.1f} to "
-                             f"{self._last_s:.1f} simulated seconds")
+        first_s = summary.first_ns / 1e9 + summary.time_zero_s
+        last_s = summary.last_ns / 1e9 + summary.time_zero_s
+        self._lap_s = last_s - first_s + GAP_S
+        self._start_s = first_s if start_s is None else max(start_s, first_s)
+        if self._start_s > last_s:
+            raise UsageError(f"--start {start_s:g}: the recording goes from {first_s:.1f} to "
+                             f"{last_s:.1f} simulated seconds")
+
+    def messages(self) -> Iterator[Due | None]:
+        """Yield what is to be played, lap by lap; None for each message that is not."""
+        zero_s = self.summary.time_zero_s
+        reader = BagReader(self._path)  # the summary's is asked for its channels meanwhile
+        for lap in count() if self._loop else range(1):
+            is_empty = True
+            for channel, message in reader.messages():
+                at_s = message.log_time / 1e9 + zero_s + lap * self._lap_s
+                key, payload = key_of(channel), None
+                if key is not None and at_s >= self._start_s and self._wants(key):
+                    try:
+                        payload = self.forms.of(key).payload(message.data)
+                    except (ValueError, RecursionError):  # of another version of this program
+                        self.refused += 1
+                is_empty &= payload is None
+                yield None if key is None or payload is None else Due(lap, at_s, key, payload)
+            if lap and is_empty:  # in the first lap all may lie before the start
+                return
+
+
+class Replay(RecordedRun):
+    """A recorded run that is played back onto a bus. Use: `run`, once.
+
+    Args:
+        path: of the recording.
+        port: number under which tools find it.
+        rate: simulated seconds per second.
+        hmi_port: port of an operator's page; 0 for none.
+        said: told, in a line, what happens.
+        chosen: as of `RecordedRun`.
+
+    Attributes:
+        viewer: takes key and payload of what is played, and returns whether to go on.
+
+    Raises:
+        BagError: as of `RecordedRun`.
+        UsageError: as of `RecordedRun`, or a port is taken.
+    """
+
+    def __init__(self, path: Path, *, port: int = DEFAULT_PORT, rate: float = 1.0,
+                 hmi_port: int = 0,
+                 said: Callable[[str], None] = lambda _line: None, **chosen: Any) -> None:
+        super().__init__(path, **chosen)
+        self.played = 0
+        self._port = port
+        self._rate = rate
+        self._hmi_port = hmi_port
+        self.viewer: Callable[[str, bytes], bool] = lambda _key, _payload: True
+        self._said = said
+        self._sockets = ""
+        self._lives: dict[str, int] = {}
         claim_port(port)
         if hmi_port:
             try:
@@ -141,16 +191,20 @@ class Replay:
         Raises:
             UsageError: the number is taken, or there is no place for a socket.
         """
-        async with contextlib.aclosing(self._messages(stop)) as messages:
+        async with contextlib.aclosing(self._until_stopped(stop)) as messages:
             due = await anext(messages, None)  # may lie deep in the file: no clock runs yet
             clock = Clock(time.monotonic() + delay_s - self._start_s / self._rate, self._rate)
             async with self._on_the_bus(clock) as (bus, page):
-                while due and await _until(clock.source_time(due[1]), stop):
-                    self._send(bus, *due)
+                while due and await _until(clock.source_time(due.at_s), stop):
+                    self._send(bus, due)
+                    if not self.viewer(due.key, due.payload):
+                        stop.set()
                     due = await anext(messages, None)
                 if page and not page.done() and not stop.is_set():
                     self._said("the recording is over; the page stays, ctrl-C ends it")
-                    await stop.wait()
+                    stopped = asyncio.create_task(stop.wait())
+                    await asyncio.wait((page, stopped), return_when=asyncio.FIRST_COMPLETED)
+                    stopped.cancel()
                 await asyncio.sleep(_LINGER_S)  # what was sent last is still under way
 
     @contextlib.asynccontextmanager
@@ -184,42 +238,27 @@ class Replay:
 
     # -- playing --------------------------------------------------------------------------------
 
-    async def _messages(self, stop: asyncio.Event) -> AsyncGenerator[_Due, None]:
-        """Yield what is to be played, lap by lap, until `stop`; others get their turn meanwhile."""
-        zero_s = self.summary.time_zero_s
-        reader = BagReader(self._path)  # the summary's is asked for its channels meanwhile
-        lap, found = 0, True
-        while found:
-            found = self._loop and lap == 0  # what comes before the start is for later laps
-            for number, (channel, message) in enumerate(reader.messages()):
-                if number % _YIELD_EVERY == 0:
-                    await asyncio.sleep(0)
-                if stop.is_set():
-                    return
-                at_s = message.log_time / 1e9 + zero_s + lap * self._lap_s
-                key = key_of(channel)
-                if at_s < self._start_s or key is None or not self._wants(key):
-                    continue
-                try:
-                    payload = self._forms.of(key).payload(message.data)
-                except (ValueError, RecursionError):  # of another version of this program
-                    self.refused += 1
-                    continue
-                found = self._loop
-                yield lap, at_s, key, payload
-            lap += 1
+    async def _until_stopped(self, stop: asyncio.Event) -> AsyncGenerator[Due, None]:
+        """Yield what is to be played, until `stop`; other tasks get their turn meanwhile."""
+        for number, due in enumerate(self.messages()):
+            if number % _YIELD_EVERY == 0:
+                await asyncio.sleep(0)
+            if stop.is_set():
+                return
+            if due is not None:
+                yield due
 
-    def _send(self, bus: ZenohBus, lap: int, _at_s: float, key: str, payload: bytes) -> None:
-        """Send a message; in later laps as of later lives, or readers would take it for a copy."""
-        if self._loop:
-            header = header_of(payload)
-            if header is not None and lap == 0:
-                self._lives[header.source] = max(
-                    header.incarnation, self._lives.get(header.source, 0))
-            elif header is not None:
-                lives = lap * self._lives.get(header.source, header.incarnation)
-                payload = renumbered(payload, lives, lap * self._lap_s)
-        bus.publish(self._forms.of(key).topic or _STRANGE, key, payload)
+    def _send(self, bus: ZenohBus, due: Due) -> None:
+        """Send a message; in later laps as of later incarnations, or readers drop it as a copy."""
+        payload = due.payload
+        header = header_of(payload) if self._loop else None
+        if header is not None and due.lap == 0:
+            self._lives[header.source] = max(
+                header.incarnation, self._lives.get(header.source, 0))
+        elif header is not None:
+            lives = due.lap * self._lives.get(header.source, header.incarnation)
+            payload = renumbered(payload, lives, due.lap * self._lap_s)
+        bus.publish(self.forms.of(due.key).topic or _STRANGE, due.key, payload)
         self.played += 1
 
     def _page_ended(self, page: asyncio.Task[None]) -> None:
@@ -257,8 +296,8 @@ class Replay:
             head = topics.HEARTBEAT.at("")
             nodes = [key.removeprefix(head) for key in self.summary.keys if key.startswith(head)]
         system = folder / SYSTEM
-        if self._document:
-            system.write_text(tomli_w.dumps(self._document), encoding="utf-8")
+        if self.document:
+            system.write_text(tomli_w.dumps(self.document), encoding="utf-8")
         page = f"http://127.0.0.1:{self._hmi_port}/" if self._hmi_port else ""
         told = {name: value for name, value in run.items() if name not in NOT_CHOSEN}
         return run_info.RunInfo(
@@ -272,11 +311,11 @@ class Replay:
         if not self._hmi_port:
             return None
         run = RunContext(RunPlan(f"replay of {self._path.name}", page=PagePlan(self._hmi_port)),
-                         self._known.system, self._document)
+                         self.known.system, self.document)
         with contextlib.suppress(ValueError, OSError):  # a page without a map shows the rest
             restore(self.summary.files, folder)
-            run = replace(run, application=self._known.kind.restored(folder))
-        kind = page_of(self._known)
+            run = replace(run, application=self.known.kind.restored(folder))
+        kind = page_of(self.known)
         panels: tuple[Panel, ...] = kind.panels
         with contextlib.suppress(ValueError):  # panels of another version
             panels = kind.given(PAGE, run.system, SYSTEM)["panels"]
@@ -284,7 +323,7 @@ class Replay:
         return page(Context(
             PAGE, 1, clock, shared(bus), {"panels": tuple(
                 panel for panel in panels if not panel.stick)}, run,
-            topics={topic.key: topic for topic in self._known.topics}))
+            topics={topic.key: topic for topic in self.known.topics}))
 
 
 def recorded_system(summary: Summary) -> tuple[dict[str, Any], Known]:

@@ -1,9 +1,9 @@
-"""A picture of the robot from behind and above, for the operator's page; a program of its own.
+"""The robot from behind and above: for replays, and for the page, to which a program sends it.
 
-It is run as `python -m rampart.sim.osmosis.camera`, by whoever shows the picture, and reads from
-standard input: one line that says what to build, then one line for each picture that is wanted. It
-answers each with the picture, a JPEG behind its length in four bytes (big-endian). So it renders
-only what is asked for, no faster than it is read, and ends when its input does.
+The program is run as `python -m rampart.sim.osmosis.camera`, by whoever shows the picture. It reads
+one line that says what to build, then one line for each picture that is wanted. It answers each
+with the picture, a JPEG behind its length in four bytes (big-endian). So it renders only what is
+asked for, no faster than it is read, and ends when its input does.
 
 It has a scene of its own and follows what the controller believes: published pose and obstacles.
 The physics never waits for it. It runs at the lowest priority, and where nothing can be rendered
@@ -28,9 +28,13 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw
 
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.sim.osmosis.scene import Scene, WorldError
+from rampart.sim.runs.physics import RobotModel
 
 PIXELS_PER_M = 10
 MAX_PIXELS = 8192
@@ -70,39 +74,40 @@ class View(msgspec.Struct, forbid_unknown_fields=True):
     obstacles: tuple[Obstacle, ...] = ()
 
 
-class Camera:
-    """Renders an airport.
+class AirportModel(RobotModel):
+    """The robot at its airport, seen from behind and above.
 
-    Raises:
-        Exception: whatever MuJoCo raises where nothing can be rendered.
+    Args:
+        application: with the airport.
     """
 
-    def __init__(self, airport: Airport, width: int, height: int) -> None:
+    def __init__(self, application: Osmosis) -> None:
+        airport = application.airport
         self._scene = Scene(airport, lambda spec: dress(spec, airport))
-        self._renderer = mujoco.Renderer(self._scene.model, height, width)
-        self._camera = mujoco.MjvCamera()
-        self._camera.distance, self._camera.elevation = 4.6, -22.0
-        self._options = mujoco.MjvOption()
-        self._options.geomgroup[:] = (1, 1, 1, 1, 0, 0)  # obstacles that are not there are in 4
+        super().__init__(self._scene.model, self._scene.data)
+        self.camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        self.camera.distance, self.camera.elevation = 4.6, -22.0
+        self.options.geomgroup[:] = (1, 1, 1, 1, 0, 0)  # obstacles that are not there are in 4
 
-    def picture(self, view: View) -> bytes:
-        """Return a JPEG of what there is to see; NaN poses are taken for the last one."""
-        scene = self._scene
-        x_m, y_m, yaw_rad = map(_number, (view.x_m, view.y_m, view.yaw_rad))
+    def take(self, topic: Topic[Any], body: Any) -> None:
+        """Place the robot where it believes to be, and the obstacles that are there."""
+        if topic == topics.POSE:
+            self.place(body.x_m, body.y_m, body.yaw_rad)
+        elif topic == topics.OBSTACLES:
+            self.put(tuple((o.name, o.x_m, o.y_m, o.radius_m)
+                           for o in body.obstacles if o.present))
+
+    def place(self, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Place the robot; a pose that is not finite is ignored."""
         if all(map(math.isfinite, (x_m, y_m, yaw_rad))):
-            scene.place_robot(x_m, y_m, yaw_rad)
+            self._scene.place_robot(x_m, y_m, yaw_rad)
             ahead = 1.2
-            self._camera.lookat[:] = (x_m + ahead * math.cos(yaw_rad),
-                                      y_m + ahead * math.sin(yaw_rad), 0.3)
-            self._camera.azimuth = math.degrees(yaw_rad)
-        self._put(view.obstacles)
-        mujoco.mj_forward(scene.model, scene.data)
-        self._renderer.update_scene(scene.data, self._camera, self._options)
-        out = io.BytesIO()
-        Image.fromarray(self._renderer.render()).save(out, "JPEG", quality=_JPEG_QUALITY)
-        return out.getvalue()
+            self.camera.lookat[:] = (x_m + ahead * math.cos(yaw_rad),
+                                     y_m + ahead * math.sin(yaw_rad), 0.3)
+            self.camera.azimuth = math.degrees(yaw_rad)
 
-    def _put(self, obstacles: tuple[Obstacle, ...]) -> None:
+    def put(self, obstacles: tuple[Obstacle, ...]) -> None:
+        """Have these obstacles stand there, and no others."""
         scene = self._scene
         wanted = {name: (_number(x), _number(y), _number(r)) for name, x, y, r in obstacles}
         for name in [n for n in scene.present if n not in wanted]:
@@ -112,6 +117,29 @@ class Camera:
             if there is None or (there.x_m, there.y_m, there.radius_m) != (x, y, r):
                 with contextlib.suppress(WorldError):  # one too many, or one that makes no sense
                     scene.put(name, x, y, r, shapely.Polygon())
+
+
+class Camera:
+    """Renders an airport.
+
+    Raises:
+        Exception: whatever MuJoCo raises where nothing can be rendered.
+    """
+
+    def __init__(self, airport: Airport, width: int, height: int) -> None:
+        self._robot = AirportModel(Osmosis.on_map(airport))
+        self._renderer = mujoco.Renderer(self._robot.model, height, width)
+
+    def picture(self, view: View) -> bytes:
+        """Return a JPEG of what there is to see; NaN poses are taken for the last one."""
+        robot = self._robot
+        robot.place(_number(view.x_m), _number(view.y_m), _number(view.yaw_rad))
+        robot.put(view.obstacles)
+        mujoco.mj_forward(robot.model, robot.data)
+        self._renderer.update_scene(robot.data, robot.camera, robot.options)
+        out = io.BytesIO()
+        Image.fromarray(self._renderer.render()).save(out, "JPEG", quality=_JPEG_QUALITY)
+        return out.getvalue()
 
 
 def _number(value: float | None) -> float:

@@ -10,6 +10,7 @@ class Quadrotor(Application):
     """The application of the quadrotor's system."""
 
     topics = tuple(topic for topic in vars(t).values() if isinstance(topic, Topic))
+    model = "quadrotor.physics:QuadrotorModel"
     faults = "quadrotor.faults:QuadrotorFaults"
     examples = (("--virtual --fault weak-rotor@10", "a rotor loses 30 % of its thrust"),
                 ("--virtual --fault kill:pilot@15", "the pilot dies in flight"))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,6 +19,8 @@ from quadrotor import topics as t
 from quadrotor.rotation import Quaternion, tilt, yaw
 from quadrotor.rotors import SpeedControllers
 from quadrotor.vehicle import MOST_THRUST_N, Vector
+from rampart import Application, Topic
+from rampart.sim.runs.physics import RobotModel
 
 STEP_S = 0.002
 
@@ -184,3 +187,15 @@ class Physics:
 
 _IMU_NOISE = np.array([_GYRO_RADPS] * 3 + [_ACCEL_MPS2] * 3)
 _GPS_NOISE = np.array([_GPS_XY_M, _GPS_XY_M, _GPS_Z_M])
+
+
+class QuadrotorModel(RobotModel):
+    """The vehicle of a replay: it is where it believes to be."""
+
+    def __init__(self, _application: Application) -> None:
+        super().__init__(mujoco.MjModel.from_xml_path(str(_MODEL)))
+
+    def take(self, _topic: Topic[Any], body: Any) -> None:
+        """Move the vehicle."""
+        if isinstance(body, t.Estimate):
+            self.stand((body.x_m, body.y_m, body.z_m), body.attitude)
