@@ -6,7 +6,6 @@ import signal
 import pytest
 from flights import SYSTEM
 from quadrotor import topics as t
-from quadrotor.faults import QuadrotorFaults
 
 from rampart import INJECTION_REPORT, parse_specification
 from rampart.actors.operator.requests import InjectRequest
@@ -106,8 +105,3 @@ def test_on_processes_they_come_by_hand_and_as_planned(file, tmp_path, monkeypat
     assert {fault["fault"]: fault["effective"] for fault in result["faults"]} == {
         "weak-rotor:1:0.95@2+1": True, "battery-gauge-high@2+1": True}
     assert result["restarts"]["mission"] >= 1
-
-
-def test_what_is_no_rotor_is_told(capsys):
-    with pytest.raises(ValueError, match=r"rotors are 0 to 3"):
-        QuadrotorFaults().own("weak-rotor:9", "f1", None)

@@ -67,12 +67,6 @@ def test_each_limit_makes_a_flight_unsafe_from_when_it_is_passed(wrong, reason):
     assert verdict.unsafe_s == 5.0
 
 
-def test_before_it_has_flown_it_is_not_over():
-    judge = judged(*[truth(z_m=0.0, turning=False)] * 9)
-    assert judge.over(9.0) is None
-    assert not judge.verdict().success
-
-
 def test_of_whom_nothing_is_heard_nothing_is_known():
     assert judged().verdict().safe is None
 

@@ -65,10 +65,6 @@ def test_a_reserve_that_fails_while_it_flies_hands_over_at_once():
     assert bench.play(LATE_S + 0.02, reserve=None) == (FIRST, 1)
 
 
-def test_a_reserve_that_fails_while_it_does_not_fly_changes_nothing():
-    assert Bench().play(2.0, reserve=None) == (FIRST, 0)
-
-
 def test_when_both_are_dead_the_last_command_holds_for_a_while_and_then_they_idle():
     bench = Bench()
     assert bench.play(0.35, pilot=None, reserve=None)[0] == FIRST
@@ -82,9 +78,3 @@ def test_a_command_that_is_old_or_from_a_stranger_changes_nothing():
     assert bench.rotors.command("pilot", SECOND, bench.now_s - 1.0)
     assert not bench.rotors.command("stranger", SECOND, bench.now_s)
     assert bench.rotors.turn(bench.now_s) == FIRST
-
-
-def test_before_anybody_commands_nothing_turns():
-    rotors = SpeedControllers(("pilot", "reserve"), 0.4)
-    assert rotors.turn(100.0) == (0.0,) * 4
-    assert rotors.age_s(100.0) == 0.0

@@ -7,7 +7,7 @@ import pytest
 from quadrotor import topics as t
 from quadrotor.attitude import AttitudeFilter, ImuVote, VerticalFilter
 from quadrotor.estimator import FusedState
-from quadrotor.rotation import tilt, yaw
+from quadrotor.rotation import tilt
 from quadrotor.vehicle import G_MPS2
 
 DICE = random.Random(7)
@@ -40,28 +40,6 @@ def test_one_imu_that_is_wrong_is_outvoted(wrong):
     rate, force = found
     assert rate[0] == pytest.approx(0.0, abs=0.01)
     assert force[2] == pytest.approx(G_MPS2, abs=0.01)
-
-
-def test_three_that_agree_are_sound():
-    vote = ImuVote()
-    for tick in range(50):
-        for which in range(3):
-            vote.take(which, reading(), tick * 0.01)
-        vote.vote(tick * 0.01)
-    assert vote.sound == 3
-
-
-def test_without_any_imu_nothing_is_known():
-    vote, _ = voted(None)
-    assert vote.vote(100.0) is None
-    assert vote.sound == 0
-
-
-def test_attitude_begins_level_with_the_yaw_of_the_magnetometer():
-    attitude = AttitudeFilter()
-    attitude.level((0.0, 0.0, G_MPS2), 1.0)
-    assert tilt(attitude.q) == pytest.approx(0.0, abs=1e-6)
-    assert yaw(attitude.q) == pytest.approx(1.0)
 
 
 def test_attitude_at_rest_on_a_slope_is_that_of_the_slope():
@@ -113,23 +91,6 @@ def test_a_fix_that_jumps_pulls_slowly_enough_to_be_noticed():
     for tick in range(1, 11):
         state.fix(fix(x_m=8.0), tick * 0.1)
     assert 0.1 < state.position[0] < 0.6
-
-
-def test_a_fix_that_drifts_away_disagrees_with_the_estimate():
-    state = FusedState()
-    for tick in range(300):
-        for _ in range(10):
-            state.step((0.0, 0.0, 0.0), 0.01)
-        state.fix(fix(x_m=0.05 * tick), tick * 0.1)
-    assert 0.05 * 299 - state.position[0] > 2.0
-
-
-def test_velocity_is_that_of_the_gps_within_a_second():
-    state = FusedState()
-    state.fix(fix(), 0.0)
-    for tick in range(20):
-        state.fix(fix(speed_mps=2.0), tick * 0.1)
-    assert state.velocity[0] == pytest.approx(2.0, abs=0.1)
 
 
 def test_what_is_no_number_or_repeated_is_not_taken():
