@@ -1,22 +1,16 @@
-"""What one host sees of the others, and keeps for them: processes, recordings, checkpoints."""
+"""What the first host keeps for the others: checkpoints."""
 
 from __future__ import annotations
 
 import json
 import shutil
 import signal
-import subprocess
-import sys
 import time
-from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from rampart.actors.ftm import topics
-from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
-from rampart.actors.recording.message_form import Forms, header_of
-from rampart.testing import RealRun
+from rampart.actors.recording.bag_reader import BagReader
 from tests import ROOT
 from tests.whole.network import Line, Network, network, why_not
 from tests.whole.test_two_hosts import CELL_ON_GROUND, host, specification, with_keys
@@ -29,72 +23,6 @@ pytestmark = [pytest.mark.processes, pytest.mark.alone,
 def net():
     with network(["robot", "ground"]) as made:
         yield made
-
-
-def listed(net: Network, name: str, run: RealRun) -> tuple[dict[str, str], str]:
-    """Return each node that `kill-node --list` lists, with its host, and what it tells."""
-    done = subprocess.run(
-        net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_node",
-                    "--list", "--json", "--port", str(run.port)),
-        capture_output=True, text=True, check=True, timeout=30)
-    return {row["name"]: row["host"] for row in json.loads(done.stdout)}, done.stderr
-
-
-def recorded(file: Path) -> tuple[Counter[str], Summary]:
-    """Return how many messages of each source a recording has, and what else is in it."""
-    forms, reader, sources = Forms(topics.ALL), BagReader(file), Counter[str]()
-    for channel, message in reader.messages():
-        if (key := key_of(channel)) and (header := header_of(forms.of(key).payload(message.data))):
-            sources[header.source] += 1
-    return sources, Summary(BagReader(file))
-
-
-@pytest.mark.parametrize("keyed", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_the_first_host_sees_what_the_other_does(net, tmp_path, keyed):
-    spec = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1)
-    own = with_keys(tmp_path, spec) if keyed else dict.fromkeys(net.addresses, ("--no-keys",))
-    file = tmp_path / "run.mcap"
-    with (host(net, "ground", tmp_path / "g", spec, *own["ground"]) as ground,
-          host(net, "robot", tmp_path / "r", spec, *own["robot"], "--record", str(file)) as robot):
-        ground.wait_for("takes part in run")
-        robot.wait_for("ctrl-C ends it")
-        ground.wait_for("router_b_ground adopted")
-        for name, run in (("robot", robot), ("ground", ground)):
-            found, told = listed(net, name, run)
-            assert {found[node] for node in (*CELL_ON_GROUND, "supervisor_ground")} == {"ground"}
-            assert {found[node] for node in ("gripper", "supervisor", "router_a")} == {"robot"}
-            assert told == ""
-        beside = subprocess.run(  # on the other host, too, while the run goes on
-            net.command("ground", sys.executable, "-P", "-m", "rampart.cli.main", "record",
-                        str(tmp_path / "beside.mcap"), "--duration", "2",
-                        "--port", str(ground.port)),
-            capture_output=True, text=True, check=False, timeout=60)
-        assert beside.returncode == 0, beside.stderr
-        net.line = Line(is_cut=True)
-        robot.wait_for("camera respawned by supervisor, incarnation 1000001")
-        found, told = listed(net, "robot", robot)
-        assert found["camera"] == "robot"
-        assert "supervisor_ground" not in found
-        assert told == "kill-node: the processes of ground are missing: nothing was heard\n"
-        net.line = Line()
-        robot.wait_for("supervisor_ground back")
-        robot.wait_until(lambda: not any(map(robot.pid, CELL_ON_GROUND)), 10, "not given back")
-        time.sleep(1.0)
-        robot.process.send_signal(signal.SIGINT)
-        code, _ = robot.result(20)
-        assert code == 0
-    sources, summary = recorded(tmp_path / "beside.mcap")
-    assert all(sources[node] > 10 for node in ("camera", "gripper", "router_a")), sources
-    assert summary.unheard.keys() == {"robot"}
-    sources, summary = recorded(file)
-    for node in (*CELL_ON_GROUND, "supervisor_ground", "router_a_ground", "observer_ground"):
-        assert sources[node] > 10, (node, sources)
-    assert sources["gripper"] > 10
-    cut = [end_s - begin_s for begin_s, end_s in summary.unheard["ground"] if end_s and end_s > 1.5]
-    assert cut, summary.unheard  # the partition is told
-    assert 0.6 < max(cut) < 20
-    assert not {"gripper", "supervisor", "cell_manager"} & json.loads(summary.end["lost"]).keys()
-    assert "; ground could not be heard all the time" in robot.story
 
 
 def counted(file: Path) -> dict[int, tuple[int, int]]:
