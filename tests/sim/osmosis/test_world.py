@@ -257,6 +257,17 @@ def test_a_world_goes_on_as_it_was_left():
     assert (after.truth().collisions, after.truth().prohibited_s) == (0, 0.0)
 
 
+def test_collisions_go_on_counting():
+    sim = world()
+    sim.command(1.0, 0.0)
+    sim.add_obstacle("crate", 3.0, 0.0, 0.4)
+    sim.step_to(4.0)
+    assert sim.truth().collisions > 0
+    after = world(start_s=5.0, kept=sim.keep())
+    after.step_to(5.1)
+    assert after.truth().collisions >= sim.truth().collisions
+
+
 def test_a_kept_world_that_makes_no_sense_is_refused():
     kept = msgspec.structs.replace(world().keep(), pose=(math.nan, 0.0, 0.0))
     with pytest.raises(StateError, match="not finite"):
