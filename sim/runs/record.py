@@ -22,6 +22,7 @@ from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.web.audit import AuditLine
 from rampart.manager.strategies.registry import decision_in_words
 from rampart.sim.faults.scenario import FaultOutcome
+from rampart.sim.runs.curves import Curve
 
 KEPT = 10_000
 """Most events, intervals, decisions or names of a kind that are kept of a run."""
@@ -97,6 +98,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         faults: that were planned, and what became of them.
         keeping_up: whether the machine kept up with the rate; None in virtual time.
         audit: who did what on the operator's page.
+        curves: the robot's numbers; empty where its report draws others.
     """
 
     run_id: str
@@ -116,6 +118,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     faults: tuple[FaultOutcome, ...] = ()
     keeping_up: KeptUp | None = None
     audit: tuple[AuditLine, ...] = ()
+    curves: tuple[Curve, ...] = ()
 
 
 class RunRecorder:

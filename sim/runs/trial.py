@@ -39,6 +39,7 @@ from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import INJECTOR, Injector, ProcessControl
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.console import Console
+from rampart.sim.runs.curves import CurveRecorder
 from rampart.sim.runs.judge import UNSTABLE, Judge, Verdict
 from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord, RunRecorder, Safety
@@ -62,6 +63,7 @@ class Trial:
         margins: how far from harm a run was: names, and how they are headed in a report.
         margin_unit: of all of them.
         exact_below: above it a margin may be a lower bound; None if all are exact.
+        draws: whether its report has curves of all the robot's numbers.
         resumes: whether what was seen in one part of a run is known in the next.
         pictures: class path of the `RunPictures` that a campaign's report shows; "" for none.
 
@@ -87,6 +89,7 @@ class Trial:
     margins: ClassVar[Mapping[str, str]] = {}
     margin_unit: ClassVar[str] = "m"
     exact_below: ClassVar[float | None] = None
+    draws: ClassVar[bool] = True
     resumes: ClassVar[bool] = True
     pictures: ClassVar[str] = ""
 
@@ -104,6 +107,7 @@ class Trial:
         self.injects: Injector | None = None
         self._outcomes_before: tuple[FaultOutcome, ...] = ()
         self._brought_back = 0
+        self._curves = CurveRecorder(system_topics(run.system) if self.draws else ())
         self._worlds = frozenset(n.name for n in run.system.nodes if n.kind is Kind.WORLD)
         self._unjudged = ""
         self._keeping_up = None if run.plan.virtual else KeepingUp(
@@ -112,7 +116,7 @@ class Trial:
     def sinks(self, clock: Clock) -> list[Sink]:
         """Return what wants to hear the run's messages."""
         del clock
-        return [self._look_at_world, self.recorder.feed,
+        return [self._look_at_world, self.recorder.feed, self._curves.take,
                 *([self.console.take] if self.console else ())]
 
     def _look_at_world(self, topic: Topic[Any], message: Any, header: Header) -> None:
@@ -139,7 +143,7 @@ class Trial:
 
         spec, observers = self.run.system, context(OBSERVER)
         kind = observer_class(spec)
-        judged = {topic.key: topic for topic in judged_topics(spec, kind)}
+        judged = self._curves.topics | {t.key: t for t in judged_topics(spec, kind)}
         observers = replace(observers, parameters={"judged": list(judged)}, topics=judged)
         actors: list[Actor] = [kind(observers, [take, *self.sinks(observers.clock)])]
         if scenario:
@@ -224,6 +228,7 @@ class Trial:
         """Return the fields of a record that come from elsewhere than messages."""
         log = self.run.plan.page.audit_log
         return {"faults": self.outcomes(), "audit": read_audit(Path(log)) if log else (),
+                "curves": self._curves.curves(),
                 "keeping_up": self._keeping_up.result(now_s) if self._keeping_up else None}
 
     def concluded(self, verdict: Verdict, now_s: float, why: str) -> RunRecord:

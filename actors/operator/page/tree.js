@@ -60,7 +60,7 @@ export class FaultTree {
     if (below || shape.mechanism) svg("path", { class: "line stem", d: `M${shape.x - (shape.mechanism ? STEM : below ? STEM : 0)} ${middle}H${shape.x}` }, group);
     box(shape, group, shape.gate ? "" : "basic");
     if (shape.gate) this.addGate(shape.gate, right, middle, group);
-    else svg("circle", { class: "gate", cx: right, cy: middle, r: 5 }, group);
+    else svg("circle", { class: "gate", cx: right + 5, cy: middle, r: 5 }, group);
     const title = svg("title", {}, group);
     const tag = svg("text", { class: "tag", x: shape.x + shape.width / 2, y: shape.y - 3 }, group);
     let barrier = null;
