@@ -42,18 +42,6 @@ async def test_an_hmi_respawned_in_mid_run_starts_nothing(world):
     assert world.others.requests == []
 
 
-async def test_a_page_gets_the_map_once_and_then_states(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        world.others.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
-        async with websockets.connect(f"ws://{at}/ws", origin=f"http://{at}") as page:
-            hello = await hear(page, "hello")
-            assert hello["map"]["name"] == AIRPORT.name
-            assert hello["missions"] == ["A", "B", "AB"]
-            state = await hear(page, "state")
-            assert state["pose"]["value"] == {"x_m": 1.0, "y_m": 2.0, "yaw_rad": 0.5}
-
-
 async def test_the_emergency_stop_is_reset_from_the_page(world):
     async with world.hmi(hmi_port=free_port()) as hmi:
         at = await served(hmi)
@@ -100,19 +88,6 @@ async def test_a_page_that_cannot_be_shown_is_closed_with_a_reason_and_told(worl
         await eventually(lambda: bool(world.others.diagnostics))
         assert "RuntimeError: no introduction" in world.others.diagnostics[0].reason
         assert hmi._server.pages == 0
-
-
-async def test_a_picture_that_fails_is_told_and_the_page_goes_on(world, monkeypatch):
-    async def fail(*_):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(hmi_server.PageServer, "_picture", fail)
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        async with httpx.AsyncClient() as client:
-            assert (await client.get(f"http://{at}/camera.jpg")).status_code == 500
-        await eventually(lambda: bool(world.others.diagnostics))
-        assert "/camera.jpg: ZeroDivisionError" in world.others.diagnostics[0].reason
 
 
 async def test_a_mission_is_started_from_the_page_unless_one_runs(world):

@@ -8,15 +8,12 @@ import json
 import pytest
 import websockets
 
-from rampart.actors.bus import messages as bm
-from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.supervision.kill_node import SignalError, UnknownNodeError
 from rampart.actors.supervision.process_title import RunProcess
-from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.world import hear, repeated, served
 from tests.osmosis_system import shipped_system
@@ -72,19 +69,6 @@ def open_page(at: str, **options):
 
 
 @pytest.mark.usefixtures("patient")
-async def test_a_page_drives_while_it_holds_the_stick_and_letting_go_stops(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            hand = Hand(page)
-            await hand.take()
-            await hand.hold(0.25, -1.0)
-            await eventually(lambda: m.Joystick(0.25, -1.0, dead_man=True) in world.others.stick)
-            await hand.let_go()
-            await eventually(lambda: world.others.stick[-1] == RELEASED)
-    assert world.others.stick.count(RELEASED) == 2  # at the start of its life, and now
-
-
-@pytest.mark.usefixtures("patient")
 async def test_a_held_stick_is_repeated_as_often_as_the_robot_needs_it(world):
     """At twenty times real time, the Safety Pilot's 0.3 s are 15 ms: no page is that fast."""
     async with world.hmi(hmi_port=free_port()) as hmi:
@@ -131,27 +115,6 @@ async def test_an_hmi_that_is_stopped_lets_go(world):
         await Hand(page).take()
     await eventually(lambda: world.others.stick[-1] == RELEASED)
     await page.close()
-
-
-@pytest.mark.usefixtures("patient")
-async def test_of_two_operators_one_has_the_stick_and_the_other_is_told(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        async with open_page(at) as one, open_page(at) as two:
-            first, second = Hand(one), Hand(two)
-            await first.take()
-            await second.let_go()
-            await second.hold(-1.0, -1.0)
-            for _ in range(3):
-                assert "page 1 has the stick" in (await second.hold(-1.0, -1.0))["text"]
-                assert (await first.hold())["drives"]
-            assert (await operating(two, lambda o: o["holder"] is not None))["holder"] == 1
-            await first.let_go()
-            assert not (await second.hold(0.75, 0.0))["drives"]
-            await second.let_go()
-            assert (await second.hold(0.75, 0.0))["drives"]
-            await eventually(lambda: m.Joystick(0.75, 0.0, dead_man=True) in world.others.stick)
-    assert not any(s.forward < 0 for s in world.others.stick)
 
 
 async def test_a_stick_out_of_bounds_is_refused(world):
@@ -204,26 +167,6 @@ async def test_the_page_says_whether_the_stick_has_an_effect_now(world):
 
 
 # ---- strategy, signals, faults ------------------------------------------------------------------
-
-
-async def test_a_strategy_is_asked_for_from_the_page_and_the_answer_shown(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            assert "mission-first" in (await hear(page, "operating"))["strategies"]
-            told = await ask(page, type="strategy", name="luck")
-            assert "no strategy 'luck'; there are: " in told["text"]
-            assert (await ask(page, type="strategy", name="mission-first"))["type"] == "done"
-            await eventually(lambda: bool(world.others.adaptations))
-            request = world.others.adaptations[0]
-            assert (request.action, request.name, json.loads(request.values)) == (
-                "set", "strategy", {"value": "mission-first"})
-            world.others.publish(ftm_topics.ADAPTATION, fm.AdaptationAnswer(
-                request.request, False, "not in the middle of a recovery: RM2", 0))
-            async with asyncio.timeout(5):
-                while "RM2" not in (state := await hear(page, "state"))["order"]["text"]:
-                    pass
-            assert state["order"]["text"] == (
-                "strategy mission-first refused: not in the middle of a recovery: RM2")
 
 
 async def test_a_signal_to_a_node_of_another_host_is_ordered_of_its_supervisor(world, monkeypatch):
@@ -284,26 +227,6 @@ async def test_without_processes_nothing_can_be_signalled(world):
             assert "no processes that could be signalled" in told["text"]
 
 
-async def test_a_fault_is_injected_from_the_page_and_its_effect_shown(world):
-    async with world.hmi(hmi_port=free_port(), faults=OsmosisFaults().offered()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            names = {f["name"] for f in (await hear(page, "operating"))["faults"]}
-            assert {"command-out-of-bounds", "gps-bias", "brake-failure"} <= names
-            told = await ask(page, type="inject", fault="command-out-of-bounds", duration_s=3)
-            assert told["text"] == "fault command-out-of-bounds asked for, for 3 s"
-            await eventually(lambda: bool(world.others.injections))
-            order = world.others.injections[0]
-            assert (order.topic, order.set_fields["linear_mps"], order.duration_s) == (
-                "control/command", 3.0, 3.0)
-            world.others.publish(bus_topics.INJECTION_REPORT, bm.InjectionReport(
-                order.injection, "osmosis_control", 60, True, ""))
-            shown = await operating(page, lambda o: o["faults"] and o["faults"][0]["ended"])
-            assert shown["faults"][0]["state"] == "over, 60 messages changed"
-            told = await ask(page, type="inject", fault="brake-failure", permanent=True)
-            assert told["text"] == "fault brake-failure asked for, until its process ends"
-            await eventually(lambda: bool(world.others.actuator_faults))
-
-
 async def test_a_fault_that_nobody_takes_is_shown_to_have_no_effect(world):
     async with world.hmi(hmi_port=free_port(), system=shipped_system()) as hmi:
         async with open_page(await served(hmi)) as page:
@@ -314,5 +237,3 @@ async def test_a_fault_that_nobody_takes_is_shown_to_have_no_effect(world):
             assert shown["faults"][0]["state"] == (
                 "no effect: nobody that publishes plan/route answers")
             assert len({o.injection for o in world.others.injections}) == 1
-
-

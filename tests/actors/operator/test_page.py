@@ -107,16 +107,6 @@ async def test_a_certificate_can_be_opened_and_stays_open_when_decisions_follow(
         assert "RM3: FTM4 is dominated by FTM1" in text
 
 
-async def test_the_map_follows_the_robot_on_request(world):
-    async with page(world) as tab, repeated(world.others.sweep):
-        await tab.until("document.querySelector('.robot').getAttribute('visibility') === 'visible'")
-        await tab.value("document.getElementById('follow').click()")
-        box = "document.getElementById('map').viewBox.baseVal"
-        await tab.until(f"{box}.width < 30")
-        assert await tab.value(f"Math.abs({box}.x + {box}.width / 2 + 10) < 0.1") is True
-        assert await tab.value("document.getElementById('follow').ariaPressed") == "true"
-
-
 async def test_values_of_a_connection_that_is_cut_are_marked_as_old_within_two_seconds(world):
     async with world.hmi(hmi_port=free_port(), system=SPEC) as hmi, browser() as tab:
         await tab.show(f"http://{await served(hmi)}/")

@@ -19,7 +19,6 @@ from rampart.actors.operator.panels import Panel
 from rampart.actors.runtime.actor import Actor, Header, on
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import published
-from rampart.cli.analyse.check_verbs import explain
 from rampart.testing import eventually
 from tests import ROOT
 from tests.actors.operator.test_operating import Hand as Driver
@@ -126,10 +125,6 @@ def test_the_page_publishes_what_its_stick_says_and_does_not_hear_it():
     assert found.topics == {"tank/hand": HAND}
 
 
-def test_without_the_stick_nothing_publishes_what_the_robot_needs():
-    assert "node needs: hears 'tank/hand', which nothing publishes" in refused("", "Needs")
-
-
 def test_a_stick_of_the_page_s_class_is_checked_as_one_of_the_specification():
     own = PAGE.replace("rampart.actors.operator.hmi:Hmi", f"{__name__}:OwnHmi")
     assert "tank/hand" in published(laid_out("", "Needs", page=own).members["page"])
@@ -200,21 +195,11 @@ def test_the_example_of_the_document_is_sound():
     assert [p.stick for p in found.members["page"].parameters.panels] == [DRIVE.stick]
 
 
-def test_who_publishes_what_a_stick_says_is_explained():
-    talk = {talk.topic: talk for talk in explain(laid_out(FIELDS, "Needs")).talks}["tank/hand"]
-    assert (talk.from_, talk.to) == (("page",), ("needs",))
-
-
 def test_two_publishers_of_a_stick():
     assert refused(FIELDS, "Driven", "Rival") == (
         "tank.toml: page: panel 'Drive': stick: node rival publishes 'tank/hand' as well, and may "
         "move what an operator let go of; a topic of the stick's own is right (or several = True "
         "in the Topic)")
-
-
-def test_two_sticks_on_one_topic_are_refused():
-    assert refused(f"{FIELDS}\n" + panel("Again", FIELDS), "Driven") == (
-        "tank.toml: $.panel: panel 'Drive': another stick is told on tank/hand too; one is right")
 
 
 # ---- its messages -------------------------------------------------------------------------------
@@ -229,12 +214,6 @@ def test_a_number_goes_from_bound_to_bound_and_is_0_at_rest():
     turned = Steered(Hand, ("left", "forward"), "", (-4.0, 0.5))
     assert turned((0.5, 1.0)) == Hand(0.5, -2.0)
     assert math.copysign(1.0, turned(None).left) == 1.0
-
-
-def test_a_whole_number_stays_one():
-    said = Steered(Place, ("count",), "", (7.0,))
-    assert said((0.5, 0.0)) == Place(count=4)
-    assert type(said((1.0, 0.0)).count) is int
 
 
 @pytest.mark.parametrize(("name", "words"), [
