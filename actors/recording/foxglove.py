@@ -151,16 +151,12 @@ class TriangleListPrimitive(Record, frozen=True):
     indices: tuple[int, ...] = ()
 
 
-class Solid(Record, frozen=True):
-    """Base of what fills a box of a size."""
+class CubePrimitive(Record, frozen=True):
+    """A box."""
 
     pose: Pose
     size: Vector3
     color: Color
-
-
-class CubePrimitive(Solid, frozen=True):
-    """A box."""
 
 
 class CylinderPrimitive(Record, frozen=True):
@@ -171,10 +167,6 @@ class CylinderPrimitive(Record, frozen=True):
     bottom_scale: float
     top_scale: float
     color: Color
-
-
-class SpherePrimitive(Solid, frozen=True):
-    """An ellipsoid."""
 
 
 class ArrowPrimitive(Record, frozen=True):
@@ -199,23 +191,14 @@ class TextPrimitive(Record, frozen=True):
     text: str
 
 
-class KeyValuePair(Record, frozen=True):
-    """Something more about an entity."""
-
-    key: str
-    value: str
-
-
 class SceneEntity(Stamped, frozen=True):
     """A thing in the scene, which replaces the one with the same id on the same channel."""
 
     id: str
     lifetime: Time
     frame_locked: bool
-    metadata: tuple[KeyValuePair, ...] = ()
     arrows: tuple[ArrowPrimitive, ...] = ()
     cubes: tuple[CubePrimitive, ...] = ()
-    spheres: tuple[SpherePrimitive, ...] = ()
     cylinders: tuple[CylinderPrimitive, ...] = ()
     lines: tuple[LinePrimitive, ...] = ()
     triangles: tuple[TriangleListPrimitive, ...] = ()

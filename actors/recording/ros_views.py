@@ -29,7 +29,7 @@ _PIXEL_M = 0.01
 """Width of a line that has it in pixels."""
 
 _ADD, _DELETE_ALL = 0, 3
-_ARROW, _CUBE, _SPHERE, _CYLINDER, _STRIP, _LIST, _TEXT, _TRIANGLES = 0, 1, 2, 3, 4, 5, 9, 11
+_ARROW, _CUBE, _CYLINDER, _STRIP, _LIST, _TEXT, _TRIANGLES = 0, 1, 3, 4, 5, 9, 11
 
 Shown = Iterator[tuple[str, str, bytes]]
 """Topic of ROS 2, its type, and a message of it."""
@@ -111,8 +111,7 @@ class RosViews:
         for arrow in entity.arrows:
             yield self._marker(entity, _ARROW, arrow.pose, arrow.color, (
                 arrow.shaft_length + arrow.head_length, arrow.shaft_diameter, arrow.shaft_diameter))
-        for kind, solids in ((_CUBE, entity.cubes), (_SPHERE, entity.spheres),
-                             (_CYLINDER, entity.cylinders)):
+        for kind, solids in ((_CUBE, entity.cubes), (_CYLINDER, entity.cylinders)):
             for solid in solids:
                 yield self._marker(entity, kind, solid.pose, solid.color,
                                    (solid.size.x, solid.size.y, solid.size.z))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import re
 import socket
 import tempfile
 import time
@@ -23,7 +22,7 @@ from typing import Any, NamedTuple
 import msgspec
 import tomli_w
 
-from rampart.actors.bus import run_folder, run_info, topics
+from rampart.actors.bus import run_folder, run_info
 from rampart.actors.bus.bus import BusError, shared
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.messages import Message
@@ -43,7 +42,6 @@ from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.members import application_class, load_class
 from rampart.actors.web.page_plan import PagePlan
-from rampart.cli import systems
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.session import pause
 from rampart.manager.spec.schema import Kind
@@ -57,7 +55,6 @@ GAP_S = 0.1
 """Simulated seconds between two laps."""
 
 _STRANGE: Topic[Any] = Topic("", Message, Qos.SENSOR, 0, "", "What was recorded on no topic's key.")
-_BEFORE_0_7 = re.compile(r"0\.[0-6]\b")
 _YIELD_EVERY = 50
 _LINGER_S = 0.3
 
@@ -292,9 +289,6 @@ class Replay(RecordedRun):
             nodes = msgspec.json.decode(run.get("nodes", "[]"), type=list[str])
         except UNREADABLE:
             nodes = []
-        if not nodes:  # 0.5.0 wrote none of a run in virtual time
-            head = topics.HEARTBEAT.at("")
-            nodes = [key.removeprefix(head) for key in self.summary.keys if key.startswith(head)]
         system = folder / SYSTEM
         if self.document:
             system.write_text(tomli_w.dumps(self.document), encoding="utf-8")
@@ -327,38 +321,25 @@ class Replay(RecordedRun):
 
 
 def recorded_system(summary: Summary) -> tuple[dict[str, Any], Known]:
-    """Return the system of a recording, as TOML and read.
-
-    A recording of before 0.7 is of the shipped robot and names no application. Where its system
-    cannot be read, because its schema is another, the shipped one counts. The TOML is empty if the
-    recorded system cannot be read.
-    """
-    shipped = systems.load(None)
-    is_shipped = _BEFORE_0_7.match(summary.run.get("rampart_version", "")) is not None
+    """Return the system of a recording, as TOML and read; what cannot be read is left out."""
     document: dict[str, Any] = {}
-    found = shipped if is_shipped else NO_SYSTEM
+    found = NO_SYSTEM
     with contextlib.suppress(StopIteration, ValueError):
         text = next(data for name, _, data in summary.files if name == SYSTEM).decode()
         document = read_document(text, SYSTEM)
-        if is_shipped:
-            document = {"application": dict(shipped.application), **document}
         found = check_document(document, SYSTEM)
     try:
         return document, Known(found, application_class(found))
-    except ValueError:  # somebody's own, which is not installed here
+    except ValueError:  # an application that is not installed here
         return document, Known(found)
 
 
 def page_of(known: Known) -> type[Hmi]:
-    """Return the class of the operator's page of a system; before 0.7 it was the shipped one's."""
-    shipped = systems.load(None)
-    is_shipped = known.kind is application_class(shipped)
-    for spec in (known.system, *((shipped,) if is_shipped else ())):
-        for node in spec.nodes:
-            with contextlib.suppress(ValueError):
-                if node.kind is Kind.NON_CONTROL and issubclass(
-                        found := load_class(node.actor), Hmi):
-                    return found
+    """Return the class of the operator's page of a system."""
+    for node in known.system.nodes:
+        with contextlib.suppress(ValueError):
+            if node.kind is Kind.NON_CONTROL and issubclass(found := load_class(node.actor), Hmi):
+                return found
     return Hmi
 
 

@@ -377,17 +377,6 @@ def test_a_frame_comes_back_and_a_broken_one_is_refused():
             parse_frame(broken)
 
 
-def test_a_tap_looks_for_a_recorder_once_a_second_and_not_with_every_message(port, monkeypatch):
-    looks = []
-    monkeypatch.setattr(RecorderConnection, "_look", lambda self: looks.append(now_s))
-    now_s = 0.0
-    node = RecorderConnection(port, lambda: now_s)
-    for step in range(400):
-        now_s = step * 0.01
-        node.take("rampart/k", b"")
-    assert looks == pytest.approx([0.0, 1.0, 2.0, 3.0], abs=0.02)
-
-
 def test_a_node_without_a_descriptor_left_goes_on_unrecorded(port, monkeypatch):
     def none_left(*_arguments: object) -> None:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
