@@ -90,13 +90,6 @@ def test_a_screen_of_80_by_24_tells_what_matters():
         shown, "localization")
 
 
-def test_a_silent_module_is_told_where_there_is_room_for_it():
-    picture = busy()
-    told(picture, ftm_topics.MANAGER_STATUS,
-         msgspec.structs.replace(MANAGER, silent=("DM7", "DM9")))
-    assert "2 of 3: DM7 silent; DM9 silent" in line_of(screen(picture), "detection")
-
-
 def test_a_process_in_trouble_comes_first_and_the_busiest_next_if_asked():
     def order(**changes) -> list[str]:
         return [line.split()[0] for line in screen(busy(), **changes)

@@ -78,16 +78,6 @@ def test_an_obstacle_that_flickers_is_waited_for():
     assert world.least_clearance_m > 0.5
 
 
-def test_a_respawned_row_follower_resumes_in_the_middle():
-    world = World()
-    drive(world, LightRow(ROW), 10)
-    assert 4.0 < world.x_m < 12.0
-    motion = drive(world, LightRow(ROW), 30)
-    assert motion.arrived
-    assert all(b[0] >= a[0] - 1e-6
-               for a, b in zip(world.track, world.track[1:], strict=False)), "no way back"
-
-
 @pytest.mark.parametrize(("ratio", "expected"), [
     (1.0, "ok"), (0.5, "ok"), (0.499, "dim"), (0.05, "dim"), (0.049, "out"), (0.0, "out")])
 def test_a_verdict_follows_the_icao_limits(ratio, expected):

@@ -8,7 +8,7 @@ import pytest
 
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Light
-from rampart.actors.osmosis.control.following.light_ledger import LightLedger, LightsKept
+from rampart.actors.osmosis.control.following.light_ledger import LightLedger
 from rampart.actors.osmosis.control.polyline import Polyline
 
 LIGHTS = tuple(Light(f"L{i}", "L", 4.0 * i, 0.0, 100.0) for i in range(1, 6))
@@ -58,17 +58,6 @@ def test_another_missions_status_shows_nothing(ledger):
     assert ledger.judged == {"L1"}
     assert ledger.to_send_again(9.0) == []
     assert ledger.detour(ledger.on_row(ROW), 10.0, ended=False) is None
-
-
-def test_what_was_kept_is_sent_at_once_by_the_next_life(ledger):
-    ledger.add(measured("L1"), 5.0)
-    successor = LightLedger(LIGHTS)
-    successor.restore(ledger.kept)
-    successor.begin("x")  # the same mission
-    successor.hear(shown())
-    assert successor.to_send_again(5.1) == [measured("L1")]
-    successor.begin("another")
-    assert successor.kept == LightsKept("another")
 
 
 def test_a_light_passed_without_a_measurement_is_gone_back_for_and_then_given_up(ledger):
