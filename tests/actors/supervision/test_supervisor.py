@@ -30,8 +30,9 @@ from rampart.actors.system.layout import Layout
 from rampart.manager.spec.nodes import Kind, NodeSpec
 from rampart.manager.spec.tables import Supervision
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.testing import eventually, run, turns
+from rampart.testing import eventually, turns
 from tests import ROOT
+from tests.virtual_time import within
 
 PLAN = RunPlan("r", 20000, system_file=str(ROOT / "systems" / "paper.toml"))
 USUAL = Supervision()
@@ -248,163 +249,117 @@ async def running(supervision: Supervision = USUAL,
         await asyncio.gather(beats, world.task, return_exceptions=True)
 
 
-def no_descriptor() -> OSError:
-    return OSError(errno.EMFILE, os.strerror(errno.EMFILE))
-
-
 @pytest.mark.parametrize("mute", [False, True])
-def test_a_supervisor_that_fails_ends_nobody_and_its_next_life_adopts_all(mute):
-    async def scenario() -> None:
-        async with running() as world:
-            before = set(world.machine.processes)
-            killed = world.kill("DM1")
-            world.machine.fork_error = RuntimeError("a defect")
-            if mute:  # it cannot say that it failed, either
-                def publish(*_: object) -> None:
-                    raise RuntimeError("no bus")
-                world.supervisor.context.bus.publish = publish
-            with contextlib.suppress(RuntimeError):
-                await world.task
-            assert world.machine.ended == []
-            assert set(world.machine.processes) - {killed.pid} == {
-                p.pid for p in world.machine.processes.values() if not p.killed}
-            world.machine.fork_error = None
-            world.start()
-            await eventually(world.all_run)
-            after = {p.pid for p in world.machine.processes.values() if not p.killed}
-            assert len(after) == len(before)
-            assert len(before - after) == 1
-
-    run(scenario)
+@within(running)
+async def test_a_supervisor_that_fails_ends_nobody_and_its_next_life_adopts_all(world, mute):
+    before = set(world.machine.processes)
+    killed = world.kill("DM1")
+    world.machine.fork_error = RuntimeError("a defect")
+    if mute:  # it cannot say that it failed, either
+        def publish(*_: object) -> None:
+            raise RuntimeError("no bus")
+        world.supervisor.context.bus.publish = publish
+    with contextlib.suppress(RuntimeError):
+        await world.task
+    assert world.machine.ended == []
+    assert set(world.machine.processes) - {killed.pid} == {
+        p.pid for p in world.machine.processes.values() if not p.killed}
+    world.machine.fork_error = None
+    world.start()
+    await eventually(world.all_run)
+    after = {p.pid for p in world.machine.processes.values() if not p.killed}
+    assert len(after) == len(before)
+    assert len(before - after) == 1
 
 
-def test_a_supervisor_that_is_told_to_stop_ends_all_in_reverse():
-    async def scenario() -> None:
-        async with running() as world:
-            started = [p.names[0] for p in world.machine.processes.values()]
-            world.supervisor.stop()
-            await world.task
-            assert world.machine.ended == started[::-1]
-
-    run(scenario)
-
-
-def test_a_heartbeat_of_a_node_that_it_does_not_start_is_nothing_to_it():
-    async def scenario() -> None:
-        async with running() as world:
-            world.say(bus_topics.HEARTBEAT, Heartbeat(1, 1, 0.1, 0, 0), "stranger", 1,
-                      key=bus_topics.HEARTBEAT.at("hmi"))
-            await turns()
-            assert not world.task.done()
-
-    run(scenario)
+@within(running)
+async def test_a_supervisor_that_is_told_to_stop_ends_all_in_reverse(world):
+    started = [p.names[0] for p in world.machine.processes.values()]
+    world.supervisor.stop()
+    await world.task
+    assert world.machine.ended == started[::-1]
 
 
 @pytest.mark.parametrize("way", ["silent", "repeats old news"])
-def test_a_manager_that_beats_and_whose_status_is_not_heard_is_replaced(way):
-    async def scenario() -> None:
-        async with running() as world:
-            _, life, pid = world.row("ftm_manager")
-            for _ in range(20):
-                status(world, life)
-                await asyncio.sleep(0.1)
-            assert world.row("ftm_manager") == ("running", life, pid)
-            heard_s = world.clock.now()
-            for _ in range(10):
-                if way == "repeats old news":
-                    status(world, life, heard_s)
-                await asyncio.sleep(0.1)
-            assert world.row("ftm_manager")[:2] == ("running", life + 1)
-            assert ("ftm_manager", "wedged", life) in world.events
-            # Its next life is given the time that it needs.
-            await asyncio.sleep(2.0)
-            assert world.row("ftm_manager")[:2] == ("running", life + 1)
-            status(world, life)  # nor does its old life speak for it
-            await asyncio.sleep(2.0)
-            assert world.row("ftm_manager")[:2] == ("running", life + 1)
-
-    run(scenario)
+@within(running)
+async def test_a_manager_that_beats_and_whose_status_is_not_heard_is_replaced(world, way):
+    _, life, pid = world.row("ftm_manager")
+    for _ in range(20):
+        status(world, life)
+        await asyncio.sleep(0.1)
+    assert world.row("ftm_manager") == ("running", life, pid)
+    heard_s = world.clock.now()
+    for _ in range(10):
+        if way == "repeats old news":
+            status(world, life, heard_s)
+        await asyncio.sleep(0.1)
+    assert world.row("ftm_manager")[:2] == ("running", life + 1)
+    assert ("ftm_manager", "wedged", life) in world.events
+    # Its next life is given the time that it needs.
+    await asyncio.sleep(2.0)
+    assert world.row("ftm_manager")[:2] == ("running", life + 1)
+    status(world, life)  # nor does its old life speak for it
+    await asyncio.sleep(2.0)
+    assert world.row("ftm_manager")[:2] == ("running", life + 1)
 
 
-def test_who_waits_for_a_processor_is_not_taken_for_wedged_and_who_waits_for_nothing_is():
-    async def scenario() -> None:
-        async with running() as world:
-            (starved,), (wedged,) = world.machine.of("DM1"), world.machine.of("DM2")
-            world.machine.starving = {"DM1"}
-            world.machine.starves_from_s = asyncio.get_running_loop().time()
-            world.silent |= {starved.pid, wedged.pid}
-            await eventually(lambda: wedged.killed, 0.8)
-            await asyncio.sleep(3.0)
-            assert not starved.killed
-            assert world.row("DM1") == ("running", 1, starved.pid)
-            world.machine.starving.clear()  # it has a processor, and says nothing all the same
-            await eventually(lambda: starved.killed, 0.8)
-
-    run(scenario)
+@within(running)
+async def test_who_waits_for_a_processor_is_not_taken_for_wedged_who_waits_for_nothing_is(world):
+    (starved,), (wedged,) = world.machine.of("DM1"), world.machine.of("DM2")
+    world.machine.starving = {"DM1"}
+    world.machine.starves_from_s = asyncio.get_running_loop().time()
+    world.silent |= {starved.pid, wedged.pid}
+    await eventually(lambda: wedged.killed, 0.8)
+    await asyncio.sleep(3.0)
+    assert not starved.killed
+    assert world.row("DM1") == ("running", 1, starved.pid)
+    world.machine.starving.clear()  # it has a processor, and says nothing all the same
+    await eventually(lambda: starved.killed, 0.8)
 
 
-@pytest.mark.parametrize(("silent", "killed"), [(("DM1",), True),
-                                                (("DM1", "DM2", "DM3", "DM4"), False)])
-def test_where_many_are_silent_at_once_who_runs_is_blamed_for_nothing(silent, killed):
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.turning = True
-            processes = [world.machine.of(name)[0] for name in silent]
-            world.silent |= {process.pid for process in processes}
-            await asyncio.sleep(1.5)
-            assert [process.killed for process in processes] == [killed] * len(silent)
-            world.silent.clear()
-
-    run(scenario)
-
-
-@pytest.mark.parametrize("turning", [False, True])
-def test_where_many_are_silent_for_long_all_are_replaced_whatever_they_do(turning):
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.turning = turning
-            processes = [world.machine.of(f"DM{i}")[0] for i in range(1, 6)]
-            world.silent |= {process.pid for process in processes}
-            await eventually(lambda: all(p.killed for p in processes), MOST_EXCUSED_S + 1.0)
-
-    run(scenario)
+@pytest.mark.parametrize(("silent", "turning", "until_s"), [
+    (1, True, 1.5), (5, True, MOST_EXCUSED_S + 1.0), (5, False, MOST_EXCUSED_S + 1.0)])
+@within(running)
+async def test_where_many_are_silent_at_once_who_runs_is_blamed_late(
+        world, silent, turning, until_s):
+    world.machine.turning = turning
+    processes = [world.machine.of(f"DM{i + 1}")[0] for i in range(silent)]
+    world.silent |= {process.pid for process in processes}
+    await asyncio.sleep(1.5)
+    if turning:
+        assert [process.killed for process in processes] == [silent == 1] * silent
+    await eventually(lambda: all(p.killed for p in processes), until_s - 1.5)
 
 
-def test_what_is_not_heard_because_a_router_died_is_no_fault_of_any_process():
-    async def scenario() -> None:
-        async with running() as world:
-            answers = iter([False, True])
-            world.supervisor._bus.moved = lambda: next(answers, False)
-            process = world.machine.of("DM1")[0]
-            world.silent.add(process.pid)
-            timeout_s = world.spec.timing.heartbeat_timeout_s
-            await asyncio.sleep(timeout_s + 0.1)
-            assert not process.killed
-            await eventually(lambda: process.killed, 0.3 + 0.2)
-
-    run(scenario)
+@within(running)
+async def test_what_is_not_heard_because_a_router_died_is_no_fault_of_any_process(world):
+    answers = iter([False, True])
+    world.supervisor._bus.moved = lambda: next(answers, False)
+    process = world.machine.of("DM1")[0]
+    world.silent.add(process.pid)
+    timeout_s = world.spec.timing.heartbeat_timeout_s
+    await asyncio.sleep(timeout_s + 0.1)
+    assert not process.killed
+    await eventually(lambda: process.killed, 0.3 + 0.2)
 
 
-def test_a_process_that_waits_for_a_processor_has_longer_to_start():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.starving = {"DM1"}
-            world.machine.starves_from_s = asyncio.get_running_loop().time()
-            bound = world.machine.add
-            world.machine.add = lambda names, life: mute(bound(names, life))
+@within(running)
+async def test_a_process_that_waits_for_a_processor_has_longer_to_start(world):
+    world.machine.starving = {"DM1"}
+    world.machine.starves_from_s = asyncio.get_running_loop().time()
+    bound = world.machine.add
+    world.machine.add = lambda names, life: mute(bound(names, life))
 
-            def mute(process: Process) -> Process:
-                world.silent.add(process.pid)
-                return process
+    def mute(process: Process) -> Process:
+        world.silent.add(process.pid)
+        return process
 
-            for name in ("DM1", "DM2"):
-                world.kill(name)
-            await eventually(lambda: ("DM2", "wedged", 2) in world.events, 5.0)
-            assert ("DM1", "wedged", 2) not in world.events
-            world.silent.clear()
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-
-    run(scenario)
+    for name in ("DM1", "DM2"):
+        world.kill(name)
+    await eventually(lambda: ("DM2", "wedged", 2) in world.events, 5.0)
+    assert ("DM1", "wedged", 2) not in world.events
+    world.silent.clear()
+    await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
 
 
 def status(world: World, life: int, stamp_s: float | None = None) -> None:
@@ -412,188 +367,146 @@ def status(world: World, life: int, stamp_s: float | None = None) -> None:
               "ftm_manager", life, stamp_s=stamp_s)
 
 
-def test_a_process_that_no_descriptor_is_left_for_is_held_as_soon_as_there_is_one():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.hold_error = no_descriptor()
-            world.kill("DM1")
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-            world.machine.hold_error = None
-            await asyncio.sleep(0.1)
-            world.kill("DM1")
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
-            assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
-
-    run(scenario)
+NO_DESCRIPTOR = OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
 
-def test_a_process_that_ends_while_nobody_can_hold_it_is_missed():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.hold_error = no_descriptor()
-            world.kill("DM1")
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-            world.kill("DM1")
-            await asyncio.sleep(0.1)
-            world.machine.hold_error = None
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
-            assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
-
-    run(scenario)
-
-
-def test_a_process_that_nobody_can_hold_is_not_replaced_before_it_is_gone():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.hold_error = no_descriptor()
-            world.kill("DM1")
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-            world.respawn("DM1", 2)
-            await asyncio.sleep(1.0)
-            assert world.machine.forks == [("DM1", 2)]
-            world.machine.hold_error = None
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
-            assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
-
-    run(scenario)
+@asynccontextmanager
+async def unheld() -> AsyncIterator[World]:
+    """A world in which there was no descriptor left for the second incarnation of DM1."""
+    async with running() as world:
+        world.machine.fork_error = world.machine.hold_error = NO_DESCRIPTOR
+        world.kill("DM1")
+        await asyncio.sleep(0.3)
+        assert world.machine.forks == []
+        world.machine.fork_error = None  # a fork that failed is tried again
+        await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
+        world.events.clear()
+        yield world
+        world.machine.hold_error = None
+        await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
+        assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
 
 
-def test_the_end_of_a_process_that_is_being_replaced_anyway_is_no_crash():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.hold_error = no_descriptor()
-            world.kill("DM1")
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-            world.events.clear()
-            world.respawn("DM1", 2)
-            await asyncio.sleep(0.02)
-            world.kill("DM1")
-            world.machine.hold_error = None
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
-            assert world.events == [("DM1", "respawned", 3), ("DM1", "running", 3)]
-
-    run(scenario)
+@within(unheld)
+async def test_a_process_that_no_descriptor_is_left_for_is_held_as_soon_as_there_is_one(world):
+    world.machine.hold_error = None
+    await asyncio.sleep(0.1)
+    world.kill("DM1")
 
 
-def test_what_a_process_said_before_it_was_killed_does_not_make_it_run():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.fork_error = "none"
-            (victim,) = world.machine.of("DM1")
-            world.silent.add(victim.pid)
-            await eventually(lambda: victim.killed)
-            world.beat(victim)
-            await turns()
-            assert world.row("DM1")[0] == "wedged"
-            world.machine.fork_error = None
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-
-    run(scenario)
+@within(unheld)
+async def test_a_process_that_ends_while_nobody_can_hold_it_is_missed(world):
+    world.kill("DM1")
+    await asyncio.sleep(0.1)
 
 
-def test_a_fork_that_fails_for_want_of_descriptors_is_tried_again():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.fork_error = no_descriptor()
-            world.kill("DM1")
-            await asyncio.sleep(0.3)
-            world.machine.fork_error = None
-            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
-            assert world.machine.forks == [("DM1", 2)]
+@within(unheld)
+async def test_a_process_that_nobody_can_hold_is_not_replaced_before_it_is_gone(world):
+    world.respawn("DM1", 2)
+    await asyncio.sleep(1.0)
+    assert world.machine.forks == [("DM1", 2)]
 
-    run(scenario)
+
+@within(unheld)
+async def test_the_end_of_a_process_that_is_being_replaced_anyway_is_no_crash(world):
+    world.respawn("DM1", 2)
+    await asyncio.sleep(0.02)
+    world.kill("DM1")
+    world.machine.hold_error = None
+    await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
+    assert world.events == [("DM1", "respawned", 3), ("DM1", "running", 3)]
+
+
+@within(running)
+async def test_what_a_process_said_before_it_was_killed_does_not_make_it_run(world):
+    world.machine.fork_error = "none"
+    (victim,) = world.machine.of("DM1")
+    world.silent.add(victim.pid)
+    await eventually(lambda: victim.killed)
+    world.beat(victim)
+    await turns()
+    assert world.row("DM1")[0] == "wedged"
+    world.machine.fork_error = None
+    await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
 
 
 @pytest.mark.parametrize("outage_s", [0.3, 1.2, 6.0])
-def test_a_living_process_is_replaced_once_however_long_nobody_can_fork(outage_s):
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.fork_error = "none"
-            for _ in range(3):  # it is asked for again while nobody answers
-                world.respawn("safety_pilot", 1)
-                await asyncio.sleep(0.01)
-            await asyncio.sleep(outage_s)
-            assert world.row("safety_pilot")[0] == "crashed"
-            world.machine.fork_error = None
-            await asyncio.sleep(1.0)
-            assert world.machine.forks == [("safety_pilot", 2)]
-            assert world.row("safety_pilot")[:2] == ("running", 2)
-
-    run(scenario)
+@within(running)
+async def test_a_living_process_is_replaced_once_however_long_nobody_can_fork(world, outage_s):
+    world.machine.fork_error = "none"
+    for _ in range(3):  # it is asked for again while nobody answers
+        world.respawn("safety_pilot", 1)
+        await asyncio.sleep(0.01)
+    await asyncio.sleep(outage_s)
+    assert world.row("safety_pilot")[0] == "crashed"
+    world.machine.fork_error = None
+    await asyncio.sleep(1.0)
+    assert world.machine.forks == [("safety_pilot", 2)]
+    assert world.row("safety_pilot")[:2] == ("running", 2)
 
 
-def test_nothing_is_asked_for_again_before_it_is_answered():
-    async def scenario() -> None:
-        async with running() as world:
-            world.machine.is_slow = True
-            world.kill("DM1")
-            world.kill("osmosis_control")
-            for _ in range(5):
-                world.respawn("osmosis_control", 1)
-                await asyncio.sleep(1.0)
-            world.machine.is_slow = False
-            assert len(world.machine.waiting) == 2
-            for answer in world.machine.waiting:
-                answer()
-            await eventually(world.all_run)
-            assert sorted(world.machine.forks) == [("DM1", 2), ("osmosis_control", 2)]
-
-    run(scenario)
+@within(running)
+async def test_nothing_is_asked_for_again_before_it_is_answered(world):
+    world.machine.is_slow = True
+    world.kill("DM1")
+    world.kill("osmosis_control")
+    for _ in range(5):
+        world.respawn("osmosis_control", 1)
+        await asyncio.sleep(1.0)
+    world.machine.is_slow = False
+    assert len(world.machine.waiting) == 2
+    for answer in world.machine.waiting:
+        answer()
+    await eventually(world.all_run)
+    assert sorted(world.machine.forks) == [("DM1", 2), ("osmosis_control", 2)]
 
 
 @pytest.mark.parametrize("outage_s", [0.2, 0.24])  # whichever of two chains would go on first
-def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(outage_s):
-    async def scenario() -> None:
-        async with running() as world:
-            document = load_document(PLAN)
-            row = next(r for r in document["detection"] if r["name"] == "DM2")
-            row["parameters"] = {**row.get("parameters", {}), "hold_s": 0.9}
-            world.machine.fork_error = "none"
-            world.kill("DM2")
-            await asyncio.sleep(0.02)
-            world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
-                1, "retune DM2", "tester", msgspec.json.encode(document).decode()))
-            await asyncio.sleep(outage_s)
-            world.machine.fork_error = None
-            await eventually(lambda: world.row("DM2")[:2] == ("running", 2))
-            world.machine.questions = 0
-            await asyncio.sleep(1.0)
-            assert world.machine.forks == [("DM2", 2)]
-            assert world.machine.questions == 0  # nobody waits for its end any more
-
-    run(scenario)
+@within(running)
+async def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(world, outage_s):
+    document = load_document(PLAN)
+    row = next(r for r in document["detection"] if r["name"] == "DM2")
+    row["parameters"] = {**row.get("parameters", {}), "hold_s": 0.9}
+    world.machine.fork_error = "none"
+    world.kill("DM2")
+    await asyncio.sleep(0.02)
+    world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
+        1, "retune DM2", "tester", msgspec.json.encode(document).decode()))
+    await asyncio.sleep(outage_s)
+    world.machine.fork_error = None
+    await eventually(lambda: world.row("DM2")[:2] == ("running", 2))
+    world.machine.questions = 0
+    await asyncio.sleep(1.0)
+    assert world.machine.forks == [("DM2", 2)]
+    assert world.machine.questions == 0  # nobody waits for its end any more
 
 
-@pytest.mark.parametrize("life", [1, 2, 77, 2 ** 53])
-def test_a_heartbeat_that_names_a_process_of_somebody_elses_has_nobody_adopted_or_killed(life):
-    async def scenario() -> None:
-        async with running() as world:
-            (own,) = world.machine.of("DM1")
-            stranger = world.machine.add(("editor",), 1)
-            world.machine.kill(own)
-            for _ in range(20):
-                world.say(bus_topics.HEARTBEAT, Heartbeat(stranger.pid, 0, 0.1, 0, 0), "DM1", life,
-                          key=bus_topics.HEARTBEAT.at("DM1"))
-                await asyncio.sleep(0.05)
-            assert not stranger.killed
-            assert world.row("DM1")[0] == "running"
-            assert world.row("DM1")[2] not in {stranger.pid, own.pid}
-
-    run(scenario)
+@pytest.mark.parametrize("life", [1, 2, 2 ** 53])
+@within(running)
+async def test_a_heartbeat_that_names_a_process_of_somebody_elses_has_nobody_adopted_or_killed(
+        world, life):
+    (own,) = world.machine.of("DM1")
+    stranger = world.machine.add(("editor",), 1)
+    world.machine.kill(own)
+    for _ in range(20):
+        world.say(bus_topics.HEARTBEAT, Heartbeat(stranger.pid, 0, 0.1, 0, 0), "DM1", life,
+                  key=bus_topics.HEARTBEAT.at("DM1"))
+        await asyncio.sleep(0.05)
+    assert not stranger.killed
+    assert world.row("DM1")[0] == "running"
+    assert world.row("DM1")[2] not in {stranger.pid, own.pid}
 
 
 @pytest.mark.parametrize("numbers", [(3, 7), (7, 3)])
-def test_of_two_lives_of_one_node_a_new_supervisor_adopts_the_higher_and_ends_the_other(numbers):
-    async def scenario() -> None:
-        async with running() as world:
-            names = world.kill("DM2").names
-            world.task.cancel()
-            await asyncio.gather(world.task, return_exceptions=True)
-            two = [world.machine.add(names, number, bound=True) for number in numbers]
-            world.start(known={"DM2": 7})
-            await turns()
-            higher = max(two, key=lambda p: p.incarnation)
-            assert world.row("DM2") == ("running", 7, higher.pid)
-            assert world.machine.of("DM2") == [higher]
-
-    run(scenario)
+@within(running)
+async def test_of_two_lives_of_one_node_a_new_supervisor_adopts_the_higher_and_ends_the_other(
+        world, numbers):
+    names = world.kill("DM2").names
+    world.task.cancel()
+    await asyncio.gather(world.task, return_exceptions=True)
+    two = [world.machine.add(names, number, bound=True) for number in numbers]
+    world.start(known={"DM2": 7})
+    await turns()
+    higher = max(two, key=lambda p: p.incarnation)
+    assert world.row("DM2") == ("running", 7, higher.pid)
+    assert world.machine.of("DM2") == [higher]

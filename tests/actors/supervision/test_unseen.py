@@ -18,10 +18,8 @@ from rampart.actors.runtime.run_plan import load_system
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.root import needed_descriptors
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
-from rampart.actors.system.layout import load_run
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.process_run import ProcessRun
-from rampart.sim.runs.trial import Trial
 from rampart.testing import free_base_port
 from tests import ROOT
 from tests.stub_actors import Idler, launched, stub_plan, write_stub_system
@@ -131,22 +129,6 @@ async def test_a_run_whose_observer_fails_ends_in_order_and_says_why(tmp_path, m
 
 
 @pytest.mark.processes
-async def test_a_run_without_a_mission_whose_observer_fails_ends_too(tmp_path, monkeypatch):
-    plan = stub_plan(write_stub_system(tmp_path))
-    stream = io.StringIO()
-    trial = Trial(load_run(plan, load_system(plan)), None, stream)
-    run = ProcessRun(trial)
-    usual = trial.sinks
-    monkeypatch.setattr(trial, "sinks", lambda clock: [*usual(clock), broken_sink])
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    async with asyncio.timeout(30):
-        await run.run()
-    assert run.failure == WHY
-    assert WHY in stream.getvalue()
-    assert find_processes(plan.base_port) == []
-
-
-@pytest.mark.processes
 async def test_a_run_may_open_as_many_files_as_the_hard_limit_allows(tmp_path):
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, before[1]))
@@ -161,7 +143,7 @@ async def test_a_run_may_open_as_many_files_as_the_hard_limit_allows(tmp_path):
 @pytest.mark.processes
 @pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"),
                     reason="only root can be a user who may start no process")
-@pytest.mark.parametrize("processes", range(1, 4))
+@pytest.mark.parametrize("processes", [1, 3])
 def test_a_run_that_may_start_too_few_processes_is_refused_in_one_line(tmp_path, processes):
     reads_all = ["--inh-caps=-all,+dac_override", "--ambient-caps=-all,+dac_override"]
     result = subprocess.run(
@@ -180,8 +162,5 @@ def test_a_run_that_may_open_too_few_files_is_refused_in_one_line(tmp_path):
          "--system", "paper", "--no-hmi", "--port", str(free_base_port()),
          "--report", str(tmp_path / "report")],
         check=False, capture_output=True, text=True, timeout=60)
-    assert result.returncode == 2
-    assert result.stderr == (
-        "launch.py: open files: the hard limit is 64, and 23 processes need "
-        f"{needed_descriptors(23)}; raise it, as with `ulimit -Hn {needed_descriptors(23)}` in the "
-        "shell of a privileged user\n")
+    assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
+    assert f"the hard limit is 64, and 23 processes need {needed_descriptors(23)}" in result.stderr
