@@ -28,10 +28,8 @@ from rampart.actors.supervision.process_title import parse_title
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
 from rampart.files import toml
-from rampart.files.plain_text import one_line
-from rampart.files.reading import FileError, read_bytes
+from rampart.files.reading import FileError
 from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa
-from rampart.manager.model.gates import GateError, detection_gate, recovery_gate
 from rampart.manager.spec.adaptation import ChangeError, parse_value
 from rampart.sim.campaign.store import Store, StoreError
 from tests import ROOT
@@ -59,16 +57,10 @@ def edited(old: str, new: str) -> str:
 NESTED = "x = " + "[" * 100_000 + "]" * 100_000
 AIRPORTS = {
     "nested 100,000 deep": (TOML + NESTED, "more than 32 deep"),
-    "tables nested without end": ("x = " + "{a=" * 100_000, "more than 32 deep"),
     "longer than any airport": (TOML + "#" * (5 << 20), "longer than 4 MB"),
     "a coordinate of 400 digits": (edited("T = [30.0", f"T = [1{'0' * 400}"),
                                    "nodes.T[0]: 1000000000"),
-    "a coordinate of 5,000 digits": (edited("T = [30.0", f"T = [1{'0' * 5000}"),
-                                     "an integer with thousands of digits"),
     "a coordinate beyond the earth": (edited("T = [30.0", "T = [3e7"), "nodes.T[0]: 30000000.0"),
-    "half a width that no float squares": (edited("half_width_m = 3.0", "half_width_m = 1e308"),
-                                           "surface[0].half_width_m: 1e+308: must be between"),
-    "a fillet beyond all measure": ("fillet_radius_m = 1e300\n" + TOML, "fillet_radius_m: 1e+300"),
     "a thousand million lights": (edited("count = 3", "count = 1000000000"), "row[0].count"),
     "a million lights": (edited("count = 3", "count = 1000000"), "1000000 lights: at most 100000"),
     "a name that steers the terminal": (edited(
@@ -76,8 +68,6 @@ AIRPORTS = {
         ).split("[world")[0].replace("10.0, 0.0", "10.0, 9.0"), "off the pavement"),
     "a fault that lies deeper than the next node has values": (
         edited("S = [0.0, 0.0]\nT = [30.0, 0.0]", "S = [0.0, []]\nT = [0.0]"), "nodes.S[1]: []"),
-    "a number where a table belongs": (edited("[missions.M]", "[missions]\nM = 3\n[world]"),
-                                       "missions.M: 3"),
 }
 
 
@@ -88,23 +78,12 @@ def test_an_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, tex
     assert words in refusal(capsys, launch.main, "--virtual", "--airport", str(path))
 
 
-def test_a_mission_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys):
-    path = tmp_path / "mission.toml"
-    path.write_text(AIRPORTS["nested 100,000 deep"][0])
-    refusal(capsys, launch.main, "--virtual", "--mission", str(path))
-
-
 SPECS = {
     "nested": ("x = " + "[" * 100_000, "more than 32 deep"),
     "long": (SPEC + "#" * (1 << 20), "longer than 512 kB"),
     "many events": (SPEC + "".join(f'[[event]]\nname = "X{i}"\n' for i in range(6000)),
                     "expected a list, at most 5000 long"),
-    "many orders": (SPEC + "".join(f"[orders.x{i}]\n" for i in range(20)),
-                    "expected a table, at most 16 long"),
     "a long name": (SPEC.replace('name = "DM1"', f'name = "D{"1" * 200}"', 1), "expected a name"),
-    "a gate of a thousand names": (
-        SPEC.replace('detect = "DM1"', f'detect = "{" and ".join(["DM1"] * 1000)}"', 1),
-        "1999 names, words and parentheses"),
     "ways that no number holds": (
         SPEC.replace('recover = "RM2"',
                      f'recover = "{" and ".join(["(RM1 or RM2)"] * 20_000)}"', 1),
@@ -135,15 +114,6 @@ def test_a_table_to_be_replaced_is_read_within_the_same_bounds(tmp_path, capsys)
     assert "32 deep" in refusal(capsys, rampart, "adapt", "replace", "FTM7", str(path))
     with pytest.raises(ChangeError, match="expected a TOML value"):
         parse_value(NESTED)
-
-
-def test_a_gate_as_large_as_may_be_is_read_and_a_larger_one_is_not():
-    names = [f"DM{i}" for i in range(16)]
-    assert detection_gate(" and ".join(names * 12)).names == tuple(names)
-    with pytest.raises(GateError, match="at most 64"):
-        detection_gate(f"2 of ({', '.join(['DM1'] * 65)})")
-    with pytest.raises(GateError, match="at most 400"):
-        recovery_gate(" or ".join(["RM1"] * 300))
 
 
 # -- graphs and masks ------------------------------------------------------------------------------
@@ -188,7 +158,6 @@ def foreign(folder: Path, image: bytes | None = None, graph: str = json.dumps(GR
 
 FOREIGN = {
     "50,000 x 50,000 pixels": ({"image": png_of(50_000, 50_000)}, "at most 16777216"),
-    "13,000 x 13,000 pixels": ({"image": png_of(13_000, 13_000)}, "13000 x 13000 pixels"),
     "no rows": ({"image": png_of(100, 0)}, "unreadable"),
     "noise": ({"image": png_noise(1000)}, "more than 20000 rectangles"),
     "another kind of image by the name of a PNG": ({"image": b"GIF89a" + b"\0" * 100},
@@ -196,8 +165,6 @@ FOREIGN = {
     "a graph nested without end": ({"graph": '{"nodes":' + "[" * 100_000}, "not JSON"),
     "a node of 400 digits": ({"graph": '{"nodes":[{"id":"N","x":1' + "0" * 400 + ',"y":0}],'
                               '"edges":[]}'}, "must be a finite number of metres"),
-    "a node of 5,000 digits": ({"graph": '{"nodes":[{"id":"N","x":1' + "0" * 5000 + ',"y":0}],'
-                                '"edges":[]}'}, "not JSON"),
     "a node far away": ({"graph": '{"nodes":[{"id":"N","x":1e9,"y":0}],"edges":[]}'},
                         "must be within 1,000,000 m"),
     "half a character as a name": ({"graph": '{"nodes":[{"id":"\\ud800","x":1,"y":0}],'
@@ -376,14 +343,3 @@ def test_a_document_at_the_limits_is_read_and_strings_and_comments_hold_anything
         toml.parse(".".join("a" * 50_000) + " = 1")
     with pytest.raises(FileError, match="32 deep"):
         toml.parse("n = " + "[" * 33 + "]" * 33)
-
-
-def test_what_is_said_of_a_file_is_one_printable_line_of_bounded_length():
-    assert one_line("a\n\tb\x1b[31m\ud800") == "a b\\u001b[31m\\ud800"
-    assert len(one_line("x" * 10_000_000)) < 1000
-    assert one_line("Flughafen Zürich: 滑走路") == "Flughafen Zürich: 滑走路"
-
-
-def test_a_file_is_read_no_further_than_it_may_be_long():
-    with pytest.raises(FileError, match="longer than 64 kB"):
-        read_bytes(Path("/dev/zero"), 1 << 16)

@@ -56,6 +56,7 @@ def test_what_is_not_printable_is_written_as_its_number(text, shown):
 def test_one_line_is_one_line_and_not_too_long():
     assert one_line(" a \n\t b\x1b ") == "a b\\u001b"
     assert one_line("x" * 1000, 10) == "xxx ... xx"
+    assert one_line("Flughafen Zürich: 滑走路") == "Flughafen Zürich: 滑走路"
     assert printable("a\nb\x1b", keep="\n") == "a\nb\\u001b"
 
 
@@ -72,11 +73,6 @@ def test_what_tools_print_is_harmless_whatever_they_are_told(text, capsys):
     assert harmless(out + err)
     *_, end, reset = [line for line in out.splitlines() if line]
     assert (json.loads(reset), end) == ({"recovery": text, "by": text}, "}")
-
-
-def test_a_forged_line_stays_within_the_line_of_who_sent_it(capsys):
-    say("1.000 x\n2.000 localization#1 forged")
-    assert capsys.readouterr().out.count("\n") == 1
 
 
 @pytest.mark.parametrize("topic", all_topics(), ids=lambda t: t.key)

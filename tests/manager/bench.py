@@ -89,6 +89,42 @@ class Bench:
                         track.name, track.reported, track.reason, track.nodes, track.since_s))
         return outputs
 
+    def play(self, script: str) -> Bench:
+        """Play a timeline, step by step, and compare what follows of each step.
+
+        A step is `DM4 node` (reports activity of nodes), `-DM4`, `RM3 done` (with `41`: of that
+        decision), `wait 1.0` (`without DM1`: which is not heard), `reset RM1` or `refused RM1`.
+        Behind it: `> +RM2 -RM3`, the commands of this step; `= RM2 (RM3)`, the orders then. What is
+        known is checked by `latched:`, `active:`, `silent:`, `late:`; `rejected: RM3 words` looks
+        for a reason of the last decision.
+        """
+        for step in filter(None, map(str.strip, script.replace("\n", ";").split(";"))):
+            action, is_ordered, orders = step.partition("=")
+            action, is_told, told = action.partition(">")
+            outputs = self._act(*action.split())
+            if is_told:
+                found = [f"{'+' if on else '-'}{rm}" for rm, on in commands(outputs)]
+                assert found == told.split(), step
+            if is_ordered:
+                assert self.orders == orders.strip(), step
+        return self
+
+    def _act(self, word: str, *rest: str) -> list:
+        if word.startswith(("DM", "-DM")):
+            return self.active(word, *rest) if word[0] == "D" else self.idle(word[1:])
+        if word.startswith("RM"):
+            return self.report(word, RecoveryPhase(rest[0]), *map(int, rest[1:]))
+        if word == "wait":
+            return self.wait(float(rest[0]), hearing=tuple(dm for dm in DMS if dm not in rest[2:]))
+        if word in {"reset", "refused"}:
+            assert self.reset(rest[0]).granted == (word == "reset"), rest
+        elif word == "rejected:":
+            why = dict(self.decisions[-1].decision.rejected)[rest[0]]
+            assert " ".join(rest[1:]) in why, why
+        else:
+            assert set(getattr(self.state, word.rstrip(":"))) == set(rest), (word, rest)
+        return []
+
     @property
     def orders(self) -> str:
         """Recoveries under orders, draining ones in brackets."""

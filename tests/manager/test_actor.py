@@ -7,6 +7,8 @@ the nodes are played. Nothing here takes real time.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
@@ -16,7 +18,6 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import decode
 from rampart.actors.detection.freshness import Freshness
-from rampart.actors.detection.module import DetectionModule
 from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -32,12 +33,11 @@ from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
 from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.system.members import Member, heard, published
 from rampart.manager.actor import DECISIONS_PER_INCARNATION, FtmManager
 from rampart.sim.virtual.virtual_loop import VirtualLoop
-from rampart.testing import run
 from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor, hang
 from tests.osmosis_system import COMMAND, POSE, System, shipped_system
+from tests.virtual_time import within
 
 CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
 OTHERS = ("hmi", "teleoperation")
@@ -97,18 +97,6 @@ class Recorder(Actor):
     def taken(self) -> list[tuple[tuple[str, ...], int, tuple[str, ...]]]:
         """Active mechanisms, rule and recoveries of each decision."""
         return [(d.active, d.rule, d.recoveries) for d in self.decisions]
-
-
-class Obedient(Actor):
-    """Hears all commands to recovery modules."""
-
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        self.heard: list[fm.RecoveryCommand] = []
-
-    @on(ftm_topics.RECOVERY_COMMAND)
-    def command(self, message: fm.RecoveryCommand, _header: Header) -> None:
-        self.heard.append(message)
 
 
 class Counter(Actor):
@@ -186,403 +174,304 @@ class Whole(System):
         return self.recorder.statuses[-1]
 
 
-def in_whole_system(scenario: Any) -> None:
-    async def begin() -> None:
-        async with Whole() as system:
-            await system.begin()
-            await scenario(system)
-
-    run(begin)
+@asynccontextmanager
+async def whole() -> AsyncIterator[Whole]:
+    async with Whole() as system:
+        await system.begin()
+        yield system
 
 
-def test_a_healthy_system_decides_nothing_in_a_minute():
-    async def scenario(system: Whole) -> None:
-        await asyncio.sleep(60.0)
-        assert system.recorder.decisions == []
-        assert system.recorder.problems == []
-        assert system.pilot.heard == 0
-        assert system.base.orders == []
-
-    in_whole_system(scenario)
+@within(whole)
+async def test_a_healthy_system_decides_nothing_in_a_minute(system):
+    await asyncio.sleep(60.0)
+    assert system.recorder.decisions == []
+    assert system.recorder.problems == []
+    assert system.pilot.heard == 0
+    assert system.base.orders == []
 
 
 @pytest.mark.parametrize(("node", "mechanism", "recovery"), [
     ("osmosis_control", "FTM4", "RM3"), ("mission_manager", "FTM4", "RM3"),
     ("hmi", "FTM5", "RM4"), ("localization", "FTM7", "RM4")])
-def test_a_killed_node_is_asked_for_before_any_time_passes_and_released_when_it_is_back(
-        node, mechanism, recovery):
-    async def scenario(system: Whole) -> None:
-        await system.kill(node)
-        killed_s = system.clock.now()
-        await system.settle()
-        at, request = system.supervisor.requests[0]
-        assert (at, request.node, request.failed_incarnation, request.by) == (
-            killed_s, node, 1, recovery)
-        await asyncio.sleep(3.0)
-        assert system.recorder.taken == [((mechanism,), 1, (recovery,)), ((), 0, ())]
-        assert system.recorder.decisions[0].detected_s == killed_s
-        assert (recovery, "done") in system.recorder.recoveries
-        assert system.status.activated == ()
-        assert system.incarnations[node] == 2
-
-    in_whole_system(scenario)
+@within(whole)
+async def test_a_killed_node_is_asked_for_before_any_time_passes_and_released_when_it_is_back(
+        system, node, mechanism, recovery):
+    await system.kill(node)
+    killed_s = system.clock.now()
+    await system.settle()
+    at, request = system.supervisor.requests[0]
+    assert (at, request.node, request.failed_incarnation, request.by) == (
+        killed_s, node, 1, recovery)
+    await asyncio.sleep(3.0)
+    assert system.recorder.taken == [((mechanism,), 1, (recovery,)), ((), 0, ())]
+    assert system.recorder.decisions[0].detected_s == killed_s
+    assert (recovery, "done") in system.recorder.recoveries
+    assert system.status.activated == ()
+    assert system.incarnations[node] == 2
 
 
-def test_a_hanging_node_is_respawned_after_the_heartbeat_timeout():
-    async def scenario(system: Whole) -> None:
-        hang(system.nodes["graph_planner"])
-        await asyncio.sleep(1.0)
-        assert system.incarnations["graph_planner"] == 2
-        assert system.recorder.taken[0] == (("FTM4",), 1, ("RM3",))
+@within(whole)
+async def test_a_stale_command_stops_the_robot_until_it_is_fresh_again(system):
+    system.robot.silent.add("command")
+    await asyncio.sleep(1.5)
+    assert system.pilot.mode is PilotMode.STOP
+    assert system.pilot.orders["RM2"].reason.startswith("DM2: command not updated")
+    system.robot.silent.clear()
+    await asyncio.sleep(2.0)
+    assert system.pilot.mode is PilotMode.AUTO
+    assert system.recorder.taken == [(("FTM2",), 1, ("RM2",)), ((), 0, ())]
 
-    in_whole_system(scenario)
+
+@within(whole)
+async def test_nonsense_on_the_command_and_a_hanging_node_are_answered(system):
+    hang(system.nodes["graph_planner"])
+    await asyncio.sleep(1.0)
+    assert system.incarnations["graph_planner"] == 2
+    assert system.recorder.taken[0] == (("FTM4",), 1, ("RM3",))
+    system.robot.speed_mps = 3.0
+    system.robot.talk()
+    await system.settle()
+    assert system.pilot.mode is PilotMode.STOP, "with the first message"
 
 
-def test_a_stale_command_stops_the_robot_until_it_is_fresh_again():
-    async def scenario(system: Whole) -> None:
-        system.robot.silent.add("command")
-        await asyncio.sleep(1.5)
+@within(whole)
+async def test_an_emergency_stop_comes_with_the_fix_and_stays_until_it_is_reset(system):
+    system.robot.y_m = 2.2
+    system.robot.talk()
+    await system.settle()
+    assert system.base.engaged
+    reset = fm.Reset("RM1", "operator")
+    system.robot.publish(ftm_topics.RESET, reset)
+    await system.settle()
+    assert system.recorder.problems == ["reset refused: the cause persists: FTM1 active"]
+    system.robot.y_m = 0.0
+    await asyncio.sleep(5.0)
+    assert system.base.engaged
+    assert system.status.latched == ("RM1",)
+    system.robot.publish(ftm_topics.RESET, reset)
+    await system.settle()
+    assert not system.base.engaged
+    assert system.status.latched == ()
+
+
+@within(whole)
+async def test_the_paper_row_3_wrong_value_and_crash_give_the_controlled_stop(system):
+    system.supervisor.answer = "nothing"
+    await system.kill("osmosis_control")
+    await system.settle()
+    system.robot.speed_mps = 3.0
+    system.robot.talk()
+    await asyncio.sleep(0.2)
+    assert system.recorder.taken[-1] == (("FTM3", "FTM4"), 3, ("RM2",))
+    assert "RM3" in system.status.activated  # not cut off: it drains
+    # They share no claim, and RM2 is safer, so it does not wait for the respawn.
+    assert system.pilot.mode is PilotMode.STOP
+    system.supervisor.answer = "respawned"
+    await asyncio.sleep(0.5)
+    assert system.incarnations["osmosis_control"] == 2
+
+
+@within(whole)
+async def test_a_recovery_module_that_is_respawned_while_activated_is_commanded_again(system):
+    system.robot.silent.add("pose")
+    await asyncio.sleep(2.0)
+    await system.kill("RM5")
+    await system.settle()
+    before = system.pilot.heard
+    system.revive("RM5")
+    await system.settle()
+    assert system.pilot.heard > before
+    assert system.pilot.mode is PilotMode.TELEOPERATION
+    await asyncio.sleep(1.0)
+    assert system.status.activated == ("RM5",)
+
+
+@within(whole)
+async def test_a_respawned_detection_module_does_not_let_go_of_a_fault_that_persists(system):
+    system.robot.silent.add("command")
+    await asyncio.sleep(2.0)
+    assert system.pilot.mode is PilotMode.STOP
+    await system.kill("DM2")
+    await asyncio.sleep(0.3)
+    system.revive("DM2")
+    for _ in range(60):
+        await asyncio.sleep(0.05)
         assert system.pilot.mode is PilotMode.STOP
-        assert system.pilot.orders["RM2"].reason.startswith("DM2: command not updated")
-        system.robot.silent.clear()
-        await asyncio.sleep(2.0)
-        assert system.pilot.mode is PilotMode.AUTO
-        assert system.recorder.taken == [(("FTM2",), 1, ("RM2",)), ((), 0, ())]
-
-    in_whole_system(scenario)
 
 
-def test_a_stale_pose_hands_over_to_teleoperation():
-    async def scenario(system: Whole) -> None:
-        system.robot.silent.add("pose")
-        await asyncio.sleep(1.5)
-        assert system.pilot.mode is PilotMode.TELEOPERATION
-        assert system.recorder.taken == [(("FTM6",), 1, ("RM5",))]
-
-    in_whole_system(scenario)
-
-
-def test_nonsense_on_the_command_stops_the_robot_with_the_first_message():
-    async def scenario(system: Whole) -> None:
-        system.robot.speed_mps = 3.0
-        system.robot.talk()
-        await system.settle()
-        assert system.pilot.mode is PilotMode.STOP
-
-    in_whole_system(scenario)
+@within(whole)
+async def test_a_detection_module_that_stays_away_counts_as_active(system):
+    await system.kill("DM3")
+    await asyncio.sleep(1.5)
+    assert system.status.silent == ("DM3",)
+    assert system.pilot.mode is PilotMode.STOP
+    system.revive("DM3")
+    await asyncio.sleep(1.5)
+    assert system.status.silent == ()
+    assert system.pilot.mode is PilotMode.AUTO
 
 
-def test_an_emergency_stop_comes_with_the_fix_and_stays_until_it_is_reset():
-    async def scenario(system: Whole) -> None:
-        system.robot.y_m = 2.2
-        system.robot.talk()
-        await system.settle()
-        assert system.base.engaged
-        reset = fm.Reset("RM1", "operator")
-        system.robot.publish(ftm_topics.RESET, reset)
-        await system.settle()
-        assert system.recorder.problems == ["reset refused: the cause persists: FTM1 active"]
-        system.robot.y_m = 0.0
-        await asyncio.sleep(5.0)
-        assert system.base.engaged
-        assert system.status.latched == ("RM1",)
-        system.robot.publish(ftm_topics.RESET, reset)
-        await system.settle()
-        assert not system.base.engaged
-        assert system.status.latched == ()
-
-    in_whole_system(scenario)
-
-
-def test_the_paper_row_3_wrong_value_and_crash_give_the_controlled_stop():
-    async def scenario(system: Whole) -> None:
-        system.supervisor.answer = "nothing"
-        await system.kill("osmosis_control")
-        await system.settle()
-        system.robot.speed_mps = 3.0
-        system.robot.talk()
-        await asyncio.sleep(0.2)
-        assert system.recorder.taken[-1] == (("FTM3", "FTM4"), 3, ("RM2",))
-        assert "RM3" in system.status.activated  # not cut off: it drains
-        # They share no claim, and RM2 is safer, so it does not wait for the respawn.
-        assert system.pilot.mode is PilotMode.STOP
-        system.supervisor.answer = "respawned"
-        await asyncio.sleep(0.5)
-        assert system.incarnations["osmosis_control"] == 2
-
-    in_whole_system(scenario)
+@within(whole)
+async def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once(system):
+    system.supervisor.answer = "nothing"
+    timeout_s = system.run.system.timing.detection_silence_timeout_s
+    hung_s = system.clock.now()
+    hang(system.actors["DM3"])
+    await asyncio.sleep(3.0)
+    (at_s, request), = system.supervisor.requests
+    assert 0.4 * timeout_s < at_s - hung_s < 0.75 * timeout_s
+    assert (request.node, request.failed_incarnation, request.by) == ("DM3", 1, "ftm_manager")
+    assert system.status.silent == ("DM3",)
+    await system.kill("DM3")
+    system.revive("DM3")
+    await asyncio.sleep(2.0)
+    assert system.status.silent == ()
+    hang(system.actors["DM3"])
+    await asyncio.sleep(2.0)
+    assert [(r.request, r.node, r.failed_incarnation)
+            for _, r in system.supervisor.requests] == [(1, "DM3", 1), (2, "DM3", 2)]
 
 
-def test_a_flapping_detection_module_does_not_thrash_the_recovery():
-    async def scenario(system: Whole) -> None:
-        await system.kill("DM6")
-        flapper = system.start("DM6", DetectionModule)
-        await system.settle()
-        for _ in range(40):
-            flapper.activate("flap")
-            await asyncio.sleep(0.3)
-            flapper.know_idle()
-            await asyncio.sleep(0.7)
-        releases = [d for d in system.recorder.decisions if not d.active]
-        assert len(releases) <= 3
-        await asyncio.sleep(12.0)
-        assert system.status.active == ()
-        assert system.pilot.mode is PilotMode.AUTO
-
-    in_whole_system(scenario)
-
-
-def test_a_recovery_module_that_is_respawned_while_activated_is_commanded_again_at_once():
-    async def scenario(system: Whole) -> None:
-        system.robot.silent.add("pose")
-        await asyncio.sleep(2.0)
-        await system.kill("RM5")
-        await system.settle()
-        before = system.pilot.heard
-        system.revive("RM5")
-        await system.settle()
-        assert system.pilot.heard > before
-        assert system.pilot.mode is PilotMode.TELEOPERATION
-        await asyncio.sleep(1.0)
-        assert system.status.activated == ("RM5",)
-
-    in_whole_system(scenario)
-
-
-def test_a_respawned_detection_module_does_not_let_go_of_a_fault_that_persists():
-    async def scenario(system: Whole) -> None:
-        system.robot.silent.add("command")
-        await asyncio.sleep(2.0)
-        assert system.pilot.mode is PilotMode.STOP
-        await system.kill("DM2")
-        await asyncio.sleep(0.3)
-        system.revive("DM2")
-        for _ in range(60):
-            await asyncio.sleep(0.05)
-            assert system.pilot.mode is PilotMode.STOP
-
-    in_whole_system(scenario)
-
-
-def test_a_detection_module_that_stays_away_counts_as_active():
-    async def scenario(system: Whole) -> None:
-        await system.kill("DM3")
-        await asyncio.sleep(1.5)
-        assert system.status.silent == ("DM3",)
-        assert system.pilot.mode is PilotMode.STOP
-        system.revive("DM3")
-        await asyncio.sleep(1.5)
-        assert system.status.silent == ()
-        assert system.pilot.mode is PilotMode.AUTO
-
-    in_whole_system(scenario)
-
-
-def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once_before_it_counts():
-    async def scenario(system: Whole) -> None:
-        system.supervisor.answer = "nothing"
-        timeout_s = system.run.system.timing.detection_silence_timeout_s
-        hung_s = system.clock.now()
-        hang(system.actors["DM3"])
-        await asyncio.sleep(3.0)
-        (at_s, request), = system.supervisor.requests
-        assert 0.4 * timeout_s < at_s - hung_s < 0.75 * timeout_s
-        assert (request.node, request.failed_incarnation, request.by) == ("DM3", 1, "ftm_manager")
-        assert system.status.silent == ("DM3",)
-        await system.kill("DM3")
-        system.revive("DM3")
-        await asyncio.sleep(2.0)
-        assert system.status.silent == ()
-        hang(system.actors["DM3"])
-        await asyncio.sleep(2.0)
-        assert [(r.request, r.node, r.failed_incarnation)
-                for _, r in system.supervisor.requests] == [(1, "DM3", 1), (2, "DM3", 2)]
-
-    in_whole_system(scenario)
-
-
-def test_a_detection_module_whose_reports_are_old_news_is_silent():
-    async def scenario(system: Whole) -> None:
-        system.supervisor.answer = "nothing"
-        tool = system.start("tool", Tool)
-        await system.settle()
-        tool.publish(bus_topics.INJECT, bm.Injection("i.1", "detection/DM3", "freeze", 60.0))
-        await asyncio.sleep(0.5)
-        assert system.status.silent == ()
-        await asyncio.sleep(1.0)
-        assert system.status.silent == ("DM3",)
-
-    in_whole_system(scenario)
+@within(whole)
+async def test_a_detection_module_whose_reports_are_old_news_is_silent(system):
+    system.supervisor.answer = "nothing"
+    tool = system.start("tool", Tool)
+    await system.settle()
+    tool.publish(bus_topics.INJECT, bm.Injection("i.1", "detection/DM3", "freeze", 60.0))
+    await asyncio.sleep(0.5)
+    assert system.status.silent == ()
+    await asyncio.sleep(1.0)
+    assert system.status.silent == ("DM3",)
 
 
 @pytest.mark.parametrize("late", [("DM2", "DM3"), ("DM1", "DM2", "DM3", "DM4", "DM5")])
-def test_while_several_are_late_none_is_replaced(late):
-    async def scenario(system: Whole) -> None:
-        for name in late:
-            hang(system.actors[name])
-        await asyncio.sleep(0.9)
-        assert system.supervisor.requests == []
-
-    in_whole_system(scenario)
+@within(whole)
+async def test_while_several_are_late_none_is_replaced(system, late):
+    for name in late:
+        hang(system.actors[name])
+    await asyncio.sleep(0.9)
+    assert system.supervisor.requests == []
 
 
-def test_a_respawned_manager_adopts_a_latched_emergency_stop():
-    async def scenario(system: Whole) -> None:
-        system.robot.y_m = 2.2
-        await asyncio.sleep(0.5)
-        await system.kill("ftm_manager")
-        system.robot.y_m = 0.0
+@within(whole)
+async def test_a_respawned_manager_adopts_a_latched_emergency_stop(system):
+    system.robot.y_m = 2.2
+    await asyncio.sleep(0.5)
+    await system.kill("ftm_manager")
+    system.robot.y_m = 0.0
+    await asyncio.sleep(2.0)
+    system.revive("ftm_manager")
+    for _ in range(100):
+        await asyncio.sleep(0.05)
+        assert system.base.engaged
+    assert system.status.latched == ("RM1",)
+    system.robot.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
+    await asyncio.sleep(0.5)
+    assert not system.base.engaged
+
+
+@within(whole)
+async def test_manager_and_emergency_stop_killed_together_do_not_lose_the_latch(system):
+    system.robot.y_m = 2.2
+    await asyncio.sleep(0.5)
+    await system.kill("ftm_manager")
+    await system.kill("RM1")
+    system.robot.y_m = 0.0
+    await asyncio.sleep(1.0)
+    system.revive("ftm_manager")
+    await asyncio.sleep(0.3)
+    system.revive("RM1")
+    for _ in range(100):
+        await asyncio.sleep(0.05)
+        assert system.base.engaged
+    assert system.status.latched == ("RM1",)
+
+
+@within(whole)
+async def test_a_respawned_manager_keeps_the_stop_in_force_while_it_finds_its_way(system):
+    system.robot.silent.add("command")
+    await asyncio.sleep(1.5)
+    await system.kill("ftm_manager")
+    system.revive("ftm_manager")
+    for _ in range(40):
+        await asyncio.sleep(0.05)
+        assert system.pilot.mode is PilotMode.STOP
+    system.robot.silent.clear()
+    await asyncio.sleep(2.0)
+    assert system.pilot.mode is PilotMode.AUTO
+    numbers = [d.decision for d in system.recorder.decisions]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] > DECISIONS_PER_INCARNATION
+
+
+@within(whole)
+async def test_a_manager_killed_during_a_respawn_lets_it_finish(system):
+    system.supervisor.delay_s = 0.4
+    await system.kill("graph_planner")
+    await system.settle()
+    await system.kill("ftm_manager")
+    system.revive("ftm_manager")
+    await asyncio.sleep(3.0)
+    assert system.incarnations["graph_planner"] == 2
+    assert system.status.activated == ()
+    assert system.pilot.heard == 0
+
+
+@within(whole)
+async def test_a_manager_that_was_stopped_takes_nobodys_unread_mail_for_silence(system):
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    for pause_s in (0.31, 0.4, 0.5, 0.7, 1.1, 5.0):
+        loop.jump(pause_s)
         await asyncio.sleep(2.0)
-        system.revive("ftm_manager")
-        for _ in range(100):
-            await asyncio.sleep(0.05)
-            assert system.base.engaged
-        assert system.status.latched == ("RM1",)
-        system.robot.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
-        await asyncio.sleep(0.5)
-        assert not system.base.engaged
-
-    in_whole_system(scenario)
+    assert not system.base.engaged
+    assert all("DM" not in name for s in system.recorder.statuses for name in s.silent)
+    assert system.recorder.decisions == []
 
 
-def test_manager_and_emergency_stop_killed_together_do_not_lose_the_latch():
-    async def scenario(system: Whole) -> None:
-        system.robot.y_m = 2.2
-        await asyncio.sleep(0.5)
-        await system.kill("ftm_manager")
-        await system.kill("RM1")
-        system.robot.y_m = 0.0
-        await asyncio.sleep(1.0)
-        system.revive("ftm_manager")
-        await asyncio.sleep(0.3)
-        system.revive("RM1")
-        for _ in range(100):
-            await asyncio.sleep(0.05)
-            assert system.base.engaged
-        assert system.status.latched == ("RM1",)
-
-    in_whole_system(scenario)
+@within(whole)
+async def test_a_manager_that_was_stopped_waits_for_modules_that_go_on_after_it(system):
+    for actor in system.actors.values():
+        actor.hold(True)
+    await asyncio.sleep(5.0)
+    system.actors["ftm_manager"].hold(False)
+    await asyncio.sleep(0.8 * GRACE_S)
+    for actor in system.actors.values():
+        actor.hold(False)
+    await asyncio.sleep(2.0)
+    assert system.recorder.decisions == []
+    assert set(system.incarnations.values()) == {1}
+    system.actors["DM6"].hold(True)
+    await asyncio.sleep(2.0)
+    assert "DM6" in system.status.silent
 
 
-def test_a_respawned_manager_keeps_the_stop_in_force_while_it_finds_its_way():
-    async def scenario(system: Whole) -> None:
-        system.robot.silent.add("command")
-        await asyncio.sleep(1.5)
-        await system.kill("ftm_manager")
-        system.revive("ftm_manager")
-        for _ in range(40):
-            await asyncio.sleep(0.05)
-            assert system.pilot.mode is PilotMode.STOP
-        system.robot.silent.clear()
-        await asyncio.sleep(2.0)
-        assert system.pilot.mode is PilotMode.AUTO
-        numbers = [d.decision for d in system.recorder.decisions]
-        assert numbers == sorted(set(numbers))
-        assert numbers[-1] > DECISIONS_PER_INCARNATION
-
-    in_whole_system(scenario)
+@within(whole)
+async def test_it_shows_that_it_lives_to_who_looks_ten_times_a_second(system):
+    stamps = set()
+    for _ in range(200):
+        await asyncio.sleep(0.01)
+        posted = system.hub.board.read(ftm_topics.MANAGER_STATUS.at())
+        assert posted is not None
+        stamps.add(decode(ftm_topics.MANAGER_STATUS, posted)[0].stamp)
+    assert len(stamps) == pytest.approx(20, abs=1)
 
 
-def test_a_manager_killed_during_a_respawn_lets_it_finish():
-    async def scenario(system: Whole) -> None:
-        system.supervisor.delay_s = 0.4
-        await system.kill("graph_planner")
-        await system.settle()
-        await system.kill("ftm_manager")
-        system.revive("ftm_manager")
-        await asyncio.sleep(3.0)
-        assert system.incarnations["graph_planner"] == 2
-        assert system.status.activated == ()
-        assert system.pilot.heard == 0
-
-    in_whole_system(scenario)
-
-
-def test_a_manager_that_was_stopped_takes_nobodys_unread_mail_for_silence():
-    async def scenario(system: Whole) -> None:
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, VirtualLoop)
-        for pause_s in (0.31, 0.4, 0.5, 0.7, 1.1, 5.0):
-            loop.jump(pause_s)
-            await asyncio.sleep(2.0)
-        assert not system.base.engaged
-        assert all("DM" not in name for s in system.recorder.statuses for name in s.silent)
-        assert system.recorder.decisions == []
-
-    in_whole_system(scenario)
-
-
-def test_a_manager_that_was_stopped_waits_for_modules_that_go_on_after_it():
-    async def scenario(system: Whole) -> None:
-        for actor in system.actors.values():
-            actor.hold(True)
+@within(whole)
+async def test_what_is_wanted_and_how_it_is_obeyed_is_repeated_and_sent_once_a_second(system):
+    counter = system.start("counter", Counter)
+    sent = system.overhear("ftm_manager")
+    reported = system.overhear("RM1")
+    await asyncio.sleep(3.0)
+    for activated in (False, True):
+        if activated:
+            system.robot.y_m = 2.2
+            await asyncio.sleep(1.0)
+        assert system.base.engaged == activated
+        sent.clear()
+        reported.clear()
+        counter.commands = counter.reports = 0
         await asyncio.sleep(5.0)
-        system.actors["ftm_manager"].hold(False)
-        await asyncio.sleep(0.8 * GRACE_S)
-        for actor in system.actors.values():
-            actor.hold(False)
-        await asyncio.sleep(2.0)
-        assert system.recorder.decisions == []
-        assert set(system.incarnations.values()) == {1}
-        system.actors["DM6"].hold(True)
-        await asyncio.sleep(2.0)
-        assert "DM6" in system.status.silent
-
-    in_whole_system(scenario)
-
-
-def test_a_manager_that_has_heard_nobody_releases_nobody_until_its_grace_is_over():
-    async def scenario() -> None:
-        async with System(system=shipped_system()) as system:
-            modules = system.start("modules", Obedient)
-            system.start("ftm_manager", FtmManager)
-            await asyncio.sleep(shipped_system().timing.startup_grace_s - 0.1)
-            assert modules.heard == []
-            await asyncio.sleep(0.5)
-            assert any(command.activate for command in modules.heard)
-
-    run(scenario)
-
-
-def test_it_shows_that_it_lives_to_who_looks_ten_times_a_second():
-    async def scenario(system: Whole) -> None:
-        stamps = set()
-        for _ in range(200):
-            await asyncio.sleep(0.01)
-            posted = system.hub.board.read(ftm_topics.MANAGER_STATUS.at())
-            assert posted is not None
-            stamps.add(decode(ftm_topics.MANAGER_STATUS, posted)[0].stamp)
-        assert len(stamps) == pytest.approx(20, abs=1)
-
-    in_whole_system(scenario)
-
-
-def test_what_is_wanted_and_how_it_is_obeyed_is_repeated_and_sent_once_a_second():
-    async def scenario(system: Whole) -> None:
-        counter = system.start("counter", Counter)
-        sent = system.overhear("ftm_manager")
-        reported = system.overhear("RM1")
-        await asyncio.sleep(3.0)
-        for activated in (False, True):
-            if activated:
-                system.robot.y_m = 2.2
-                await asyncio.sleep(1.0)
-            assert system.base.engaged == activated
-            sent.clear()
-            reported.clear()
-            counter.commands = counter.reports = 0
-            await asyncio.sleep(5.0)
-            for key in ("recovery/RM1/command", "recovery/RM1/state"):
-                assert sum(k == key for k, _ in (*sent, *reported)) == pytest.approx(5, abs=1)
-            assert min(counter.commands, counter.reports) >= 24
-
-    in_whole_system(scenario)
-
-
-def test_it_hears_only_modules_and_people_and_commands_all_recovery_modules():
-    member = Member("ftm_manager", FtmManager, FtmManager.Parameters())
-    assert heard(member) == {
-        "detection/{name}": None, "recovery/{name}/state": None, "manager/reset": None,
-        "manager/adapt": None}
-    assert published(member)["recovery/{name}/command"] is None
-    assert published(member)["heartbeat/{name}"] == ("ftm_manager",)
+        for key in ("recovery/RM1/command", "recovery/RM1/state"):
+            assert sum(k == key for k, _ in (*sent, *reported)) == pytest.approx(5, abs=1)
+        assert min(counter.commands, counter.reports) >= 24

@@ -10,8 +10,6 @@ from rampart.actors.access.rights import rights_of_all
 from rampart.actors.access.rules import Host, rules_of
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
-from rampart.sim.virtual.virtual_bus import VirtualBus
-from rampart.testing import virtual_run
 from tests.actors.access.declared import disagreements, on_each_host, rules_as_declared
 from tests.actors.access.keyed import layout_of
 from tests.two_hosts import two_hosts
@@ -39,31 +37,6 @@ def who_says(key):
 ])
 def test_a_key_is_its_publishers(key, who):
     assert who_says(key) == who
-
-
-@pytest.mark.slow
-def test_what_actors_do_in_a_mission_with_faults_they_may(monkeypatch):
-    """Or it would be refused when keys are on; what they may is no more than what they do."""
-    done = {"says": set(), "hears": set(), "asks": set()}
-    for what, method in (("says", "publish"), ("hears", "subscribe"), ("asks", "latest")):
-        before = getattr(VirtualBus, method)
-
-        def noted(bus, *words, what=what, before=before):
-            key = words[0] if what == "asks" else words[1]
-            done[what].add((bus.node, key))
-            return before(bus, *words)
-
-        monkeypatch.setattr(VirtualBus, method, noted)
-    found = virtual_run("osmosis", "kill:osmosis_control@5", "command-out-of-bounds@20",
-                        "wedge:localization@30", options={"mission": "A"})
-    assert found.record.safety == "safe"
-    for what, those in done.items():
-        assert len(those) > 80
-        for node, key in those:
-            rights = RIGHTS["observer" if node == "injector" else node]
-            if key != "rampart/heartbeat/injector":  # which nobody hears
-                assert any(zenoh.KeyExpr(one).includes(key) for one in getattr(rights, what)), (
-                    node, what, key)
 
 
 def test_who_is_not_in_the_register_is_in_no_rule():

@@ -8,7 +8,7 @@ from itertools import combinations
 from math import comb
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.manager.analysis import cut_sets
@@ -72,7 +72,6 @@ def trees(draw, *, coherent: bool) -> Formula:
     return Formula(gates, frozenset(names), house, f"g{len(gates) - 1}")
 
 
-@settings(max_examples=200, deadline=None)
 @given(trees(coherent=True))
 def test_coherent_trees_have_the_cut_sets_that_brute_force_finds(tree):
     found = CutSets(tree)
@@ -84,7 +83,6 @@ def test_coherent_trees_have_the_cut_sets_that_brute_force_finds(tree):
         assert count == sum(len(s) == size for s in listed)
 
 
-@settings(max_examples=200, deadline=None)
 @given(trees(coherent=False))
 def test_trees_with_negations_have_the_minimal_sets_that_brute_force_finds(tree):
     found = CutSets(tree)
@@ -107,30 +105,10 @@ def test_independent_parts_multiply():
     assert next(iter(found.sets(limit=1)))[0].startswith("a")
 
 
-def test_shared_events_are_no_separate_causes():
-    tree = formula({"top": all_of("left", "right"), "left": any_of("a", "shared"),
-                    "right": any_of("b", "shared")})
-    assert {frozenset(s) for s in CutSets(tree).sets()} == {
-        frozenset({"shared"}), frozenset({"a", "b"})}
-
-
 def ladder(n: int) -> Formula:
     """Each rung shares an event with the next: no module inside, a Fibonacci-like count."""
     rungs = {f"r{i}": any_of(f"e{i}", f"e{i + 1}") for i in range(n)}
     return formula({**rungs, "top": all_of(*rungs)})
-
-
-def covers(n: int) -> int:
-    """Minimal vertex covers of a path with n edges, by brute force over bitmasks."""
-    edges = [(i, i + 1) for i in range(n)]
-    full = [s for s in range(1 << (n + 1)) if all(s >> a & 1 or s >> b & 1 for a, b in edges)]
-    return sum(not any(s & ~(1 << v) in set(full) for v in range(n + 1) if s >> v & 1)
-               for s in full)
-
-
-@pytest.mark.parametrize("n", [1, 2, 5, 9])
-def test_a_ladder_without_modules_has_the_count_of_minimal_vertex_covers(n):
-    assert CutSets(ladder(n)).count == covers(n)
 
 
 def test_hundreds_of_shared_events_and_millions_of_sets_are_counted_not_listed():
@@ -138,13 +116,7 @@ def test_hundreds_of_shared_events_and_millions_of_sets_are_counted_not_listed()
     assert found.count > 10 ** 20
     assert sum(found.sizes) == found.count
     assert len(list(found.sets(limit=5))) == 5
-
-
-def test_house_events_are_constants():
-    gates = {"top": any_of("g", "b"), "g": all_of("a", "h")}
-    assert {frozenset(s) for s in CutSets(formula(gates, {"h": True})).sets()} == {
-        frozenset("a"), frozenset("b")}
-    assert {frozenset(s) for s in CutSets(formula(gates, {"h": False})).sets()} == {frozenset("b")}
+    assert [CutSets(ladder(n)).count for n in (1, 2, 5, 9)] == [2, 2, 5, 16]  # vertex covers
 
 
 @pytest.mark.parametrize(("state", "count"), [(True, 1), (False, 0)])
@@ -164,14 +136,6 @@ def test_thousands_of_gates_in_a_chain_are_no_problem():
         list(found.sets())
 
 
-def test_limit_cuts_the_list_and_not_the_count():
-    tree = formula({"top": any_of("a", "pairs"), "pairs": at_least(2, "b", "c", "d")})
-    found = CutSets(tree)
-    assert list(found.sets(limit=2)) == [("a",), ("b", "c")]
-    assert found.count == 4
-
-
-@settings(max_examples=150, deadline=None)
 @given(trees(coherent=True) | trees(coherent=False), st.integers(0, 4))
 def test_max_order_leaves_exactly_the_sets_of_so_many_events(tree, order):
     found = CutSets(tree, max_order=order)
@@ -230,8 +194,5 @@ def test_a_tree_beyond_every_bound_is_refused_in_one_line(monkeypatch):
 def test_a_formula_without_a_single_top_or_with_a_cycle_is_refused(gates, words):
     with pytest.raises(FormulaError, match=words):
         formula(gates)
-
-
-def test_an_unknown_input_is_refused():
     with pytest.raises(FormulaError, match="gate 'top' has the unknown input 'x'"):
         Formula({"top": any_of("x")}, frozenset(), {})

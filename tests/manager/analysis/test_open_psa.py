@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import xml.etree.ElementTree as ET
 from itertools import combinations
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.manager.analysis.cut_sets import CutSets
@@ -16,7 +15,6 @@ from rampart.manager.analysis.formula import formula_of
 from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
 from rampart.manager.spec.specification import parse_specification
 from tests import system_file
-from tests.manager.bench import paper
 
 
 def mef(*definitions: str, data: str = "") -> str:
@@ -88,11 +86,6 @@ def test_private_names_of_components_do_not_meet():
                f'<define-component name="left">{inner}</define-component>',
                f'<define-component name="right">{inner}</define-component>')
     assert cut_sets(text) == sets("ft.left.e ft.right.e")
-
-
-def test_the_top_may_be_chosen():
-    text = mef(gate("one", f"<or>{events('a')}</or>"), gate("two", f"<or>{events('b')}</or>"))
-    assert cut_sets(text, "two") == sets("b")
 
 
 def test_formulas_nested_by_the_thousand_are_read():
@@ -170,7 +163,6 @@ def holds(formula: Any, gates: dict[str, Any], occurred: frozenset[str]) -> bool
     return HOLDS[tag]([holds(part, gates, occurred) for part in parts], k)
 
 
-@settings(max_examples=150, deadline=None)
 @given(FORMULAS, inner(st.sampled_from("abcde")), inner(st.sampled_from("abcde")))
 def test_nested_formulas_have_the_minimal_sets_that_brute_force_finds(top, lone, negation):
     gates = {"top/lone": lone, "top/not": negation}  # names that a reader might make up as well
@@ -184,79 +176,69 @@ def test_nested_formulas_have_the_minimal_sets_that_brute_force_finds(top, lone,
     assert cut_sets(text, "top") == set(minimal)
 
 
-@pytest.mark.parametrize("system", ["osmosis", "cell"])
-def test_what_is_exported_comes_back_the_same(system):
-    path = system_file(system)
+@pytest.mark.parametrize("system", ["paper", "osmosis", "cell"])
+def test_what_is_exported_comes_back_the_same_and_raises_no_doubt(system):
+    path, doubts = system_file(system), list[OpenPsaError]()
     spec = parse_specification(path.read_text(encoding="utf-8"), path.name)
-    back = read_open_psa(write_open_psa(spec), "out.xml")
-    there = formula_of(spec.build_fault_tree())
+    text, there = write_open_psa(spec), formula_of(spec.build_fault_tree())
+    back = read_open_psa(text, "out.xml", doubt=doubts.append)
     assert set(CutSets(back).sets()) == set(CutSets(there).sets())
-    assert back.top == there.top
-
-
-def test_titles_and_barriers_are_exported_as_labels_and_attributes():
-    text = write_open_psa(paper())
-    assert "<label>Moving inside a prohibited area</label>" in text
-    assert '<attribute name="barrier" value="FTM1" />' in text
+    assert (back.top, doubts) == (there.top, [])
+    for connective in ("or", "and", "atleast"):  # in paper a crash alone stops localization
+        assert all(len(found) > 1 for found in ET.fromstring(text).iter(connective))
+    if system == "paper":
+        assert "<label>Moving inside a prohibited area</label>" in text
+        assert '<attribute name="barrier" value="FTM1" />' in text
 
 
 BOMB = ('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
         "<opsa-mef>&b;</opsa-mef>")
 EXTERNAL = ('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
             "<opsa-mef>&a;</opsa-mef>")
-TREE = "f.xml: /opsa-mef/define-fault-tree[@name='ft']/"
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    (BOMB, "f.xml: /: DTDForbidden: document type definitions and entities are not read; leave "
-           "them out"),
-    (EXTERNAL, "f.xml: /: DTDForbidden: document type definitions and entities are not read; "
-               "leave them out"),
-    ("<opsa-mef>", "f.xml: /: not well-formed XML: no element found: line 1, column 10"),
-    ("", "f.xml: /: not well-formed XML: no element found: line 1, column 0"),
-    ("<html/>", "f.xml: /html: expected the root element 'opsa-mef'"),
-    (mef(gate("top", "<or></or>")), TREE + "define-gate[@name='top']/or: empty gate; it needs "
-                                           "inputs"),
-    (mef(gate("top", "")), TREE + "define-gate[@name='top']: 0 formulas; a gate has exactly one"),
+@pytest.mark.parametrize(("text", "words"), [
+    (BOMB, "document type definitions and entities are not read"),
+    (EXTERNAL, "document type definitions and entities are not read"),
+    *((junk, "not well-formed XML") for junk in (
+        "<opsa-mef>", "", b"\xff\xfe", b"\x00", b"<?xml version='1.0' encoding='x'?>")),
+    ("<html/>", "/html: expected the root element 'opsa-mef'"),
+    (mef(gate("top", "")), "0 formulas; a gate has exactly one"),
     (mef(gate("top", f"<or>{events('a')}</or>"), gate("top", f"<or>{events('b')}</or>")),
-     TREE + "define-gate[@name='top']: duplicate name 'top', already defined at "
-     + TREE.removeprefix("f.xml: ") + "define-gate[@name='top']"),
-    (mef(gate("top", '<or><gate name="g7"/></or>')),
-     TREE + "define-gate[@name='top']/or/gate[@name='g7']: there is no gate 'g7'"),
+     "duplicate name 'top', already defined at "),
     (mef(gate("top", '<or><house-event name="a"/></or>'), '<define-basic-event name="a"/>'),
-     TREE + "define-gate[@name='top']/or/house-event[@name='a']: 'a' is a basic-event, not a "
-            "house-event"),
+     "'a' is a basic-event, not a house-event"),
     (mef(gate("top", '<or><gate name="g"/></or>'), gate("g", '<or><gate name="h"/></or>'),
-         gate("h", '<or><gate name="g"/></or>')),
-     "f.xml: /opsa-mef: cycle g > h > g; an event cannot be its own cause"),
-    (mef(gate("top", f'<atleast min="4">{events("a", "b", "c")}</atleast>')),
-     TREE + "define-gate[@name='top']/atleast: min = '4': expected a number from 1 to 3, the "
-            "inputs"),
-    (mef(gate("top", f'<atleast>{events("a")}</atleast>')),
-     TREE + "define-gate[@name='top']/atleast: min = '': expected a number from 1 to 1, the "
-            "inputs"),
-    (mef(gate("top", f'<cardinality min="2" max="1">{events("a", "b")}</cardinality>')),
-     TREE + "define-gate[@name='top']/cardinality: min = 2 is more than max = 1"),
-    (mef(gate("top", f"<xor>{events('a')}</xor>")),
-     TREE + "define-gate[@name='top']/xor: 1 inputs; 'xor' takes 2"),
-    (mef(gate("top", f"<maybe>{events('a')}</maybe>")),
-     TREE + "define-gate[@name='top']/maybe: unknown connective; known: and, or, not, xor, nand, "
-            "nor, iff, imply, atleast, cardinality, constant"),
-    (mef(gate("top", '<or><constant value="maybe"/></or>')),
-     TREE + "define-gate[@name='top']/or/constant: value 'maybe': expected 'true' or 'false'"),
+         gate("h", '<or><gate name="g"/></or>')), "/opsa-mef: cycle g > h > g"),
+    *((mef(gate("top", body)), f"define-gate[@name='top']/{words}") for body, words in (
+        ("<or></or>", "or: empty gate"),
+        ('<or><gate name="g7"/></or>', "or/gate[@name='g7']: there is no gate 'g7'"),
+        (f'<atleast min="4">{events("a", "b", "c")}</atleast>', "atleast: min = '4': expected"),
+        (f'<atleast>{events("a")}</atleast>', "atleast: min = '': expected a number from 1 to 1"),
+        (f'<cardinality min="2" max="1">{events("a", "b")}</cardinality>', "cardinality: min = 2"),
+        (f"<xor>{events('a')}</xor>", "xor: 1 inputs; 'xor' takes 2"),
+        (f"<maybe>{events('a')}</maybe>", "maybe: unknown connective; known: and, or"),
+        ('<or><constant value="maybe"/></or>', "or/constant: value 'maybe': expected"))),
     (mef(gate("a", f"<or>{events('x')}</or>"), gate("b", f"<or>{events('x')}</or>")),
-     "f.xml: /opsa-mef: 2 gates are no input of another: a, b; say which is the top"),
-    (mef(), "f.xml: /opsa-mef: no gates; a top is needed"),
-    (mef(gate("", f"<or>{events('x')}</or>")),
-     TREE + "define-gate[1]: name '': expected a name without dots"),
-    (mef('<define-CCF-group name="c"/>'),
-     TREE + "define-CCF-group[@name='c']: not supported: common-cause groups would change the cut "
-            "sets"),
+     "2 gates are no input of another: a, b; say which is the top"),
+    (mef(), "no gates; a top is needed"),
+    (mef(gate("", f"<or>{events('x')}</or>")), "define-gate[1]: name '': expected a name"),
+    (mef('<define-CCF-group name="c"/>'), "define-CCF-group[@name='c']: not supported"),
 ])
-def test_refused(text, message):
+def test_refused(text, words):
     with pytest.raises(OpenPsaError) as caught:
         read_open_psa(text, "f.xml")
-    assert re.sub(r"^f\.xml:\d+: ", "f.xml: ", str(caught.value)) == message
+    assert str(caught.value).startswith("f.xml:")
+    assert words in str(caught.value)
+
+
+def test_the_top_may_be_chosen_and_the_line_of_a_mistake_is_told():
+    text = mef(gate("one", f"<or>{events('a')}</or>"), gate("two", f"<or>{events('b')}</or>"))
+    assert cut_sets(text, "two") == sets("b")
+    with pytest.raises(OpenPsaError, match="unknown top gate 'x'; known: one, two"):
+        cut_sets(text, "x")
+    with pytest.raises(OpenPsaError, match=r"^f\.xml:5: "):
+        cut_sets(mef("\n", gate("top", "\n<or>\n" + events("a") + '\n<gate name="g7"/></or>')))
 
 
 DECLARED = '<define-basic-event name="{}"/>'
@@ -303,12 +285,6 @@ def test_what_is_not_understood_is_refused_and_not_skipped(text, where):
     assert str(caught.value).startswith("f.xml:1: ")
 
 
-def test_the_line_of_a_mistake_is_told():
-    text = mef("\n", gate("top", "\n<or>\n" + events("a") + '\n<gate name="g7"/></or>'))
-    with pytest.raises(OpenPsaError, match=r"^f\.xml:5: "):
-        read_open_psa(text, "f.xml")
-
-
 def test_spaces_around_a_name_do_not_make_it_another_one():
     left = gate("left", f"<or>{events('pump', 'v')}</or>")
     right = gate(" right", f"<or>{events(' pump ', 'w')}</or>")
@@ -338,31 +314,3 @@ def test_what_is_probably_a_mistake_is_reported_and_refused_if_asked_for(text, w
 
     with pytest.raises(OpenPsaError):
         read_open_psa(text, "f.xml", doubt=refuse)
-
-
-def test_a_tree_that_is_sound_raises_no_doubt():
-    doubts: list[OpenPsaError] = []
-    read_open_psa(write_open_psa(paper()), "f.xml", doubt=doubts.append)
-    assert not doubts
-
-
-def test_an_export_has_no_connective_of_one_input():
-    spec = paper()  # where a crash alone stops localization
-    text = write_open_psa(spec)
-    for connective in ("or", "and", "atleast"):
-        for found in ET.fromstring(text).iter(connective):
-            assert len(found) > 1
-    assert set(CutSets(read_open_psa(text, "f.xml")).sets()) == set(
-        CutSets(formula_of(spec.build_fault_tree())).sets())
-
-
-def test_an_unknown_top_is_refused_with_those_that_are_known():
-    with pytest.raises(OpenPsaError, match="unknown top gate 'x'; known: top"):
-        read_open_psa(mef(gate("top", f"<or>{events('a')}</or>")), "f.xml", "x")
-
-
-@pytest.mark.parametrize(
-    "junk", [b"\xff\xfe", b"\x00", b"<a", b"<?xml version='1.0' encoding='x'?>"])
-def test_bytes_that_are_no_xml_are_refused_too(junk):
-    with pytest.raises(OpenPsaError, match="not well-formed"):
-        read_open_psa(junk, "f.xml")

@@ -12,16 +12,16 @@ from rampart.cli.main import main
 from rampart.manager.analysis import active_sets, transitions
 from rampart.manager.analysis.active_sets import ActiveSets, order_agrees_with_tree
 from rampart.manager.analysis.transitions import Transitions, explore
-from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, _askable, verify
+from rampart.manager.analysis.verification import MEANING, Report, verify
 from rampart.manager.arbitration.arbiter import Arbiter
 from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.model.order import PartialOrder
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision
 from rampart.manager.strategies.guarded_repair import GuardedRepair
-from rampart.manager.strategies.registry import STRATEGIES, UnknownStrategyError
+from rampart.manager.strategies.registry import STRATEGIES
 from rampart.manager.strategies.safety_first import SafetyFirst
-from tests.manager.bench import Bench, edited, paper
+from tests.manager.bench import edited, paper
 
 SPEC = paper()
 ARRANGEMENT = Arrangement(SPEC.build_mechanisms(), SPEC.build_ftm_tree(), SPEC.build_order())
@@ -34,9 +34,6 @@ def report() -> Report:
 
 def failing(report: Report) -> dict[tuple[str, str], int]:
     return {(p.strategy, p.name): p.count for p in report.properties if not p.holds}
-
-
-# ---- the shipped system -----------------------------------------------------------------------
 
 
 def test_every_property_is_checked_for_every_strategy(report):
@@ -59,20 +56,20 @@ def test_exactly_these_properties_fail_on_the_papers_system(report):
         ("mission-first", "repairs-run"): 240,
         ("simultaneous", "repairs-run"): 28,
     }
-
-
-def test_guarded_repair_holds_everything(report):
-    assert all(p.holds for p in report.properties if p.strategy == "guarded-repair")
-
-
-def test_in_how_many_sets_the_robot_stops_for_good(report):
     assert report.permissiveness == {"safety-first": 90, "mission-first": 64,
                                      "simultaneous": 88, "guarded-repair": 88}
-
-
-def test_repairs_that_starve_behind_the_last_resort_are_counted_apart(report):
     assert report.stuck_behind_last_resort == {"safety-first": 66, "mission-first": 56,
                                                "simultaneous": 62, "guarded-repair": 0}
+    first = {p.name: p.counterexamples[0] for p in report.properties
+             if p.strategy == "safety-first" and not p.holds}
+    assert first == {
+        "monotone": (
+            "FTM4 and FTM7 active: runs RM1 (rule 4)",
+            "FTM2, FTM4 and FTM7 active: runs RM2 (rule 3)",
+            "with FTM2 active as well, RM2 runs instead of RM1, which is safer"),
+        "repairs-run": (
+            "FTM2 and FTM4 active: runs RM2 (rule 2)",
+            "RM3 never runs, so FTM4 stays active for ever")}
 
 
 @pytest.mark.parametrize(("strategy", "failing", "stuck"), [
@@ -95,24 +92,6 @@ def test_what_holds_has_no_counterexample_and_what_fails_has_the_shortest_first(
         assert all(line and "\n" not in line for t in checked.counterexamples for line in t)
 
 
-@pytest.mark.parametrize(("name", "trace"), [
-    ("monotone", (
-        "FTM4 and FTM7 active: runs RM1 (rule 4)",
-        "FTM2, FTM4 and FTM7 active: runs RM2 (rule 3)",
-        "with FTM2 active as well, RM2 runs instead of RM1, which is safer")),
-    ("repairs-run", (
-        "FTM2 and FTM4 active: runs RM2 (rule 2)",
-        "RM3 never runs, so FTM4 stays active for ever")),
-])
-def test_the_counterexamples_of_safety_first_can_be_read(report, name, trace):
-    found = next(p for p in report.properties
-                 if (p.name, p.strategy) == (name, "safety-first"))
-    assert found.counterexamples[0] == trace
-
-
-# ---- a system of three recoveries, small enough to explore as a whole -------------------------
-
-
 def three():
     """FTM1(RM1) above FTM2(RM2) above FTM4(RM3)."""
     return msgspec.structs.replace(
@@ -126,36 +105,6 @@ def test_two_recoveries_at_a_time_and_all_together_lead_to_the_same_verdicts():
     assert whole.states > 3 * by_pairs.states / 2
     assert {(p.name, p.holds) for p in by_pairs.properties} == {
         (p.name, p.holds) for p in whole.properties}
-
-
-def test_every_alternative_and_every_number_of_failures_is_explored():
-    """RM5 is asked for when two alternatives before it fail, RM6 when all four fail."""
-    first, _, _, crash, *_ = SPEC.mechanisms
-    replace = msgspec.structs.replace
-    recoveries = [replace(r, escalate_to="RM6" if r.name == "RM3" else "") for r in SPEC.recoveries]
-    spec = replace(
-        SPEC, recoveries=(*recoveries, replace(recoveries[1], name="RM6")),
-        mechanisms=(first, replace(crash, recover="RM3 or RM4 or RM5 or RM2")),
-        orders={"safer": {"RM1": tuple(f"RM{i}" for i in range(2, 7))}})
-    arrangement = Arrangement(spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order())
-    sets = ActiveSets(arrangement, arrangement.order, SafetyFirst())
-    assert _askable(sets) == {frozenset({f"RM{i}"}) for i in range(1, 7)}
-
-
-def test_the_start_of_a_manager_is_not_explored_and_holds_less():
-    """If this fails, the limits in docs/explanation/arbitration.md can be narrowed."""
-    bench = Bench(oriented=False)
-    bench.active("DM6")
-    bench.report("RM2", RecoveryPhase.DEGRADED, 41)  # ordered by the manager before this one
-    assert bench.orders == "RM2 (RM5)"
-    assert bench.arbiter.mechanisms.overlap("RM2", "RM5")
-    assert not bench.state.oriented
-    start = two("RM2", "RM5").initial().state
-    assert start.oriented
-    assert not any(track.adopted for track in start.recoveries)
-
-
-# ---- broken arbiters --------------------------------------------------------------------------
 
 
 class ForgetsReleases(Arbiter):
@@ -204,28 +153,34 @@ class NeverReleases(Arbiter):
         return track
 
 
-@pytest.mark.parametrize(("mutant", "properties"), [
-    (Arbiter, set()),
-    (ForgetsReleases, {"no-conflicting-claims"}),
-    (ForgetsClaims, {"no-conflicting-claims"}),
-    (MakesAllWait, {"emergency-stop-at-once"}),
-    (ForgetsDeadlines, {"recovery-ends"}),
-    (CutsOff, {"none-cut-off"}),
-    (NeverReleases, {"one-decision"}),
-])
-def test_a_broken_arbiter_is_found_out(monkeypatch, mutant, properties):
-    monkeypatch.setattr(transitions, "Arbiter", mutant)
-    found = {p.name for p in verify(SPEC, ["safety-first"]).properties if not p.holds}
-    assert properties <= found - {"monotone", "repairs-run"}
-    if not properties:
-        assert found == {"monotone", "repairs-run"}
-
-
 def two(*names: str, with_modules: bool = False, deaths: bool = True) -> Transitions:
     contracts = ARRANGEMENT.mechanisms.contracts
     asked = [frozenset(part) for n in range(2) for part in combinations(names, n)]
     return Transitions([contracts[n] for n in names], ARRANGEMENT.order, asked, ["RM1"],
                        exclusive=True, with_modules=with_modules, deaths=deaths)
+
+
+PAIR = ("RM2", "RM5")
+
+
+@pytest.mark.parametrize(("mutant", "names", "name", "trace"), [
+    (ForgetsReleases, PAIR, "no-conflicting-claims", (
+        "asked for: RM2", "asked for: RM5", "RM2 reports done",
+        "RM2 and RM5 may both hold what they claim")),
+    (ForgetsClaims, PAIR, "no-conflicting-claims", ()),
+    (MakesAllWait, ("RM1", "RM2"), "emergency-stop-at-once", (
+        "asked for: RM2", "asked for: RM1", "RM1 was decided on and has to wait")),
+    (ForgetsDeadlines, PAIR, "recovery-ends", ()),
+    (CutsOff, ("RM3",), "none-cut-off", (
+        "asked for: RM3", "RM3 obeys", "asked for: nothing", "RM3 is released half-way")),
+    (NeverReleases, PAIR, "one-decision", ())])
+def test_a_broken_arbiter_is_found_out_by_the_shortest_trace(
+        monkeypatch, mutant, names, name, trace):
+    one = len(names) == 1
+    assert name not in explore(two(*names, with_modules=one, deaths=not one))[1]
+    monkeypatch.setattr(transitions, "Arbiter", mutant)
+    _, found = explore(two(*names, with_modules=one, deaths=not one))
+    assert found[name][-len(trace):] == trace if trace else found[name]
 
 
 def test_a_latch_is_explored_with_what_excuses_it_and_without():
@@ -241,39 +196,6 @@ def test_a_latch_is_explored_with_what_excuses_it_and_without():
     excused = dict(system.successors(stopped))["what excuses is found"]
     assert excused.state.latched == ()
     assert dict(system.successors(excused))["the excuse ends"].state.latched == ("RM1",)
-
-
-def test_a_release_that_is_forgotten_has_the_shortest_trace(monkeypatch):
-    monkeypatch.setattr(transitions, "Arbiter", ForgetsReleases)
-    _, found = explore(two("RM2", "RM5"))
-    assert found["no-conflicting-claims"] == (
-        "asked for: RM2", "asked for: RM5", "RM2 reports done",
-        "RM2 and RM5 may both hold what they claim")
-
-
-def test_a_recovery_that_is_cut_off_has_the_shortest_trace(monkeypatch):
-    monkeypatch.setattr(transitions, "Arbiter", CutsOff)
-    _, found = explore(two("RM3", with_modules=True, deaths=False))
-    assert found["none-cut-off"] == (
-        "asked for: RM3", "RM3 obeys", "asked for: nothing", "RM3 is released half-way")
-
-
-def test_an_emergency_stop_that_waits_has_the_shortest_trace(monkeypatch):
-    monkeypatch.setattr(transitions, "Arbiter", MakesAllWait)
-    _, found = explore(two("RM1", "RM2"))
-    assert found["emergency-stop-at-once"] == (
-        "asked for: RM2", "asked for: RM1", "RM1 was decided on and has to wait")
-
-
-def test_the_decomposition_finds_the_same_in_a_broken_arbiter_as_the_whole(monkeypatch):
-    for mutant in (CutsOff, MakesAllWait):
-        monkeypatch.setattr(transitions, "Arbiter", mutant)
-        verdicts = [{(p.name, p.holds) for p in verify(
-            three(), ["safety-first"], together).properties} for together in (2, 3)]
-        assert verdicts[0] == verdicts[1]
-
-
-# ---- broken strategies ------------------------------------------------------------------------
 
 
 class Mutant(SafetyFirst):
@@ -297,11 +219,26 @@ def found_in(strategy, arrangement=ARRANGEMENT) -> dict[str, tuple[str, ...]]:
             for p in ActiveSets(arrangement, arrangement.order, strategy).check() if not p.holds}
 
 
-def test_a_strategy_that_takes_nothing_is_found_out():
-    found = found_in(Mutant(lambda d: ()))
-    assert found["one-decision"] == (
-        "FTM1 active: runs nothing (rule 1)", "that is not a set of known recoveries, each once")
-    assert {"safe-enough", "emergency-stop-at-once", "repairs-run"} <= found.keys()
+@pytest.mark.parametrize(("active", "taken", "name", "trace"), [
+    ("FTM1", (), "one-decision", (
+        "FTM1 active: runs nothing (rule 1)",
+        "that is not a set of known recoveries, each once")),
+    ("FTM2 FTM6", ("RM2", "RM5"), "no-conflicting-claims", (
+        "FTM2 and FTM6 active: runs RM2 and RM5 (rule 4)", "RM2 and RM5 claim the same resource")),
+    ("FTM1 FTM6", ("RM1", "RM5"), "no-harm", (
+        "FTM1 and FTM6 active: runs RM1 and RM5 (rule 2)", "RM1 disables motion, which RM5 needs")),
+    ("FTM2 FTM4", ("RM3",), "safe-enough", (
+        "FTM2 and FTM4 active: runs RM3 (rule 2)",
+        "FTM2 asks for RM2, and nothing that runs is as safe")),
+    ("FTM1 FTM2", ("RM2",), "emergency-stop-at-once", (
+        "FTM1 and FTM2 active: runs RM2 (rule 2)",
+        "FTM1 asks for RM1, the last resort, and it is not run"))])
+def test_a_broken_strategy_is_found_out(active, taken, name, trace):
+    strategy = Mutant(lambda d: taken if d.active == tuple(active.split()) else None)
+    assert found_in(strategy)[name] == trace
+    strategy.exclusive = True
+    assert len(taken) < 2 or found_in(strategy)["one-decision"][-1] == (
+        "a strategy that runs one at a time has to take one")
 
 
 def test_a_strategy_that_takes_what_there_is_not_or_one_twice_is_found_out():
@@ -322,44 +259,11 @@ def test_a_strategy_that_changes_its_mind_is_found_out():
     assert found_in(Mutant(moody))["one-decision"][-1] == "asked again, it decides otherwise"
 
 
-def test_an_exclusive_strategy_that_takes_two_is_found_out():
-    strategy = Mutant(lambda d: ("RM3", "RM4") if d.active == ("FTM4", "FTM5") else None)
-    strategy.exclusive = True
-    assert found_in(strategy)["one-decision"][-1] == (
-        "a strategy that runs one at a time has to take one")
-
-
-def test_a_strategy_that_runs_recoveries_in_conflict_is_found_out():
-    found = found_in(Mutant(lambda d: ("RM2", "RM5") if d.active == ("FTM2", "FTM6") else None))
-    assert found["no-conflicting-claims"] == (
-        "FTM2 and FTM6 active: runs RM2 and RM5 (rule 4)", "RM2 and RM5 claim the same resource")
-
-
-def test_a_strategy_that_disables_what_it_needs_is_found_out():
-    found = found_in(Mutant(lambda d: ("RM1", "RM5") if d.active == ("FTM1", "FTM6") else None))
-    assert found["no-harm"] == ("FTM1 and FTM6 active: runs RM1 and RM5 (rule 2)",
-                                "RM1 disables motion, which RM5 needs")
-
-
 def test_a_recovery_that_disables_what_it_needs_itself_is_found_out():
     spec = edited(RM5={"disables": frozenset({"motion"})})
     arrangement = Arrangement(spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order())
     assert found_in(SafetyFirst(), arrangement)["no-harm"] == (
         "FTM6 active: runs RM5 (rule 1)", "RM5 disables motion, which RM5 needs")
-
-
-def test_a_strategy_that_does_less_than_is_asked_for_is_found_out():
-    found = found_in(Mutant(lambda d: ("RM3",) if d.active == ("FTM2", "FTM4") else None))
-    assert found["safe-enough"] == (
-        "FTM2 and FTM4 active: runs RM3 (rule 2)",
-        "FTM2 asks for RM2, and nothing that runs is as safe")
-
-
-def test_a_strategy_that_keeps_the_last_resort_waiting_is_found_out():
-    found = found_in(Mutant(lambda d: ("RM2",) if d.active == ("FTM1", "FTM2") else None))
-    assert found["emergency-stop-at-once"] == (
-        "FTM1 and FTM2 active: runs RM2 (rule 2)",
-        "FTM1 asks for RM1, the last resort, and it is not run")
 
 
 def test_an_escalation_that_never_reaches_the_root_is_found_out(monkeypatch):
@@ -395,69 +299,39 @@ def test_an_order_that_contradicts_the_tree_is_found_out():
     assert order_agrees_with_tree(ARRANGEMENT, ARRANGEMENT.order).holds
 
 
-# ---- limits, and the command ------------------------------------------------------------------
-
-
 def large(count: int):
     first, *others = SPEC.mechanisms
     return msgspec.structs.replace(SPEC, mechanisms=(first, *others, *(
         msgspec.structs.replace(first, name=f"FTM{i}") for i in range(8, count + 1))))
 
 
-def test_a_system_too_large_to_look_at_every_set_is_refused():
-    with pytest.raises(TooLargeError) as caught:
-        verify(large(17))
-    assert str(caught.value) == ("paper: 17 mechanisms have 131071 active sets; at most 16 "
-                                 "mechanisms can be verified exhaustively")
-
-
-def test_an_unknown_strategy_is_refused():
-    with pytest.raises(UnknownStrategyError, match="unknown strategy 'bold'; known: guarded"):
-        verify(SPEC, ["bold"])
-
-
-def refused(capsys, *arguments: str) -> str:
-    assert main(["verify", *arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    return captured.err
-
-
-def test_the_command_refuses_nonsense_in_one_line(capsys, monkeypatch):
-    assert "unknown strategy 'bold'; known: guarded-repair" in refused(
-        capsys, "--strategy", "bold")
-    assert "--together 0: a number from 1 up is right" in refused(capsys, "--together", "0")
-    monkeypatch.setattr("rampart.cli.systems.load", lambda name: large(17))
-    assert "at most 16 mechanisms can be verified" in refused(capsys)
+def test_nonsense_is_refused_in_one_line(capsys, monkeypatch):
+    for arguments, words in ((("--strategy", "bold"), "unknown strategy 'bold'; known: guarded-re"),
+                             (("--together", "0"), "--together 0: a number from 1 up is right"),
+                             ((), "at most 16 mechanisms can be verified")):
+        if not arguments:
+            monkeypatch.setattr("rampart.cli.systems.load", lambda name: large(17))
+        assert main(["verify", *arguments]) == 2
+        told = capsys.readouterr()
+        assert (told.out, told.err.count("\n")) == ("", 1)
+        assert words in told.err
 
 
 def test_the_command_prints_json_of_the_promised_shape(capsys):
-    assert main(["verify", "paper", "--strategy", "safety-first", "--json"]) == 0
+    assert main(["verify", "paper", "--strategy", "guarded-repair", "--strict", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert {"states", "permissiveness", "stuck_behind_last_resort", "properties"} <= told.keys()
-    assert told["permissiveness"] == {"safety-first": 90}
-    assert told["stuck_behind_last_resort"] == {"safety-first": 66}
+    assert told["permissiveness"] == {"guarded-repair": 88}
+    assert told["stuck_behind_last_resort"] == {"guarded-repair": 0}
     assert told["states"] > 1000
     for row in told["properties"]:
         assert {"name", "strategy", "holds", "count", "counterexamples"} <= row.keys()
-    assert {row["name"] for row in told["properties"] if not row["holds"]} == {
-        "monotone", "repairs-run"}
-
-
-@pytest.mark.parametrize(("strategy", "code"), [("safety-first", 1), ("guarded-repair", 0)])
-def test_strict_the_exit_code_tells_whether_all_holds(capsys, strategy, code):
-    assert main(["verify", "paper", "--strategy", strategy, "--strict"]) == code
+        assert row["holds"]
 
 
 def test_the_command_prints_a_table_the_states_and_the_traces(capsys):
-    assert main(["verify", "paper", "--strategy", "safety-first"]) == 0
+    assert main(["verify", "paper", "--strategy", "safety-first", "--strict"]) == 1
     told = capsys.readouterr().out
-    assert "active sets in which a repair" in told
-    assert "\\u000a" not in told
-    assert "127 active sets, " in told
-    assert "FAILS in 32" in told
-    assert "90 of 127" in told
-    assert "66 of 127" in told
-    assert "not explored: the start of a manager" in told
-    assert "  2. RM3 never runs, so FTM4 stays active for ever" in told
+    for words in ("127 active sets, ", "FAILS in 32", "90 of 127", "66 of 127",
+                  "not explored: the start of a manager",
+                  "  2. RM3 never runs, so FTM4 stays active for ever"):
+        assert words in told

@@ -1,168 +1,79 @@
 """The arbiter when recoveries fail, and when the manager itself is killed, as timelines."""
 
+import pytest
+
 from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
 from rampart.manager.model.mechanisms import RecoveryPhase as Phase
-from tests.manager.bench import DMS, RMS, Bench, commands, edited, paper
+from tests.manager.bench import DMS, RMS, Bench, edited, paper
 
 ACTING, DONE, IDLE, FAILED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.FAILED
 
 
-# ---- failures ---------------------------------------------------------------------------------
+CONTROL = "osmosis_control"
+
+TIMELINES = {
+    "a failed respawn escalates to the one it names": f"""
+        DM4 {CONTROL}; RM3 acting; RM3 failed > -RM3 +RM2; rejected: RM3 failed:
+        rejected: RM3 escalated to RM2""",
+    "without a name the recovery of the mechanism above follows":
+        "DM7 hmi; RM4 failed > -RM4 +RM5; rejected: RM4 failed: it reports failure; "
+        "rejected: RM4 escalated to RM5",
+    "and this is that of FTM2 above FTM5": "DM5 hmi; RM4 failed > -RM4 +RM2",
+    "escalation of a shared recovery goes above all its mechanisms":
+        "DM5 hmi; DM7 localization; RM4 failed = RM1",
+    "a recovery that is not done by its deadline escalates": """
+        DM2; RM2 acting; wait 1.95 = RM2; wait 0.1 = RM1 (RM2)
+        rejected: RM2 failed: not done within 2 s""",
+    "so does one whose module is dead": "DM2; wait 2.1 = RM1",
+    "new causes do not excuse a deaf recovery module":
+        f"DM4 {CONTROL}; wait 0.2; -DM4; wait 0.2;" * 8 + "wait 0.05 = RM2",
+    "a dead recovery module that is no longer needed is released at its deadline":
+        "DM2; -DM2; wait 1.9 = (RM2); wait 0.2 =",
+    "a late respawn is let be and its late success counts": f"""
+        DM4 {CONTROL}; RM3 acting; wait 3.1 = RM2 (RM3); RM2 done; RM3 done = RM2; -DM4
+        wait 1.0 =""",
+    "a respawn that is done but cured nothing has failed": f"""
+        DM4 {CONTROL}; RM3 done; wait 2.9 = RM3; wait 0.2 = RM2
+        rejected: RM3 done, but DM4 still active after 3 s""",
+    "a stop whose cause persists has not failed": "DM2; RM2 done; wait 60 = RM2",
+    "a last resort that fails stays in force": "DM1; RM1 failed; wait 10 = RM1",
+    "failures are forgiven when their cause is gone": f"""
+        DM4 {CONTROL}; RM3 failed; RM2 done; -DM4; wait 1.0 =; DM4 {CONTROL} > +RM3""",
+    "a repair of one node after the other has not failed": "".join(
+        f"DM4 {node}#1; RM3 acting; RM3 done; wait 2.4;"
+        for node in (CONTROL, "graph_planner", "mission_manager")) + "wait 0.05 = RM3",
+    "a respawned recovery module is commanded again": "DM2; RM2 done; RM2 idle 0 > +RM2 = RM2",
+    "a later report of activation is not adopted": "RM2 done 0 =",
+}
 
 
-def test_a_failed_respawn_escalates_to_the_one_it_names():
-    bench = Bench()
-    bench.active("DM4", "osmosis_control")
-    bench.report("RM3", ACTING)
-    assert commands(bench.report("RM3", FAILED)) == [("RM3", False), ("RM2", True)]
-    assert any(name == "RM3" and "failed: " in why and "escalated to RM2" in why
-               for name, why in bench.decisions[-1].decision.rejected)
-    bench.wait(30.0)
-    bench.report("RM3", IDLE)
-    assert bench.orders.startswith("RM")
-    assert "RM3" not in bench.orders
-
-
-def test_without_a_name_the_recovery_of_the_mechanism_above_follows():
-    """RM4 names nobody: FTM7's parent is FTM6, hence RM5; FTM5's is FTM2, hence RM2."""
-    for dm, following in (("DM7", "RM5"), ("DM5", "RM2")):
-        bench = Bench()
-        bench.active(dm, "hmi")
-        assert commands(bench.report("RM4", FAILED)) == sorted(
-            [("RM4", False), (following, True)], key=lambda c: c[1])
-        assert ("RM4", f"failed: it reports failure; escalated to {following}") \
-            in bench.decisions[-1].decision.rejected
-
-
-def test_escalation_of_a_shared_recovery_goes_above_all_its_mechanisms():
-    bench = Bench()
-    bench.active("DM5", "hmi")
-    bench.active("DM7", "localization")
-    bench.report("RM4", FAILED)
-    assert bench.orders == "RM1"  # FTM1 is the closest above FTM5 and FTM7
-
-
-def test_a_recovery_that_is_not_done_by_its_deadline_escalates():
-    bench = Bench()
-    bench.active("DM2")
-    bench.report("RM2", ACTING)
-    bench.wait(1.95)
-    assert bench.orders == "RM2"
-    bench.wait(0.1)
-    assert bench.orders == "RM1 (RM2)"
-    assert ("RM2", "failed: not done within 2 s; escalated to RM1") \
-        in bench.decisions[-1].decision.rejected
-
-
-def test_a_dead_recovery_module_is_noticed_by_the_deadline():
-    bench = Bench()
-    bench.active("DM2")
-    bench.wait(2.1)
-    assert bench.orders == "RM1"
-
-
-def test_new_causes_do_not_excuse_a_deaf_recovery_module():
-    bench = Bench()
-    for _ in range(8):
-        bench.active("DM4", "osmosis_control")
-        bench.wait(0.2)
-        bench.idle("DM4")
-        bench.wait(0.2)
-    assert "RM2" in bench.orders
-
-
-def test_a_dead_recovery_module_that_is_no_longer_needed_is_released_at_its_deadline():
-    bench = Bench()
-    bench.active("DM2")
-    bench.idle("DM2")
-    bench.wait(1.9)
-    assert bench.orders == "(RM2)"
-    bench.wait(0.2)
-    assert bench.orders == ""
+@pytest.mark.parametrize("script", TIMELINES.values(), ids=TIMELINES)
+def test_when_recoveries_fail(script):
+    Bench().play(script)
 
 
 def test_a_repair_that_is_escalated_to_is_told_the_nodes():
-    bench = Bench(edited(RM3={"escalate_to": "RM4"}))
-    bench.active("DM4", "osmosis_control")
-    bench.report("RM3", FAILED)
+    bench = Bench(edited(RM3={"escalate_to": "RM4"})).play(f"DM4 {CONTROL}; RM3 failed")
     assert bench.state.desired["RM4"].activate
-    assert bench.state.desired["RM4"].nodes == ("osmosis_control",)
-
-
-def test_a_late_respawn_is_let_be_and_its_late_success_counts():
-    bench = Bench()
-    bench.active("DM4", "osmosis_control")
-    bench.report("RM3", ACTING)
-    bench.wait(3.1)
-    assert bench.orders == "RM2 (RM3)"
-    bench.report("RM2", DONE)
-    bench.report("RM3", DONE)
-    assert bench.orders == "RM2"
-    bench.idle("DM4")
-    bench.wait(1.0)
-    assert bench.orders == ""
-
-
-def test_a_late_one_in_the_way_is_released():
-    spec = edited(RM5={"escalate_to": "RM2"}, RM2={"escalate_to": ""})
-    bench = Bench(spec)
-    bench.active("DM6")
-    bench.report("RM5", ACTING)
-    bench.wait(2.1)
-    assert bench.orders == "RM2"
-
-
-def test_a_respawn_that_is_done_but_cured_nothing_has_failed():
-    bench = Bench()
-    bench.active("DM4", "osmosis_control")
-    bench.report("RM3", DONE)
-    bench.wait(2.9)
-    assert bench.orders == "RM3"
-    bench.wait(0.2)
-    assert bench.orders == "RM2"
-    assert any("done, but DM4 still active after 3 s" in why
-               for _, why in bench.decisions[-1].decision.rejected)
-
-
-def test_a_stop_whose_cause_persists_has_not_failed():
-    bench = Bench()
-    bench.active("DM2")
-    bench.report("RM2", DONE)
-    bench.wait(60.0)
-    assert bench.orders == "RM2"
-
-
-def test_a_last_resort_that_fails_stays_in_force():
-    bench = Bench()
-    bench.active("DM1")
-    bench.report("RM1", FAILED)
-    bench.wait(10.0)
-    assert bench.orders == "RM1"
-
-
-def test_failures_are_forgiven_when_their_cause_is_gone():
-    bench = Bench()
-    bench.active("DM4", "osmosis_control")
-    bench.report("RM3", FAILED)
-    bench.report("RM2", DONE)
-    bench.idle("DM4")
-    bench.wait(1.0)
-    assert bench.orders == ""
-    assert commands(bench.active("DM4", "osmosis_control")) == [("RM3", True)]
+    assert bench.state.desired["RM4"].nodes == (CONTROL,)
 
 
 def test_a_failure_is_forgiven_with_its_own_cause_whatever_else_is_active():
-    bench = Bench()
-    bench.active("DM4", "osmosis_control")
-    bench.active("DM5", "hmi")
-    bench.report("RM3", ACTING)
-    bench.report("RM3", FAILED)
+    bench = Bench().play(f"DM4 {CONTROL}; DM5 hmi; RM3 acting; RM3 failed")
     assert bench.state.recoveries[2].failed_for == ("FTM4",)
-    bench.idle("DM4")
-    bench.report("RM2", IDLE)
-    bench.wait(20.0, hearing=DMS)
+    bench.play("-DM4; RM2 idle; wait 20")
     assert not bench.state.recoveries[2].failure
+
+
+def test_a_recovery_module_in_a_crash_loop_escalates():
+    bench = Bench().play("DM2;" + "RM2 acting; wait 0.05; RM2 idle 0; wait 0.05;" * 30)
+    assert "RM1" in bench.orders
+
+
+def test_a_late_one_in_the_way_is_released():
+    Bench(edited(RM5={"escalate_to": "RM2"}, RM2={"escalate_to": ""})).play(
+        "DM6; RM5 acting; wait 2.1 = RM2")
 
 
 def test_a_repair_whose_detection_blames_one_life_after_the_other_has_failed():
@@ -180,105 +91,33 @@ def test_a_repair_whose_detection_blames_one_life_after_the_other_has_failed():
     assert bench.now <= 2 * deadline_s
 
 
-def test_a_repair_of_one_node_after_the_other_has_not_failed():
-    bench = Bench()
-    deadline_s = bench.arbiter.mechanisms.contracts["RM3"].deadline_s
-    for node in ("osmosis_control#1", "graph_planner#1", "mission_manager#1"):
-        bench.active("DM4", node)
-        bench.report("RM3", ACTING)
-        bench.report("RM3", DONE)
-        bench.wait(0.8 * deadline_s)
-    assert bench.orders == "RM3"
+def heard(modules: str, *but: str) -> str:
+    """All detection or recovery modules report that nothing is wrong or activated, but some."""
+    return ";".join(f"-{one}" if modules == "DM" else f"{one} idle"
+                    for one in (DMS if modules == "DM" else RMS) if one not in but)
 
 
-def test_a_respawned_recovery_module_is_commanded_again():
-    bench = Bench()
-    bench.active("DM2")
-    bench.report("RM2", DONE)
-    assert commands(bench.report("RM2", IDLE, decision=0)) == [("RM2", True)]
-    assert bench.orders == "RM2"
+BUT_RM1, BUT_RM2, BUT_RM3 = (heard("RM", one) for one in ("RM1", "RM2", "RM3"))
+
+NEW = {
+    "it adopts a latched emergency stop": f"""
+        RM1 done 41; {heard("DM")}; {BUT_RM1}; wait 20 = RM1; latched: RM1; reset RM1 =""",
+    "it keeps a stop until it has heard everybody, as RM4 alone would let the robot go": f"""
+        RM2 done 41; DM5 hmi; {heard("DM", "DM2", "DM5")}; {BUT_RM2} = RM2; DM2 = RM2""",
+    "it releases a stop whose cause is gone": f"""
+        RM2 done 41; {BUT_RM2}; {heard("DM", "DM7")} = RM2; -DM7 > -RM2""",
+    "it lets an adopted respawn finish": f"""
+        RM3 acting 41; {BUT_RM3}; {heard("DM")} = (RM3); RM3 done 41 > -RM3""",
+    "an emergency needs no orientation": "RM2 done 41; DM1 > -RM2 +RM1",
+    "the wait for orientation ends with the grace":
+        f"RM2 done 41; wait 4.9 = RM2; {heard('DM')}; wait 0.2 =",
+}
 
 
-def test_a_recovery_module_in_a_crash_loop_escalates():
-    bench = Bench()
-    bench.active("DM2")
-    for _ in range(30):
-        bench.report("RM2", ACTING)
-        bench.wait(0.05)
-        bench.report("RM2", IDLE, decision=0)
-        bench.wait(0.05)
-    assert "RM1" in bench.orders
-
-
-# ---- the manager itself is respawned ----------------------------------------------------------
-
-
-def test_a_new_manager_adopts_a_latched_emergency_stop():
-    bench = Bench(oriented=False)
-    bench.report("RM1", DONE, decision=41)
-    for dm in DMS:
-        bench.idle(dm)
-    for rm in RMS[1:]:
-        bench.report(rm, IDLE)
-    bench.wait(20.0)
-    assert bench.orders == "RM1"
-    assert bench.state.latched == ("RM1",)
-    assert bench.state.number >= 41
-    assert bench.reset("RM1").granted
-    assert bench.orders == ""
-
-
-def test_a_new_manager_keeps_a_stop_until_it_has_heard_everybody():
-    bench = Bench(oriented=False)
-    bench.report("RM2", DONE, decision=41)
-    bench.active("DM5", "hmi")  # RM4 alone would let the robot go
-    for dm in ("DM1", "DM3", "DM4", "DM6", "DM7"):
-        bench.idle(dm)
-    for rm in ("RM1", "RM3", "RM4", "RM5"):
-        bench.report(rm, IDLE)
-    assert bench.orders == "RM2"
-    bench.active("DM2")
-    assert bench.orders == "RM2"
-    assert bench.decisions[-1].number > 41
-
-
-def test_a_new_manager_releases_a_stop_whose_cause_is_gone():
-    bench = Bench(oriented=False)
-    bench.report("RM2", DONE, decision=41)
-    for rm in ("RM1", "RM3", "RM4", "RM5"):
-        bench.report(rm, IDLE)
-    for dm in DMS[:-1]:
-        bench.idle(dm)
-    assert bench.orders == "RM2"
-    assert commands(bench.idle(DMS[-1])) == [("RM2", False)]
-
-
-def test_a_new_manager_lets_an_adopted_respawn_finish():
-    bench = Bench(oriented=False)
-    bench.report("RM3", ACTING, decision=41)
-    for rm in ("RM1", "RM2", "RM4", "RM5"):
-        bench.report(rm, IDLE)
-    for dm in DMS:
-        bench.idle(dm)
-    assert bench.orders == "(RM3)"
-    assert commands(bench.report("RM3", DONE, decision=41)) == [("RM3", False)]
-
-
-def test_an_emergency_needs_no_orientation():
-    bench = Bench(oriented=False)
-    bench.report("RM2", DONE, decision=41)
-    assert commands(bench.active("DM1")) == [("RM2", False), ("RM1", True)]
-
-
-def test_the_wait_for_orientation_ends_with_the_grace():
-    bench = Bench(oriented=False)
-    bench.report("RM2", DONE, decision=41)
-    bench.wait(4.9, hearing=DMS)
-    assert bench.orders == "RM2"
-    for dm in DMS:
-        bench.idle(dm)
-    bench.wait(0.2)
-    assert bench.orders == ""
+@pytest.mark.parametrize("script", NEW.values(), ids=NEW)
+def test_a_new_manager(script):
+    bench = Bench(oriented=False).play(script)
+    assert "41" not in script or bench.state.number >= 41
 
 
 def respawned() -> Bench:
@@ -288,44 +127,20 @@ def respawned() -> Bench:
     return bench
 
 
-def test_a_respawned_manager_waits_for_a_module_no_longer_than_for_any_silent_one():
-    bench = respawned()
-    for rm in RMS:
-        bench.report(rm, IDLE)
-    others = tuple(dm for dm in DMS if dm != "DM1")
-    for dm in others:
-        bench.idle(dm)
-    silence_s = paper().timing.detection_silence_timeout_s
-    bench.wait(silence_s - 0.1, hearing=others)
-    assert bench.orders == ""
-    bench.wait(0.2, hearing=others)
-    assert bench.orders == "RM1"
+RESPAWNED = {
+    "it waits for a module no longer than for any silent one": f"""
+        {heard("RM")}; {heard("DM", "DM1")}; wait 0.85 without DM1 =; wait 0.2 without DM1 = RM1""",
+    "what was adopted is not let go in between if its module stays silent": f"""
+        RM2 done 41; {BUT_RM2}; {heard("DM", "DM2")}; wait 3.0 without DM2 > = RM2""",
+    "nothing is reset before all modules have been heard": f"""
+        RM1 done 41; refused RM1; {BUT_RM1}; {heard("DM")}; reset RM1""",
+}
 
 
-def test_what_was_adopted_is_not_let_go_in_between_if_its_module_stays_silent():
-    bench = respawned()
-    bench.report("RM2", DONE, decision=41)
-    for rm in ("RM1", "RM3", "RM4", "RM5"):
-        bench.report(rm, IDLE)
-    others = tuple(dm for dm in DMS if dm != "DM2")
-    for dm in others:
-        bench.idle(dm)
-    outputs = bench.wait(3.0, hearing=others)
-    assert ("RM2", False) not in commands(outputs)
-    assert bench.orders == "RM2"
-
-
-def test_nothing_is_reset_before_all_modules_have_been_heard():
-    bench = respawned()
-    bench.report("RM1", DONE, decision=41)
-    answer = bench.reset("RM1")
-    assert not answer.granted
-    assert answer.reason == "not all modules have been heard yet"
-    for rm in RMS[1:]:
-        bench.report(rm, IDLE)
-    for dm in DMS:
-        bench.idle(dm)
-    assert bench.reset("RM1").granted
+@pytest.mark.parametrize("script", RESPAWNED.values(), ids=RESPAWNED)
+def test_a_respawned_manager(script):
+    """Whose modules run already."""
+    respawned().play(script)
 
 
 def test_a_number_that_was_never_given_is_not_counted_on_from():
@@ -355,9 +170,3 @@ def test_a_latch_beneath_a_safer_recovery_survives_the_manager():
     state = recall(bench.arbiter, memory, 100.0, 0)
     assert set(state.latched) == {"RM1", "RM2"}
     assert [t.wanted for t in state.recoveries[:2]] == [True, False]
-
-
-def test_a_later_report_of_activation_is_not_adopted():
-    bench = Bench()
-    bench.report("RM2", DONE, decision=0)
-    assert bench.orders == ""

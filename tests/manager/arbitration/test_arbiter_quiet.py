@@ -5,7 +5,7 @@ from __future__ import annotations
 from unittest import mock
 
 import msgspec
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.manager.arbitration.arbiter import Arbiter, build_arbiter
@@ -30,7 +30,6 @@ EVERYBODY = [*(DetectionHeard(name, False) for name in DMS),
              *(RecoveryHeard(name, False, RecoveryPhase.IDLE, 0) for name in RMS)]
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.sampled_from(STRATEGIES),
        st.lists(st.tuples(INPUTS, st.sampled_from([0.0, 0.05, 0.4, 3.0])), max_size=25))
 def test_the_short_way_leads_where_the_long_way_does(strategy, walk):

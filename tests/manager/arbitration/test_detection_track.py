@@ -2,7 +2,7 @@
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.manager.arbitration.detection_track import (
@@ -110,7 +110,6 @@ def test_flapping_is_soon_seen_as_one_long_activity(period_s):
     assert "." not in beliefs[200:]
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 30), st.integers(1, 30)), min_size=1, max_size=20))
 def test_however_it_flaps_it_is_released_within_the_bound(flaps):
     """No starvation: idle for `release_hold_max_s`, it is believed."""
@@ -120,7 +119,6 @@ def test_however_it_flaps_it_is_released_within_the_bound(flaps):
     assert ".A" in "." + beliefs
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.text("Ai", min_size=1, max_size=80))
 def test_an_active_report_is_always_believed_at_once(reports):
     for report, belief in zip(reports, play(reports), strict=True):

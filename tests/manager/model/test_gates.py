@@ -3,7 +3,7 @@
 from itertools import combinations, product
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.manager.model.gates import (
@@ -30,17 +30,10 @@ def rows(text: str, names: str) -> str:
 
 
 @pytest.mark.parametrize(("text", "names", "table"), [
-    ("A", "A", "-1"),
-    ("(A)", "A", "-1"),
-    ("A and B", "AB", "---1"),
-    ("A or B", "AB", "-111"),
-    ("A and not B", "AB", "--1-"),
-    ("A and B and C", "ABC", "-------1"),
-    ("A or B or C", "ABC", "-1111111"),
-    ("1 of (A, B, C)", "ABC", "-1111111"),
-    ("2 of (A, B, C)", "ABC", "---1-111"),
-    ("3 of (A, B, C)", "ABC", "-------1"),
-    ("2 of (A, B and C, A or C)", "ABC", "---11111"),
+    ("A", "A", "-1"), ("(A)", "A", "-1"), ("A and B", "AB", "---1"), ("A or B", "AB", "-111"),
+    ("A and not B", "AB", "--1-"), ("A or B or C", "ABC", "-1111111"),
+    ("2 of (A, B, C)", "ABC", "---1-111"), ("3 of (A, B, C)", "ABC", "-------1"),
+    ("2 of (A, B and C, A or C)", "ABC", "---11111"), ("(A or B) and C", "ABC", "---1-1-1"),
 ])
 def test_a_gate_has_its_truth_table(text, names, table):
     assert rows(text, names) == table
@@ -58,11 +51,6 @@ def test_not_binds_tighter_than_and_which_binds_tighter_than_or(text, same):
     assert rows(text, "ABCD") == rows(same, "ABCD")
 
 
-def test_parentheses_go_before_precedence():
-    assert rows("(A or B) and C", "ABC") == "---1-1-1"
-    assert rows("A or B and C", "ABC") == "---11111"
-
-
 @pytest.mark.parametrize(("text", "same"), [
     ("D and not (A and B)", "D and (not A or not B)"),
     ("D and not (A or B)", "D and (not A and not B)"),
@@ -72,25 +60,6 @@ def test_parentheses_go_before_precedence():
 def test_a_negation_goes_down_to_the_names_by_de_morgan(text, same):
     assert detection_gate(text) == detection_gate(same)
     assert rows(text, "ABCD") == rows(same, "ABCD")
-
-
-def test_names_come_once_each_as_written():
-    assert detection_gate("C and A or C and not B").names == ("C", "A", "B")
-
-
-# ---- silence ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("active", "silent", "holds"), [
-    ({"A"}, set(), True),
-    ({"A", "B"}, set(), False),
-    ({"A", "B"}, {"B"}, True),   # B is silent: that is no assurance that all is well
-    ({"A", "B"}, {"A"}, False),  # A counts as active, and B says that it is
-    ({"B"}, {"B"}, False),
-    ({"A", "B"}, {"A", "B"}, True),
-])
-def test_silence_is_no_alibi(active, silent, holds):
-    assert detection_gate("A and not B").holds(active, silent) is holds
 
 
 # ---- any gate ---------------------------------------------------------------------------------
@@ -120,14 +89,12 @@ def by_words(gate: Gate, active: set[str], silent: set[str]) -> bool:
     return len([1 for i in gate.inputs if by_words(i, active, silent)]) >= gate.required
 
 
-@settings(max_examples=200, deadline=None)
 @given(GATES, st.sets(st.sampled_from(NAMES)), st.sets(st.sampled_from(NAMES)))
 def test_any_gate_holds_as_its_words_say(gate, active, mute):
     silent = mute & active  # a silent module counts as active
     assert gate.holds(active, silent) == by_words(gate, active, silent)
 
 
-@settings(max_examples=200, deadline=None)
 @given(GATES)
 def test_what_is_written_is_read_again_as_the_same(gate):
     text = str(gate)
@@ -142,7 +109,6 @@ def test_what_is_written_is_read_again_as_the_same(gate):
     assert str(again) == text
 
 
-@settings(max_examples=200, deadline=None)
 @given(GATES)
 def test_a_gate_is_refused_exactly_if_it_is_active_on_nothing_or_never(gate):
     table = [gate.holds(active) for size in range(5) for active in combinations(NAMES, size)]
@@ -154,7 +120,6 @@ def test_a_gate_is_refused_exactly_if_it_is_active_on_nothing_or_never(gate):
         detection_gate(str(gate))
 
 
-@settings(max_examples=200, deadline=None)
 @given(PLAIN)
 def test_each_alternative_satisfies_its_gate_and_what_satisfies_it_contains_one(gate):
     ways = list(gate.alternatives())
@@ -213,49 +178,25 @@ def test_what_cannot_be_read_is_refused_in_one_line(read, text, line):
     assert str(caught.value).startswith(line)
 
 
-def test_a_module_may_be_called_as_a_word_of_python():
-    assert detection_gate("None or lambda").names == ("None", "lambda")
-
-
-@pytest.mark.parametrize(("text", "line"), [
-    ("not A", "it is active while all its detection modules are idle"),
-    ("A or not B", "it is active while all its detection modules are idle"),
-    ("A or not A", "it is active while all its detection modules are idle"),
-    ("A and not A", "it can never be active"),
-    ("A and B and not (A or C)", "it can never be active"),
-    (many(MAX_NAMES + 1), f"a gate over {MAX_NAMES + 1} modules; at most {MAX_NAMES} are right, "
-                          "more belong into the fault tree"),
-])
-def test_a_detection_gate_must_be_able_to_change(text, line):
-    with pytest.raises(GateError) as caught:
-        detection_gate(text)
-    assert str(caught.value) == line
-
-
-@pytest.mark.parametrize(("text", "line"), [
-    ("not RM1", "'not RM1' cannot be run; names, 'and' and 'or' are right"),
-    ("RM2 and not RM1", "'not RM1' cannot be run; names, 'and' and 'or' are right"),
-    ("RM2 or (RM3 and not RM1)", "'not RM1' cannot be run; names, 'and' and 'or' are right"),
-    ("2 of (RM1, RM2, RM3)", "'2 of' does not say which; names, 'and' and 'or' are right"),
-    ("RM4 or 2 of (RM1, RM2, RM3)",
-     "'2 of' does not say which; names, 'and' and 'or' are right"),
-    (many(MAX_NAMES + 1), f"{MAX_NAMES + 1} recovery modules; at most {MAX_NAMES} are right"),
-])
-def test_a_recovery_gate_must_say_what_to_run(text, line):
-    with pytest.raises(GateError) as caught:
-        recovery_gate(text)
-    assert str(caught.value) == line
+@pytest.mark.parametrize(("read", "text", "words"), [
+    (detection_gate, "not A", "active while all its detection modules are idle"),
+    (detection_gate, "A or not A", "active while all its detection modules are idle"),
+    (detection_gate, "A and B and not (A or C)", "it can never be active"),
+    (detection_gate, many(MAX_NAMES + 1), f"a gate over {MAX_NAMES + 1} modules; at most"),
+    (recovery_gate, "RM2 or (RM3 and not RM1)", "'not RM1' cannot be run"),
+    (recovery_gate, "RM4 or 2 of (RM1, RM2, RM3)", "'2 of' does not say which"),
+    (recovery_gate, many(MAX_NAMES + 1), f"{MAX_NAMES + 1} recovery modules; at most")])
+def test_a_detection_gate_has_to_change_and_a_recovery_gate_to_say_what_to_run(read, text, words):
+    with pytest.raises(GateError, match=words):
+        read(text)
+    assert detection_gate("None or lambda or None").names == ("None", "lambda")
+    assert len(detection_gate(many(MAX_NAMES)).names) == MAX_NAMES
+    assert len(recovery_gate(many(MAX_NAMES)).names) == MAX_NAMES
 
 
 @pytest.mark.parametrize(("pairs", "ways"), [(7, "128"), (60, str(2**60))])
 def test_a_recovery_gate_with_too_many_alternatives_is_refused_without_making_them(pairs, ways):
     with pytest.raises(GateError) as caught:
         recovery_gate(" and ".join(["(RM1 or RM2)"] * pairs))
-    assert str(caught.value) == f"{ways} alternatives; at most 64 are right"
-
-
-def test_the_largest_gates_are_read():
+    assert str(caught.value).startswith(f"{ways} alternatives; at most 64")
     assert len(list(recovery_gate(" and ".join(["(RM1 or RM2)"] * 6)).alternatives())) == 64
-    assert len(detection_gate(many(MAX_NAMES)).names) == MAX_NAMES
-    assert len(recovery_gate(many(MAX_NAMES)).names) == MAX_NAMES
-    detection_gate("(" * MAX_DEPTH + "A" + ")" * MAX_DEPTH)

@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.manager.model.order import (
@@ -31,16 +31,6 @@ def test_dom_on_the_rm_order_as_in_the_paper(names, greatest):
     assert greatest == RM_ORDER.greatest(names)
 
 
-@pytest.mark.parametrize(("names", "greatest"), [
-    ({"FTM1", "FTM2", "FTM4"}, "FTM1"),
-    ({"FTM2", "FTM4"}, "FTM2"),
-    ({"FTM4", "FTM5"}, None),
-    ({"FTM6", "FTM4"}, None),
-])
-def test_dom_on_the_ftm_tree_as_in_the_paper(names, greatest):
-    assert greatest == FTM_TREE.greatest(names)
-
-
 @pytest.mark.parametrize(("names", "lowest"), [
     ({"FTM4", "FTM5"}, "FTM2"),
     ({"FTM4", "FTM7"}, "FTM1"),
@@ -59,10 +49,6 @@ def test_the_ftm_tree_is_the_one_of_figure_8():
     assert FTM_TREE.root == "FTM1"
 
 
-def test_maximal_elements_have_nothing_above_them_in_the_set():
-    assert {"RM2", "RM5"} == set(RM_ORDER.maximal({"RM2", "RM3", "RM5", "RM4"}))
-
-
 def test_a_chain_skips_nothing_that_lies_between():
     assert FTM_TREE.chain("FTM1", "FTM7") == ("FTM1", "FTM6", "FTM7")
     with pytest.raises(ValueError, match="FTM7 is not above FTM1"):
@@ -74,21 +60,10 @@ def test_a_cycle_is_named_all_the_way_round():
         PartialOrder("abc", {"a": "b", "b": "c", "c": "a"})
     assert caught.value.cycle == ("a", "b", "c", "a")
     assert find_cycle({"a": ["a"]}) == ("a", "a")
-
-
-def test_an_order_refuses_names_that_it_does_not_have():
-    with pytest.raises(UnknownElementError, match="unknown 'RM9'; known: RM1, RM2"):
-        RM_ORDER.greatest({"RM1", "RM9"})
-
-
-def test_the_empty_set_has_no_lowest_common_dominant():
-    with pytest.raises(ValueError, match="empty set"):
-        FTM_TREE.lowest_common_dominant([])
-
-
-def test_a_chain_of_thousands_is_no_problem():
     names = [f"n{i}" for i in range(5000)]
     assert find_cycle({a: [b] for a, b in pairwise(names)}) is None
+    with pytest.raises(UnknownElementError, match="unknown 'RM9'; known: RM1, RM2"):
+        RM_ORDER.greatest({"RM1", "RM9"})
 
 
 NAMES = "abcdefg"
@@ -98,7 +73,6 @@ RELATIONS = st.tuples(
     st.sets(st.tuples(st.integers(0, 6), st.integers(0, 6)).filter(lambda p: p[0] < p[1])))
 
 
-@settings(max_examples=150, deadline=None)
 @given(RELATIONS, st.sets(st.sampled_from(NAMES)))
 def test_any_order_agrees_with_warshall(relation, members):
     letters, pairs = relation
@@ -121,7 +95,6 @@ def test_any_order_agrees_with_warshall(relation, members):
         order.maximal(members))
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.lists(st.integers(0, 100), min_size=6, max_size=6), st.data())
 def test_the_lowest_common_dominant_of_any_tree_agrees_with_walking_up(choices, data):
     parents: dict[str, str | None] = {"n0": None}

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import copy
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rampart.actors.ftm import messages as m
@@ -21,14 +24,14 @@ from rampart.manager.spec.adaptation import (
     ChangeError,
     adapt,
     changed_actors,
-    describe,
     parse_value,
 )
 from rampart.manager.spec.checks import find_nonsense
 from rampart.manager.spec.specification import SpecificationError, SystemSpec, read_document
-from rampart.testing import run, turns
+from rampart.testing import turns
 from tests.manager.bench import PAPER, paper
 from tests.manager.test_actor import Whole
+from tests.virtual_time import within
 
 DOCUMENT = read_document(PAPER, "paper.toml")
 
@@ -57,12 +60,6 @@ def test_enabling_again_gives_back_the_same_system():
     assert spec.build_ftm_tree().parents == paper().build_ftm_tree().parents
 
 
-def test_what_the_tree_closes_over_has_to_be_in_time_for_the_barrier_above():
-    """Without FTM2, FTM4 would have to be faster than DM1: the budget says no."""
-    with pytest.raises(SpecificationError, match=r"FTM4 needs 0.990 s .* of 0.100 s before DM1"):
-        change("disable", "DM2")
-
-
 def test_a_parameter_is_retuned_and_only_that_module_has_to_be_started_anew():
     spec = change("retune", "DM1", margin_m=0.7)
     assert next(d for d in spec.detections if d.name == "DM1").parameters["margin_m"] == 0.7
@@ -79,42 +76,28 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
 
 
 @pytest.mark.parametrize(("action", "name", "values", "message"), [
-    ("disable", "FTM9", {}, "unknown detection module, recovery module or mechanism 'FTM9'; known: "
-                            "DM1, DM2, DM3, DM4, DM5, DM6, DM7, RM1, RM2, RM3, RM4, RM5, FTM1, "
-                            "FTM2, FTM3, FTM4, FTM5, FTM6, FTM7"),
+    ("disable", "FTM9", {}, "unknown detection module, recovery module or mechanism 'FTM9'"),
     ("retune", "FTM3", {}, "retune FTM3: nothing to change; name fields and values"),
     ("retune", "FTM3", {"name": "X"}, "name = 'X': a name cannot be changed"),
-    ("retune", "FTM3", {"margin_m": 1}, "margin_m = 1: unknown field of a mechanism; known: detect,"
-                                        " recover, event, against, explains, enabled"),
+    ("retune", "FTM3", {"margin_m": 1}, "margin_m = 1: unknown field of a mechanism; known: "),
     ("replace", "FTM3", {"name": "X"}, "name = 'X': a replacement keeps the name, 'FTM3'"),
     ("set", "airport", {"value": "x"}, "unknown setting 'airport'; known: strategy, shadow, order"),
     ("set", "strategy", {}, "set strategy: the value is missing"),
-    ("set", "strategy", {"value": "bold"},
-     "paper.toml: $.strategy = 'bold': unknown strategy; known: guarded-repair, mission-first, "
-     "safety-first, simultaneous"),
-    ("set", "order", {"value": "comfort"},
-     "paper.toml: $.order = 'comfort': unknown order; known: safer"),
-    ("disable", "RM1", {}, "paper.toml: recovery RM2: escalate_to = 'RM1': RM2 escalates to it, "
-                           "and it is disabled"),
-    ("disable", "FTM1", {}, "paper.toml: mechanism FTM2: event = 'command_calculation_error': "
-                            "FTM3: the FTMTree has 3 roots: FTM2, FTM3, FTM6; exactly one mechanism"
-                            " may have no other above it, e.g. one on the top event"),
-    ("retune", "DM2", {"timeout_s": 5.0},
-     "paper.toml: $.timing: the time budget does not fit: FTM2 needs 5.150 s (detection 5.000 + "
-     "arbitration 0.050 + actuation 0.100) of 1.250 s before the robot drifts out of the corridor"),
-    ("retune", "FTM3", {"against": {"within_s": 5.0, "hazard": "x", "typo": 1}},
-     "paper.toml: mechanism FTM3: against.typo = 1: unknown field; known: within_s, hazard"),
-    ("retune", "FTM3", {"detect": "DM3 and not DM3"},
-     "paper.toml: mechanism FTM3: detect = 'DM3 and not DM3': it can never be active"),
-    ("retune", "RM3", {"deadline_s": "soon"},
-     "paper.toml: recovery RM3: deadline_s = 'soon': expected a number > 0"),
-    ("replace", "DM1", {"parameters": 3},
-     "paper.toml: detection DM1: parameters = 3: expected a table"),
+    ("set", "strategy", {"value": "bold"}, "$.strategy = 'bold': unknown strategy; known: "),
+    ("set", "order", {"value": "comfort"}, "$.order = 'comfort': unknown order; known: safer"),
+    ("disable", "RM1", {}, "recovery RM2: escalate_to = 'RM1': RM2 escalates to it"),
+    ("disable", "FTM1", {}, "the FTMTree has 3 roots: FTM2, FTM3, FTM6"),
+    ("disable", "DM2", {}, "FTM4 needs 0.990 s"),  # it would have to be faster than DM1
+    ("retune", "DM2", {"timeout_s": 5.0}, "the time budget does not fit: FTM2 needs 5.150 s"),
+    ("retune", "FTM3", {"detect": "DM3 and not DM3"}, "mechanism FTM3: detect = 'DM3 and not DM3'"),
+    ("retune", "RM3", {"deadline_s": "soon"}, "RM3: deadline_s = 'soon': expected a number > 0"),
+    ("replace", "DM1", {"parameters": 3}, "detection DM1: parameters = 3: expected a table"),
 ])
 def test_refused_in_one_line(action, name, values, message):
     with pytest.raises((ChangeError, SpecificationError)) as caught:
         change(action, name, **values)
-    assert str(caught.value) == message
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 JSON = st.recursive(
@@ -124,7 +107,6 @@ JSON = st.recursive(
                                                                 max_size=3), max_leaves=6)
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.sampled_from(list(Action)),
        st.sampled_from(["DM2", "RM3", "FTM4", "FTM1", "strategy", "order", "shadow", "x"]),
        st.dictionaries(st.sampled_from(
@@ -155,11 +137,6 @@ def test_values_are_read_as_toml_and_words_as_text(text, value):
 def test_a_value_that_is_neither_is_refused(text):
     with pytest.raises(ChangeError, match="expected a TOML value"):
         parse_value(text)
-
-
-def test_a_change_is_described_in_a_few_words():
-    assert describe(Change(Action.RETUNE, "DM1", {"margin_m": 0.7})) == "retune DM1: margin_m = 0.7"
-    assert describe(Change(Action.SET, "order", {"value": ["a", "b"]})) == "set order to ['a', 'b']"
 
 
 # -- the manager ---------------------------------------------------------------------------------
@@ -197,150 +174,112 @@ class Engineer(Actor):
         return self.answers[-1]
 
 
-def in_adaptable_system(scenario: Any) -> None:
-    async def begin() -> None:
-        async with Whole() as system:
-            system.run = replace(system.run, document=copy.deepcopy(DOCUMENT))
-            await system.begin()
-            engineer = system.start("engineer", Engineer)
-            await asyncio.sleep(0.1)
-            await scenario(system, engineer)
-
-    run(begin)
-
-
-def test_a_change_is_applied_at_once_told_whole_and_repeated_and_nothing_else_happens():
-    async def scenario(system: Whole, engineer: Engineer) -> None:
-        answer = await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')
-        assert (answer.accepted, answer.reason, answer.version) == (True, "", 1)
-        told = engineer.systems[-1]
-        assert (told.version, told.change) == (1, "set strategy to 'guarded-repair'")
-        assert msgspec.json.decode(told.document)["strategy"] == "guarded-repair"
-        assert system.status.strategy == "guarded-repair"
-        count = len(engineer.systems)
-        await asyncio.sleep(5.0)
-        assert len(engineer.systems) >= count + 4
-        assert system.recorder.decisions == []  # belief in all modules was kept
-        assert system.pilot.heard == 0
-
-    in_adaptable_system(scenario)
+@asynccontextmanager
+async def adaptable(keys: str = "") -> AsyncIterator[tuple[Whole, Engineer]]:
+    async with Whole() as system:
+        system.run = replace(system.run, document=copy.deepcopy(DOCUMENT),
+                             plan=msgspec.structs.replace(system.run.plan, keys=keys))
+        await system.begin()
+        engineer = system.start("engineer", Engineer)
+        await asyncio.sleep(0.1)
+        yield system, engineer
 
 
-def test_the_new_strategy_decides_from_then_on():
-    async def scenario(system: Whole, engineer: Engineer) -> None:
-        await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')
-        await engineer.ask("set", "shadow", '{"value": "safety-first"}')
-        system.robot.silent.add("command")
-        await asyncio.sleep(1.2)
-        await system.kill("osmosis_control")
-        await asyncio.sleep(0.3)
-        assert (("FTM2", "FTM4"), 2, ("RM2", "RM3")) in system.recorder.taken
-        assert any(s.strategy == "safety-first" and s.recoveries == ("RM2",)
-                   for s in engineer.shadows)
-        assert system.incarnations["osmosis_control"] == 2
-
-    in_adaptable_system(scenario)
-
-
-@pytest.mark.parametrize("values", [
-    '{"against": {"within_s": 5.0, "hazard": "x", "typo": 1}}',
-    '{"timeout_s": 1' + 400 * "0" + "}",
-    '{"value": ' + 5000 * "[" + 5000 * "]" + "}",
-    '{"value": NaN}', "[]", "\xff", ""])
-def test_whatever_is_typed_the_manager_refuses_it_and_lives(values):
-    async def scenario(system: Whole, engineer: Engineer) -> None:
-        for action, name in (("retune", "FTM2"), ("set", "strategy")):
-            answer = await engineer.ask(action, name, values)
-            assert not answer.accepted
-            assert answer.reason
-            assert "\n" not in answer.reason
-        assert (await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')).accepted
-
-    in_adaptable_system(scenario)
+@within(adaptable)
+async def test_a_change_is_applied_at_once_told_whole_and_repeated_and_nothing_else_happens(given):
+    system, engineer = given
+    answer = await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')
+    assert (answer.accepted, answer.reason, answer.version) == (True, "", 1)
+    told = engineer.systems[-1]
+    assert (told.version, told.change) == (1, "set strategy to 'guarded-repair'")
+    assert msgspec.json.decode(told.document)["strategy"] == "guarded-repair"
+    assert system.status.strategy == "guarded-repair"
+    count = len(engineer.systems)
+    await asyncio.sleep(5.0)
+    assert len(engineer.systems) >= count + 4
+    assert system.recorder.decisions == []  # belief in all modules was kept
+    assert system.pilot.heard == 0
 
 
-def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
-    async def scenario(system: Whole, engineer: Engineer) -> None:
-        system.robot.silent.add("command")
-        await asyncio.sleep(1.5)
-        answer = await engineer.ask("disable", "FTM7")
-        assert not answer.accepted
-        assert answer.reason == ("not in the middle of a recovery: RM2; try again when it is over")
-        answer = await engineer.ask("retune", "DM99", '{"margin_m": 0.7}')
-        assert answer.reason.startswith("unknown detection module, recovery module or mechanism")
-        answer = await engineer.ask("retune", "DM4", '{"timeout_s": 0.01}')
-        assert "would raise false alarms" in answer.reason
-        system.robot.silent.clear()
-        await asyncio.sleep(2.0)
-        assert (await engineer.ask("disable", "FTM7")).accepted
+@within(adaptable)
+async def test_the_new_strategy_decides_from_then_on(given):
+    system, engineer = given
+    await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')
+    await engineer.ask("set", "shadow", '{"value": "safety-first"}')
+    system.robot.silent.add("command")
+    await asyncio.sleep(1.2)
+    await system.kill("osmosis_control")
+    await asyncio.sleep(0.3)
+    assert (("FTM2", "FTM4"), 2, ("RM2", "RM3")) in system.recorder.taken
+    assert any(s.strategy == "safety-first" and s.recoveries == ("RM2",)
+               for s in engineer.shadows)
+    assert system.incarnations["osmosis_control"] == 2
 
-    in_adaptable_system(scenario)
+
+@within(adaptable)
+async def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not(given):
+    system, engineer = given
+    system.robot.silent.add("command")
+    await asyncio.sleep(1.5)
+    answer = await engineer.ask("disable", "FTM7")
+    assert not answer.accepted
+    assert answer.reason == ("not in the middle of a recovery: RM2; try again when it is over")
+    answer = await engineer.ask("retune", "DM99", '{"margin_m": 0.7}')
+    assert answer.reason.startswith("unknown detection module, recovery module or mechanism")
+    answer = await engineer.ask("retune", "DM4", '{"timeout_s": 0.01}')
+    assert "would raise false alarms" in answer.reason
+    system.robot.silent.clear()
+    await asyncio.sleep(2.0)
+    assert (await engineer.ask("disable", "FTM7")).accepted
 
 
 @pytest.mark.parametrize(("action", "name", "values", "words"), [
     ("explode", "FTM7", "{}", "'explode' is not a valid Action"),
     ("disable", "FTM7", "[]", "Expected `object`"),
-    ("disable", "FTM7", "{", "Input data was truncated"),
-    ("disable", "FTM1", "{}", "the FTMTree has 3 roots"),
+    ("retune", "FTM2", '{"timeout_s": 1' + 400 * "0" + "}", ""),
+    ("set", "strategy", '{"value": ' + 5000 * "[" + 5000 * "]" + "}", ""),
+    ("set", "strategy", '{"value": NaN}', ""), ("set", "strategy", "\xff", ""),
     ("retune", "DM1", '{"actor": "rampart.actors.osmosis.detection.bounds:Nobody"}',
      "no such actor class"),
     ("retune", "DM3", '{"actor": "rampart.actors.osmosis.recovery.emergency_stop:EmergencyStop"}',
-     "it does not publish detection/{name}, as the modules of this table do"),
+     "it does not publish detection/{name}"),
     ("retune", "DM3", '{"actor": "rampart.actors.detection.stub:StubDetection"}',
      "no actor of the system that was started is in that module"),
-    ("retune", "RM5",
-     '{"actor": "rampart.actors.osmosis.control.localization.localization:Localization"}',
-     "it does not publish recovery/{name}/state, as the modules of this table do"),
-    ("retune", "DM4", '{"timeout_s": 0.01}',
-     "paper.toml: detection DM4: parameters.timeout_s = 0.01: would raise false alarms; at least "
-     "0.420 s, 3 periods of heartbeat_period_s = 0.140 s, is right"),
-    ("retune", "DM1", '{"hold_s": -1}',
-     "paper.toml: detection DM1: parameters.hold_s = -1: expected a number, 0 or more"),
-    ("retune", "DM5", '{"process": "DM1"}',
-     "DM5: process = 'DM1': expected 'DM5', which stays while a system runs"),
-    ("retune", "DM3", '{"hold": 1}',
-     "paper.toml: detection DM3: parameters.hold = 1: unknown field; known: hold_s, suspects"),
+    ("retune", "DM4", '{"timeout_s": 0.01}', "parameters.timeout_s = 0.01: would raise false"),
+    ("retune", "DM5", '{"process": "DM1"}', "DM5: process = 'DM1': expected 'DM5', which stays"),
+    ("retune", "DM3", '{"hold": 1}', "detection DM3: parameters.hold = 1: unknown field; known"),
 ])
-def test_what_is_refused_changes_nothing(action, name, values, words):
-    async def scenario(system: Whole, engineer: Engineer) -> None:
-        answer = await engineer.ask(action, name, values)
-        assert not answer.accepted
-        assert words in answer.reason
-        assert "\n" not in answer.reason
-        assert engineer.systems == []
-        system.robot.silent.add("command")
-        await asyncio.sleep(1.5)
-        assert system.recorder.taken == [(("FTM2",), 1, ("RM2",))]
-
-    in_adaptable_system(scenario)
-
-
-def test_a_mechanism_that_is_disabled_does_not_recover():
-    async def scenario(system: Whole, engineer: Engineer) -> None:
-        assert (await engineer.ask("disable", "FTM5")).accepted
-        await system.kill("hmi")
-        await asyncio.sleep(2.0)
-        assert system.recorder.decisions == []
-        assert (await engineer.ask("enable", "FTM5")).accepted
-        await asyncio.sleep(1.0)
-        assert system.recorder.taken[0] == (("FTM5",), 1, ("RM4",))
-        assert system.incarnations["hmi"] == 2
-
-    in_adaptable_system(scenario)
+@within(adaptable)
+async def test_what_is_refused_changes_nothing(given, action, name, values, words):
+    system, engineer = given
+    answer = await engineer.ask(action, name, values)
+    assert not answer.accepted
+    assert words in answer.reason
+    assert "\n" not in answer.reason
+    assert engineer.systems == []
+    system.robot.silent.add("command")
+    await asyncio.sleep(1.5)
+    assert system.recorder.taken == [(("FTM2",), 1, ("RM2",))]
 
 
-def test_with_credentials_a_change_that_they_do_not_permit_is_refused():
-    async def begin() -> None:
-        async with Whole() as system:
-            system.run = replace(system.run, document=copy.deepcopy(DOCUMENT),
-                                 plan=msgspec.structs.replace(system.run.plan, keys="keys"))
-            await system.begin()
-            engineer = system.start("engineer", Engineer)
-            await asyncio.sleep(0.1)
-            answer = await engineer.ask(
-                "retune", "DM5", '{"watch": ["hmi", "teleoperation", "localization"]}')
-            assert not answer.accepted
-            assert answer.reason.startswith("DM5: would need other topics")
-            assert (await engineer.ask("retune", "DM1", '{"margin_m": 0.7}')).accepted
+@within(adaptable)
+async def test_a_mechanism_that_is_disabled_does_not_recover(given):
+    system, engineer = given
+    assert (await engineer.ask("disable", "FTM5")).accepted
+    await system.kill("hmi")
+    await asyncio.sleep(2.0)
+    assert system.recorder.decisions == []
+    assert (await engineer.ask("enable", "FTM5")).accepted
+    await asyncio.sleep(1.0)
+    assert system.recorder.taken[0] == (("FTM5",), 1, ("RM4",))
+    assert system.incarnations["hmi"] == 2
 
-    run(begin)
+
+@within(partial(adaptable, keys="keys"))
+async def test_with_credentials_a_change_that_they_do_not_permit_is_refused(given):
+    _, engineer = given
+    answer = await engineer.ask(
+        "retune", "DM5", '{"watch": ["hmi", "teleoperation", "localization"]}')
+    assert not answer.accepted
+    assert answer.reason.startswith("DM5: would need other topics")
+    assert (await engineer.ask("retune", "DM1", '{"margin_m": 0.7}')).accepted

@@ -74,15 +74,9 @@ def test_the_numbers_of_the_shipped_robot():
             timing.heartbeat_timeout_s) == (0.99, 0.99, 0.99, 0.99, 0.36, 0.405, 0.44)
 
 
-def test_everything_in_the_shipped_system_fits():
-    budgets = {budget.name: budget for budget in check(SPEC)}
-    assert {"FTM1", "FTM2", "FTM3", "FTM4", "FTM5", "FTM6", "FTM7", "safety_pilot",
-            "blind_pilot", "dead_man", "manager_watch", "silent_detection"} == set(budgets)
-    assert all(budget.fits for budget in budgets.values())
+def test_everything_in_the_shipped_systems_fits_and_what_races_no_distance_says_what_it_races():
+    assert all(budget.fits for budget in check(SPEC))
     assert not list(find_false_alarms(SPEC.timing))
-
-
-def test_everything_in_the_full_system_fits_and_what_races_no_distance_says_what_it_races():
     spec = full_system()
     budgets = {budget.name: budget for budget in check(spec)}
     assert len(budgets) == len(spec.mechanisms) + 5
@@ -94,31 +88,15 @@ def test_everything_in_the_full_system_fits_and_what_races_no_distance_says_what
     assert all(budgets[name].hazard for name in stated)
 
 
-def test_a_crash_is_masked_before_its_consequence_is_detected():
-    timing = SPEC.timing
-    masked_s = (timing.heartbeat_timeout_s + timing.arbitration_s + timing.actuation_s
-                + timing.respawn_s)
-    assert masked_s <= timing.command_timeout_s + 1e-9
-    assert masked_s <= timing.localization_timeout_s + 1e-9
-
-
-def test_only_a_recovery_that_brings_a_node_back_pays_for_the_respawn():
-    respawn_s = {budget.name: budget.respawn_s for budget in check(SPEC) if budget.respawn_s}
-    assert respawn_s == {"FTM4": 0.4, "FTM5": 0.4, "FTM7": 0.4}
-
-
-def test_the_heartbeat_follows_a_command_timeout_that_is_given():
+def test_only_a_repair_pays_for_the_respawn_and_a_given_command_timeout_moves_the_heartbeat():
+    assert {b.name: b.respawn_s for b in check(SPEC) if b.respawn_s} == {
+        "FTM4": 0.4, "FTM5": 0.4, "FTM7": 0.4}
     timing = derive_timeouts(ROBOT, changed(Timing(), command_timeout_s=0.9))
-    assert timing.command_timeout_s == 0.9
-    assert timing.heartbeat_timeout_s == pytest.approx(0.35)
-
-
-def test_the_heartbeat_timeout_is_at_most_five_periods():
+    assert (timing.command_timeout_s, round(timing.heartbeat_timeout_s, 6)) == (0.9, 0.35)
     timing = derive_timeouts(changed(ROBOT, corridor_clearance_m=20.0), Timing())
-    assert timing.heartbeat_timeout_s == 0.5
+    assert timing.heartbeat_timeout_s == 0.5, "at most five periods"
 
 
-@settings(max_examples=100, deadline=None)
 @given(speed=st.floats(0.2, 3.0), brake=st.floats(0.5, 5.0), clearance=st.floats(0.5, 10.0),
        stop=st.floats(0.3, 5.0))
 def test_derived_timeouts_always_fit_whatever_the_robot(speed, brake, clearance, stop):
@@ -156,12 +134,6 @@ def test_a_guard_that_is_switched_off_needs_no_time():
     layers = changed(SPEC.layers, safety_pilot_checks=False, dead_man=False, manager_watch=False,
                      ftm=False)
     assert [b.name for b in check(changed(SPEC, layers=layers))] == ["safety_pilot"]
-
-
-def test_a_budget_explains_itself():
-    assert str(check(SPEC)[3]) == (
-        "FTM4 needs 0.990 s (detection 0.440 + arbitration 0.050 + actuation 0.100 + respawn "
-        "0.400) of 0.990 s before DM2 of FTM2 detects the consequence")
 
 
 @pytest.mark.parametrize("field", sorted(PERIODS.keys() - GUARDED))

@@ -16,11 +16,6 @@ SPEC = parse_specification(TEXT, "two.toml")
 TWO = '[[host]]\nname = "ground"\naddress = "192.168.7.2"\n\n'
 
 
-def test_what_does_not_say_runs_on_the_first():
-    assert SPEC.host_of["DM10"] == "ground"
-    assert SPEC.host_of["DM1"] == SPEC.host_of["RM1"] == SPEC.host_of["simulator"] == "robot"
-
-
 def test_the_first_host_s_names_are_those_of_a_system_of_one_machine():
     hosts = Hosts(SPEC)
     assert hosts.supervisors == {"": "supervisor", "ground": "supervisor_ground"}
@@ -31,9 +26,6 @@ def test_the_first_host_s_names_are_those_of_a_system_of_one_machine():
     assert hosts.listens(1, "tcp") == ["tcp/192.168.7.1:7461"]
     assert Hosts(SPEC, "ground").dials(1, "tls") == ["tls/192.168.7.1:7461"]
     assert hosts.meeting_place() == ("192.168.7.1", 7462)
-
-
-def test_addresses_of_the_sixth_version_are_put_into_brackets():
     spec = parse_specification(TEXT.replace("192.168.7.1", "fd00::1"), "two.toml")
     assert Hosts(spec).listens(0, "tcp") == ["tcp/[fd00::1]:7460"]
 

@@ -1,6 +1,6 @@
 """Safety-first against an oracle written from the paper's words, for all 127 active sets."""
 
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import pytest
 
@@ -83,12 +83,6 @@ def test_every_active_set_is_decided_as_the_paper_says(active):
     assert tuple(sorted(active)) == decision.active
 
 
-def test_the_oracle_meets_all_four_blocks():
-    counts = {block: sum(oracle(s)[0] == block for s in ALL_SETS) for block in (1, 2, 3, 4)}
-    assert sum(counts.values()) == 127
-    assert all(counts.values())
-
-
 @pytest.mark.parametrize(("active", "block", "executed"), [
     (["FTM7"], 1, "RM4"),
     (["FTM1", "FTM6"], 2, "RM1"),
@@ -100,52 +94,13 @@ def test_table_iii_of_the_paper(active, block, executed):
     assert (block, (executed,)) == (decision.rule, decision.recoveries)
 
 
-@pytest.mark.parametrize(("active", "executed"), [
-    (["FTM5", "FTM7"], "RM4"), (["FTM2", "FTM3"], "RM2"),
-])
-def test_two_mechanisms_that_share_a_recovery_run_it_by_block_3(active, executed):
-    decision = decide(active, MECHANISMS, TREE, ORDER)
-    assert (3, (executed,)) == (decision.rule, decision.recoveries)
-    assert tuple(active) == decision.mechanisms
-
-
-def test_nothing_active_means_nothing_to_do():
-    decision = decide([], MECHANISMS, TREE, ORDER)
-    assert (decision.rule, decision.recoveries) == (0, ())
-
-
-@pytest.mark.parametrize("active", ALL_SETS, ids=lambda s: "+".join(sorted(s)))
-def test_the_certificate_holds_for_every_active_set(active):
-    """Each chain is one of dominance, and each alternative is either taken or rejected."""
-    decision = decide(active, MECHANISMS, TREE, ORDER)
-    for chain in decision.path:
-        links = chain.split(" > ")
-        for upper, lower in pairwise(links):
-            assert dominates_in_tree(upper, lower) if upper.startswith("FTM") \
-                else (upper, lower) in IS_SAFER
-    if decision.rule in {2, 4}:
-        assert active - set(decision.mechanisms) == {
-            chain.split(" > ")[-1] for chain in decision.path}
-    rejected = {name for name, _ in decision.rejected}
-    assert {RECOVERY[x] for x in active} <= rejected | set(decision.recoveries)
-    assert not rejected & set(decision.recoveries)
-    assert all(why for _, why in decision.rejected)
-
-
-def test_the_certificate_reads_like_an_explanation():
-    decision = decide(["FTM2", "FTM6", "FTM5"], MECHANISMS, TREE, ORDER)
-    assert decision.path == ("FTM1 > FTM2", "FTM1 > FTM2 > FTM5", "FTM1 > FTM6")
-    assert ("RM5", "does not dominate RM2") in decision.rejected
-
-
-def test_an_unknown_mechanism_is_named_with_those_that_are_known():
+def test_what_is_unknown_is_named_with_what_is_known_and_nothing_active_needs_nothing():
     with pytest.raises(UnknownElementError, match=r"unknown mechanism 'FTM9'; known: FTM1, FTM2"):
         decide(["FTM1", "FTM9"], MECHANISMS, TREE, ORDER)
-
-
-def test_an_unknown_strategy_is_named_with_those_that_are_known():
     with pytest.raises(UnknownStrategyError, match=r"unknown strategy 'bold'; known: .*safety-f"):
         find_strategy("bold")
+    nothing = decide([], MECHANISMS, TREE, ORDER)
+    assert (nothing.rule, nothing.recoveries) == (0, ())
 
 
 def test_a_strategy_can_be_added_but_not_replaced_by_accident():
