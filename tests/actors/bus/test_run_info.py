@@ -8,14 +8,12 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import islice
 
 import msgspec
 import pytest
 
 from rampart.actors.bus import run_info
 from rampart.testing import free_base_port
-from rampart.testing.ports import bases
 
 
 @contextmanager
@@ -62,16 +60,6 @@ def test_somebodys_socket_whose_name_is_no_text_does_not_matter():
           socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stranger):
         stranger.bind(b"\0caf\xe9." + str(os.getpid()).encode())
         assert INFO in run_info.find_runs(), port
-
-
-def test_the_workers_of_a_test_run_take_different_ports(monkeypatch):
-    monkeypatch.setenv("PYTEST_XDIST_WORKER_COUNT", "3")
-    taken = []
-    for worker in range(3):
-        monkeypatch.setenv("PYTEST_XDIST_WORKER", f"gw{worker}")
-        taken.extend(islice(bases(), 100))
-    assert len(set(taken)) == 300
-    assert not any(base % 40 for base in taken)
 
 
 def test_a_base_whose_launcher_s_name_is_taken_is_not_free(monkeypatch):

@@ -14,8 +14,8 @@ from rampart.actors.recovery.respawn import Respawn, RespawnCore
 from rampart.actors.runtime.run_context import RunContext
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import VirtualSystem
-from rampart.testing import run as virtually
 from tests import CELL
+from tests.virtual_time import within
 
 
 def core(*nodes: str) -> RespawnCore:
@@ -31,75 +31,50 @@ def seen(core: RespawnCore, node: str = "a", incarnation: int = 1, now_s: float 
     core.beat(node, incarnation, now_s, now_s)
 
 
-def test_a_dead_node_is_asked_for_with_the_incarnation_that_died():
+@pytest.mark.parametrize(("heard", "died", "at_s", "failed"), [
+    (True, True, 1.06, 3),  # it is dead
+    (True, False, 1.4, 3),  # its heartbeat is overdue
+    (True, False, 1.05, 2),  # it was heard a moment ago: its predecessor is accused
+    (False, False, 0.0, 0)])  # it was never heard of
+def test_a_node_is_asked_for_once_with_the_incarnation_that_failed(heard, died, at_s, failed):
     rm = core()
-    seen(rm, incarnation=3)
-    rm.event("a", "crashed", 3, "", 1.05)
-    assert rm.order(["a"], 1.06, renewed=False)
-    assert rm.take_requests() == [request(100, "a", 3)]
-    assert rm.take_requests() == []
-    assert rm.pending == ("a",)
-
-
-def test_a_node_whose_heartbeat_is_overdue_is_named():
-    rm = core()
-    seen(rm, incarnation=3)
-    rm.order(["a"], 1.4, renewed=False)
-    assert rm.take_requests() == [request(100, "a", 3)]
-
-
-def test_in_a_fast_system_a_heartbeat_is_overdue_before_the_watchdog_reports_it():
-    text = CELL.read_text(encoding="utf-8").replace(
-        "heartbeat_timeout_s = 0.3", "heartbeat_timeout_s = 0.18\nheartbeat_period_s = 0.06")
-    run = RunContext(system=parse_specification(text, "cell.toml"))
-
-    async def scenario():
-        async with VirtualSystem(run) as system:
-            rm = system.start("RM", Respawn, nodes=["a"])
-            asked = system.hear(topics.RESPAWN)
-            await system.settle()
-            system.say(HEARTBEAT, Heartbeat(1, 1, 0.06, 0, 0), "a", incarnation=3)
-            await asyncio.sleep(0.18)
-            system.say(topics.RECOVERY_COMMAND, RecoveryCommand(True, 1, ("a",), ""), "manager",
-                       member="RM")
-            await system.settle()
-            assert asked[-1].message.failed_incarnation == 3
-            assert rm.activated
-
-    virtually(scenario)
-
-
-def test_a_node_heard_a_moment_ago_is_not_accused_its_predecessor_is():
-    rm = core()
-    seen(rm, incarnation=3)
-    rm.order(["a"], 1.05, renewed=False)
-    assert rm.take_requests() == [request(100, "a", 2)]
-
-
-def test_a_node_never_heard_of_is_asked_for_without_a_name():
-    rm = core()
-    rm.order(["a"], 0.0, renewed=False)
-    assert rm.take_requests() == [request(100, "a", 0)]
-
-
-def test_the_same_order_again_asks_for_nothing_more():
-    rm = core()
-    rm.order(["a"], 0.0, renewed=False)
-    rm.take_requests()
-    assert not rm.order(["a"], 0.1, renewed=False)
-    assert not rm.order(["a"], 0.2, renewed=True)
-    assert rm.take_requests() == []
-
-
-def test_an_unanswered_request_is_repeated_with_the_same_number():
-    rm = core()
-    rm.order(["a"], 0.0, renewed=False)
+    if heard:
+        seen(rm, incarnation=3)
+    if died:
+        rm.event("a", "crashed", 3, "", 1.05)
+    assert rm.order(["a"], at_s, renewed=False)
     first = rm.take_requests()
-    rm.retry(0.2)
-    assert rm.take_requests() == first
-    rm.event("a", "respawned", 1, "", 0.3)
-    rm.retry(0.4)
+    assert first == [request(100, "a", failed)]
+    assert rm.pending == ("a",)
+    assert not rm.order(["a"], at_s + 0.1, renewed=True)
     assert rm.take_requests() == []
+    rm.retry(at_s + 0.3)
+    assert rm.take_requests() == first, "it was not answered"
+    rm.event("a", "respawned", 4, "", at_s + 0.4)
+    rm.retry(at_s + 0.5)
+    assert rm.take_requests() == []
+    rm.release()
+    assert (rm.take_requests(), rm.pending, rm.back, rm.problem) == ([], (), (), "")
+    rm.event("a", "crashed", 5, "", at_s + 0.6)
+    assert rm.take_requests() == []
+
+
+FAST = parse_specification(CELL.read_text(encoding="utf-8").replace(
+    "heartbeat_timeout_s = 0.3", "heartbeat_timeout_s = 0.18\nheartbeat_period_s = 0.06"), "fast")
+
+
+@within(lambda: VirtualSystem(RunContext(system=FAST)))
+async def test_in_a_fast_system_a_heartbeat_is_overdue_before_the_watchdog_reports_it(system):
+    rm = system.start("RM", Respawn, nodes=["a"])
+    asked = system.hear(topics.RESPAWN)
+    await system.settle()
+    system.say(HEARTBEAT, Heartbeat(1, 1, 0.06, 0, 0), "a", incarnation=3)
+    await asyncio.sleep(0.18)
+    system.say(topics.RECOVERY_COMMAND, RecoveryCommand(True, 1, ("a",), ""), "manager",
+               member="RM")
+    await system.settle()
+    assert asked[-1].message.failed_incarnation == 3
+    assert rm.activated
 
 
 # what comes between the request for node a, whose life 3 died at 1 s, and the end
@@ -154,25 +129,20 @@ def test_a_heartbeat_sent_before_the_order_proves_nothing_one_sent_after_it_does
     assert rm.back == ("a",)
 
 
-def test_a_new_life_that_dies_is_asked_for_again():
+@pytest.mark.parametrize("dies", [True, False])
+def test_a_new_life_that_dies_or_is_not_heard_is_asked_for_again(dies):
     rm = core()
     rm.event("a", "crashed", 3, "", 1.0)
-    rm.order(["a"], 1.0, renewed=False)
+    rm.order(["a", "z"], 1.0, renewed=False)
+    assert rm.problem == "z: not among the nodes that this module may respawn"
     rm.event("a", "respawned", 4, "", 1.1)
-    rm.take_requests()
-    rm.event("a", "crashed", 4, "", 1.2)
-    assert rm.take_requests() == [request(101, "a", 4)]
-
-
-def test_a_new_life_that_is_not_heard_is_asked_for_again():
-    rm = core()
-    rm.event("a", "crashed", 3, "", 1.0)
-    rm.order(["a"], 1.0, renewed=False)
-    rm.event("a", "respawned", 4, "", 1.1)
-    rm.take_requests()
-    rm.retry(2.0)
-    assert rm.take_requests() == []
-    rm.retry(2.1)
+    assert [ask.node for ask in rm.take_requests()] == ["a"]
+    if dies:
+        rm.event("a", "crashed", 4, "", 1.2)
+    else:
+        rm.retry(2.0)
+        assert rm.take_requests() == []
+        rm.retry(2.1)
     assert rm.take_requests() == [request(101, "a", 4)]
 
 
@@ -209,19 +179,3 @@ def test_what_was_given_up_is_tried_again_on_a_new_order_only():
     assert not rm.order(["a"], 0.2, renewed=False)
     assert rm.order(["a"], 0.3, renewed=True)
     assert rm.problem == ""
-
-
-def test_a_node_that_is_not_its_own_is_a_problem_and_the_others_are_respawned():
-    rm = core("a")
-    assert rm.order(["a", "z"], 0.0, renewed=False)
-    assert [ask.node for ask in rm.take_requests()] == ["a"]
-    assert rm.problem == "z: not among the nodes that this module may respawn"
-
-
-def test_release_forgets_everything():
-    rm = core()
-    rm.order(["a", "z"], 0.0, renewed=False)
-    rm.release()
-    assert (rm.take_requests(), rm.pending, rm.back, rm.problem) == ([], (), (), "")
-    rm.event("a", "crashed", 5, "", 0.1)
-    assert rm.take_requests() == []

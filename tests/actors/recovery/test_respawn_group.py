@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 import pytest
@@ -12,6 +15,7 @@ from rampart.actors.ftm import topics
 from rampart.actors.recovery.respawn_group import RespawnGroup
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.testing import VirtualSystem, run
+from tests.virtual_time import within
 
 CHAIN = ["camera", "finder", "planner"]
 
@@ -50,23 +54,21 @@ class FakeSupervisor(Actor):
             node, "respawned", 1, self.system.incarnations[node], "R", ""))
 
 
-def play(script: Any, broken: set[str] = frozenset(), **parameters: Any) -> None:
-    async def scenario() -> None:
-        async with VirtualSystem() as system:
-            for name in CHAIN:
-                system.start(name, Node)
-            supervisor = system.start("supervisor", FakeSupervisor, system, broken)
-            reports = system.hear(topics.RECOVERY)
-            system.start("R", RespawnGroup, nodes=CHAIN, **parameters)
-            await asyncio.sleep(0.5)
+@asynccontextmanager
+async def played(broken: set[str] = frozenset(), **parameters: Any) -> AsyncIterator[Any]:
+    async with VirtualSystem() as system:
+        for name in CHAIN:
+            system.start(name, Node)
+        supervisor = system.start("supervisor", FakeSupervisor, system, broken)
+        reports = system.hear(topics.RECOVERY)
+        system.start("R", RespawnGroup, nodes=CHAIN, **parameters)
+        await asyncio.sleep(0.5)
 
-            def command(decision: int, *nodes: str, activate: bool = True) -> None:
-                system.say(topics.RECOVERY_COMMAND, m.RecoveryCommand(
-                    activate, decision, nodes, "why"), "manager", member="R")
+        def command(decision: int, *nodes: str, activate: bool = True) -> None:
+            system.say(topics.RECOVERY_COMMAND, m.RecoveryCommand(
+                activate, decision, nodes, "why"), "manager", member="R")
 
-            await script(system, supervisor, command, reports)
-
-    run(scenario)
+        yield system, supervisor, command, reports
 
 
 def phase(reports: Any) -> str:
@@ -81,53 +83,50 @@ def phase(reports: Any) -> str:
     (["planner"], "all", ["camera", "finder", "planner"]),
 ])
 def test_those_that_depend_on_it_go_with_it_in_order(named, others, restarted):
-    async def script(system: Any, supervisor: Any, command: Any, reports: Any) -> None:
-        accused = [f"{name}#1" for name in named]
-        for _ in range(20):  # the manager repeats what it wants
-            command(1, *accused)
-            await asyncio.sleep(0.05)
-        assert [node for node, _ in supervisor.done] == restarted
-        assert {name: system.incarnations[name] for name in CHAIN} == {
-            name: 2 if name in restarted else 1 for name in CHAIN}
-        assert list(dict.fromkeys(supervisor.asked)) == restarted
-        assert phase(reports) == "done"
+    async def scenario() -> None:
+        async with played(others=others) as (system, supervisor, command, reports):
+            for _ in range(20):  # the manager repeats what it wants
+                command(1, *(f"{name}#1" for name in named))
+                await asyncio.sleep(0.05)
+            assert [node for node, _ in supervisor.done] == restarted
+            assert {name: system.incarnations[name] for name in CHAIN} == {
+                name: 2 if name in restarted else 1 for name in CHAIN}
+            assert list(dict.fromkeys(supervisor.asked)) == restarted
+            assert phase(reports) == "done"
 
-    play(script, others=others)
-
-
-def test_one_that_does_not_come_back_fails_it_and_those_after_it_are_left_alone():
-    async def script(system: Any, supervisor: Any, command: Any, reports: Any) -> None:
-        command(1, "camera#1")
-        await asyncio.sleep(3.0)
-        assert [node for node, _ in supervisor.done] == ["camera", "finder"]
-        assert phase(reports) == "failed"
-        assert system.incarnations["planner"] == 1
-        assert "finder, planner" in reports[-1].message.reason
-
-    play(script, broken={"finder"})
+    run(scenario)
 
 
-def test_a_new_order_restarts_them_again_and_a_release_ends_it():
-    async def script(system: Any, supervisor: Any, command: Any, reports: Any) -> None:
-        command(1, "finder#1")
-        await asyncio.sleep(1.0)
-        assert phase(reports) == "done"
-        command(2, "finder#2")
-        await asyncio.sleep(1.0)
-        assert (phase(reports), system.incarnations["planner"]) == ("done", 3)
-        command(3, activate=False)
-        await asyncio.sleep(0.5)
-        assert phase(reports) == "idle"
-        assert system.incarnations == {**system.incarnations, "camera": 1, "finder": 3}
-
-    play(script)
+@within(partial(played, broken={"finder"}))
+async def test_one_that_does_not_come_back_fails_it_and_those_after_it_are_left_alone(given):
+    system, supervisor, command, reports = given
+    command(1, "camera#1")
+    await asyncio.sleep(3.0)
+    assert [node for node, _ in supervisor.done] == ["camera", "finder"]
+    assert phase(reports) == "failed"
+    assert system.incarnations["planner"] == 1
+    assert "finder, planner" in reports[-1].message.reason
 
 
-def test_a_node_of_another_group_is_refused():
-    async def script(_system: Any, supervisor: Any, command: Any, reports: Any) -> None:
-        command(1, "gripper")
-        await asyncio.sleep(0.3)
-        assert supervisor.done == []
-        assert "gripper: not among the nodes" in reports[-1].message.reason
+@within(played)
+async def test_a_new_order_restarts_them_again_and_a_release_ends_it(given):
+    system, _, command, reports = given
+    command(1, "finder#1")
+    await asyncio.sleep(1.0)
+    assert phase(reports) == "done"
+    command(2, "finder#2")
+    await asyncio.sleep(1.0)
+    assert (phase(reports), system.incarnations["planner"]) == ("done", 3)
+    command(3, activate=False)
+    await asyncio.sleep(0.5)
+    assert phase(reports) == "idle"
+    assert system.incarnations == {**system.incarnations, "camera": 1, "finder": 3}
 
-    play(script)
+
+@within(played)
+async def test_a_node_of_another_group_is_refused(given):
+    _, supervisor, command, reports = given
+    command(1, "gripper")
+    await asyncio.sleep(0.3)
+    assert supervisor.done == []
+    assert "gripper: not among the nodes" in reports[-1].message.reason

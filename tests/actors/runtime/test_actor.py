@@ -6,12 +6,10 @@ import ast
 import asyncio
 import inspect
 import math
-import re
 import textwrap
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-import msgspec
 import pytest
 
 from rampart.actors.bus import messages as bm
@@ -31,9 +29,7 @@ from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.declaration import Declared
-from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_system
-from rampart.actors.supervision.node_process import make_actor
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import load_class
@@ -173,18 +169,6 @@ async def test_a_message_from_the_future_is_refused_and_shuts_out_none_that_is_o
             assert listener.heard[0][0].x_m == 1.0
 
 
-async def test_a_superseded_incarnation_is_refused(make_bus):
-    async with running(Listener, "listener", make_bus) as listener:
-        async with running(Talker, "talker", make_bus, incarnation=2) as talker:
-            await eventually(lambda: bool(listener.peers))
-            talker.publish(topics.POSE, m.Pose(2.0, 0.0, 0.0))
-            await eventually(lambda: len(listener.heard) == 1)
-            stale = encode(Header("talker", 1, 5, 0.0), m.Pose(1.0, 0.0, 0.0))
-            talker._bus.publish(topics.POSE, topics.POSE.at(), stale)
-            await eventually(lambda: listener._rejected == 1)
-            assert [body.x_m for body, _ in listener.heard] == [2.0]
-
-
 @pytest.mark.parametrize("forged", [1, 3, 77, 2 ** 53])
 def test_an_incarnation_that_was_not_issued_last_makes_nobody_deaf_to_the_real_one(forged):
     taken, refused = [], []
@@ -222,22 +206,16 @@ def test_after_a_pause_a_source_is_not_believed_that_has_a_successor_which_was_n
 
 @pytest.mark.parametrize(("given_s", "obeyed"), [(10.0, True), (9.31, True), (9.29, False),
                                                  (-1.0, False)])
-def test_a_command_that_was_under_way_for_too_long_is_not_obeyed(given_s, obeyed):
+def test_a_command_that_was_under_way_for_too_long_is_not_obeyed_and_a_state_is(given_s, obeyed):
     taken, refused = [], []
-    receive = ArrivalGuard(lambda: 10.0, command_age_s=0.7).receiver(
-        ftm_topics.RESPAWN, lambda _key, message: taken.append(message.stamp),
-        lambda _key, reason: refused.append(reason))
-    receive("k", encode(Header("RM3", 1, 1, given_s), fm.RespawnRequest(1, "DM1", 1, "RM3")))
-    assert (taken == [given_s]) is obeyed
+    guard = ArrivalGuard(lambda: 10.0, command_age_s=0.7)
+    for topic, body in ((ftm_topics.RESPAWN, fm.RespawnRequest(1, "DM1", 1, "RM3")),
+                        (topics.POSE, m.Pose(0.0, 0.0, 0.0))):
+        guard.receiver(topic, lambda _key, message: taken.append(message.stamp),
+                       lambda _key, reason: refused.append(reason))(
+            "k", encode(Header("RM3", 1, 1, given_s), body))
+    assert taken == [given_s] * (2 if obeyed else 1)
     assert refused == ([] if obeyed else [f"a command, given {10.0 - given_s:.2f} s ago"])
-
-
-def test_a_state_may_be_of_any_age_where_commands_may_not():
-    taken = []
-    receive = ArrivalGuard(lambda: 10.0, command_age_s=0.7).receiver(
-        topics.POSE, lambda _key, message: taken.append(message.stamp), lambda *_: None)
-    receive("k", encode(Header("talker", 1, 1, 0.5), m.Pose(0.0, 0.0, 0.0)))
-    assert taken == [0.5]
 
 
 async def test_a_command_that_comes_twice_is_handled_once(make_bus):
@@ -252,15 +230,8 @@ async def test_a_command_that_comes_twice_is_handled_once(make_bus):
             assert [b.recovery for b, _ in listener.heard] == ["RM1", "RM2"]
 
 
-async def test_publishing_an_undeclared_topic_raises(make_bus):
-    async with running(Listener, "listener", make_bus) as listener:
-        with pytest.raises(ValueError, match="outputs do not declare"):
-            listener.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
-
-
 async def test_a_handler_that_raises_ends_its_actor_only(make_bus):
-    clock = Clock(0.0)
-    victim = Listener(Context("listener", 1, clock, make_bus("listener", 1)))
+    victim = Listener(Context("listener", 1, Clock(0.0), make_bus("listener", 1)))
     task = asyncio.create_task(victim.run())
     async with running(Talker, "talker", make_bus) as talker:
         await eventually(lambda: bool(victim.peers))
@@ -268,6 +239,8 @@ async def test_a_handler_that_raises_ends_its_actor_only(make_bus):
         with pytest.raises(RuntimeError, match="poisoned"):
             await asyncio.wait_for(task, 5)
         talker.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+        with pytest.raises(ValueError, match="outputs do not declare"):
+            talker.publish(topics.SCAN, m.LaserScan(0.0, 0.1, 8.0, b""))
 
 
 async def test_timers_run_at_the_rate_of_simulated_time(make_bus):
@@ -277,48 +250,6 @@ async def test_timers_run_at_the_rate_of_simulated_time(make_bus):
         elapsed, ticked = fast.clock.now() - start, fast.ticks - ticks
         assert elapsed > 0.9
         assert ticked == pytest.approx(elapsed / 0.02, rel=0.5)
-
-
-@pytest.mark.parametrize(("mode", "expected"), [
-    ("drop", []),
-    ("freeze", [(0.0, 0.5)] * 3),
-    ("corrupt", [(99.0, 1.0), (99.0, 2.0), (99.0, 3.0)]),
-])
-async def test_an_injected_fault_changes_what_is_published(make_bus, mode, expected):
-    async with running(Listener, "listener", make_bus) as listener:
-        async with running(Talker, "talker", make_bus) as talker:
-            await eventually(lambda: bool(listener.peers))
-            talker.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0), stamp=0.5)
-            await eventually(lambda: len(listener.heard) == 1)
-            fault = bm.Injection("i1", "localization/pose", mode, 60.0,
-                                set_fields={"x_m": 99.0} if mode == "corrupt" else {})
-            talker._on_injection(fault, Header("tool", 1, 1, 0.0))
-            for x in (1.0, 2.0, 3.0):
-                talker.publish(topics.POSE, m.Pose(x, 0.0, 0.0), stamp=x)
-                await asyncio.sleep(0.05)
-            talker._injections.gate.expire("i1")
-            talker.publish(topics.POSE, m.Pose(7.0, 0.0, 0.0), stamp=4.0)
-            await eventually(lambda: listener.heard[-1][0].x_m == 7.0)
-            assert [(b.x_m, h.stamp) for b, h in listener.heard[1:-1]] == expected
-
-
-async def test_a_newcomer_hears_the_states_of_its_partners_at_once(make_bus):
-    class Stateful(Actor):
-        outputs = (topics.GOAL,)
-
-    class Newcomer(Listener):
-        @on(topics.GOAL)
-        def goal(self, message: m.GoalOrder, header: Header) -> None:
-            self.heard.append((message, header))
-
-    order = m.GoalOrder("m1", 0, m.Goal(1.0, 2.0, m.Mode.TAXI), True)
-    async with running(Stateful, "talker", make_bus) as stateful:
-        stateful.publish(topics.GOAL, order, stamp=0.125)  # once, and never repeated by itself
-        await asyncio.sleep(0.05)
-        async with running(Newcomer, "listener", make_bus) as newcomer:
-            await eventually(lambda: bool(newcomer.heard))
-            assert newcomer.heard[0][0] == order
-            assert newcomer.heard[0][1].stamp == 0.125
 
 
 class Former(Talker):
@@ -403,30 +334,19 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.osmosis.page.hmi:Hm",
-     "node hmi: actor = 'rampart.actors.osmosis.page.hmi:Hm': no such actor class; "
-     "known: OsmosisHmi"),
-    ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.operator.himi:Hmi",
-     "node hmi: actor = 'rampart.actors.operator.himi:Hmi': No module named "
-     "'rampart.actors.operator.himi'"),
-    ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.runtime.stub_node:StubNode",
-     "detection DM3: actor = 'rampart.actors.runtime.stub_node:StubNode': it does not publish "
-     "detection/{name}, as "
-     "the modules of this table do"),
-    ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.recovery.stub:StubRecovery",
-     "detection DM3: actor = 'rampart.actors.recovery.stub:StubRecovery': it does not publish "
-     "detection/"),
-    ("rampart.actors.osmosis.recovery.controlled_stop:ControlledStop",
-     "rampart.actors.detection.stub:StubDetection",
-     "recovery RM2: actor = 'rampart.actors.detection.stub:StubDetection': it does not publish "
-     "recovery/"),
-])
+    ("osmosis.page.hmi:OsmosisHmi", "osmosis.page.hmi:Hm",
+     "node hmi: .*: no such actor class; known: OsmosisHmi"),
+    ("osmosis.page.hmi:OsmosisHmi", "operator.himi:Hmi", "node hmi: .*: No module named "),
+    ("osmosis.detection.bounds:Bounds", "recovery.stub:StubRecovery",
+     "detection DM3: .*: it does not publish detection/"),
+    ("osmosis.recovery.controlled_stop:ControlledStop", "detection.stub:StubDetection",
+     "recovery RM2: .*: it does not publish recovery/")])
 def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(
         tmp_path, old, new, message):
     file = tmp_path / "other.toml"
     file.write_text((SHIPPED / "paper.toml").read_text().replace(old, new))
     plan = RunPlan("run", system_file=str(file))
-    with pytest.raises(ValueError, match=re.escape(f"{file}: {message}")):
+    with pytest.raises(ValueError, match=f"{file}: {message}"):
         Layout(plan, load_system(plan))
 
 
@@ -447,18 +367,6 @@ async def test_the_heart_beats_at_the_period_that_the_system_states():
     node.stop()
     await task
     assert (beats[-1] - beats[0]) * 100.0 / (len(beats) - 1) == pytest.approx(3.0, rel=0.5)
-
-
-def test_a_process_is_given_the_heartbeat_period_of_the_spec():
-    file = SHIPPED / "paper.toml"
-    plan = RunPlan("run", system_file=str(file))
-    spec = load_system(plan)
-    timing = msgspec.structs.replace(spec.timing, heartbeat_period_s=0.123)
-    layout = Layout(plan, msgspec.structs.replace(spec, timing=timing))
-    loop = asyncio.new_event_loop()
-    node = make_actor(layout, "DM2", 1, RunContext(plan, layout.spec), loop)
-    loop.close()
-    assert node.context.heartbeat_period_s == 0.123
 
 
 @pytest.mark.parametrize(("base", "name"), [

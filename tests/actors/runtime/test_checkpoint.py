@@ -19,7 +19,6 @@ from rampart.actors.runtime.checkpoint import (
     CheckpointStore,
     Keeper,
     MemoryCheckpoints,
-    NoCheckpoints,
     Record,
     StateError,
     StateFormat,
@@ -80,26 +79,17 @@ class Broken(CheckpointStore):
 # -- formats -------------------------------------------------------------------------------------
 
 
-@given(st.integers(0, 2**40), st.integers(), st.text())
-def test_a_state_survives_encoding(count, step, label):
-    state = Counter(count, step % 1000, label)
-    assert COUNTER.decode(3, COUNTER.encode(state)) == state
-
-
-def test_a_field_that_was_added_with_a_default_needs_no_new_version():
-    assert COUNTER.decode(3, msgspec.msgpack.encode({"count": 5, "step": 1})) == Counter(5, 1)
-
-
 @pytest.mark.parametrize(("version", "body", "why"), [
     (4, {"count": 5, "step": 1}, "version 4, expected 3"),
     (2, {"count": 5, "step": 1}, "version 2, expected 3"),
     (3, {"count": "many", "step": 1}, "count"),
     (3, {"count": -1, "step": 1}, "it is negative"),
-    (3, [1, 2], "Counter"),
+    (3, [1, 2], "Counter"), (3, {"count": 5}, "step"),
 ])
 def test_a_state_that_cannot_be_used_is_refused_in_one_line(version, body, why):
     with pytest.raises(StateError) as refused:
         COUNTER.decode(version, msgspec.msgpack.encode(body))
+    assert COUNTER.decode(3, msgspec.msgpack.encode({"count": 5, "step": 1})) == Counter(5, 1)
     assert why in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -113,28 +103,13 @@ def test_no_bytes_whatever_do_more_than_be_refused(data, version):
 # -- the keeper ----------------------------------------------------------------------------------
 
 
-def test_a_store_that_keeps_nothing_keeps_nothing():
-    desk = Desk(NoCheckpoints(), expected=True)
-    desk.keep(1)
-    assert desk.count() is None
-    assert desk.told == []
-
-
-def test_a_state_is_saved_once():
+def test_a_state_is_saved_once_and_the_last_generations_are_kept():
     shelf: list[Record] = []
     desk = Desk(MemoryCheckpoints(shelf, 1))
-    for count in (1, 1, 2, 2, 1):
+    for count in (1, 1, 2, 2, 1, *range(2, 9)):
         desk.keep(count)
-    assert [COUNTER.decode(r.version, r.state).count for r in shelf] == [1, 2, 1]
+    assert [r.generation for r in shelf] == [10, 9, 8, 7][:GENERATIONS]
     assert desk.told == []
-
-
-def test_the_last_generations_are_kept():
-    shelf: list[Record] = []
-    desk = Desk(MemoryCheckpoints(shelf, 1))
-    for count in range(9):
-        desk.keep(count)
-    assert [r.generation for r in shelf] == [9, 8, 7, 6][:GENERATIONS]
 
 
 def test_the_first_process_expects_nothing_and_a_later_one_reports_that_nothing_was_found():

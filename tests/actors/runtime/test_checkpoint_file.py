@@ -101,25 +101,17 @@ def restarted(folder: Path, incarnation: int = 2) -> tuple[Counter | None, list[
 # -- what is found again -------------------------------------------------------------------------
 
 
-def test_an_empty_store_has_nothing(store):
-    assert store(1).load() == ((), ())
-
-
 def test_what_was_saved_is_there_for_the_next_incarnation_newest_first(store):
-    first = store(1)
-    for number in range(7):
-        first.save(3, 2, b"state %d" % number)
-    records = store(2).load().records
-    assert [r.state for r in records] == [b"state %d" % n for n in (6, 5, 4, 3)][:GENERATIONS]
-    assert records[0][:4] == (1, 7, 3, 2)
-
-
-def test_generations_go_on_counting_in_the_next_process(store):
-    store(1).save(1, 0, b"a")
-    second = store(2)
-    second.load()
+    first, second = store(1), store(2)
+    assert first.load() == ((), ())
+    for byte in b"abcdefg":
+        first.save(3, 2, bytes([byte]) * LARGEST_STATE_BYTES)
+    loaded = second.load()
+    assert [r.state[:1] for r in loaded.records] == [b"g", b"f", b"e", b"d"][:GENERATIONS]
+    assert loaded.records[0][:4] == (1, 7, 3, 2)
+    assert loaded.problems == ()
     second.save(1, 0, b"b")
-    assert [r.generation for r in store(3).load().records] == [2, 1]
+    assert [r.generation for r in store(3).load().records][:2] == [8, 7]
 
 
 def test_a_superseded_process_overwrites_nothing_and_loads_nothing(store):
@@ -272,38 +264,33 @@ def test_garbage_of_any_kind_is_one_line_and_the_node_runs(tmp_path):
         assert "\n" not in told[0]
 
 
-@pytest.mark.parametrize("thing", [
-    "folder", "fifo", "socket", "link", "nowhere", "huge", "device", "another run's",
-    "another node's", "of 0.7"])
-def test_something_else_in_the_place_of_a_file_is_one_line_and_the_node_runs(tmp_path, thing):
-    folder = tmp_path / "checkpoints"
-    folder.mkdir()
-    file = folder / "node.1.1"
-    if thing == "folder":
-        file.mkdir()
-    elif thing == "fifo":
-        os.mkfifo(file)
-    elif thing == "socket":
-        with socket.socket(socket.AF_UNIX) as bound:
-            bound.bind(str(file))
-    elif thing == "link":
-        file.symlink_to(counted(tmp_path / "elsewhere"))
-    elif thing == "nowhere":
-        file.symlink_to(tmp_path / "nothing")
-    elif thing == "huge":
-        with file.open("wb") as huge:
-            huge.truncate(1 << 40)
-    elif thing == "device":
-        if os.getuid():
-            pytest.skip("takes root")
-        os.mknod(file, 0o600 | 0o020000, os.makedev(1, 5))  # /dev/zero
-    elif thing == "of 0.7":
-        (folder / "node.sqlite").write_bytes(b"SQLite format 3\0" + bytes(4000))
-    else:
-        run, node = ("other", "node") if thing == "another run's" else ("run", "other")
-        put(folder, node, run, Record(1, 1, 1, 0, FORM.encode(Counter(3))))
+def bind(file: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(file))
+
+
+def of_another(run: str, node: str) -> Callable[[Path], object]:
+    def make(file: Path) -> None:
+        put(file.parent, node, run, Record(1, 1, 1, 0, FORM.encode(Counter(3))))
         if node != "node":
-            (folder / "other.1.1").rename(file)
+            (file.parent / f"{node}.1.1").rename(file)
+
+    return make
+
+
+THINGS: dict[str, Callable[[Path], object]] = {
+    "folder": Path.mkdir, "fifo": os.mkfifo, "socket": bind,
+    "link": lambda file: file.symlink_to(counted(file.parent.parent / "elsewhere")),
+    "nowhere": lambda file: file.symlink_to(file.parent / "nothing"),
+    "huge": lambda file: (file.touch(), os.truncate(file, 1 << 40)),
+    "another run's": of_another("other", "node"), "another node's": of_another("run", "other"),
+    "of 0.7": lambda file: (file.parent / "node.sqlite").write_bytes(b"SQLite format 3\0")}
+
+
+@pytest.mark.parametrize("thing", THINGS)
+def test_something_else_in_the_place_of_a_file_is_one_line_and_the_node_runs(folder, thing):
+    folder.mkdir()
+    THINGS[thing](folder / "node.1.1")
     begun_s = time.monotonic()
     found, told = restarted(folder)
     assert time.monotonic() - begun_s < 5
@@ -313,16 +300,10 @@ def test_something_else_in_the_place_of_a_file_is_one_line_and_the_node_runs(tmp
     assert "\n" not in told[0]
 
 
-@pytest.mark.parametrize("thing", ["folder", "fifo", "link"])
-def test_something_in_the_place_of_the_next_file_is_reported_and_gone_round(folder, thing):
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo, lambda file: file.symlink_to("/dev/full")])
+def test_something_in_the_place_of_the_next_file_is_reported_and_gone_round(folder, make):
     counted(folder)
-    file = folder / "node.2.7"
-    if thing == "folder":
-        file.mkdir()
-    elif thing == "fifo":
-        os.mkfifo(file)
-    else:
-        file.symlink_to("/dev/full")
+    make(folder / "node.2.7")
     told, now_s = list[str](), [0.0]
     keeper = Keeper(FileCheckpoints(folder, "node", "run", 2, syncs=False), told.append,
                     lambda: now_s[0], expected=True)
@@ -395,15 +376,6 @@ def test_without_permission_what_can_be_read_is_found_and_the_rest_is_one_line()
     assert "Permission denied" in saved
 
 
-def test_a_state_of_the_largest_size_is_kept(store, folder):
-    first = store(1)
-    for byte in b"abcdefghijk":
-        first.save(1, 0, bytes([byte]) * LARGEST_STATE_BYTES)
-    loaded = store(2).load()
-    assert [r.state[:1] for r in loaded.records] == [b"k", b"j", b"i", b"h"]
-    assert loaded.problems == ()
-
-
 # -- killed in the middle ------------------------------------------------------------------------
 
 
@@ -433,5 +405,3 @@ def test_a_process_that_ends_in_any_write_leaves_its_last_acknowledged_state_or_
         following = life["acknowledged"] + 1 if life["acknowledged"] else start
         assert life["found"] in (oldest, following), life
         before = life["found"]
-
-

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from contextlib import asynccontextmanager
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
@@ -14,8 +15,8 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.sim.virtual.virtual_bus import VirtualBus
-from rampart.testing import run
 from tests.osmosis_system import System
+from tests.virtual_time import within
 
 
 class Talker(Actor):
@@ -94,126 +95,81 @@ class Scene:
         self.tool.publish(bus_topics.INJECT, bm.Injection("i", topic, mode, duration_s, **fields))
 
 
-def play(scenario):
-    """Run a scenario with a scene, in virtual time."""
-
-    async def whole() -> None:
-        async with System() as system:
-            scene = Scene(system)
-            await scene.open()
-            await scenario(scene)
-
-    run(whole)
+@asynccontextmanager
+async def scene():
+    async with System() as system:
+        made = Scene(system)
+        await made.open()
+        yield made
 
 
-async def wait(seconds: float) -> None:
-    await asyncio.sleep(seconds)
+@within(scene)
+async def test_a_duplicate_is_the_same_payload_twice_and_reaches_no_actor_twice(scene):
+    scene.inject("duplicate", 9.0)
+    scene.tool.publish(bus_topics.INJECT, bm.Injection("j", "manager/reset", "duplicate", 9.0))
+    await asyncio.sleep(3.05)
+    assert len(scene.wire) == 2 * (30 + 3)
+    for first, second in zip(scene.wire[::2], scene.wire[1::2], strict=True):
+        assert first == second
+    sequences = [decode(topics.POSE, p)[0].sequence for p in scene.wire[::2]
+                 if b"RM1" not in p]
+    assert sequences == sorted(set(sequences))
+    assert scene.listener.poses == [float(i) for i in range(1, 31)]
+    assert scene.listener.resets == ["10", "20", "30"]
 
 
-def test_a_duplicate_is_the_same_payload_twice_and_reaches_no_actor_twice():
-    async def scenario(scene: Scene) -> None:
-        scene.inject("duplicate", 9.0)
-        scene.tool.publish(bus_topics.INJECT, bm.Injection("j", "manager/reset", "duplicate", 9.0))
-        await wait(3.05)
-        assert len(scene.wire) == 2 * (30 + 3)
-        for first, second in zip(scene.wire[::2], scene.wire[1::2], strict=True):
-            assert first == second
-        sequences = [decode(topics.POSE, p)[0].sequence for p in scene.wire[::2]
-                     if b"RM1" not in p]
-        assert sequences == sorted(set(sequences))
-        assert scene.listener.poses == [float(i) for i in range(1, 31)]
-        assert scene.listener.resets == ["10", "20", "30"]
-
-    play(scenario)
+@within(scene)
+async def test_a_fault_for_a_while_reports_its_order_its_first_effect_and_its_end(scene):
+    scene.inject("drop", 0.95)
+    await asyncio.sleep(2.0)
+    assert scene.listener.told == [(0, False, ""), (1, False, ""), (9, True, "")]
+    assert scene.listener.poses == [float(i) for i in range(10, 20)]
 
 
-def test_a_delayed_duplicate_is_late_twice_and_heard_once():
-    async def scenario(scene: Scene) -> None:
-        scene.inject("delay", 5.0, delay_s=0.25)
-        scene.tool.publish(
-            bus_topics.INJECT, bm.Injection("j", "localization/pose", "duplicate", 5.0))
-        await wait(0.32)
-        assert scene.listener.poses == []
-        await wait(0.1)
-        assert scene.listener.poses == [1.0]
-        assert len(scene.wire) == 2
-
-    play(scenario)
+@within(scene)
+async def test_a_permanent_fault_sets_no_timer_and_never_ends(scene):
+    timers = len(scene.talker._timers)
+    scene.inject("drop", math.inf)
+    await scene.system.settle()
+    assert len(scene.talker._timers) == timers
+    await asyncio.sleep(1000.0)
+    assert scene.talker.said > 9000
+    assert scene.listener.poses == []
+    assert scene.listener.told == [(0, False, ""), (1, False, "")]
 
 
-def test_a_fault_for_a_while_reports_its_order_its_first_effect_and_its_end():
-    async def scenario(scene: Scene) -> None:
-        scene.inject("drop", 0.95)
-        await wait(2.0)
-        assert scene.listener.told == [(0, False, ""), (1, False, ""), (9, True, "")]
-        assert scene.listener.poses == [float(i) for i in range(10, 20)]
-
-    play(scenario)
-
-
-def test_a_permanent_fault_sets_no_timer_and_never_ends():
-    async def scenario(scene: Scene) -> None:
-        timers = len(scene.talker._timers)
-        scene.inject("drop", math.inf)
-        await scene.system.settle()
-        assert len(scene.talker._timers) == timers
-        await wait(1000.0)
-        assert scene.talker.said > 9000
-        assert scene.listener.poses == []
-        assert scene.listener.told == [(0, False, ""), (1, False, "")]
-
-    play(scenario)
+@within(scene)
+async def test_a_permanent_fault_dies_with_its_process(scene):
+    scene.inject("drop", math.inf)
+    await asyncio.sleep(1.0)
+    await scene.system.kill("talker")
+    scene.system.start("talker", Talker)
+    await asyncio.sleep(0.55)
+    assert scene.listener.poses == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
 
 
-def test_a_permanent_fault_dies_with_its_process():
-    async def scenario(scene: Scene) -> None:
-        scene.inject("drop", math.inf)
-        await wait(1.0)
-        await scene.system.kill("talker")
-        scene.system.start("talker", Talker)
-        await wait(0.55)
-        assert scene.listener.poses == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-
-    play(scenario)
+@within(scene)
+async def test_an_order_without_duration_ends_the_fault_with_its_count_once(scene):
+    scene.inject("drop", 5.0)
+    await asyncio.sleep(1.05)
+    scene.inject("drop", 0.0)
+    await asyncio.sleep(9.0)
+    assert scene.listener.poses[0] == 11.0
+    assert [r for r in scene.listener.told if r[1]] == [(10, True, "")]
 
 
-def test_an_order_without_duration_ends_the_fault_with_its_count_and_no_second_end_follows():
-    async def scenario(scene: Scene) -> None:
-        scene.inject("drop", 5.0)
-        await wait(1.05)
-        scene.inject("drop", 0.0)
-        await wait(9.0)
-        assert scene.listener.poses[0] == 11.0
-        assert [r for r in scene.listener.told if r[1]] == [(10, True, "")]
-
-    play(scenario)
+@within(scene)
+async def test_a_fault_that_does_not_fit_its_topic_is_refused_when_it_is_ordered(scene):
+    scene.inject("corrupt", 5.0, set_fields={"z_m": 1.0})
+    await asyncio.sleep(1.05)
+    ((affected, finished, reason),) = scene.listener.told
+    assert (affected, finished) == (0, True)
+    assert "'z_m': Pose has no such field; known: x_m, y_m, yaw_rad" in reason
+    assert len(scene.listener.poses) == 10
 
 
-def test_a_fault_ordered_again_lasts_as_long_as_was_said_last():
-    async def scenario(scene: Scene) -> None:
-        scene.inject("drop", 1.05)
-        await wait(0.5)
-        scene.inject("drop", 2.55)
-        await wait(4.0)
-        assert scene.listener.poses[0] == 31.0
-        assert [r for r in scene.listener.told if r[1]] == [(30, True, "")]
-
-    play(scenario)
-
-
-def test_a_fault_that_does_not_fit_its_topic_is_refused_when_it_is_ordered():
-    async def scenario(scene: Scene) -> None:
-        scene.inject("corrupt", 5.0, set_fields={"z_m": 1.0})
-        await wait(1.05)
-        ((affected, finished, reason),) = scene.listener.told
-        assert (affected, finished) == (0, True)
-        assert "'z_m': Pose has no such field; known: x_m, y_m, yaw_rad" in reason
-        assert len(scene.listener.poses) == 10
-
-    play(scenario)
-
-
-def test_a_fault_that_fails_on_its_first_message_is_reported_as_no_effect():
+@within(scene)
+async def test_a_fault_that_fails_on_its_first_message_is_reported_as_no_effect(scene):
     class Broken(Actor):
         outputs = (topics.SCAN,)
 
@@ -221,24 +177,19 @@ def test_a_fault_that_fails_on_its_first_message_is_reported_as_no_effect():
         def speak(self) -> None:
             self.publish(topics.SCAN, m.LaserScan(0.0, 0.1, 8.0, b"12345"))
 
-    async def scenario(scene: Scene) -> None:
-        scene.system.start("broken", Broken)
-        await scene.system.settle()
-        scene.inject("corrupt", 5.0, "summit_xl/scan", add_fields={"ranges_f32": 1.0})
-        await wait(9.0)
-        assert [r[:2] for r in scene.listener.told] == [(0, False), (0, True)]
-        assert "5 bytes" in scene.listener.told[-1][2]
-        (diagnostic,) = scene.listener.diagnostics
-        assert (diagnostic.context, diagnostic.offender) == ("fault injection", "summit_xl/scan")
-
-    play(scenario)
+    scene.system.start("broken", Broken)
+    await scene.system.settle()
+    scene.inject("corrupt", 5.0, "summit_xl/scan", add_fields={"ranges_f32": 1.0})
+    await asyncio.sleep(9.0)
+    assert [r[:2] for r in scene.listener.told] == [(0, False), (0, True)]
+    assert "5 bytes" in scene.listener.told[-1][2]
+    (diagnostic,) = scene.listener.diagnostics
+    assert (diagnostic.context, diagnostic.offender) == ("fault injection", "summit_xl/scan")
 
 
-def test_the_reports_of_injections_cannot_be_dropped():
-    async def scenario(scene: Scene) -> None:
-        scene.inject("drop", 5.0, "inject/report")
-        await wait(1.0)
-        assert {r.node for r in scene.listener.reports} == {"talker", "listener", "tool"}
-        assert all("inject/report" in r.reason for r in scene.listener.reports)
-
-    play(scenario)
+@within(scene)
+async def test_the_reports_of_injections_cannot_be_dropped(scene):
+    scene.inject("drop", 5.0, "inject/report")
+    await asyncio.sleep(1.0)
+    assert {r.node for r in scene.listener.reports} == {"talker", "listener", "tool"}
+    assert all("inject/report" in r.reason for r in scene.listener.reports)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import random
-from array import array
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rampart.actors.bus.messages import Injection
@@ -78,8 +77,11 @@ def test_each_mode_changes_what_it_says_and_nothing_else(mode, fields, at_12, at
     assert sent(faults, [10.0, 11.0]) == [(10.0, 10.0, 0.0, 1), (11.0, 11.0, 0.0, 1)]
     assert faults.order(Injection("i", "localization/pose", mode, 5.0, **fields), 11.5) == ""
     assert sent(faults, [12.0, 13.0]) == [at_12, at_13]
+    goal = Goal(0.0, 0.0, Mode.TAXI)
+    assert faults.apply("rampart/mission/goal", goal, 13.5, 13.5).body is goal
     assert faults.expire("i") == 2
     assert sent(faults, [14.0]) == [(14.0, 14.0, 0.0, 1)]
+    assert faults.apply(KEY, POSE, 15.0, 15.0).body is POSE
 
 
 @pytest.mark.parametrize("mode", ["freeze", "stuck"])
@@ -87,19 +89,6 @@ def test_what_freezes_before_its_first_message_repeats_that_one(mode):
     faults = gate(mode)
     assert [x for x, *_ in sent(faults, [10.0, 11.0, 12.0])] == [10.0, 10.0, 10.0]
     assert faults.expire("i") == 2
-
-
-def test_with_no_injection_in_force_the_very_message_passes():
-    out = FaultGate().apply(KEY, POSE, 3.0, 4.0)
-    assert out.body is POSE
-    assert (out.stamp, out.delay_s, out.copies) == (3.0, 0.0, 1)
-
-
-def test_other_keys_pass():
-    drop = gate("drop")
-    goal = Goal(0.0, 0.0, Mode.TAXI)
-    assert drop.apply("rampart/mission/goal", goal, 10.0, 10.0).body is goal
-    assert drop.expire("i") == 0
 
 
 def test_faults_on_one_topic_act_in_the_order_in_which_they_were_ordered():
@@ -130,14 +119,6 @@ def test_an_intermittent_fault_comes_and_goes_from_the_moment_of_injection(on_s,
     times_s = [10.0 + 0.5 * i for i in range(len(expected))]
     assert "".join("x" if out is None else "." for out in sent(faults, times_s)) == expected
     assert faults.expire("i") == expected.count("x")
-
-
-@given(on_s=st.integers(1, 9), off_s=st.integers(1, 9), since_s=st.integers(0, 1000))
-def test_an_intermittent_fault_keeps_its_rhythm_however_long_it_lasts(on_s, off_s, since_s):
-    slow = [True] * on_s + [False] * off_s
-    faults = gate("drop", on_s=float(on_s), off_s=float(off_s))
-    out = faults.apply(KEY, POSE, 0.0, 10.0 + since_s)
-    assert (out is None) == slow[since_s % len(slow)]
 
 
 @pytest.mark.parametrize(("mode", "stamps"), [
@@ -193,13 +174,6 @@ def test_noise_has_the_spread_it_was_ordered_with_and_comes_from_the_seed():
 
 
 # -- corruption of each kind of field ------------------------------------------------------------
-
-
-def test_a_ramp_grows_from_the_moment_of_the_order():
-    ramp = gate("corrupt", ramp_fields={"y_m": 0.25})
-    assert ramp.apply(KEY, POSE, 10.0, 10.0).body == POSE
-    assert ramp.apply(KEY, POSE, 14.0, 14.0).body == Pose(1.0, 3.0, 0.5)
-    assert ramp.expire("i") == 1
 
 
 def test_a_route_keeps_its_ends_and_moves_as_a_whole():
@@ -260,11 +234,6 @@ def test_the_noise_of_an_array_differs_from_element_to_element():
     assert np.std(after) == pytest.approx(0.3, rel=0.08)
 
 
-def test_an_array_can_be_replaced_by_its_bytes():
-    raw = array("f", [1.0, 2.0]).tobytes()
-    assert corrupted(scan([4.0]), set_fields={"ranges_f32": raw}).ranges_f32 == raw
-
-
 @given(yaw=st.floats(-math.pi, math.pi, exclude_min=True), bias=st.floats(-20.0, 20.0))
 def test_an_angle_stays_an_angle_whatever_is_added(yaw, bias):
     moved = corrupted(Imu(yaw, 0.0, 0.0, 0.0), add_fields={"yaw_rad": bias}).yaw_rad
@@ -273,6 +242,8 @@ def test_an_angle_stays_an_angle_whatever_is_added(yaw, bias):
 
 
 @given(st.floats())
+@example(math.nextafter(math.pi, 4))
+@example(math.nextafter(-math.pi, -4))
 def test_wrapping_ends_in_the_half_open_range_and_leaves_what_is_in_it(angle):
     wrapped = wrap(angle)
     if not math.isfinite(angle):
@@ -280,18 +251,7 @@ def test_wrapping_ends_in_the_half_open_range_and_leaves_what_is_in_it(angle):
     else:
         assert -math.pi < wrapped <= math.pi
         assert wrapped == angle or not -math.pi < angle <= math.pi
-
-
-@pytest.mark.parametrize("angle", [math.pi, -math.pi, 3 * math.pi,
-                                   math.nextafter(math.pi, 4), math.nextafter(-math.pi, -4)])
-def test_wrapping_is_right_at_the_seam(angle):
-    assert -math.pi < wrap(angle) <= math.pi
-    assert wrap(-math.pi) == math.pi == wrap(math.pi)
-
-
-def test_an_angle_that_is_set_and_a_value_that_is_no_number_are_left_as_they_were_set():
-    assert corrupted(POSE, set_fields={"yaw_rad": 9.0}).yaw_rad == 9.0
-    assert math.isnan(corrupted(POSE, set_fields={"x_m": math.nan}).x_m)
+    assert wrap(-math.pi) == wrap(3 * math.pi) == math.pi == wrap(math.pi)
 
 
 # -- what counts ---------------------------------------------------------------------------------
@@ -339,34 +299,26 @@ def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
 
 
 @pytest.mark.parametrize(("mode", "fields", "words"), [
-    ("hug", {}, "mode = 'hug': must be one of drop, freeze, stuck"),
-    ("drop", {"duration_s": -1.0}, "duration_s = -1: must be 0 or more, inf for permanent"),
+    ("hug", {}, "mode = 'hug'"),
+    ("drop", {"duration_s": -1.0}, "duration_s = -1"),
     ("drop", {"duration_s": math.nan}, "duration_s = nan"),
     ("delay", {"delay_s": -0.1}, "delay_s = -0.1"),
     ("delay", {"delay_s": math.inf}, "delay_s = inf"),
     ("delay", {}, "delay_s = 0: must be above 0"),
-    ("restamp", {}, "stamp_s = 0: must be finite seconds"),
-    ("restamp", {"stamp_s": math.nan}, "stamp_s = nan"),
-    ("restamp", {"stamp_s": math.inf}, "stamp_s = inf"),
+    ("restamp", {}, "stamp_s = 0"),
     ("drop", {"stamp_s": -math.inf}, "stamp_s = -inf"),
-    ("drop", {"share": 1.1}, "share = 1.1: must be between 0 and 1"),
-    ("drop", {"share": -0.1}, "share = -0.1"),
+    ("drop", {"share": 1.1}, "share = 1.1"),
     ("drop", {"share": math.nan}, "share = nan"),
-    ("drop", {"on_s": -1.0, "off_s": 1.0}, "on_s = -1"),
-    ("drop", {"on_s": 1.0}, "on_s = 1, off_s = 0: an intermittent fault needs both"),
-    ("drop", {"off_s": 1.0}, "on_s = 0, off_s = 1"),
+    ("drop", {"on_s": 1.0}, "on_s = 1, off_s = 0"),
     ("drop", {"on_s": math.inf, "off_s": 1.0}, "on_s = inf"),
     ("drop", {"topic": "inject/report"}, "topic = 'inject/report'"),
-    ("corrupt", {}, "mode = 'corrupt': no field is set"),
-    ("corrupt", {"add_fields": {"x_m": math.inf}}, "add_fields 'x_m' = inf: must be finite"),
-    ("corrupt", {"noise_fields": {"x_m": -1.0}}, "noise_fields 'x_m' = -1: must be finite, 0 or"),
-    ("corrupt", {"ramp_fields": {"x_m": math.nan}}, "ramp_fields 'x_m' = nan"),
+    ("corrupt", {}, "mode = 'corrupt'"),
+    ("corrupt", {"add_fields": {"x_m": math.inf}}, "add_fields 'x_m' = inf"),
+    ("corrupt", {"noise_fields": {"x_m": -1.0}}, "noise_fields 'x_m' = -1"),
     ("corrupt", {"set_fields": {"z_m": 1.0}}, "'z_m': Odometry has no such field; known: pose"),
-    ("corrupt", {"set_fields": {"pose.z_m": 1.0}}, "'pose.z_m': Odometry has no such field"),
     ("corrupt", {"set_fields": {"pose.x_m.a": 1.0}}, "'pose.x_m.a': Odometry has no such field"),
     ("corrupt", {"set_fields": {"pose.x_m": "far"}}, "'pose.x_m' = 'far': Expected `float`"),
     ("corrupt", {"add_fields": {"pose": 1.0}}, "'pose': Pose is no number"),
-    ("corrupt", {"noise_fields": {"pose": 1.0}}, "'pose': Pose is no float"),
     ("corrupt", {"keep_ends": ("pose",)}, "keep_ends 'pose': not a list"),
 ])
 def test_what_makes_no_sense_is_refused_for_one_reason_and_nothing_happens(mode, fields, words):

@@ -1,6 +1,7 @@
 """A state that says the same again is posted: it is sent when it changes, and once a second."""
 
 import asyncio
+from contextlib import asynccontextmanager
 from typing import ClassVar
 
 import pytest
@@ -9,7 +10,8 @@ from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.topics import HEARTBEAT
 from rampart.actors.runtime.actor import Actor, every, on
-from rampart.testing.virtual import VirtualSystem, run
+from rampart.testing.virtual import VirtualSystem
+from tests.virtual_time import within
 
 PERIOD_S = 0.1
 """Of heartbeats, as of an actor whose system says nothing else."""
@@ -55,71 +57,65 @@ class Reader(Actor):
         self.beats += 1
 
 
-def scenario_of(play):
-    async def scenario():
-        Gauge.value = 1.0
-        async with VirtualSystem() as system:
-            sent = system.overhear("gauge")
-            reader = system.start("reader", Reader)
-            system.start("gauge", Gauge)
-            await asyncio.sleep(0.5)
-            return await play(system, reader, sent)
-
-    return run(scenario)
+@asynccontextmanager
+async def postings():
+    Gauge.value = 1.0
+    async with VirtualSystem() as system:
+        sent = system.overhear("gauge")
+        reader = system.start("reader", Reader)
+        system.start("gauge", Gauge)
+        await asyncio.sleep(0.5)
+        yield system, reader, sent
 
 
 def count(sent, key):
     return sum(k == key for k, _ in sent)
 
 
-def test_what_says_the_same_is_sent_once_a_second_and_read_with_each_heartbeat():
-    async def play(_system, reader, sent):
-        sent.clear()
-        reader.levels.clear()
-        reader.beats = 0
-        await asyncio.sleep(10.0)
-        assert count(sent, "level") == pytest.approx(10, abs=1)
-        assert count(sent, "heartbeat/gauge") == pytest.approx(2, abs=1)
-        assert len(reader.levels) == pytest.approx(100, abs=2)
-        assert reader.beats == pytest.approx(100, abs=2)
-        assert all(now_s - stamp_s <= 2 * PERIOD_S for now_s, _, stamp_s in reader.levels)
-        assert max(reader.ages_s) == pytest.approx(0.0)  # it came when it was posted
-
-    scenario_of(play)
-
-
-def test_a_change_is_sent_at_once():
-    async def play(_system, reader, sent):
-        sent.clear()
-        reader.levels.clear()
-        Gauge.value = 2.0
-        await asyncio.sleep(0.25)
-        assert count(sent, "level") == 1
-        changed = next((now_s, stamp_s) for now_s, value, stamp_s in reader.levels if value == 2.0)
-        assert changed[0] == pytest.approx(changed[1])
-
-    scenario_of(play)
+@within(postings)
+async def test_what_says_the_same_is_sent_once_a_second_and_read_with_each_heartbeat(given):
+    _system, reader, sent = given
+    sent.clear()
+    reader.levels.clear()
+    reader.beats = 0
+    await asyncio.sleep(10.0)
+    assert count(sent, "level") == pytest.approx(10, abs=1)
+    assert count(sent, "heartbeat/gauge") == pytest.approx(2, abs=1)
+    assert len(reader.levels) == pytest.approx(100, abs=2)
+    assert reader.beats == pytest.approx(100, abs=2)
+    assert all(now_s - stamp_s <= 2 * PERIOD_S for now_s, _, stamp_s in reader.levels)
+    assert max(reader.ages_s) == pytest.approx(0.0)  # it came when it was posted
 
 
-def test_each_message_is_taken_once_by_whatever_way_it_came():
-    async def play(_system, reader, _sent):
-        await asyncio.sleep(5.0)
-        stamps = [stamp_s for _, _, stamp_s in reader.levels]
-        assert stamps == sorted(set(stamps))
+@within(postings)
+async def test_a_change_is_sent_at_once(given):
+    _system, reader, sent = given
+    sent.clear()
+    reader.levels.clear()
+    Gauge.value = 2.0
+    await asyncio.sleep(0.25)
+    assert count(sent, "level") == 1
+    changed = next((now_s, stamp_s) for now_s, value, stamp_s in reader.levels if value == 2.0)
+    assert changed[0] == pytest.approx(changed[1])
 
-    scenario_of(play)
+
+@within(postings)
+async def test_each_message_is_taken_once_by_whatever_way_it_came(given):
+    _system, reader, _sent = given
+    await asyncio.sleep(5.0)
+    stamps = [stamp_s for _, _, stamp_s in reader.levels]
+    assert stamps == sorted(set(stamps))
 
 
-def test_one_that_hangs_posts_no_more_and_one_that_goes_on_does_again():
-    async def play(system, reader, _sent):
-        gauge = system.actors["gauge"]
-        gauge.hold(True)
-        await asyncio.sleep(2 * PERIOD_S)
-        reader.beats = 0
-        await asyncio.sleep(2.0)
-        assert reader.beats == 0
-        gauge.hold(False)
-        await asyncio.sleep(2 * PERIOD_S)
-        assert reader.beats >= 1
-
-    scenario_of(play)
+@within(postings)
+async def test_one_that_hangs_posts_no_more_and_one_that_goes_on_does_again(given):
+    system, reader, _sent = given
+    gauge = system.actors["gauge"]
+    gauge.hold(True)
+    await asyncio.sleep(2 * PERIOD_S)
+    reader.beats = 0
+    await asyncio.sleep(2.0)
+    assert reader.beats == 0
+    gauge.hold(False)
+    await asyncio.sleep(2 * PERIOD_S)
+    assert reader.beats >= 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import msgspec
@@ -13,7 +12,6 @@ from rampart.actors.runtime.actor import Actor
 from rampart.manager.actor import FtmManager
 from rampart.manager.spec.tables import Supervision
 from tests import ROOT
-from tests.stub_actors import IdleDetection, Idler, write_stub_system
 
 SICK_S = (14.0, 40.0)
 """Simulated seconds, far longer than it takes to be given up."""
@@ -24,27 +22,11 @@ SOON = Supervision(intensity=8, period_s=6.0, backoff_max_s=0.2, attempt_s=1.0, 
 _SOON = "\n[supervision]\n" + "".join(
     f"{name} = {value}\n" for name, value in msgspec.structs.asdict(SOON).items())
 
-WELL = "RAMPART_TEST_WELL"
-"""Of the environment: names a file; as long as there is none, a `SickIdler` fails."""
-
-
 class Sick(Actor):
     def on_start(self) -> None:
         if SICK_S[0] <= self.clock.now() < SICK_S[1]:
             raise RuntimeError("sick")
         super().on_start()
-
-
-class SickIdler(Idler):
-    """For real processes."""
-
-    def on_start(self) -> None:
-        if self.context.incarnation > 1 and not Path(os.environ[WELL]).exists():
-            raise RuntimeError("sick")
-
-
-class SickIdleDetection(SickIdler, IdleDetection):
-    pass
 
 
 class SickPilot(Sick, SafetyPilot):
@@ -74,16 +56,4 @@ def write_sick_system(directory: Path, node: str) -> Path:
     file = directory / "sick.toml"
     file.write_text(text.replace(f'"{usual}"', f'"{sick.__module__}:{sick.__name__}"', 1)
                     + _SOON, encoding="utf-8")
-    return file
-
-
-def write_sick_stubs(directory: Path, *nodes: str) -> Path:
-    """Write the stub system in which some nodes are sick, and soon given up."""
-    text = write_stub_system(directory).read_text(encoding="utf-8")
-    for node in nodes:
-        at = text.index(f'"{node}"')
-        text = text[:at] + text[at:].replace("tests.stub_actors:Idle",
-                                             f"{SickIdler.__module__}:SickIdle", 1)
-    file = directory / "sick.toml"
-    file.write_text(text + _SOON, encoding="utf-8")
     return file

@@ -78,11 +78,10 @@ HEARS = "class Reader(Actor):\n    @on({})\n    def level(self, message, header)
 
 
 def test_a_topic_that_nothing_publishes_is_a_typo(tank):
-    assert line_of(tank, HEARS.format("LEVLE"), "Gauge", "Reader") == (
-        "node reader: hears 'tank/levle', which nothing publishes; did you mean 'tank/level'? What "
-        "a node can do without is named in optional_inputs of its class")
+    assert line_of(tank, HEARS.format("LEVLE"), "Gauge", "Reader").startswith(
+        "node reader: hears 'tank/levle', which nothing publishes; did you mean 'tank/level'? ")
     assert line_of(tank, HEARS.format("LEVEL"), "Reader").startswith(
-        "node reader: hears 'tank/level', which nothing publishes; What a node can do without")
+        "node reader: hears 'tank/level', which nothing publishes; ")
 
 
 @pytest.mark.parametrize("code", [
@@ -138,16 +137,26 @@ def test_a_repair_has_to_reach_the_nodes_that_its_detection_watches(tmp_path):
         Layout(plan, load_system(plan))
 
 
+JUDGE = """
+class Fair(Judge):
+    @on({})
+    def level(self, message, header): pass
+"""
+
+
 def test_one_key_with_two_types(tank):
-    assert line_of(tank, HEARS.format("AGAIN"), "Gauge", "Reader") == (
-        "node reader: topic 'tank/level' is tank_here:Flow of qos sensor, and tank_here:Level of "
-        "qos sensor to node gauge; declare it once, and import it")
+    line = "topic 'tank/level' is tank_here:Flow of qos sensor, and tank_here:Level of "
+    assert line_of(tank, HEARS.format("AGAIN"), "Gauge", "Reader").startswith(
+        f"node reader: {line}")
+    judge = '[judge]\nclass = "tank_here:Fair"\n'
+    assert line_of(tank, JUDGE.format("AGAIN"), "Gauge", more=judge).startswith(
+        f"$.judge: Fair: {line}")
+    assert tank(JUDGE.format("LEVEL"), "Gauge", more=judge).spec.judge["class"] == "tank_here:Fair"
 
 
 def test_two_publishers_of_what_is_one_node_s_to_say(tank):
-    assert line_of(tank, "", "Gauge", "Second", "Pump") == (
-        "node second: publishes 'tank/level', as node gauge does; of a topic of qos sensor the "
-        "latest message counts, so that one may (or several = True in the Topic)")
+    assert line_of(tank, "", "Gauge", "Second", "Pump").startswith(
+        "node second: publishes 'tank/level', as node gauge does; ")
     both = "class Other(Actor):\n    outputs = ({},)\n\nclass Third(Other): pass\n"
     for allowed in ("ORDER", "SHARED", "VALVE"):
         assert len(tank(both.format(allowed), "Other", "Third").members) == 4
@@ -158,26 +167,20 @@ def test_two_publishers_of_what_is_one_node_s_to_say(tank):
 
 
 @pytest.mark.parametrize(("code", "cause"), [
-    (HEARS.format("LEVEL").replace("def", "async def"),
-     "TypeError: Reader.level is an async def, which would never run; a handler is a plain def"),
+    (HEARS.format("LEVEL").replace("def", "async def"), "TypeError: Reader.level is an async def"),
     ("class Reader(Pump):\n    async def level(self, message, header): pass\n",
-     "TypeError: Reader.level is an async def, which would never run; a handler is a plain def"),
-    (HEARS.format("LEVEL").replace("pass", "yield"),
-     "TypeError: Reader.level has a yield, and would never run; a handler is a plain def"),
-    (HEARS.format("LEVEL").replace(", header", ""),
-     "TypeError: Reader.level: def level(self, message, header) is right"),
-    (HEARS.format("Level"), "TypeError: @on(Level): a Topic is right"),
-    ("class Reader(Actor):\n    @every(0)\n    def tick(self): pass\n",
-     "ValueError: @every(0): a period above 0, in simulated seconds, is right"),
-    ("class Reader(Actor):\n    @every(-0.5)\n    def tick(self): pass\n",
-     "ValueError: @every(-0.5): a period above 0, in simulated seconds, is right"),
-    ("class Reader(Actor):\n    @every\n    def tick(self): pass\n",
-     "ValueError: @every(tick): a period above 0, in simulated seconds, is right"),
+     "TypeError: Reader.level is an async def"),
+    (HEARS.format("LEVEL").replace("pass", "yield"), "TypeError: Reader.level has a yield"),
+    (HEARS.format("LEVEL").replace(", header", ""), "TypeError: Reader.level: def level(self, "),
+    (HEARS.format("Level"), "TypeError: @on(Level): a Topic"),
+    *((f"class Reader(Actor):\n    @every{period}\n    def tick(self): pass\n",
+       f"ValueError: @every({shown}): a period above 0") for period, shown in (
+           ("(0)", "0"), ("(-0.5)", "-0.5"), ("", "tick"))),
 ])
 def test_a_handler_that_would_never_run(tank, code, cause):
     line = line_of(tank, code, "Reader")
     assert line.startswith(
-        f"node reader: actor = 'tank_here:Reader': tank_here cannot be imported: {cause} (")
+        f"node reader: actor = 'tank_here:Reader': tank_here cannot be imported: {cause}")
     assert "/tank_here.py, line " in line
 
 
@@ -196,39 +199,16 @@ def test_an_actor_of_the_wrong_kind(tank):
     assert "world" in tank(module, "World", kind="world").members
 
 
-JUDGE = """
-class Fair(Judge):
-    @on({})
-    def level(self, message, header): pass
-"""
-
-
 @pytest.mark.parametrize(("said", "line"), [
     ("", "$.judge.class: missing; name a class derived from rampart.Judge"),
-    ('class = "tank_here:Fiar"\n', "$.judge.class = 'tank_here:Fiar': no such judge class; "
-     "known: Gauge, Second, Pump, Fair"),
-    ('class = "tank_here:Pump"\n', "$.judge.class = 'tank_here:Pump': no judge; name a class "
-     "derived from rampart.Judge"),
+    ('class = "tank_here:Fiar"\n', "$.judge.class = 'tank_here:Fiar': no such judge class"),
+    ('class = "tank_here:Pump"\n', "$.judge.class = 'tank_here:Pump': no judge; "),
     ('class = "tank_here:Fair"\nlitres = 3\n', "$.judge.litres = 3: unknown field; known: none"),
-    ('class = "tank_here:Fair"\n', "$.judge: Fair hears 'tank/levle', which nothing publishes; did "
-     "you mean 'tank/level'? What a node can do without is named in optional_inputs of its class"),
+    ('class = "tank_here:Fair"\n', "$.judge: Fair hears 'tank/levle', which nothing publishes; "),
 ])
 def test_a_judge_that_cannot_judge(tank, said, line):
     more = f"[judge]\n{said or 'litres = 3'}"
-    assert line_of(tank, JUDGE.format("LEVLE"), "Gauge", more=more) == line
-
-
-def test_a_judge_has_the_topic_of_who_publishes_it(tank):
-    more = '[judge]\nclass = "tank_here:Fair"\n'
-    assert line_of(tank, JUDGE.format("AGAIN"), "Gauge", more=more) == (
-        "$.judge: Fair: topic 'tank/level' is tank_here:Flow of qos sensor, and tank_here:Level of "
-        "qos sensor to node gauge; declare it once, and import it")
-
-
-def test_a_judge_hears_what_is_published(tank):
-    more = '[judge]\nclass = "tank_here:Fair"\n'
-    assert tank(JUDGE.format("LEVEL"), "Gauge", more=more).spec.judge == {
-        "class": "tank_here:Fair"}
+    assert line_of(tank, JUDGE.format("LEVLE"), "Gauge", more=more).startswith(line)
 
 
 @pytest.mark.parametrize(("said", "line"), [
