@@ -207,6 +207,7 @@ class FileCheckpoints(CheckpointStore):
         self._generation = 0
         self._before: list[Record] = []
         self._open: _Open | None = None
+        self._written: _Open | None = None
         self._retired: list[int] = []
         self._trouble = ""
         self._is_lost = False
@@ -248,6 +249,9 @@ class FileCheckpoints(CheckpointStore):
         except OSError as error:
             raise CheckpointError(f"{self._folder / self._node}: {error.strerror}") from None
         self._before = [*self._before, record][-GENERATIONS:]
+        former, self._written = self._written, self._open
+        if former is not None and former != self._written:
+            self._retired.append(former.file)
         if self._thread is None and self._syncs:
             self._thread = threading.Thread(target=self._work, daemon=True,
                                             name=f"checkpoints {self._node}")
@@ -267,9 +271,8 @@ class FileCheckpoints(CheckpointStore):
             self._thread.join(_END_S)
             if self._thread.is_alive():  # the disk does not answer: the process ends without it
                 return
-        if self._open is not None:
-            self._retired.append(self._open.file)
-            self._open = None
+        self._retired += {one.file for one in (self._open, self._written) if one is not None}
+        self._open = self._written = None
         self._close_retired()
 
     def _writable(self) -> int:
@@ -296,8 +299,8 @@ class FileCheckpoints(CheckpointStore):
         if not stat.S_ISREG(os.fstat(file).st_mode):
             os.close(file)
             raise OSError(0, "is not a regular file")
-        if self._open is not None:
-            self._retired.append(self._open.file)
+        if self._open is not None and self._open != self._written:
+            os.close(self._open.file)
         self._open, self._is_lost = _Open(file, first), False
         return file
 
@@ -312,7 +315,7 @@ class FileCheckpoints(CheckpointStore):
         while not self._over.is_set():
             self._wanted.wait()
             self._wanted.clear()
-            newest = self._open
+            newest = self._written  # not before: the states of the former are not in it yet
             if newest is None:
                 continue
             try:

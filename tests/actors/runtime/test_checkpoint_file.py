@@ -141,6 +141,25 @@ def test_a_full_file_is_followed_by_another_and_the_older_ones_go(folder):
     store.close()
 
 
+def test_a_full_file_stays_until_the_last_states_are_in_the_next_one(folder, monkeypatch):
+    """Else a process that is killed while it writes there has lost what it has acknowledged."""
+    files, write = list[int](), os.write
+
+    def slow(file: int, frames: bytes) -> int:
+        if not os.fstat(file).st_size:
+            time.sleep(0.3)  # the thread has time to sync and remove
+            files.append(len(files_of(folder, "node")))
+        return write(file, frames)
+
+    monkeypatch.setattr(checkpoint_file.os, "write", slow)
+    store = FileCheckpoints(folder, "node", "run", 1)
+    for number in range(20):
+        store.save(1, 0, b"%02d" % number * 5000)
+    store.close()
+    assert len(files) > 1
+    assert min(files[1:]) > 1
+
+
 def test_the_generations_of_former_processes_are_still_there_when_the_newest_is_damaged(folder):
     """Also when the files of those were removed, and each has kept one state only."""
     for incarnation in range(1, 8):
