@@ -1,10 +1,11 @@
-"""docs/how-to/any-language.md: its C and its Python are nodes that work, its numbers are right."""
+"""docs/how-to/any-language.md: its programs are nodes that work, its numbers are right."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import re
+import shutil
 import subprocess
 import sys
 
@@ -30,14 +31,22 @@ def block(language: str, begins: str = "") -> str:
 TUG = block("toml", "name = \"tug\"")
 
 
-def write_tug(folder, *, compiled: bool = True) -> None:
-    """Write the system of the page into a folder."""
+COMPILERS = {"c": ["gcc", "-Wall", "-Wextra", "-Werror"],
+             "c++": ["g++", "-x", "c++", "-Wall", "-Wextra", "-Werror"],
+             "rust": ["rustc", "-Dwarnings"]}
+
+
+def write_tug(folder, language: str = "") -> None:
+    """Write the system of the page into a folder, with the wheels in a language."""
     (folder / "tug.toml").write_text(TUG)
     (folder / "cart.py").write_text(block("python", "from rampart"))
-    if compiled:
-        (folder / "wheels.c").write_text(block("c"))
-        subprocess.run(["gcc", "-Wall", "-Wextra", "-Werror", "-o", "wheels", "wheels.c"],
-                       cwd=folder, check=True)
+    if language == "bash":
+        (folder / "wheels").write_text(block("bash"))
+        (folder / "wheels").chmod(0o755)
+    elif language:
+        source = "wheels.rs" if language == "rust" else "wheels.c"
+        (folder / source).write_text(block(language.removesuffix("++")))
+        subprocess.run([*COMPILERS[language], "-o", "wheels", source], cwd=folder, check=True)
 
 
 def test_each_field_and_each_number_is_on_the_page():
@@ -45,12 +54,12 @@ def test_each_field_and_each_number_is_on_the_page():
         assert f"`{field}`" in TEXT
     assert f"{MAX_PACKET:,} bytes" in TEXT
     assert f"{GRACE_S} s later SIGKILL" in TEXT
-    assert f"{output_log.LOG_BYTES_PER_S // 10**6} MB per second in two files of " in TEXT
-    assert f"of {output_log.LOG_BYTES // 10**6} MB" in TEXT
+    assert (f"{output_log.LOG_BYTES_PER_S // 10**6} MB per second in two files of "
+            f"{output_log.LOG_BYTES // 10**6} MB") in " ".join(TEXT.split())
 
 
 def test_the_stand_in_plays_the_command_in_virtual_time(tmp_path, monkeypatch):
-    write_tug(tmp_path, compiled=False)
+    write_tug(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
 
     async def scenario():
@@ -64,8 +73,11 @@ def test_the_stand_in_plays_the_command_in_virtual_time(tmp_path, monkeypatch):
 
 
 @pytest.mark.processes
-def test_the_c_program_is_a_node_and_faults_can_be_put_into_what_it_says(tmp_path):
-    write_tug(tmp_path)
+@pytest.mark.parametrize("language", ["c", "c++", "rust", "bash"])
+def test_the_program_is_a_node_and_faults_can_be_put_into_its_messages(tmp_path, language):
+    if language in COMPILERS and not shutil.which(COMPILERS[language][0]):
+        pytest.skip(f"no {COMPILERS[language][0]}")
+    write_tug(tmp_path, language)
     with RealRun(tmp_path, "tug.toml") as tug:
         tug.sleep_until(1)
         assert heard(tug) == [5.0, 5.0]
@@ -79,11 +91,11 @@ def test_the_c_program_is_a_node_and_faults_can_be_put_into_what_it_says(tmp_pat
 @pytest.mark.processes
 @pytest.mark.parametrize("with_keys", [False, True])
 def test_the_plain_zenoh_program_is_a_node(tmp_path, monkeypatch, with_keys):
-    write_tug(tmp_path, compiled=False)
+    write_tug(tmp_path)
     (tmp_path / "wheels.py").write_text(block("python", "import json"))
     (tmp_path / "tug.toml").write_text(TUG.replace(
         '["./wheels"]', f'[{json.dumps(sys.executable)}, "wheels.py"]').replace(
-        "notify = true", 'key = "wheels/alive"'))
+        'topic = "tug/wheels"', 'key = "wheels/alive"'))
     monkeypatch.syspath_prepend(tmp_path)  # for its driver, when keys are made for it
     more = ("--keys", str(make_keys(tmp_path / "keys", layout_of(str(tmp_path / "tug.toml"))))
             ) if with_keys else ()
