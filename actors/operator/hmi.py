@@ -327,7 +327,7 @@ class Hmi(Actor):
     def _show_system(self, system: SystemSpec, version: int) -> None:
         if self._port and system is not NO_SYSTEM and version > self._version:
             self._version = version
-            self._state.titles = system.titles
+            self._state.narrator.titles = system.titles
             self._state.picture.put("system", draw_system(system))
 
     # -- hearing --------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Faults that the operator injects from the page: ordered, watched, and told what came of them.
+"""Faults that the operator injects from the page: ordered, watched, and reported.
 
 Pure. A fault has a name of the catalogue that the launcher hands out, or is `MODE:TOPIC`. It acts
 where the topic is published; that node reports that it took hold, its first effect, and its end
@@ -208,7 +208,7 @@ class Injections:
                 continue
             if o.unanswered and now_s > o.begins_s + TAKE_HOLD_S:
                 where = ", ".join(x.place for x in o.unanswered)
-                o.reason = f"nobody that publishes {where} answers"
+                o.reason = f"no publisher of {where} answers"
                 told.append(self._conclude(o))
             elif now_s > o.begins_s + o.duration_s + LATE_END_S:  # never of one that is permanent
                 o.reason = "its publisher did not report the end, it was restarted"

@@ -49,9 +49,9 @@ _OPTIONS = sorted(frozenset().union(*(options for _, options in _SHOWS.values())
 
 
 class Shown(NamedTuple):
-    """A field of a panel: by which of its keys, of which kinds it may be, and who says it.
+    """A field of a panel: the key that names it, the kinds it may have, and its publisher.
 
-    `is_said`: the page publishes it; others are heard.
+    `is_said`: the page publishes it; it subscribes to the others.
     """
 
     key: str
@@ -78,12 +78,12 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         max: Upper end of a gauge (1 if left out) or of a plot (its greatest value).
         unit: Behind the number.
         seconds: How much of the past a plot shows.
-        of: States that are shown in this order; one that is not listed is shown besides.
+        of: States that are shown in this order; a state that is not listed is shown beside them.
         extent_m: x and y of the lower left and of the upper right corner of a map; what it has to
             hold if left out.
         held: A truth value of a stick's messages: whether an operator holds it.
         scale: What the numbers of a stick are when it is at its end; the bounds of their types if
-            left out, 1 where these have none. A negative one turns the direction round.
+            left out, 1 where these have none. A negative one reverses the direction.
         columns: How wide it is; as much as suits it if left out.
     """
 
@@ -111,7 +111,7 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         shown = [key for key in _SHOWS if getattr(self, key) is not None]
         if len(shown) != 1:
             said = f"{self.title!r} gives {' and '.join(shown) or 'nothing to show'}"
-            raise ValueError(f"{said}; one of {', '.join(_SHOWS)} is right")
+            raise ValueError(f"{said}; expected one of {', '.join(_SHOWS)}")
         _, options = _SHOWS[self.kind]
         defaults = dict(zip(self.__struct_fields__[-len(self.__struct_defaults__):],
                             self.__struct_defaults__, strict=True))
@@ -124,8 +124,8 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
             raise ValueError(f"{self.title!r}: min = {low:g} is not below max = {high:g}")
         box = self.extent_m
         if box is not None and not (box[0] < box[2] and box[1] < box[3]):
-            raise ValueError(f"{self.title!r}: extent_m: x0, y0, x1, y1 with x0 < x1 and y0 < y1 "
-                             "is right")
+            raise ValueError(f"{self.title!r}: extent_m: expected x0, y0, x1, y1 with x0 < x1 and "
+                             "y0 < y1")
         if self.stick is not None:
             self._check_stick(self.stick)
 
@@ -133,21 +133,21 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         fields = (*numbers, *((self.held,) if self.held else ()))
         keys = dict.fromkeys(field.partition(":")[0] for field in fields)
         if len(keys) > 1:
-            raise ValueError(f"{self.title!r}: stick: fields of {' and '.join(keys)}; those of one "
-                             "topic are right")
+            raise ValueError(f"{self.title!r}: stick: fields of {' and '.join(keys)}; expected "
+                             "those of one topic")
         if len({*fields}) < len(fields):
-            raise ValueError(f"{self.title!r}: stick: {', '.join(fields)}: each field once is "
-                             "right")
+            raise ValueError(f"{self.title!r}: stick: {', '.join(fields)}: expected each "
+                             "field once")
         if self.scale and len(self.scale) != len(numbers):
-            raise ValueError(f"{self.title!r}: scale = {[*self.scale]}: one number for each of "
-                             f"{', '.join(numbers)} is right")
+            raise ValueError(f"{self.title!r}: scale = {[*self.scale]}: expected one number for "
+                             f"each of {', '.join(numbers)}")
         if not all(1e-9 <= abs(scale) <= LARGEST for scale in self.scale):
-            raise ValueError(f"{self.title!r}: scale = {[*self.scale]}: numbers other than 0, at "
-                             f"most {LARGEST:g} are right")
+            raise ValueError(f"{self.title!r}: scale = {[*self.scale]}: expected numbers other "
+                             f"than 0, at most {LARGEST:g}")
 
     @property
     def topic(self) -> str:
-        """Key of the topic on which its stick is told, "" if it is none."""
+        """Key of the topic that its stick publishes, "" if it is not a stick."""
         return self.stick[0].partition(":")[0] if self.stick else ""
 
     @property
@@ -161,7 +161,7 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         return self.seconds if self.plot else 600.0 if self.map else 0.0
 
     def fields(self) -> Iterator[Shown]:
-        """Yield the fields that it shows, or says."""
+        """Yield the fields that it shows or publishes."""
         kinds, _ = _SHOWS[self.kind]
         value = getattr(self, self.kind)
         if kinds:
@@ -187,7 +187,7 @@ def read_panels(spec: SystemSpec, file: str) -> tuple[Panel, ...]:
         if panel.script is not None:
             raise SpecificationError(
                 file, f"$.panel[{place}].script", f"{panel.title!r}: only the class of a page has "
-                "scripts; a field of a topic is right, e.g. gauge", panel.script)
+                "scripts; expected a field of a topic, e.g. gauge", panel.script)
     if problem := problem_of(panels):
         raise SpecificationError(file, "$.panel", problem)
     return panels
@@ -240,10 +240,10 @@ def problem_of(panels: Sequence[Panel]) -> str:
     told = [panel.topic for panel in panels if panel.stick]
     rival = next((panel for panel in panels if told.count(panel.topic) > 1), None)
     if rival is not None:
-        return f"panel {rival.title!r}: another stick is told on {rival.topic} too; one is right"
+        return f"panel {rival.title!r}: another stick publishes {rival.topic} too; expected one"
     if len(panels) > MAX_PANELS:
-        return f"{len(panels)} panels; at most {MAX_PANELS} are right"
+        return f"{len(panels)} panels; expected at most {MAX_PANELS}"
     kept = sum(1 for panel in panels if panel.kept_s for _ in panel.fields())
     if kept > MAX_KEPT:
-        return f"panels: {kept} fields in plots and maps; at most {MAX_KEPT} together are right"
+        return f"panels: {kept} fields in plots and maps; expected at most {MAX_KEPT} together"
     return ""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import msgspec
@@ -81,6 +81,7 @@ class HmiState:
 
     Attributes:
         picture: what pages are shown.
+        narrator: words for what happens; it has the titles of modules, mechanisms and recoveries.
     """
 
     def __init__(self) -> None:
@@ -90,7 +91,7 @@ class HmiState:
         self._patience_s: dict[str, float] = {}
         self._traces: dict[str, Trace] = {}
         self._detections: dict[str, fm.DetectionView] = {}
-        self._narrator = Narrator()
+        self.narrator = Narrator()
         self._outcomes = 0
         picture.section("system", bounds=_SYSTEM)
         picture.section("order", {"number": 0, "text": ""})
@@ -131,15 +132,6 @@ class HmiState:
             self._aged.append(name)
             self.picture.section(name, show=show)
 
-    @property
-    def titles(self) -> Mapping[str, str]:
-        """Titles of modules, mechanisms and recoveries."""
-        return self._narrator.titles
-
-    @titles.setter
-    def titles(self, titles: Mapping[str, str]) -> None:
-        self._narrator.titles = titles
-
     # -- hearing --------------------------------------------------------------------------------
 
     def keep(self, what: str, message: Any, now_s: float) -> None:
@@ -158,7 +150,7 @@ class HmiState:
         self.picture.put("manager", Heard(status))
         self._show_detections(False)
         for name, view in self._detections.items():
-            self._tell(self._narrator.detection(name, view.active, view.reason), now_s)
+            self._tell(self.narrator.detection(name, view.active, view.reason), now_s)
 
     def decision(self, record: fm.DecisionRecord, now_s: float) -> None:
         """Add a decision of the manager to the decision log."""
@@ -167,13 +159,13 @@ class HmiState:
             "t": round(now_s, 2), "number": r.decision, "active": r.active, "block": r.rule,
             "strategy": r.strategy, "recoveries": r.recoveries, "path": r.path,
             "words": decision_in_words(r.active, r.rule, r.recoveries, r.strategy,
-                                       self._narrator.titles),
+                                       self.narrator.titles),
             "rule": f"{r.rule} of {r.strategy}",
             "rejected": [f"{name}: {why}" for name, why in r.rejected]})
 
     def event(self, message: fm.ProcessEvent | bm.Diagnostic, header: Header) -> None:
         """Log what happened to a process, or an error report of a node."""
-        self._tell(self._narrator.describe(message, header), header.stamp)
+        self._tell(self.narrator.describe(message, header), header.stamp)
 
     def _tell(self, lines: Iterable[Line], now_s: float) -> None:
         for line in lines:

@@ -9,11 +9,11 @@ stop. So:
   `Origin` of whatever changes something must be the page's own. Programs that are no browsers send
   no Origin.
 * On any other address a token is needed as well, for everything but the files of the page, which
-  are the same for everybody; and the page is encrypted, unless somebody who knows the network says
-  that it need not be. An address literal cannot be rebound, so it is a fine `Host`; and so are the
-  names in the page's certificate.
+  are the same for everybody. The page is encrypted, unless the operator declares that it need not
+  be. An address literal cannot be rebound, so it is a valid `Host`, as are the names in the page's
+  certificate.
 
-Who somebody is and what they may do is decided in `gate` and `visitors`.
+`gate` and `visitors` decide who a visitor is and what it may do.
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ class Access(msgspec.Struct, frozen=True):
             raise AccessError(f"page on {self.host}: needs a token, since other machines reach it")
         if not (self.tls or self.plain):
             raise AccessError(f"page on {self.host}: other machines reach it, so it is encrypted: "
-                              "--hmi-cert FILE --hmi-key FILE; or say --hmi-unencrypted if nobody "
-                              "else is on that network")
+                              "--hmi-cert FILE --hmi-key FILE; or use --hmi-unencrypted on a "
+                              "network without strangers")
 
     @property
     def url(self) -> str:

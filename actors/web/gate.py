@@ -70,7 +70,7 @@ class Gate:
         """Return who shows a token, and a `Set-Cookie` for them; or None, and why not."""
         visitor = self._owner or self._register.by_token(token)
         if visitor is None:
-            return None, "that token opens nothing"
+            return None, "unknown token"
         return visitor, self._set_cookie(
             self._signer(visitor).sign(visitor.name).decode(), LASTS_S)
 

@@ -102,7 +102,7 @@ def load(certificate: Path, key: Path) -> tuple[ssl.SSLContext, Certificate]:
 
 def _in_words(certificate: Path, key: Path, error: Exception, *, is_locked: bool) -> str:
     if is_locked:
-        return f"key {key}: needs a passphrase; one without is right, in a file of mode 0600"
+        return f"key {key}: needs a passphrase; expected a key without, in a file of mode 0600"
     if getattr(error, "reason", "") in _MISMATCH:
         return f"key {key}: is not that of certificate {certificate}"
     why = " ".join((getattr(error, "reason", None) or str(error)).lower().replace("_", " ").split())

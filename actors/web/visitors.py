@@ -73,8 +73,8 @@ def check_name(name: str) -> str:
         VisitorError: it can be none.
     """
     if not _NAME.fullmatch(name):
-        raise VisitorError(f"name {name[:40]!r}: up to 40 of letters, digits, and _ . @ - are "
-                           "right, a letter or digit first")
+        raise VisitorError(f"name {name[:40]!r}: expected up to 40 letters, digits, and _ . @ -, "
+                           "a letter or digit first")
     return name
 
 
@@ -110,17 +110,17 @@ def parse(lines: Iterable[str]) -> dict[str, Visitor]:
             raise VisitorError(f"line {number}: {error}") from None
         found[visitor.name] = visitor
     if len(found) > MOST:
-        raise VisitorError(f"{len(found)} names: {MOST} are the most")
+        raise VisitorError(f"{len(found)} names: {MOST} at most")
     return found
 
 
 def _visitor(words: list[str]) -> Visitor:
     if len(words) != 3:
-        raise VisitorError("NAME ROLE SHA256 is right, as `rampart tokens issue` writes it")
+        raise VisitorError("expected NAME ROLE SHA256, as `rampart tokens issue` writes it")
     name, role, kept = words
     check_name(name)
     if not _DIGEST.fullmatch(kept):
-        raise VisitorError(f"{name}: no SHA-256 of a token in 64 hexadecimal digits")
+        raise VisitorError(f"{name}: expected the SHA-256 of a token in 64 hexadecimal digits")
     return Visitor(name, check_role(role), kept)
 
 
@@ -182,7 +182,7 @@ def revoke(file: Path, name: str) -> None:
 def _write(file: Path, visitors: dict[str, Visitor]) -> None:
     """Replace the file as a whole; comments in it are lost."""
     if len(visitors) > MOST:
-        raise VisitorError(f"{len(visitors)} names: {MOST} are the most")
+        raise VisitorError(f"{len(visitors)} names: {MOST} at most")
     lines = "".join(f"{v.name} {v.role} {v.digest}\n" for v in visitors.values())
     target = file.resolve()
     handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")  # mode 0600

@@ -29,7 +29,7 @@ export function bar(part, kind) {
 }
 
 export class Visitor {
-  /** `entered` is called when somebody has logged in, here or in another tab, `left` when out. */
+  /** `entered` is called after a login, here or in another tab, `left` after a logout. */
   constructor(entered, left) {
     this.entered = entered;
     this.left = left;
@@ -64,7 +64,7 @@ export class Visitor {
         return;
       }
     } catch {
-      this.ask("The HMI is not reachable; try again.");
+      this.ask("The HMI does not answer; try again.");
       return;
     }
     this.close();
@@ -80,7 +80,7 @@ export class Visitor {
     }
   }
 
-  /** Take a message of the HMI; tell whether it said who the visitor is. */
+  /** Take a message of the HMI; return whether it names the visitor. */
   receive(message) {
     if (message.type !== "visitor") return false;
     why = message.barred;

@@ -5,8 +5,8 @@ import { NOT_LOGGED_IN, Visitor, bar, barred } from "./access.js";
 import { Arrangement } from "./arrange.js";
 import { Camera } from "./camera.js";
 import { DecisionLog, EventLog, LINES } from "./log.js";
-import { ProcessTable } from "./nodes.js";
 import { Operating } from "./operate.js";
+import { ProcessTable } from "./nodes.js";
 import { Panels } from "./panels.js";
 import { FaultTree, Order } from "./tree.js";
 
@@ -23,7 +23,7 @@ const operating = new Operating((wish) => send(wish));
 const camera = new Camera();
 const memory = new Memory();
 const visitor = new Visitor(connect, () => { if (socket) lost("logged out"); });
-let picture = {};            // all that was heard, by section
+let picture = {};            // all that was received, by section
 let fresh = { decisions: [], events: [] };  // lines of the logs that are not shown yet
 const changed = new Set();   // sections that are not shown yet
 let frame = 0;
@@ -154,7 +154,7 @@ function toast(text) {
 
 // ---- showing ----------------------------------------------------------------------------------
 
-/** Begin a connection; what the HMI does not tell is not offered. */
+/** Begin a connection; what the HMI does not announce is not offered. */
 async function hello(message) {
   const from = socket;
   retryMs = 500;
@@ -199,7 +199,7 @@ const PARTS = [
   }],
 ];
 
-/** Show what changed. A part that fails, on values that nobody foresaw, does not take the others along. */
+/** Show what changed. A part that fails on unexpected values does not affect the others. */
 function show(s) {
   say($("clock"), clock(s.time_s));
   panels.show(s, changed);

@@ -1,4 +1,4 @@
-// A picture of the robot, rendered while somebody looks. The next one is asked for when the last
+// A picture of the robot, rendered while a page shows it. The next one is asked for when the last
 // one is shown, so a slow page or renderer gets fewer pictures and no backlog.
 
 import { $, say } from "./dom.js";

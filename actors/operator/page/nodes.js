@@ -2,7 +2,7 @@
 // their texts change, so that a focused button in one keeps the focus.
 
 import { $, element, say } from "./dom.js";
-import { signalButton } from "./faults.js";
+import { signalButton } from "./operate.js";
 
 const STATES = { running: "good", starting: "warn", stopped: "bad", wedged: "bad", crashed: "bad", "given up": "bad" };
 const COLUMNS = ["state", "pid", "age", "restarts", "cpu", "mb"];

@@ -147,7 +147,7 @@ export class Stick {
     this.draw();
   }
 
-  /** Forget what is held: a page without focus need not be told of its end. */
+  /** Forget what is held: a page without focus may never receive its end. */
   letGo() {
     this.keys.clear();
     this.dragged = null;
@@ -163,7 +163,7 @@ export class Stick {
       : { type: "stick", panel: this.panel, held: false });
   }
 
-  // ---- what the HMI says ------------------------------------------------------------------------
+  // ---- answers of the HMI ------------------------------------------------------------------------
 
   begin(hello) {
     this.gamepads = hello.panels.find((panel) => panel.stick).title === this.panel;

@@ -1,5 +1,5 @@
 // The fault tree with its mechanisms as barriers, and the order of the recoveries. The layout comes
-// from the HMI; here it is drawn once, and lit as detections come and go. Nothing is said by colour
+// from the HMI; here it is drawn once, and lit as detections come and go. Nothing is shown by colour
 // alone: what is lit is also framed and has a word beside it.
 
 import { svg, say } from "./dom.js";

@@ -1,4 +1,4 @@
-// What panels can show of fields of topics, and a stick that says them. A field's section of the picture is named as the field,
+// What panels can show of fields of topics. A field's section of the picture is named as the field,
 // "topic:field", and has its value, whether that is stale, and where the past is shown its time.
 
 import { clock, element, figure, say, svg } from "./dom.js";
@@ -7,7 +7,7 @@ import { View } from "./view.js";
 
 const label = (field) => field.slice(field.indexOf(":") + 1);
 
-/** What a field says now, in words; also that it was not heard. */
+/** The present value of a field in words, or that it was not heard. */
 function now(picture, field, unit = "") {
   const heard = picture[field];
   if (!heard) return "not heard";

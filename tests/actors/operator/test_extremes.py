@@ -21,7 +21,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Light, Mission
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
-from rampart.actors.osmosis.page.map import MAX_GRAPH, MAX_LIGHTS, page_map
+from rampart.actors.osmosis.page.map import MAX_LIGHTS
 from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser
@@ -153,14 +153,6 @@ def test_a_page_that_missed_a_new_mission_is_told_which_lights_are_unmeasured_ag
     state.mission(m.MissionStatus("2", "A", m.MissionPhase.RUNNING, 0, (), (), (), ""), 3.0)
     assert json.loads(msgspec.json.encode(state.picture.changes(seen)))["lights"] == {"A01": None}
     assert json.loads(msgspec.json.encode(state.picture.changes(0)))["lights"] == {}
-
-
-def test_a_map_with_more_in_it_than_can_be_seen_says_what_is_missing():
-    crowd = {f"n{i}": (float(i), 0.0) for i in range(MAX_GRAPH + 5)}
-    found = page_map(dataclasses.replace(
-        with_lights(MAX_LIGHTS + 1), nodes=crowd, edges=(("n0", "n1"),) * (MAX_GRAPH + 7)))
-    assert found.left_out == {"nodes of the graph": 5, "edges of the graph": 7, "lights": 1}
-    assert page_map(AIRPORT).left_out == {}
 
 
 SCALARS = st.none() | st.booleans() | st.integers(-2**63, 2**63 - 1) | st.floats() | st.text()

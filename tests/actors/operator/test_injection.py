@@ -78,7 +78,7 @@ def test_a_fault_that_nobody_takes_says_so():
     faults.order("drop:summit_xl/upper_scan", 0.0, 5.0, 0.0)
     assert faults.expire(TAKE_HOLD_S - 0.1) == []
     (told,) = faults.expire(TAKE_HOLD_S + 0.1)
-    assert "no effect: nobody that publishes summit_xl/upper_scan answers" in told
+    assert "no effect: no publisher of summit_xl/upper_scan answers" in told
     assert faults.due(TAKE_HOLD_S + 0.2) == []
 
 

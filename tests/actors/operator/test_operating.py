@@ -235,5 +235,5 @@ async def test_a_fault_that_nobody_takes_is_shown_to_have_no_effect(world):
             await ask(page, type="inject", fault="drop:plan/route")
             shown = await operating(page, lambda o: o["faults"] and o["faults"][0]["ended"])
             assert shown["faults"][0]["state"] == (
-                "no effect: nobody that publishes plan/route answers")
+                "no effect: no publisher of plan/route answers")
             assert len({o.injection for o in world.others.injections}) == 1

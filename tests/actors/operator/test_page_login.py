@@ -55,7 +55,7 @@ async def test_one_logs_in_stays_in_over_a_reload_and_logs_out(tmp_path):
         await tab.until(f"{ASKED} && {TEXT} === 'Log in with your token.'")
         await tab.screenshot(tmp_path / "login.png")
         await enter(tab, "wrong-wrong-wrong-wrong")
-        await tab.until(f"{TEXT} === 'that token opens nothing.'")
+        await tab.until(f"{TEXT} === 'unknown token.'")
         await enter(tab, TOKEN)
         await tab.until(LIVE)
         assert await tab.value("document.cookie") == ""  # scripts do not see it

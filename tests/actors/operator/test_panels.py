@@ -161,27 +161,27 @@ def caught(panels: str) -> ValueError:
     (panel("Level", 'gauge = "tank/level:height_m"') * 2,
      "tank.toml: $.panel: panel 'Level': there are two of this title; each panel needs its own"),
     (panel("Map", 'script = "map.js"'),
-     "tank.toml: $.panel[0].script = 'map.js': 'Map': only the class of a page has scripts; a "
-     "field of a topic is right, e.g. gauge"),
+     "tank.toml: $.panel[0].script = 'map.js': 'Map': only the class of a page has scripts; "
+     "expected a field of a topic, e.g. gauge"),
     (panel("Level", 'gauge = "tank/level"'),
      "tank.toml: $.panel[0].gauge = 'tank/level': expected 'topic:field', e.g. "
      "'tank/level:height_m'"),
     ("".join(panel(f"P{i}", f'plot = {["tank/level:height_m"] * 8}') for i in range(5)),
-     f"tank.toml: $.panel: panels: 40 fields in plots and maps; at most {MAX_KEPT} together are "
-     "right"),
+     f"tank.toml: $.panel: panels: 40 fields in plots and maps; expected at most {MAX_KEPT} "
+     "together"),
 ])
 def test_a_panel_that_names_something_wrong_is_refused_in_one_line(panels, line):
     assert str(caught(panels)) == line
 
 
 @pytest.mark.parametrize(("rest", "words"), [
-    ("", "'Level' gives nothing to show; one of gauge, plot, table, states, text, map, stick, "
-     "script is right"),
-    ('gauge = "a:b"\ntext = "a:b"', "'Level' gives gauge and text; one of "),
+    ("", "'Level' gives nothing to show; expected one of gauge, plot, table, states, text, map, "
+     "stick, script"),
+    ('gauge = "a:b"\ntext = "a:b"', "'Level' gives gauge and text; expected one of "),
     ('gauge = "a:b"\nseconds = 3', "'Level': seconds means nothing to a gauge; it takes max, min, "
      "unit"),
     ('gauge = "a:b"\nmin = 2', "'Level': min = 2 is not below max = 1"),
-    ('map = ["a:x", "a:y"]\nextent_m = [0, 0, 0, 1]', "'Level': extent_m: x0, y0, x1, y1 with"),
+    ('map = ["a:x", "a:y"]\nextent_m = [0, 0, 0, 1]', "'Level': extent_m: expected x0, y0"),
 ])
 def test_a_panel_shows_one_thing_and_takes_what_that_needs(rest, words):
     said = str(caught(panel("Level", rest)))
@@ -197,8 +197,8 @@ def test_panels_that_no_node_shows_are_refused():
 
 def test_more_panels_than_a_page_has_room_for_are_refused():
     many = "".join(panel(f"P{i}", 'text = "tank/level:height_m"') for i in range(MAX_PANELS + 1))
-    with pytest.raises(ValueError, match=rf"tank.toml: \$.panel: {MAX_PANELS + 1} panels; at "
-                                         rf"most {MAX_PANELS} are right"):
+    with pytest.raises(ValueError, match=rf"tank.toml: \$.panel: {MAX_PANELS + 1} panels; "
+                                         rf"expected at most {MAX_PANELS}"):
         layout(many)
 
 

@@ -15,12 +15,6 @@ def shown(state: OsmosisState, now_s: float = 0.0) -> dict:
     return json.loads(msgspec.json.encode(state.picture.changes(0)))
 
 
-def test_a_snapshot_of_nothing_heard_is_complete():
-    snapshot = shown(OsmosisState(), 1.0)
-    assert snapshot["pose"] is snapshot["mission"] is snapshot["nodes"] is None
-    assert snapshot["events"] == snapshot["detections"] == snapshot["route"] == []
-
-
 def test_the_track_has_a_point_where_the_robot_has_moved_and_a_limit():
     state = OsmosisState()
     for i in range(3 * TRACK_POINTS):

@@ -131,7 +131,7 @@ def test_a_stick_of_the_page_s_class_is_checked_as_one_of_the_specification():
     assert refused("", "Driven", "Rival", page=own).startswith(
         "tank.toml: page: panel 'Hand': stick: node rival publishes 'tank/hand' as well")
     assert refused(FIELDS, "Driven", page=own) == (
-        "tank.toml: page: panel 'Hand': another stick is told on tank/hand too; one is right")
+        "tank.toml: page: panel 'Hand': another stick publishes tank/hand too; expected one")
 
 
 def test_a_member_of_a_family_has_a_stick_and_the_others_are_somebody_else_s():
@@ -151,17 +151,17 @@ def test_a_member_of_a_family_has_a_stick_and_the_others_are_somebody_else_s():
     ('stick = ["tank/hand:held"]',
      "tank.toml: page: panel 'Drive': stick: topic tank/hand: held is a truth; a number is right"),
     (f'{FIELDS}\nheld = "tank/hand:left"', "'Drive': stick: tank/hand:forward, tank/hand:left, "
-     "tank/hand:left: each field once is right"),
+     "tank/hand:left: expected each field once"),
     ('stick = ["tank/hand:forward"]\nheld = "tank/hand:left"',
      "tank.toml: page: panel 'Drive': held: topic tank/hand: left is a number; a truth is right"),
     ('stick = ["tank/hand:forward", "tank/level:height_m"]',
-     "'Drive': stick: fields of tank/hand and tank/level; those of one topic are right"),
+     "'Drive': stick: fields of tank/hand and tank/level; expected those of one topic"),
     (f'{FIELDS}\nheld = "tank/pump:running"',
-     "'Drive': stick: fields of tank/hand and tank/pump; those of one topic are right"),
+     "'Drive': stick: fields of tank/hand and tank/pump; expected those of one topic"),
     (f"{FIELDS}\nscale = [1.0]",
-     "'Drive': scale = [1.0]: one number for each of tank/hand:forward, tank/hand:left is right"),
+     "'Drive': scale = [1.0]: expected one number for each of tank/hand:forward, tank/hand:left"),
     (f"{FIELDS}\nscale = [1.0, 0.0]",
-     "'Drive': scale = [1.0, 0.0]: numbers other than 0, at most 1e+09 are right"),
+     "'Drive': scale = [1.0, 0.0]: expected numbers other than 0, at most 1e+09"),
     (f"{FIELDS}\nscale = [0.1, nan]", "scale"),
     (f"{FIELDS}\nscale = [0.1, inf]", "scale"),
     (f"{FIELDS}\nseconds = 3", "'Drive': seconds means nothing to a stick; it takes held, scale"),

@@ -57,11 +57,6 @@ def test_the_way_of_an_event_ends_at_the_first_barrier_above():
     assert way["moving_inside_prohibited_area"] == ()
 
 
-def test_an_event_with_several_parents_leads_all_their_ways():
-    way = {box.name: box.way for box in draw_system(system("cell"))["tree"].boxes}
-    assert {"encoder_a_lost", "encoder_b_lost", "vision_node_crash"} <= set(way["power_dip"])
-
-
 def test_a_tree_that_nobody_could_read_is_not_drawn_and_the_page_says_so():
     spec = system("paper")
     leaf = next(event for event in spec.events if not event.of)

@@ -34,7 +34,7 @@ def test_a_line_says_who_when_what_and_what_came_of_it(tmp_path, made):
     log = made.log(file)
     log.write("reset", who="anna", address="10.0.0.7", role="drive", page=3,
               asked={"recovery": "RM1"}, why="reset of RM1 asked for")
-    log.write("log in", address="10.0.0.8", refused=True, why="that token opens nothing")
+    log.write("log in", address="10.0.0.8", refused=True, why="unknown token")
     first, second = (json.loads(line) for line in file.read_text().splitlines())
     utc = first.pop("utc")
     assert (len(utc), utc[10], utc[-6:]) == (29, "T", "+00:00")

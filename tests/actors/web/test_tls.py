@@ -46,7 +46,7 @@ def test_one_file_may_hold_both(tmp_path):
     ("robot.crt", "other.key", "key {key}: is not that of certificate {certificate}"),
     ("old.crt", "old.key", "certificate {certificate}: certificate has expired"),
     ("client.crt", "client.key", "certificate {certificate}: unsuitable certificate purpose"),
-    ("robot.crt", "locked.key", "key {key}: needs a passphrase; one without is right, in a file "
+    ("robot.crt", "locked.key", "key {key}: needs a passphrase; expected a key without, in a file "
                                 "of mode 0600"),
     ("robot.key", "robot.key", "certificate {certificate}: no certificate in PEM"),
     ("robot.crt", "other.crt", "key {key}: no private key in PEM")])

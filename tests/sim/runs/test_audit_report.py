@@ -24,11 +24,11 @@ def line(number: int, **fields: object) -> AuditLine:
 
 def test_what_was_done_is_in_both_reports_and_its_text_is_no_markup(tmp_path):
     run = record(line(1, asked={"recovery": "<b>RM1</b>"}, role="drive", address="10.0.0.7"),
-                 line(2, who="", outcome="refused", why="that token opens nothing", left_out=7))
+                 line(2, who="", outcome="refused", why="unknown token", left_out=7))
     written = try_report(run, lambda r: render(r, "Tank"), tmp_path)
     page = written.html.read_text()
     for text in ("anna (drive)", "10:20:30", "recovery: &lt;b&gt;RM1&lt;/b&gt;", "not known",
-                 "refused: that token opens nothing", "7 lines before this one were too many"):
+                 "refused: unknown token", "7 lines before this one were too many"):
         assert text in page
     assert "<b>RM1" not in page
     kept = json.loads(written.data.read_text())["audit"]
