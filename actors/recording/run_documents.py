@@ -19,6 +19,7 @@ from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.members import application_class, import_class, load_application
 from rampart.actors.system.topics import own_topics
+from rampart.files import working_folder
 from rampart.files.reading import FileError, read_bytes
 from rampart.manager.spec.specification import SystemSpec
 
@@ -108,11 +109,13 @@ def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
         plan: as plain data.
         described: the other attributes of `Documents`.
     """
+    system_file = Path(str(plan.get("system_file", "")))
+    working_folder.admit(system_file.parent)
     known = known_of(plan)
     own: tuple[Topic[Any], ...] = ()
     with contextlib.suppress(ValueError):  # an actor whose module is missing
         own = own_topics(known.system)
-    paths = [(SYSTEM, Path(str(plan.get("system_file", ""))))]
+    paths = [(SYSTEM, system_file)]
     with contextlib.suppress(OSError):  # a folder that cannot be listed
         paths += known.application.documents() if known.application else []
     files: list[File] = []

@@ -6,6 +6,7 @@ import inspect
 import json
 import re
 import resource
+import sys
 
 import pytest
 from mcap.reader import make_reader
@@ -274,9 +275,14 @@ def test_topics_that_only_the_robot_knows_are_neither_garbage_nor_lost(tmp_path)
     assert (told["messages"], told["garbage"], told["lost"]) == ("11", "1", "{}")
 
 
-def test_a_topic_that_only_the_robot_s_actors_declare_has_schema_unit_and_description(tmp_path):
-    told = collect({"system_file": str(write_porter_system(tmp_path))}, run_id="", title="",
-                   rate=1.0, nodes=("platform",), started="")
+def test_a_topic_that_only_the_robot_s_actors_declare_has_schema_unit_and_description(
+        tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "beside_it.py").write_text("from tests.porter_actors import Display, Platform\n")
+    system = write_porter_system(tmp_path)
+    system.write_text(system.read_text().replace('"tests.porter_actors:', '"beside_it:'))
+    told = collect({"system_file": str(system)}, run_id="", title="", rate=1.0,
+                   nodes=("platform",), started="")
     with (tmp_path / "run.mcap").open("wb") as file:
         writer = BagWriter(file, told)
         writer.take(0.1, LOAD.at(), encode(Header("platform", 1, 1, 0.1), Load(20.0)))
