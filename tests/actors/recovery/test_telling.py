@@ -128,6 +128,19 @@ async def test_a_mode_is_reached_when_the_node_says_so_and_lost_when_it_no_longe
     assert case.orders[-1] == Valve(False)
 
 
+@within(partial(played, Hold, **CONFIRMED))
+async def test_what_is_never_confirmed_fails_at_its_deadline_and_without_an_end_nothing_is_said(
+        given):
+    _, case = given
+    case.command(1)
+    await asyncio.sleep(2.1)
+    assert case.phase == "failed"
+    said = len(case.orders)
+    case.command(2, activate=False)
+    await asyncio.sleep(2.0)
+    assert len(case.orders) == said
+
+
 @within(partial(played, Hold, **SHUT, back={"shut": False}))
 async def test_a_respawned_hold_takes_back_what_its_predecessor_left(given):
     system, case = given
