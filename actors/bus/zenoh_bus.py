@@ -207,8 +207,13 @@ class ZenohBus:
             self._recorder.take(key, payload)
 
     def post(self, key: str, payload: bytes) -> bool:
-        """Put a message where the nodes of this host look; False if it has to be sent instead."""
-        if self._board is None or not self._board.post(key, payload):
+        """Post a message for the nodes of this host; False if it has to be sent instead.
+
+        A process without a router posts nothing. It receives nothing either, so its postings would
+        hide that it is deaf: for example, that the routers refuse its expired certificate.
+        """
+        if self._board is None or (self._dial and not self._linked()) or (
+                not self._board.post(key, payload)):
             return False
         self._latest[key] = payload
         return True

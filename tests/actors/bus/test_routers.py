@@ -16,6 +16,7 @@ from itertools import pairwise
 import pytest
 
 from rampart.actors.bus import zenoh_bus
+from rampart.actors.bus.board import FileBoard
 from rampart.actors.bus.bus import Bus, BusError, shared
 from rampart.actors.bus.run_folder import ROUTERS, socket_path
 from rampart.actors.bus.zenoh_bus import ZenohBus
@@ -179,6 +180,22 @@ async def test_who_has_gone_over_knows_it_once_and_comes_back_when_both_were_dea
         await routers.start(*ROUTERS)
         heard.clear()
         await send_until(writer, lambda: heard)
+
+
+async def test_a_process_without_a_router_posts_nothing(routers, sockets, tmp_path):
+    """It is deaf; what it posted would show others that it is well."""
+    await routers.start(*ROUTERS)
+    async with client(sockets, "node") as bus:
+        bus.take_name("node", None, FileBoard(str(tmp_path)))
+        assert bus.post("a", b"1")
+        for name in ROUTERS:
+            routers.send(name, signal.SIGKILL)
+        await eventually(lambda: not bus.post("a", b"2"))
+        for name in ROUTERS:
+            os.unlink(socket_path(sockets, name))
+        await routers.start(ROUTERS[0])
+        await eventually(lambda: bus.post("a", b"3"))
+        assert bus.posted("a") == b"3"
 
 
 async def test_an_actor_that_shares_a_bus_waits_until_that_is_open(routers, sockets):
