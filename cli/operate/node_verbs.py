@@ -206,7 +206,7 @@ async def status(options: argparse.Namespace) -> int:
     if has_gateway:
         say(f"ros2      {_in_ros2(graph)}")
     if left := first_to_expire(run):
-        say(f"keys      {left['days_left']} days left, of {left['name']} first, until "
+        say(f"keys      {max(left['days_left'], 0)} days left, of {left['name']} first, until "
             f"{left['not_after'][:16].replace('T', ' ')} UTC")
     if run.recording:
         say(f"recording {run.recording_in_words}")

@@ -111,11 +111,15 @@ def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
         assert run.process.poll() is None
 
 
-def test_a_node_whose_certificate_expires_is_told_with_its_file(tmp_path, keys):
-    key_folder.issue(keys, ("DM4",), "node", days=20 / 86_400)
+def test_a_module_whose_certificate_expires_stops_the_robot_and_is_named_with_its_file(
+        tmp_path, keys):
+    """It is deaf from then on, and must not look as if it had detected nothing."""
+    key_folder.issue(keys, ("DM3",), "node", days=20 / 86_400)
     with RealRun(tmp_path, "paper", "--mission", "A", "--keys", str(keys)) as run:
-        run.wait_for(f"{keys / 'DM4.pem'}: the certificate of DM4 expired at", 60)
-        assert "`rampart keys rotate DM4` renews it" in run.story
+        run.wait_for(f"{keys / 'DM3.pem'}: the certificate of DM3 expired at", 60)
+        assert "`rampart keys rotate DM3` renews it" in run.story
+        run.wait_for("(DM3) silent: it counts as active", 20)
+        assert "Controlled stop (RM2)" in run.story
 
 
 @pytest.mark.parametrize(("spoil", "words"), [
