@@ -12,6 +12,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -192,7 +193,7 @@ async def test_a_process_without_a_router_posts_nothing(routers, sockets, tmp_pa
             routers.send(name, signal.SIGKILL)
         await eventually(lambda: not bus.post("a", b"2"))
         for name in ROUTERS:
-            os.unlink(socket_path(sockets, name))
+            Path(socket_path(sockets, name)).unlink()
         await routers.start(ROUTERS[0])
         await eventually(lambda: bus.post("a", b"3"))
         assert bus.posted("a") == b"3"
