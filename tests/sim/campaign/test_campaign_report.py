@@ -340,3 +340,14 @@ def test_every_value_is_counted_once_in_a_chart_however_far_out(values, on_margi
     (0.0004, "0.04"), (0.345, "34.5"), (math.nan, "–")])  # noqa: RUF001
 def test_a_share_never_reads_as_all_or_nothing_unless_it_is(share, text):
     assert percent(share) == text
+
+
+def test_conditions_that_differ_have_rows_of_their_own_and_others_are_told_once():
+    latched = {"RM2": {"latched": True}}
+    runs = [run(obstacles=0), run(obstacles=2), run(retuned=latched), run(ftm=False)]
+    page = render(OUT, ABOUT, runs)
+    shown = [row[0] for row in Tables(page).rows if len(row) == 1]
+    assert len(shown) == 4
+    assert shown[0] == "without FTM, no obstacles"
+    assert sum("retuned" in text for text in shown) == 1
+    assert not any("measured" in text for text in shown)

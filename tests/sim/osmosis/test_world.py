@@ -272,3 +272,8 @@ def test_a_kept_world_that_makes_no_sense_is_refused():
     kept = msgspec.structs.replace(world().keep(), pose=(math.nan, 0.0, 0.0))
     with pytest.raises(StateError, match="not finite"):
         WORLD_STATE.decode(1, WORLD_STATE.encode(kept))
+
+
+def test_a_time_that_is_not_finite_is_refused():
+    with pytest.raises(WorldError, match="time must be finite"):
+        world().step_to(math.nan)

@@ -149,3 +149,74 @@ def test_a_virtual_clock_shows_what_a_clock_of_the_same_loop_shows():
         assert lean.source_time(5.1) == plain.source_time(5.1)
 
     run(scenario)
+
+
+def test_what_is_cancelled_is_not_called_and_costs_no_time():
+    async def scenario():
+        loop, seen = asyncio.get_running_loop(), []
+        for call in (loop.call_later(50, seen.append, "late"), loop.call_soon(seen.append, "now")):
+            call.cancel()
+            assert call.cancelled()
+        await asyncio.sleep(1)
+        return seen, loop.time()
+
+    assert run(scenario) == ([], 1.0)
+
+
+def test_a_callback_that_raises_is_reported_and_the_rest_goes_on():
+    async def scenario():
+        loop, seen, errors = asyncio.get_running_loop(), [], []
+        loop.set_exception_handler(lambda _loop, context: errors.append(context["exception"]))
+        loop.call_later(1, lambda: 1 / 0)
+        loop.call_later(1, seen.append, "after")
+        await asyncio.sleep(2)
+        return seen, [type(e) for e in errors]
+
+    assert run(scenario) == (["after"], [ZeroDivisionError])
+
+
+def test_files_are_served_while_time_stands_still():
+    async def scenario():
+        served = asyncio.Event()
+
+        async def serve(_reader, writer):
+            writer.write(b"hello")
+            writer.close()
+            served.set()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+        text = await reader.read()
+        writer.close()
+        server.close()
+        await server.wait_closed()
+        return text
+
+    assert run(scenario) == b"hello"
+
+
+def test_what_a_call_posts_for_now_waits_for_those_that_are_ready():
+    async def scenario():
+        loop, seen = asyncio.get_running_loop(), []
+
+        def first(what, _):
+            seen.append(what)
+            loop.post_at(loop.time(), note, "posted", None)
+            loop.call_soon(seen.append, "soon")
+
+        def note(what, _):
+            seen.append(what)
+
+        loop.post_at(1.0, first, "first", None)
+        loop.post_at(1.0, note, "second", None)
+        await asyncio.sleep(2)
+        return seen
+
+    assert run(scenario) == ["first", "second", "soon", "posted"]
+
+
+def test_a_loop_that_was_told_to_stop_does_not_wait():
+    loop = VirtualLoop()
+    loop.stop()
+    loop.run_forever()
+    loop.close()
