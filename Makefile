@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements
+.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements docs diagrams
 
 run: setup
 	$(BIN)/python launch.py
@@ -88,6 +88,25 @@ fuzz: setup
 	$(BIN)/python -m tests.fuzz.run $(FUZZ)
 	$(BIN)/python -m tests.fuzz.handler_fuzz 25
 
+# The documentation as a site, in site/; a broken link is an error. site/index.html opens from the
+# disk. The generator has an environment of its own, since the product needs none of it.
+docs: .venv-docs/installed
+	.venv-docs/bin/zensical build --clean --strict
+
+.venv-docs/installed: docs/requirements.txt
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
+
+# Draws docs/images/*.mmd as SVG, with Node's mermaid-cli and Chromium.
+diagrams:
+	for file in docs/images/*.mmd; do \
+		PUPPETEER_SKIP_DOWNLOAD=1 PUPPETEER_EXECUTABLE_PATH=$$(command -v chromium) \
+		npx --yes --package @mermaid-js/mermaid-cli@11 mmdc --quiet --input $$file \
+			--output $${file%.mmd}.svg --configFile docs/images/mermaid.json \
+			--puppeteerConfigFile docs/images/puppeteer.json --backgroundColor white || exit; \
+	done
+
 setup: .venv/installed
 
 .venv/installed: requirements.txt pyproject.toml
@@ -106,4 +125,4 @@ requirements: setup
 		--no-annotate --extra dev --output-file requirements.txt pyproject.toml
 
 clean:
-	rm -rf .venv .venv-peers .venv-ros build dist reports *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-docs .venv-peers .venv-ros build site dist reports *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -88,3 +88,14 @@ def test_no_text_installs_another_project_s_package():
              and (ROOT / name).is_file() and foreign.search(
                  (ROOT / name).read_text(encoding="utf-8", errors="replace"))]
     assert found == []
+
+
+@pytest.mark.parametrize("source", sorted((ROOT / "docs/images").glob("*.mmd")),
+                         ids=lambda file: file.stem)
+def test_diagrams_are_drawn_from_their_sources(source):
+    """`make diagrams` was run after the last change."""
+    labels = re.findall(r"[\[({|]([^\[\](){}|]+)[\])}|]", source.read_text(encoding="utf-8"))
+    words = re.findall(r"\w+", " ".join(labels))
+    drawn = source.with_suffix(".svg").read_text(encoding="utf-8")
+    assert words
+    assert [word for word in words if word not in drawn and word != "br"] == []
