@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements docs diagrams
+.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements docs diagrams release licences
 
 run: setup
 	$(BIN)/python launch.py
@@ -117,12 +117,24 @@ setup: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
 	@touch $@
 
+# Dates the changelog, sets the version, builds and tries the packages, commits, tags: VERSION=1.2.3.
+release:
+	.ci/release $(VERSION)
+
 # Pins without hashes and without index lines, so that any index can serve them.
 requirements: setup
 	$(BIN)/python -m pip install --quiet pip-tools
 	$(BIN)/python -m piptools compile --quiet --strip-extras --no-emit-index-url \
 		--no-emit-trusted-host --no-emit-find-links --no-emit-options --no-header \
 		--no-annotate --extra dev --output-file requirements.txt pyproject.toml
+
+# Lists the licences of all pinned packages in docs/contributing/licences.md.
+licences: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-licenses
+	{ printf '# Licences of dependencies\n\nThis page lists the licence of every pinned package. '; \
+	printf '`make licences` generates it.\n\n'; \
+	$(BIN)/pip-licenses --from=mixed --format=markdown \
+		--packages $$(sed 's/==.*//' requirements.txt); } > docs/contributing/licences.md
 
 clean:
 	rm -rf .venv .venv-docs .venv-peers .venv-ros build site dist reports *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

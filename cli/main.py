@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from importlib.metadata import entry_points
+from importlib.metadata import entry_points, version
 from typing import Any
 
 from rampart.cli import completion, new
@@ -86,6 +86,8 @@ def build_parser() -> RampartParser:
     verbs' subparsers, the formatter class, and a parent parser with `--port`.
     """
     parser = RampartParser(prog="rampart")
+    parser.add_argument("--version", action="version",
+                        version=f"rampart {version('rampart-robot')}")
     verbs = parser.verbs = parser.add_subparsers(
         dest="verb", required=True, metavar="VERB", parser_class=argparse.ArgumentParser)
     new.add(verbs)
