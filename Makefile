@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements docs diagrams release licences
+.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements docs diagrams release licences pictures
 
 run: setup
 	$(BIN)/python launch.py
@@ -106,6 +106,10 @@ diagrams:
 			--output $${file%.mmd}.svg --configFile docs/images/mermaid.json \
 			--puppeteerConfigFile docs/images/puppeteer.json --backgroundColor white || exit; \
 	done
+
+# Takes the page's pictures in docs/images from a real run, with Chromium; three minutes.
+pictures: setup
+	$(BIN)/python -m tests.actors.operator.pictures
 
 setup: .venv/installed
 

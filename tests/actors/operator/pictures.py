@@ -2,7 +2,7 @@
 
 Run it with `python -m tests.actors.operator.pictures [DIRECTORY]`; by default they go to
 docs/images. A real run of mission AB in which one wheel gets weak, so that the robot goes on at
-reduced speed, and Osmosis Control is killed.
+reduced speed, and Osmosis Control is killed. The film shows a kill of Localization before that.
 """
 
 from __future__ import annotations
@@ -26,6 +26,11 @@ LIVE = "document.getElementById('link').textContent === 'live'"
 RATE = 1.0
 FAULT_S = 76.0
 WIDE = (1500, 1290)
+FILM = (1280, 800)
+FILM_WIDTH = 1000
+FILM_S = 9.0
+BEFORE_S = 2.0
+FRAME_S = 0.4
 
 
 async def shoot(tab: Browser, file: Path, *, whole: bool = False) -> None:
@@ -39,6 +44,30 @@ async def shoot(tab: Browser, file: Path, *, whole: bool = False) -> None:
     if file.stat().st_size > MOST_BYTES:
         image.quantize(256, method=Image.Quantize.FASTOCTREE).save(file, optimize=True)
     print(f"{file}: {image.size[0]} x {image.size[1]}, {file.stat().st_size / 1000:.0f} kB")
+
+
+async def film(tab: Browser, run: RealRun, victim: str, file: Path) -> None:
+    """Film a node that is killed, and what follows; at most one frame each `FRAME_S`."""
+    loop = asyncio.get_running_loop()
+    begin_s, is_killed = loop.time(), False
+    frames: list[Image.Image] = []
+    times_s: list[float] = []
+    raw = file.with_suffix(".raw.png")
+    while (now_s := loop.time() - begin_s) < FILM_S:
+        if now_s > BEFORE_S and not is_killed:
+            await asyncio.to_thread(run.kill, victim)
+            is_killed = True
+        await tab.screenshot(raw)
+        image = Image.open(io.BytesIO(raw.read_bytes())).convert("RGB")
+        frames.append(image.resize((FILM_WIDTH, FILM_WIDTH * image.height // image.width)))
+        times_s.append(now_s)
+        await asyncio.sleep(max(0.0, begin_s + now_s + FRAME_S - loop.time()))
+    raw.unlink()
+    ends_s = [*times_s[1:], FILM_S]
+    frames[0].save(file, save_all=True, append_images=frames[1:], loop=0, quality=70, method=6,
+                   duration=[round(1000 * (end_s - time_s))
+                             for time_s, end_s in zip(times_s, ends_s, strict=True)])
+    print(f"{file}: {len(frames)} frames, {file.stat().st_size / 1000:.0f} kB")
 
 
 async def look(tab: Browser, width: int, height: int, scheme: str) -> None:
@@ -56,6 +85,9 @@ async def look(tab: Browser, width: int, height: int, scheme: str) -> None:
 async def take(run: RealRun, into: Path) -> None:
     """Take all pictures of a run."""
     async with browser() as tab:
+        await asyncio.to_thread(run.sleep_until, 20.0)
+        await look(tab, *FILM, "dark")
+        await film(tab, run, "localization", into / "kill-and-recovery.webp")
         await asyncio.to_thread(run.sleep_until, 58.0)
         await look(tab, *WIDE, "light")
         await shoot(tab, into / "hmi-desktop.png")
