@@ -42,7 +42,7 @@ signals:
 
 examples:
   kill-node osmosis_control                  # it is restarted
-  kill-node localization --signal STOP       # it is detected as stopped, and replaced
+  kill-node localization --signal STOP       # its heartbeat stops: it is replaced
   kill-node --list                           # list the nodes
 In a system of several hosts it signals and lists the nodes of all hosts.
 `kill -9 PID` and `pkill -9 -f osmosis_control` also work.
