@@ -94,7 +94,8 @@ def test_no_text_installs_another_project_s_package():
                          ids=lambda file: file.stem)
 def test_diagrams_are_drawn_from_their_sources(source):
     """`make diagrams` was run after the last change."""
-    labels = re.findall(r"[\[({|]([^\[\](){}|]+)[\])}|]", source.read_text(encoding="utf-8"))
+    text = source.read_text(encoding="utf-8")
+    labels = re.findall(r"[\[({|]([^\[\](){}|]+)[\])}|]", text) + re.findall(r"\w: (.+)", text)
     words = re.findall(r"\w+", " ".join(labels))
     drawn = source.with_suffix(".svg").read_text(encoding="utf-8")
     assert words
