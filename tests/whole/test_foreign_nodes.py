@@ -14,7 +14,8 @@ from rampart.actors.foreign.descendants import descendants
 from rampart.actors.foreign.output_log import LOG_BYTES
 from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.testing import RealRun
-from tests.documents.test_foreign_nodes import TUG, nodes, write_tug
+from tests.documents.test_foreign_nodes import nodes
+from tests.tug import TUG, write_tug
 
 pytestmark = pytest.mark.processes
 

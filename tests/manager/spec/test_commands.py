@@ -14,7 +14,7 @@ from rampart.manager.spec.specification import (
     check_change,
     parse_specification,
 )
-from tests.documents.test_foreign_nodes import TUG, write_tug
+from tests.tug import TUG, write_tug
 
 COMMAND_NODE = "rampart.actors.foreign.command_node:CommandNode"
 
