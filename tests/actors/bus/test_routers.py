@@ -259,8 +259,14 @@ async def test_who_hangs_tells_what_it_said_last_and_who_is_stopped_is_not_waite
         answers = ask(reader)
         await eventually(lambda: set(answers) == {b"of one that hangs", b"of one that works"})
         os.kill(hung, signal.SIGSTOP)
-        later = ask(reader)
-        await eventually(lambda: later == [b"of one that works"], 0.5)
+        await eventually(lambda: all(  # it stops thread by thread, and one that runs answers
+            thread.read_text().rpartition(") ")[2].startswith("T")
+            for thread in Path(f"/proc/{hung}/task").glob("*/stat")))
+        later, over = list[bytes](), list[bool]()
+        reader.latest(topics.GOAL.at(), lambda _key, payload: later.append(payload),
+                      lambda: over.append(True))
+        await eventually(lambda: later)
+        assert (later, over) == ([b"of one that works"], [])
         assert ask(writer) == [], "nobody asks itself"
 
 

@@ -110,7 +110,7 @@ ELSEWHERE = ["--hmi-host", "0.0.0.0"]
     (["--hmi-host", "no such host", "--hmi-unencrypted"],
      "--hmi-host no such host: no address of this machine"),
     (ELSEWHERE, "--hmi-host 0.0.0.0: page on 0.0.0.0: other machines reach it, so it is encrypted: "
-                "--hmi-cert FILE --hmi-key FILE; or say --hmi-unencrypted"),
+                "--hmi-cert FILE --hmi-key FILE; or use --hmi-unencrypted"),
     ([*ELSEWHERE, "--hmi-cert", "robot.crt"],
      "--hmi-cert robot.crt: holds no key; --hmi-key FILE is needed as well"),
     ([*ELSEWHERE, "--hmi-cert", "nothing"], "--hmi-cert, --hmi-key: key nothing: cannot be read"),
