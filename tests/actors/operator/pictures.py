@@ -26,7 +26,6 @@ LIVE = "document.getElementById('link').textContent === 'live'"
 RATE = 1.0
 FAULT_S = 76.0
 WIDE = (1500, 1290)
-FILM = (1280, 800)
 FILM_WIDTH = 1000
 FILM_S = 9.0
 BEFORE_S = 2.0
@@ -86,7 +85,7 @@ async def take(run: RealRun, into: Path) -> None:
     """Take all pictures of a run."""
     async with browser() as tab:
         await asyncio.to_thread(run.sleep_until, 20.0)
-        await look(tab, *FILM, "dark")
+        await look(tab, *WIDE, "dark")
         await film(tab, run, "localization", into / "kill-and-recovery.webp")
         await asyncio.to_thread(run.sleep_until, 58.0)
         await look(tab, *WIDE, "light")
