@@ -89,9 +89,11 @@ fuzz: setup
 	$(BIN)/python -m tests.fuzz.handler_fuzz 25
 
 # The documentation as a site, in site/; a broken link is an error. site/index.html opens from the
-# disk. The generator has an environment of its own, since the product needs none of it.
+# disk, search included. The generator has an environment of its own: the product needs none of it.
 docs: .venv-docs/installed
 	.venv-docs/bin/zensical build --clean --strict
+	sed -i 's#https://unpkg.com/iframe-worker/shim#assets/iframe-worker.js#' site/*.html
+	sed -i 's#https://unpkg.com/iframe-worker/shim#../assets/iframe-worker.js#' site/*/*.html
 
 .venv-docs/installed: docs/requirements.txt
 	$(PYTHON) -m venv .venv-docs
