@@ -69,14 +69,14 @@ chaos: setup
 # Hits every pair of processes of the full system, one after the other in long missions; an hour or
 # more. Interrupted, it goes on where it was: reports/chaos-pairs.jsonl says what is done.
 chaos-pairs: setup
-	$(BIN)/python -m tests.whole.chaos_pair_runs
+	$(BIN)/python -m tests.whole.chaos_runs pairs
 
 # Missions that have an overload of the machine on the way, 20 of each kind; an hour and a half.
 overload: setup
 	$(BIN)/python -m tests.whole.overload_runs
 
-# Missions without end, a random fault every five seconds, for so many hours: figures, a plot and a
-# page in reports/soak.*. Interrupted, it goes on where it was: the same command.
+# Missions without end, a random fault every five seconds, for so many hours; figures at the end.
+# Interrupted, it goes on where it was: the same command.
 HOURS ?= 1
 soak: setup
 	$(BIN)/python -m tests.whole.soak_runs --hours $(HOURS)

@@ -1,22 +1,23 @@
-"""Chaos: hits whatever process of a running system, in whatever way, and sees that it comes back.
+"""Chaos: hits processes of a running system, and checks that each of them comes back.
 
-The plan is pure and seeded: who is hit how, and how long after the one before. The executor waits
-until the victim has gone and another has taken its place, so that hits come in turn.
+A plan is pure and seeded: which processes are hit, how, and how long after the strike before.
+`Chaos` carries strikes out one by one, and waits each time until every victim is gone and another
+process has taken its place. If asked, it also waits until the whole system is back: the
+supervisor's table has all nodes running in the processes that /proc shows, and each of them has
+posted a heartbeat since. So nothing depends on the supervisor's word alone.
 
-Some processes are special:
+Two processes are only stopped for a moment (`PAUSE`):
 
-* The root is what a run *is*: its end ends the run. That it leaves nothing behind is
-  `tests/whole/test_launch.py`'s subject.
-* The world is only stopped for a moment. It stands for the real one, ground truth included: with
-  its process the place of the robot is gone, and nobody can bring that back; the supervisor does
-  not try. A wedged loop never turns again, so that would be its death too.
-* The process that watches the run has the verdict: its end ends the run, too. Stopped, it is
-  continued by the root.
-* A process of the pool is no node: any other one of the pool counts as its replacement.
+* The root, whose end is the run's. `test_launch.py` checks that nothing is left behind then.
+* The world. It stands for the real one, ground truth included, and is not restarted.
+
+A process of the pool is no node: any other one of the pool counts as its replacement.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import random
 import re
@@ -24,175 +25,343 @@ import signal
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
-from rampart.actors.bus.run_folder import ROUTERS
+from rampart.actors.bus.envelope import decode
+from rampart.actors.bus.run_folder import ROUTERS, board_of
+from rampart.actors.bus.topics import HEARTBEAT
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import NodeState, NodeTable
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.checkpoint_file import read
+from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import SUPERVISOR
 from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.actors.supervision.root import POOL
+from rampart.cli.output import UsageError
+from rampart.cli.session import connect
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.testing import RealRun
 
+ROOT_PROCESS = "root"
 WAYS = ("KILL", "STOP", "SEGV", "WEDGE")
+PAUSE = "PAUSE"
 BACK_WITHIN_S = 10.0
-"""Wall seconds after which a victim counts as not having come back; a loaded machine is slow."""
+"""Wall seconds for each victim of a strike, on a machine that may be busy."""
 
 WORLD_PAUSE_S = 0.4
-"""So long the world is stopped, simulated seconds: the Safety Pilot misses the laser and stops. An
-emergency stop, the right answer to a robot without senses, would follow after a second."""
+"""Simulated seconds: the Safety Pilot misses the laser and stops. After a second an emergency stop
+would follow, the right answer to a robot without senses."""
+
+ROOT_PAUSE_S = (0.3, 1.5)
+GAP_S = 0.4
+"""The second of a pair is hit at once, or up to so many wall seconds later."""
+
+EMERGENCY_STOP = "RM1"
+_LISTEN_S = 1.5
+"""A session listens for so long: it does not see who comes back later."""
 
 _ENDED = re.compile(r"\] mission \S+ (succeeded|failed|cancelled)")
+_DECISION = re.compile(r"\] decision \d+: (.*)")
+
 
 @dataclass(frozen=True, slots=True)
 class Hit:
-    """One process to be hit: `pause_s` wall seconds after the one before was repaired."""
+    """A process and how it is hit; wall seconds until it goes on, if it is only paused."""
 
-    pause_s: float
     name: str
     way: str
+    pause_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Strike:
+    """Processes that are hit, `gap_s` wall seconds apart, `after_s` after the last repair."""
+
+    hits: tuple[Hit, ...]
+    after_s: float = 0.0
+    gap_s: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Victims."""
+        return tuple(hit.name for hit in self.hits)
+
+    def __str__(self) -> str:
+        victims = "  ".join(f"{hit.way:<5} {hit.name:<16}" for hit in self.hits)
+        return victims + (f" {self.gap_s * 1e3:3.0f} ms apart" if len(self.hits) > 1 else "")
 
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """What can be hit: `mortal` in every way, `world` only by being stopped for a moment."""
+    """Processes that can be hit in every way, and those that are only paused."""
 
     mortal: tuple[str, ...]
-    world: tuple[str, ...]
+    paused: tuple[str, ...]
+
+    def hit(self, dice: random.Random, name: str, ways: Sequence[str] = WAYS) -> Hit:
+        """Return a hit of a process in a way that is drawn."""
+        if name in self.paused:
+            return Hit(name, PAUSE, dice.uniform(*ROOT_PAUSE_S) if name == ROOT_PROCESS
+                       else WORLD_PAUSE_S)
+        return Hit(name, dice.choice(ways))
 
 
 def targets(spec: SystemSpec) -> Targets:
     """Return the processes of a system, one name for each, and those that every system has."""
-    nodes = {unit: members[0] for unit, members in spec.processes().items()}
-    world = tuple(n.name for n in nodes.values() if n.kind is Kind.WORLD)
-    mortal = tuple(n.name for n in nodes.values() if n.kind is not Kind.WORLD)
-    return Targets((*mortal, SUPERVISOR, *ROUTERS, POOL), world)
+    nodes = [members[0] for members in spec.processes().values()]
+    mortal = tuple(node.name for node in nodes if node.kind is not Kind.WORLD)
+    world = tuple(node.name for node in nodes if node.kind is Kind.WORLD)
+    return Targets((*mortal, SUPERVISOR, *ROUTERS, POOL), (*world, ROOT_PROCESS))
 
 
-def each_in_every_way(of: Targets, seed: int, pause_s: tuple[float, float]) -> list[Hit]:
-    """Return four rounds in which everybody is hit, each time in another way.
+def each_in_every_way(of: Targets, seed: int, after_s: tuple[float, float]) -> list[Strike]:
+    """Return four rounds in which every process is hit, each time in another way.
 
-    Nobody is hit twice in succession: who comes back is given a moment.
+    No process is hit twice in succession.
     """
     dice = random.Random(f"chaos {seed}")
     ways = {name: dice.sample(WAYS, len(WAYS)) for name in of.mortal}
-    ways |= {name: ["STOP"] * len(WAYS) for name in of.world}
-    hits: list[Hit] = []
+    strikes: list[Strike] = []
     for i in range(len(WAYS)):
-        names = dice.sample(list(ways), len(ways))
-        if hits and names[0] == hits[-1].name:
+        names = dice.sample([*of.mortal, *of.paused], len(of.mortal) + len(of.paused))
+        if strikes and (names[0],) == strikes[-1].names:
             names.reverse()
-        hits += [Hit(dice.uniform(*pause_s), name, ways[name][i]) for name in names]
-    return hits
+        strikes += [Strike((of.hit(dice, name, ways.get(name, WAYS)[i:i + 1]),),
+                           dice.uniform(*after_s)) for name in names]
+    return strikes
 
 
-def so_many(names: Sequence[str], count: int, seed: int, pause_s: tuple[float, float]
-            ) -> list[Hit]:
-    """Return `count` hits of random processes in random ways, nobody twice in succession."""
+def so_many(names: Sequence[str], count: int, seed: int, after_s: tuple[float, float]
+            ) -> list[Strike]:
+    """Return `count` strikes of random processes, none twice in succession, in random ways."""
     dice = random.Random(f"chaos {seed}")
-    hits: list[Hit] = []
+    strikes: list[Strike] = []
     for _ in range(count):
-        others = [name for name in names if not hits or name != hits[-1].name]
-        hits.append(Hit(dice.uniform(*pause_s), dice.choice(others), dice.choice(WAYS)))
-    return hits
+        others = [name for name in names if not strikes or (name,) != strikes[-1].names]
+        strikes.append(Strike((Hit(dice.choice(others), dice.choice(WAYS)),),
+                              dice.uniform(*after_s)))
+    return strikes
+
+
+def every_pair(of: Targets, seed: int) -> list[Strike]:
+    """Return every pair of a system's processes in a drawn order, each killed, stopped or hung.
+
+    A pair with the supervisor or the root comes in all combinations of ways, and others in one.
+    """
+    dice = random.Random(f"pairs {seed}")
+    names = [name for name in of.mortal if name != POOL]  # one may replace the other
+    lasting = tuple(way for way in WAYS if way != "SEGV")
+    drawn = []
+    for pair in combinations((*names, *of.paused), 2):
+        each = [[(way,) for way in lasting] if name in names else [(PAUSE,)] for name in pair]
+        combined = list(product(*each))
+        if not {SUPERVISOR, ROOT_PROCESS} & set(pair):
+            combined = [dice.choice(combined)]
+        for ways in combined:
+            hits = [of.hit(dice, name, way) for name, way in zip(pair, ways, strict=True)]
+            dice.shuffle(hits)
+            gap_s = 0.0 if dice.random() < 0.4 else dice.uniform(0.0, GAP_S)
+            drawn.append(Strike(tuple(hits), gap_s=gap_s))
+    dice.shuffle(drawn)
+    return drawn
 
 
 @dataclass(frozen=True, slots=True)
 class Struck:
-    """A hit that was carried out: when (wall s since the run was ready), and how long it took.
+    """A strike that was carried out.
 
-    `back_s` is from the signal until another process bears the name and the old one is gone; None
-    if that did not happen within `BACK_WITHIN_S`.
+    Attributes:
+        strike: The strike.
+        replaced_s: Wall seconds from the first signal until every victim was replaced.
+        back_s: And until everything was back that was asked for; None if it was not in time.
+        others: Processes that were replaced besides.
+        missing: What was not back.
+        story: What the run printed meanwhile, if something was not back.
     """
 
-    at_s: float
-    hit: Hit
-    pid: int
+    strike: Strike
+    replaced_s: float | None
     back_s: float | None
+    others: tuple[str, ...] = ()
+    missing: str = ""
+    story: str = ""
 
     def __str__(self) -> str:
-        took = "NOT BACK" if self.back_s is None else f"back in {self.back_s * 1000:5.0f} ms"
-        return f"{self.at_s:7.2f} s  {self.hit.way:<5} {self.hit.name:<16} pid {self.pid:<8} {took}"
-
-
-def tells_end(story: str) -> bool:
-    """Whether the mission has ended, by what its run told."""
-    return _ENDED.search(story) is not None
+        back = f"NOT BACK: {self.missing}" if self.back_s is None else (
+            f"back in {self.back_s * 1e3:5.0f} ms")
+        return f"{self.strike}  {back}" + (
+            f", {', '.join(self.others)} as well" if self.others else "")
 
 
 class Chaos:
-    """Carries out hits on a run.
+    """Carries out strikes on a run whose mission is under way.
 
     Args:
-        run: the run, its mission under way.
-        world: processes that are stopped for a moment only.
-        told: called with each hit that was carried out.
+        run: The run.
+        report: Is called with each strike that was carried out.
+
+    Attributes:
+        struck: What was carried out.
+        resets: Emergency stops that were released.
+        is_unsafe: Whether the run reported something unsafe.
     """
 
-    def __init__(self, run: RealRun, world: Sequence[str] = (),
-                 told: Callable[[Struck], None] = lambda _: None) -> None:
+    def __init__(self, run: RealRun, report: Callable[[Struck], object] = lambda _: None) -> None:
         self.struck: list[Struck] = []
+        self.resets = 0
+        self.is_unsafe = False
         self._run = run
-        self._world = world
-        self._told = told
-        self._rate = run.info.rate
-        self._begun_s = time.monotonic()
+        self._report = report
+        info = run.info
+        self._rate = info.rate
+        self._clock = Clock(info.origin_s, info.rate)
+        self._board = board_of(info.folder)
+        self._read = 0
+        self._has_ended = False
+        self._decided = ""
 
-    def carry_out(self, hits: Iterable[Hit]) -> list[Hit]:
-        """Hit one after the other while the run lasts; return what was left to be done."""
-        hits = list(hits)
-        for i, hit in enumerate(hits):
-            if not self._rest(hit.pause_s) or not self._strike(hit):
-                return hits[i:]
+    def carry_out(self, strikes: Iterable[Strike]) -> list[Strike]:
+        """Strike while the run lasts; return what was left to be done."""
+        strikes = list(strikes)
+        for i, strike in enumerate(strikes):
+            until = time.monotonic() + strike.after_s
+            while time.monotonic() < until and not self.over():
+                time.sleep(0.02)
+            if self.over() or self.strike(strike) is None:
+                return strikes[i:]
         return []
 
-    @property
-    def elapsed_s(self) -> float:
-        """Wall seconds since the first hit was allowed."""
-        return time.monotonic() - self._begun_s
+    def strike(self, strike: Strike, *, everything: bool = False) -> Struck | None:
+        """Hit, and wait for the repair; return None if the run was over first.
 
-    def _over(self) -> bool:
-        return self._run.process.poll() is not None or tells_end(self._run.story)
+        Args:
+            strike: What is hit.
+            everything: Whether the whole system has to be back, and not only the victims.
+        """
+        read, before = self._read, self._pids()
+        deadline = time.monotonic() + BACK_WITHIN_S
+        while absent := [name for name in strike.names if name not in before]:
+            if self.over():
+                return None
+            if time.monotonic() > deadline:
+                return self._note(Struck(strike, None, None, (), f"{', '.join(absent)}: not there",
+                                         self._run.story_from(read)))
+            before = self._pids()
+        begun_s = time.monotonic()
+        self._send(strike, before)
+        replaced_s = None
+        while time.monotonic() < begun_s + BACK_WITHIN_S * len(strike.hits):
+            if self.over():
+                return None
+            missing = ", ".join(hit.name for hit in strike.hits
+                                if not self._is_replaced(hit, before[hit.name]))
+            if missing:
+                time.sleep(0.005)
+                continue
+            replaced_s = replaced_s or time.monotonic() - begun_s
+            missing = asyncio.run(self._missing()) if everything else ""
+            if not missing:
+                return self._note(Struck(strike, replaced_s, time.monotonic() - begun_s,
+                                         self._others(strike, before) if everything else ()))
+        return self._note(Struck(strike, replaced_s, None, self._others(strike, before), missing,
+                                 self._run.story_from(read)))
 
-    def _rest(self, pause_s: float) -> bool:
-        until = time.monotonic() + pause_s
-        while time.monotonic() < until and not self._over():
-            time.sleep(0.02)
-        return not self._over()
+    def over(self) -> bool:
+        """Return whether the mission has ended, or the run."""
+        new = self._run.story_from(self._read)
+        whole = new[:new.rfind("\n") + 1]
+        self._read += len(whole.encode())
+        self._has_ended = self._has_ended or _ENDED.search(whole) is not None
+        self.is_unsafe = self.is_unsafe or "UNSAFE" in whole
+        for decision in _DECISION.finditer(whole):
+            self._decided = decision[1]
+        return self._has_ended or self._run.process.poll() is not None
 
-    def _strike(self, hit: Hit) -> bool:
-        """Hit and wait for the repair; False if the run was over before it was done."""
-        start_s, old = time.monotonic(), self._run.pid(hit.name)
-        if old is not None:
-            os.kill(old, SIGNALS[hit.way])
-            if hit.name in self._world:
-                time.sleep(WORLD_PAUSE_S / self._rate)
-                os.kill(old, signal.SIGCONT)
-        while time.monotonic() - start_s < BACK_WITHIN_S:
-            if old is not None and self._is_back(hit, old):
-                self._note(hit, old, time.monotonic() - start_s)
-                return True
-            if self._over():
-                return False
-            time.sleep(0.005)
-        self._note(hit, old or 0, None)  # without a pid: it had failed by itself, as bad as that
-        return True
+    def release(self) -> None:
+        """Reset the emergency stop, as an operator does, when nothing else keeps the robot."""
+        latched = f"({EMERGENCY_STOP})" in self._decided and " for " not in self._decided
+        if latched and not self.over():
+            self.resets += self._run.tool("reset", EMERGENCY_STOP).returncode == 0
 
-    def _is_back(self, hit: Hit, old: int) -> bool:
-        new = self._run.pid(hit.name)
-        if hit.name in self._world:
-            return new == old and process_state(old) in "SR"
+    def _note(self, struck: Struck) -> Struck:
+        self.struck.append(struck)
+        self._report(struck)
+        return struck
+
+    def _send(self, strike: Strike, pids: dict[str, int]) -> None:
+        """Send each signal when it is due, those included that let the paused go on."""
+        due: list[tuple[float, str, int]] = []
+        for i, hit in enumerate(strike.hits):
+            at_s = i * strike.gap_s
+            due.append((at_s, hit.name, SIGNALS["STOP" if hit.way == PAUSE else hit.way]))
+            if hit.way == PAUSE:
+                pause_s = hit.pause_s / (1.0 if hit.name == ROOT_PROCESS else self._rate)
+                due.append((at_s + pause_s, hit.name, signal.SIGCONT))
+        begun_s = time.monotonic()
+        for at_s, name, number in sorted(due):
+            time.sleep(max(0.0, begun_s + at_s - time.monotonic()))
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pids[name], number)
+
+    def _pids(self) -> dict[str, int]:
+        pids = {ROOT_PROCESS: self._run.process.pid}
+        for process in sorted(find_processes(self._run.port), key=lambda p: p.incarnation):
+            pids |= dict.fromkeys(process.names, process.pid)
+        return pids
+
+    def _is_replaced(self, hit: Hit, old: int) -> bool:
+        new = self._pids().get(hit.name)
+        if hit.way == PAUSE:
+            return new == old and process_state(old) in "SRD"
         return new not in {None, old} and process_state(old) in "XZ"
 
-    def _note(self, hit: Hit, pid: int, back_s: float | None) -> None:
-        at_s = time.monotonic() - self._begun_s - (back_s or 0.0)
-        self.struck.append(Struck(at_s, hit, pid, back_s))
-        self._told(self.struck[-1])
+    def _others(self, strike: Strike, before: dict[str, int]) -> tuple[str, ...]:
+        after = self._pids()
+        return tuple(sorted(name for name, pid in before.items()
+                            if name not in strike.names and after.get(name) != pid))
+
+    async def _missing(self) -> str:
+        """Return what is not as it has to be, "" if all nodes run and sent a heartbeat just now."""
+        tables: list[NodeTable] = []
+        since_s = self._clock.now()
+        missing = "no table from the supervisor"
+        try:
+            async with connect(self._run.port) as session:
+                session.listen(topics.NODES, topics.NODES.at(),
+                               lambda _key, _header, table: tables.append(table))
+                deadline = time.monotonic() + session.real_s(_LISTEN_S)
+                while missing and time.monotonic() < deadline and not self.over():
+                    await asyncio.sleep(0.02)
+                    if tables:
+                        missing = self._compared(tables[-1], since_s)
+        except UsageError as error:  # the root does not answer
+            await asyncio.sleep(0.1)
+            return str(error)
+        return missing
+
+    def _compared(self, table: NodeTable, since_s: float) -> str:
+        there = self._pids()
+        wrong = [f"{row.name} {row.state.value}" for row in table.nodes
+                 if row.state is not NodeState.RUNNING]
+        wrong += [f"{row.name} has another pid" for row in table.nodes
+                  if there.get(row.name) != row.pid]
+        wrong += [f"{row.name} sends no heartbeat" for row in table.nodes
+                  if self._beat_of(row.name, since_s) != row.pid]
+        return ", ".join(wrong)
+
+    def _beat_of(self, node: str, since_s: float) -> int | None:
+        """Return the pid in a node's posted heartbeat; None if it is older than `since_s`."""
+        posted = self._board.read(HEARTBEAT.at(node))
+        if posted is None:
+            return None
+        header, beat = decode(HEARTBEAT, posted)
+        return beat.pid if header.stamp >= since_s else None
 
 
 def complaints(run: RealRun, code: int, result: dict[str, Any], rows: str,
@@ -200,41 +369,42 @@ def complaints(run: RealRun, code: int, result: dict[str, Any], rows: str,
     """Return what is wrong with a run that has ended; empty if all is as it has to be.
 
     Args:
-        run: the run.
-        code: exit code of `launch.py`.
-        result: what it printed with --json.
-        rows: letters of the rows of lights that the mission passes.
-        struck: what was done to it.
+        run: The run.
+        code: Exit code of `launch.py`.
+        result: What it printed with --json.
+        rows: Letters of the rows of lights that the mission passes.
+        struck: What was done to it.
     """
     wrong = [f"not back: {done}" for done in struck if done.back_s is None]
     if (code, result["mission"], result["safety"]) != (0, "success", "safe"):
         wrong.append(f"exit code {code}, {result['mission']}, {result['safety']}: "
                      + "; ".join(result["reasons"]))
     wrong += [f"left over: {p}" for p in find_processes(run.port)]
-    told = run.story
-    wrong += [f"told: {line}" for line in told.splitlines()
+    wrong += [f"printed: {line}" for line in run.story.splitlines()
               if "UNSAFE" in line or "given up" in line]
-    return wrong + _lights_wrong(Path(result["report"]).parent, result, rows)
+    if result["mission"] == "success":  # else lights are missing
+        wrong += _lights_wrong(Path(result["report"]).parent, result, rows)
+    return wrong
 
 
 def _lights_wrong(report: Path, result: dict[str, Any], rows: str) -> list[str]:
-    """Compare the three who know of lights: the result, and both nodes' checkpoints.
+    """Compare the three records of lights: the result, and both nodes' checkpoints.
 
-    A light that was measured twice has two intensities, and one of the three the other one.
+    A light that was measured twice has two intensities, and one of the three has the other one.
     """
     expected = sorted(x["name"] for x in result["lights"] if x["row"] in rows)
     run_id = Path(result["report"]).stem.removeprefix("inspection-")
     state = _newest(report / "checkpoints", "mission_manager", run_id, MISSION_STATE)
     kept = _newest(report / "checkpoints", "osmosis_control", run_id, CONTROL_STATE)
-    told = {x["name"]: x["intensity_cd"] for x in result["lights"]
-            if x["verdict"] != "not measured"}
+    reported = {x["name"]: x["intensity_cd"] for x in result["lights"]
+                if x["verdict"] != "not measured"}
     wrong = []
-    for who, lights in (("mission_manager", state.lights),
-                        ("osmosis_control", kept.lights.measured)):
+    for node, lights in (("mission_manager", state.lights),
+                         ("osmosis_control", kept.lights.measured)):
         if sorted(x.light for x in lights) != expected:
-            wrong.append(f"lights of {who}: {sorted(x.light for x in lights)}, not {expected}")
-        if {x.light: x.intensity_cd for x in lights} != told:
-            wrong.append(f"lights of {who} have other values than the result's")
+            wrong.append(f"lights of {node}: {sorted(x.light for x in lights)}, not {expected}")
+        if {x.light: x.intensity_cd for x in lights} != reported:
+            wrong.append(f"lights of {node} have other values than the result's")
     return wrong
 
 

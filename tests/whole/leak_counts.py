@@ -18,8 +18,8 @@ import psutil
 
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
+from tests.whole.chaos import ROOT_PROCESS
 
-LAUNCHER = "launch.py"
 MAX_GROWTH_MB = 15.0
 
 
@@ -47,9 +47,9 @@ class Counts:
 
 
 def count(run: RealRun, survivors: tuple[str, ...]) -> Counts:
-    """Count what a run holds now; `survivors` are looked at one by one, and the launcher."""
+    """Count what a run holds now; `survivors` are looked at one by one, and the root."""
     running = find_processes(run.port)
-    pids = {LAUNCHER: run.process.pid}
+    pids = {ROOT_PROCESS: run.process.pid}
     pids |= {name: p.pid for name in survivors for p in running if name in p.names}
     one_by_one = {name: psutil.Process(pid) for name, pid in pids.items()}
     family = {run.process.pid, *(p.pid for p in running)}
@@ -77,7 +77,7 @@ def leaks(before: Counts, after: Counts) -> list[str]:
     found = [
         f"{name}: descriptors {old} -> {after.descriptors[name]}"
         for name, old in before.descriptors.items()
-        if after.descriptors[name] > old + before.processes * (name != LAUNCHER)]
+        if after.descriptors[name] > old + before.processes * (name != ROOT_PROCESS)]
     found += [
         f"{name}: memory {mb:.1f} -> {after.memory_mb[name]:.1f} MB"
         for name, mb in before.memory_mb.items() if after.memory_mb[name] > mb + MAX_GROWTH_MB]

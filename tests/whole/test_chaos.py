@@ -1,4 +1,4 @@
-"""The short chaos test: what every change has to survive. `make chaos` runs the long one."""
+"""Short chaos: what every change has to survive. `make chaos` and `make chaos-pairs` are longer."""
 
 from __future__ import annotations
 
@@ -7,13 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from rampart.manager.spec.specification import check_document, read_document
 from rampart.testing import RealRun
-from tests import ROOT
-from tests.whole.chaos import WAYS, Chaos, Targets, complaints, each_in_every_way, targets
+from tests.whole.chaos import (
+    PAUSE,
+    ROOT_PROCESS,
+    WAYS,
+    Chaos,
+    Targets,
+    complaints,
+    each_in_every_way,
+    every_pair,
+    targets,
+)
+from tests.whole.chaos_runs import Log, load, pairs_in_a_mission, start
 from tests.whole.leak_counts import Counts, leaks
 
-SHIPPED = ROOT / "systems" / "osmosis.toml"
 PAUSE_S = (0.3, 1.0)
 ALL_FOUR = ("mission_manager", "router_a", "safety_pilot", "ftm_manager", "supervisor")
 
@@ -25,31 +33,40 @@ def write_row(directory: Path) -> Path:
     return file
 
 
-def test_everybody_is_hit_in_every_way_and_the_world_is_only_stopped():
-    everybody = targets(check_document(
-        read_document(SHIPPED.read_text(encoding="utf-8"), SHIPPED.name), SHIPPED.name))
-    hits = each_in_every_way(everybody, 1, PAUSE_S)
+def test_every_process_is_hit_in_every_way_and_world_and_root_are_only_paused():
+    of = targets(load())
+    hits = [hit for strike in each_in_every_way(of, 1, PAUSE_S) for hit in strike.hits]
     assert {"hmi", "safety_pilot", "ftm_manager", "supervisor", "router_a", "router_b", "pool",
-            "DM13", "RM8", "standby_control"} <= set(everybody.mortal)
+            "DM13", "RM8", "standby_control"} <= set(of.mortal)
     assert sorted((h.name, h.way) for h in hits) == sorted(
-        [*[("simulator", "STOP")] * 4, *((name, way) for name in everybody.mortal for way in WAYS)])
+        [*[("simulator", PAUSE), (ROOT_PROCESS, PAUSE)] * len(WAYS),
+         *((name, way) for name in of.mortal for way in WAYS)])
 
 
-COUNTS = Counts({"supervisor": 60, "launch.py": 10}, {"supervisor": 90.0, "launch.py": 50.0},
+def test_every_two_processes_are_a_pair_and_those_of_the_supervisor_in_all_combinations_of_ways():
+    of = targets(load())
+    pairs = every_pair(of, 1)
+    count = len({*of.mortal, *of.paused} - {"pool"})
+    assert len({frozenset(pair.names) for pair in pairs}) == count * (count - 1) // 2
+    assert sum(set(pair.names) == {"supervisor", "DM4"} for pair in pairs) == 9
+    assert sum(set(pair.names) == {"DM4", "DM5"} for pair in pairs) == 1
+
+
+COUNTS = Counts({"supervisor": 60, ROOT_PROCESS: 10}, {"supervisor": 90.0, ROOT_PROCESS: 50.0},
                 34, 0, 99, frozenset({"a"}))
 
 
 def test_the_same_or_less_is_no_leak_nor_are_spare_connections_and_a_little_memory():
     assert leaks(COUNTS, COUNTS) == []
     assert leaks(COUNTS, replace(
-        COUNTS, processes=33, descriptors={"supervisor": 94, "launch.py": 9},
-        memory_mb={"supervisor": 100.0, "launch.py": 50.0})) == []
+        COUNTS, processes=33, descriptors={"supervisor": 94, ROOT_PROCESS: 9},
+        memory_mb={"supervisor": 100.0, ROOT_PROCESS: 50.0})) == []
 
 
 @pytest.mark.parametrize("after", [
-    {"descriptors": {"supervisor": 95, "launch.py": 10}},
-    {"descriptors": {"supervisor": 60, "launch.py": 11}},
-    {"memory_mb": {"supervisor": 110.0, "launch.py": 50.0}},
+    {"descriptors": {"supervisor": 95, ROOT_PROCESS: 10}},
+    {"descriptors": {"supervisor": 60, ROOT_PROCESS: 11}},
+    {"memory_mb": {"supervisor": 110.0, ROOT_PROCESS: 50.0}},
     {"processes": 35}, {"zombies": 1}, {"files": 100},
     {"shared_memory": frozenset("ab")}], ids=" ".join)
 def test_whatever_becomes_more_is_one_leak(after):
@@ -61,13 +78,30 @@ def test_whatever_becomes_more_is_one_leak(after):
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("rounds", [1, pytest.param(len(WAYS), marks=pytest.mark.slow)])
 def test_a_mission_survives_whatever_is_done_to_its_processes(tmp_path, rounds):
-    hits = each_in_every_way(Targets(ALL_FOUR, ("simulator",)), 5, PAUSE_S)
-    hits = hits[:len(hits) * rounds // len(WAYS)]
+    strikes = each_in_every_way(Targets(ALL_FOUR, ("simulator", ROOT_PROCESS)), 5, PAUSE_S)
+    strikes = strikes[:len(strikes) * rounds // len(WAYS)]
     with RealRun(tmp_path, "osmosis", "--mission", str(write_row(tmp_path)), "--rate", "2") as run:
         run.wait_for("goal 1/2")
-        chaos = Chaos(run, world=("simulator",))
-        left = chaos.carry_out(hits)
+        chaos = Chaos(run)
+        left = chaos.carry_out(strikes)
         code, result = run.result()
     done = "\n".join(map(str, chaos.struck))
     assert complaints(run, code, result, "A", chaos.struck) == [], f"{done}\n{run.story}"
-    assert left == [], "the mission was over before everybody was hit"
+    assert left == [], "the mission was over before every process was hit"
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+@pytest.mark.alone
+@pytest.mark.timeout(300)
+def test_a_mission_survives_a_dozen_pairs(tmp_path, capsys):
+    among = {"supervisor", "router_a", ROOT_PROCESS, "ftm_manager", "osmosis_control",
+             "safety_pilot", "mission_manager", "DM4", "RM3", "simulator"}
+    plan = [pair for pair in every_pair(targets(load()), 1) if set(pair.names) <= among][:12]
+    todo = dict(enumerate(plan))
+    log = Log(tmp_path / "pairs.jsonl", 1)
+    pairs_in_a_mission(start(tmp_path / "run", write_row(tmp_path), 1.0), todo, log, "A")
+    printed = capsys.readouterr().out
+    assert [p["missing"] for p in log.of("pair")] == [""] * len(log.of("pair")), printed
+    assert log.of("mission")[0]["wrong"] == [], printed
+    assert len(todo) <= 6, printed
