@@ -1,8 +1,8 @@
-"""A tool's way into a run: it joins a router, announces nothing, and leaves no trace.
+"""A tool's session with a run: a client of a router, of which nodes do not notice anything.
 
-Whoever listens only to commands cannot tell whether one arrived: so a command is sent with a
-check of its effect, and repeated under the same number until the effect shows. Receivers drop the
-copies (see `ArrivalGuard`), a node that had just been restarted gets one of them.
+A publisher is not notified whether a command arrived. So a command is sent with a check of its
+effect, and repeated under the same sequence number until the effect shows. Receivers drop the
+copies (see `ArrivalGuard`); a node that has just been restarted receives one of them.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ RESEND_S = 0.1
 """Real seconds between copies of a command whose effect does not show."""
 
 _TRIES = 15
-"""A router may be starting meanwhile."""
+"""Queries while a router may be starting."""
 
 OVERHEAD_S = 0.5
-"""Real seconds granted for what does not run in simulated time: sockets, scheduling."""
+"""Real seconds for what does not scale with simulated time: sockets, scheduling."""
 
 
 async def pause(done: asyncio.Event, real_s: float) -> None:
@@ -58,7 +58,7 @@ class Session:
         run: the run.
         bus: access to its bus, opened by `connect`.
         clock: the run's simulated time.
-        may_order: False with the certificate of a viewer, whose commands no router lets through.
+        may_order: False with the certificate of a viewer, whose commands every router drops.
     """
 
     def __init__(self, run: RunInfo, bus: Bus, clock: Clock, *, may_order: bool = True) -> None:
@@ -70,18 +70,18 @@ class Session:
         self._may_order = may_order
 
     def real_s(self, simulated_s: float) -> float:
-        """Return how many real seconds to wait for something due in simulated seconds."""
+        """Return the real seconds to wait for an event that is due in simulated seconds."""
         return simulated_s / self.clock.rate + OVERHEAD_S
 
     def listen(self, topic: Topic[Any], key: str, heard: Callable[[str, Header, Any], None],
                garbage: Callable[[str, bytes, str], None] | None = None) -> None:
-        """Have `heard` called with key (below the root), header and body of each message.
+        """Subscribe to a key.
 
         Args:
-            topic: the topic that the key belongs to.
+            topic: the topic of the key.
             key: full key expression.
-            heard: called on the event loop.
-            garbage: called with key, payload and reason for what does not decode.
+            heard: called on the event loop with key (below the root), header and body.
+            garbage: called with key, payload and reason if a payload does not decode.
         """
 
         def deliver(full_key: str, payload: bytes) -> None:
@@ -97,49 +97,47 @@ class Session:
         self._bus.subscribe(topic, key, deliver)
 
     def overhear(self, topic: Topic[Any], arrived: Callable[[str, bytes], None]) -> None:
-        """Have `arrived` called with key (below the root) and payload, undecoded, of each message.
+        """Subscribe to a topic without decoding, which takes most of the time of a message.
 
-        For whoever counts messages: decoding costs most of hearing one.
+        Args:
+            topic: the topic.
+            arrived: called with key (below the root) and payload.
         """
         start = len(f"{ROOT}/")
         self._bus.subscribe(topic, topic.pattern, lambda key, load: arrived(key[start:], load))
 
     async def latest(self, topics: tuple[Topic[Any], ...], timeout_s: float) -> dict[str, Any]:
-        """Return topic key → newest body, as soon as all were heard, or after real seconds."""
+        """Return topic key → newest body, when all have arrived or after some real seconds."""
         heard = {topic.key: Latest[Any]() for topic in topics}
         for topic in topics:
             self.listen(topic, topic.pattern, heard[topic.key].keep)
-        await asyncio.gather(*(one.first(timeout_s) for one in heard.values()))
-        return {key: one.value for key, one in heard.items() if one.value is not None}
+        await asyncio.gather(*(latest.first(timeout_s) for latest in heard.values()))
+        return {key: latest.value for key, latest in heard.items() if latest.value is not None}
 
     def publish(self, topic: Topic[Any], body: msgspec.Struct) -> None:
-        """Send a message once, stamped now; for what is repeated anyway.
+        """Send a message once, stamped now; for messages that the caller repeats.
 
         Raises:
-            UsageError: this tool may only look.
+            UsageError: as of `check_may_order`.
         """
-        self._check_may_order()
+        self.check_may_order()
         self._sequence += 1
         self._bus.publish(topic, topic.at(), self._payload(self._sequence, body))
 
     async def command(self, topic: Topic[Any], body: msgspec.Struct,
                       effect: Callable[[], bool], timeout_s: float) -> bool:
-        """Send a command until `effect` holds; return False if it did not within real seconds.
+        """Repeat a command until `effect` holds; return False if it does not within real seconds.
 
         Raises:
-            UsageError: the run is a replay, where nobody obeys, this tool may only look, or the
-                message has a value that every reader would refuse.
+            UsageError: as of `check_may_order`, or a value of the message is out of bounds.
         """
-        if self.run.replay_of:
-            raise UsageError(f"port {self.run.base_port} is a replay of {self.run.replay_of}: "
-                             "nobody is there to obey")
-        self._check_may_order()
+        self.check_may_order()
         self._sequence += 1
         sequence = self._sequence
         try:
             decode(topic, self._payload(sequence, body))
         except UNREADABLE as error:
-            raise UsageError(f"not a {topic.type.__name__} that can be sent: {error}") from None
+            raise UsageError(f"cannot send this {topic.type.__name__}: {error}") from None
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout_s
         resend = loop.time()
@@ -153,10 +151,18 @@ class Session:
             await asyncio.sleep(0.01)
         return True
 
-    def _check_may_order(self) -> None:
+    def check_may_order(self) -> None:
+        """Refuse to change a run that this tool cannot change.
+
+        Raises:
+            UsageError: the run is a replay, or the certificate is a viewer's.
+        """
+        if self.run.replay_of:
+            raise UsageError(f"port {self.run.base_port} is a replay of {self.run.replay_of}: "
+                             "no node can obey")
         if not self._may_order:
-            raise UsageError("a viewer's certificate is for looking; what changes a run takes an "
-                             "operator's (`rampart keys issue --operator NAME`)")
+            raise UsageError("a viewer's certificate cannot change a run; expected an operator's "
+                             "(`rampart keys issue --operator NAME`)")
 
     def _payload(self, sequence: int, body: msgspec.Struct) -> bytes:
         return encode(Header(self.name, 1, sequence, self.clock.now()), body)
@@ -181,14 +187,14 @@ class Latest(Generic[T]):
 
 
 def tools_credentials(run: RunInfo) -> tuple[Credentials | None, str]:
-    """Return what a tool shows to join a run, and of which kind it is; None where nothing is asked.
+    """Return the credentials with which a tool joins a run, None without keys, and their kind.
 
-    That is the file that `RAMPART_KEY` names, or of the run's folder of keys the first operator's,
-    else the first viewer's, by name.
+    The file is that of `RAMPART_KEY`. Without this variable it is the first operator's of the run's
+    folder of keys, by name, else the first viewer's.
 
     Raises:
-        KeysError: there is no such file.
-        UsageError: there is none of either.
+        KeysError: the register cannot be read.
+        UsageError: there is no such file, or no operator and no viewer.
     """
     if not run.keys:
         return None, OPERATOR
@@ -199,18 +205,19 @@ def tools_credentials(run: RunInfo) -> tuple[Credentials | None, str]:
     people = {name: kind for kind in (OPERATOR, VIEWER) for name in sorted(register.of_kind(kind))}
     if chosen:
         if not os.access(chosen, os.R_OK):
-            raise UsageError(f"{KEY_VARIABLE}={chosen}: no file that can be read")
+            raise UsageError(f"{KEY_VARIABLE}={chosen}: cannot be read; expected the file of an "
+                             "operator or a viewer")
         return replace(doors, own=chosen), people.get(Path(chosen).stem, "")
     for name, kind in people.items():
         own = key_file(run.keys, name)
         if os.access(own, os.R_OK):
             return replace(doors, own=own), kind
-    raise UsageError(f"{run.keys}: no operator's and no viewer's certificate; `rampart keys issue "
-                     f"--viewer NAME` issues one, or {KEY_VARIABLE} names the file of one")
+    raise UsageError(f"{run.keys}: no certificate of an operator or a viewer; `rampart keys issue "
+                     f"--viewer NAME` issues one, or set {KEY_VARIABLE} to its file")
 
 
 async def _is_answered(bus: Bus) -> bool:
-    """Whether any node of the run answers: by its certificate a tool may hear all of them."""
+    """Whether any node answers; a tool's certificate admits messages of all nodes."""
     replies: list[str] = []
     for _ in range(_TRIES):
         done = asyncio.Event()
@@ -231,18 +238,17 @@ def _why_unanswered(run: RunInfo, shown: Credentials) -> str:
     name = Path(shown.own).stem
     known = read_register(Path(run.keys)).identities.get(name)
     why = ("its certificate is revoked" if known and known.revoked else
-           "it is no operator's and no viewer's" if known and known.kind not in {OPERATOR, VIEWER}
-           else "it was issued after the routers started, is revoked, or another one replaces it")
-    return (f"{shown.own}: the routers of the run let {name} hear nothing: {why}; they take the "
+           "expected an operator or a viewer" if known and known.kind not in {OPERATOR, VIEWER}
+           else "it was issued after the routers started, is revoked, or has been replaced")
+    return (f"{shown.own}: the routers of the run send {name} no messages: {why}; they read the "
             "register when they start: kill-node router_a; kill-node router_b")
 
 
 def days_left(run: RunInfo) -> dict[str, tuple[float, str]]:
-    """Return for each process of a run with keys how long its certificate is valid.
+    """Return process → days until its certificate expires, and the time of expiry.
 
-    Returns:
-        Name → days, and until when, UTC as ISO 8601 has it. Empty without keys, or where the
-        folder of keys or `cryptography` is missing.
+    The time is UTC in ISO 8601. The result is empty without keys, and if the folder of keys or
+    `cryptography` is missing.
     """
     if not run.keys:
         return {}
@@ -261,17 +267,17 @@ def first_to_expire(run: RunInfo) -> dict[str, Any]:
     found = days_left(run)
     if not found:
         return {}
-    name = min(found, key=lambda one: found[one])
+    name = min(found, key=lambda name: found[name])
     return {"name": name, "days_left": found[name][0], "not_after": found[name][1]}
 
 
 @contextlib.asynccontextmanager
 async def connect(port: int | None = None) -> AsyncIterator[Session]:
-    """Join the run on this machine (on base port `port` if there are several).
+    """Join the run of this machine, or that on a base port.
 
     Raises:
-        UsageError: there is no run, or it must be chosen.
-        NoEffectError: its routers let nothing through to the certificate that is shown.
+        UsageError: there is no run, or there are several and no port is given.
+        NoEffectError: its routers send nothing to the holder of this certificate.
     """
     with refusing(NoRunError, BusError, KeysError):
         run = find_run(port)

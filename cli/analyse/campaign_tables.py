@@ -1,4 +1,4 @@
-"""What came of a campaign, on the terminal and as JSON."""
+"""The results of a campaign, on the terminal and as JSON."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _SHOWN = 60
 
 def show_runs(spec: SystemSpec, runs: Sequence[Run], made: int, named: NamedCampaign | None, *,
               as_json: bool) -> None:
-    """Print what came of the runs.
+    """Print the results.
 
     Args:
-        spec: of the system.
-        runs: all of them.
-        made: how many were made now.
-        named: what campaign they are, if it has a name.
+        spec: the system.
+        runs: all runs of the campaign.
+        made: number of runs made now.
+        named: the named campaign, if it is one.
         as_json: print rows for scripts.
     """
     rows = table(runs)
@@ -50,7 +50,7 @@ def show_runs(spec: SystemSpec, runs: Sequence[Run], made: int, named: NamedCamp
 
 
 def show_faults(groups: Mapping[str, Sequence[str]], *, as_json: bool) -> int:
-    """Print the faults that there are, by kind; return the exit code."""
+    """Print the faults by kind; return the exit code."""
     if as_json:
         print_json(groups, names=True)
         return 0

@@ -1,4 +1,4 @@
-"""`rampart campaign`: thousands of runs in virtual time with faults, and what came of them."""
+"""`rampart campaign`: thousands of runs in virtual time with faults, and a report."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ def parser(program: str, system: str, campaigns: Sequence[type[NamedCampaign]]
     """Return the parser of the verb.
 
     Args:
-        program: as it is typed.
-        system: whose options it takes.
-        campaigns: that have names, and options of their own.
+        program: name of the command.
+        system: the system whose options the verb takes.
+        campaigns: named campaigns, which add options.
 
     Raises:
         UsageError: there is no such system.
@@ -87,16 +87,16 @@ def parser(program: str, system: str, campaigns: Sequence[type[NamedCampaign]]
 
 
 def named_campaigns() -> list[type[NamedCampaign]]:
-    """Return the campaigns that packages bring by entry points."""
+    """Return the campaigns of the entry points `rampart.campaigns`."""
     return [found.load() for found in sorted(
         entry_points(group="rampart.campaigns"), key=lambda campaign: campaign.name)]
 
 
 def parse(arguments: Sequence[str], program: str = "rampart campaign") -> argparse.Namespace:
-    """Return the options, with the campaign that has a name if one was chosen as `named`.
+    """Return the options, with the chosen named campaign, if any, in the list `named`.
 
     Raises:
-        UsageError: there is no such system, or the options make no sense together.
+        UsageError: there is no such system, or the options contradict each other.
     """
     campaigns = named_campaigns()
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -104,17 +104,17 @@ def parse(arguments: Sequence[str], program: str = "rampart campaign") -> argpar
     for each in campaigns:
         each.add(what)
     first.add_argument("--system")
-    said = first.parse_known_args(arguments)[0]
-    named = [chosen for each in campaigns if (chosen := each.chosen(said))]
+    known = first.parse_known_args(arguments)[0]
+    named = [chosen for each in campaigns if (chosen := each.chosen(known))]
     default = named[0].system if named else systems.DEFAULT.stem
-    options = parser(program, said.system or default, campaigns).parse_args(arguments)
+    options = parser(program, known.system or default, campaigns).parse_args(arguments)
     options.system = options.system or default
     options.named, options.run, options.flags = named, run, [each.flag for each in campaigns]
     return options
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the campaign, or what else was asked for.
+    """Do what the options ask for.
 
     Run missions in virtual time with injected faults, on all cores, and report how
     often the robot succeeded and whether it was safe. Results and report are in

@@ -1,4 +1,4 @@
-"""The work behind `rampart campaign`: choose the runs, make them, show what came of them."""
+"""The work of `rampart campaign`: choose runs, make them, report the results."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import math
 import os
 import shlex
 import sys
-import time
 from collections.abc import Iterable, Sequence
 from itertools import combinations, product
 from pathlib import Path
@@ -31,6 +30,7 @@ from rampart.cli.output import (
     unknown,
     warn,
 )
+from rampart.cli.verbs import extra
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
@@ -56,9 +56,14 @@ from rampart.sim.runs.report import in_words
 from rampart.sim.runs.trial import trial_class
 from rampart.sim.virtual.network import find_network
 
+_LOG_S = 60.0
+"""Real seconds between two lines of progress if stderr is not a terminal."""
+
+_SHRUNK_AT_MOST = 3
+
 
 def campaign(options: argparse.Namespace) -> int:
-    """Run the campaign, or what else was asked for."""
+    """Do what the options ask for, and return the exit code."""
     spec = systems.load(options.system)
     if options.list:
         return show_faults(all_groups(spec), as_json=options.json)
@@ -80,14 +85,14 @@ def campaign(options: argparse.Namespace) -> int:
         results = {run.job.key: run.result for run in store.runs({job.key for job in jobs})}
         store.close()
     except (StoreError, JobError) as error:
-        raise UsageError(f"{error}; what was finished is in {directory}, and the same command "
-                         "goes on from there") from None
-    # Those of the campaign: a stored row may have been named by an earlier one.
+        raise UsageError(f"{error}; the finished runs are in {directory}, and the same command "
+                         "continues there") from None
+    # With the jobs of this campaign: an earlier one may have stored a run under another row.
     runs = [Run(job, results[job.key]) for job in jobs if job.key in results]
     show_runs(spec, runs, made, named, as_json=options.json)
     try:
         page = _write_report(options, spec, directory, runs, named)
-    except Exception as error:  # of disk, template or chart alike: the verdict stands
+    except Exception as error:  # of disk, template or chart: the verdict stands
         warn(f"report: {directory}: {in_words(error)}")
     else:
         if not options.json:
@@ -106,7 +111,7 @@ def _check(options: argparse.Namespace) -> None:
         ("--search", options.search is not None)) if given)]
     if len(chosen) != 1:
         known = ", ".join([*options.flags, "--runs N", "--fault FAULT", "--search N"])
-        raise UsageError(f"give one of {known}; given: {', '.join(chosen) or 'none'}")
+        raise UsageError(f"expected one of {known}; given: {', '.join(chosen) or 'none'}")
     for name, value, least in (("--runs", options.runs, 1), ("--together", options.together, 1),
                                ("--seeds", options.seeds, 1), ("--search", options.search, 1),
                                ("--jobs", options.jobs, 0)):
@@ -121,7 +126,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _base_jobs(options: argparse.Namespace, spec: SystemSpec) -> list[Job]:
-    """Return what the runs have in common, crossed.
+    """Return a job for each combination of conditions.
 
     Raises:
         UsageError: the application cannot be loaded with the options.
@@ -138,7 +143,7 @@ def _base_jobs(options: argparse.Namespace, spec: SystemSpec) -> list[Job]:
 
 
 def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Job]]:
-    """Return a name for what is run, and the runs."""
+    """Return a name for the campaign, and its jobs."""
     jobs = _base_jobs(options, spec)
     if options.named:
         named: NamedCampaign = options.named[0]
@@ -160,7 +165,7 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
 
 
 def _on_different_topics(faults: Sequence[PlannedFault], spec: SystemSpec) -> bool:
-    """Tell whether no two faults disturb the same topic, or hit the same process."""
+    """Whether no two faults disturb the same topic or the same process."""
     hit: list[str] = []
     of_robot, known = faults_of(spec), systems.topics_of(spec)
     for fault in faults:
@@ -172,7 +177,7 @@ def _on_different_topics(faults: Sequence[PlannedFault], spec: SystemSpec) -> bo
 
 
 def _moments(spec: SystemSpec, job: Job, *, searched: bool = False) -> tuple[float, float]:
-    """Return between which moments faults are drawn: within a run that has none."""
+    """Return the interval from which moments of faults are drawn: within a run without faults."""
     if found := trial_class(spec).moments(spec, searched=searched):
         return found
     with refusing(ValueError):
@@ -181,7 +186,7 @@ def _moments(spec: SystemSpec, job: Job, *, searched: bool = False) -> tuple[flo
 
 
 def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[str, ...]]:
-    """Return the faults to draw from: of the kinds asked for, or all."""
+    """Return the faults to draw from: all, or those of --kinds."""
     groups = all_groups(spec)
     if not options.kinds:
         return groups
@@ -193,7 +198,7 @@ def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[st
 
 
 all_groups = refusing(ValueError)(fault_groups)
-"""The names of all faults of a system, by kind; users are told what it lacks."""
+"""Returns the names of all faults of a system, by kind."""
 
 
 def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str, ...]]
@@ -223,12 +228,9 @@ def _execute(options: argparse.Namespace, jobs: Sequence[Job], store: Store) -> 
     unique = {job.key for job in jobs}
     done = len(unique & store.keys())
     unsafe = 0
-    # On a terminal a bar; in a log a line now and then.
-    watched = sys.stderr.isatty()
     tqdm.monitor_interval = 0  # its thread would keep a single worker, this process, from forking
     with tqdm(total=len(unique), initial=done, unit="run", file=sys.stderr, smoothing=0.05,
-              disable=not watched) as bar:
-        log = ProgressLog(len(unique), done)
+              mininterval=0.1 if sys.stderr.isatty() else _LOG_S) as bar:
 
         def progress(job: Job, result: RunResult) -> None:
             nonlocal unsafe
@@ -237,50 +239,14 @@ def _execute(options: argparse.Namespace, jobs: Sequence[Job], store: Store) -> 
                 bar.write(f"unsafe: {job.key} {job.text()}", file=sys.stderr)
             bar.set_postfix(unsafe=unsafe, refresh=False)
             bar.update()
-            if not watched:
-                line = log.made_one(time.monotonic(), unsafe)
-                if line:
-                    print(line, file=sys.stderr, flush=True)
 
         return execute(jobs, store, workers=options.jobs, backend=options.backend,
                        address=options.address, progress=progress)
 
 
-class ProgressLog:
-    """What to write into a log while runs are made: a line a minute, and one for the last run.
-
-    Args:
-        total: Runs of the campaign.
-        done: Those that were made before.
-    """
-
-    PERIOD_S = 60.0
-
-    def __init__(self, total: int, done: int) -> None:
-        self._total, self._done, self._before = total, done, done
-        self._begun_s: float | None = None
-        self._told_s = 0.0
-
-    def made_one(self, now_s: float, unsafe: int) -> str:
-        """Note a run, and return the line to write, mostly none."""
-        self._done += 1
-        if self._begun_s is None:  # the first run took the start of the workers on top
-            self._begun_s = self._told_s = now_s
-            self._before = self._done
-        left = self._total - self._done
-        more = ""
-        if left:
-            if now_s - self._told_s < self.PERIOD_S:
-                return ""
-            minutes = (now_s - self._begun_s) / (self._done - self._before) * left / 60
-            more = f", {minutes:.0f} min left"
-        self._told_s = now_s
-        return f"{self._done} of {self._total} runs, {unsafe} unsafe{more}"
-
-
 def _replay(options: argparse.Namespace) -> int:
     if not options.out:
-        raise UsageError("--replay RUN: --out DIR is missing: the campaign that the run is of")
+        raise UsageError("--replay RUN: expected --out DIR, the directory of the campaign")
     directory = Path(options.out)
     if not directory.is_dir():
         raise UsageError(f"--out {options.out}: no such directory")
@@ -289,8 +255,8 @@ def _replay(options: argparse.Namespace) -> int:
         found = store.find(options.replay)
         store.close()
     if found is None:
-        raise UsageError(f"--replay {options.replay}: no run, or several, of this key in "
-                         f"{directory}")
+        raise UsageError(f"--replay {options.replay}: expected the key of one run in {directory}; "
+                         "none or several match")
     try:
         run = virtual_run(found.job)
         again = run.run()
@@ -305,21 +271,15 @@ def _replay(options: argparse.Namespace) -> int:
         print_json({"run": found.job.key, "job": found.job, "same_trace": same,
                     "content_changed": changed, "report": str(html), "record": str(data)})
     else:
+        verdict = "the same run, to the byte" if same else "NOT the same run: " + (
+            "system, files or code have changed" if changed else "the program has changed")
         say_text(f"{found.job.key}: {found.job.text()}\n"
-            f"{again.record.mission}, {again.record.safety}; "
-            f"{'; '.join(again.record.reasons) or 'as it should be'}\n"
-            f"{_told(same=same, changed=changed)}\n"
-            f"Report: {html}")
+                 f"{again.record.mission}, {again.record.safety}; "
+                 f"{'; '.join(again.record.reasons) or 'no problem'}\n"
+                 f"{verdict}\nReport: {html}")
     if not same:
-        raise NoEffectError(f"run {found.job.key}: the trace is not the one in the store")
+        raise NoEffectError(f"run {found.job.key}: the trace differs from that in the store")
     return 0
-
-
-def _told(*, same: bool, changed: bool) -> str:
-    if same:
-        return "the same run, to the byte"
-    return "NOT the same run: " + ("system, files or code are not those of then" if changed else
-                                   "the program changed")
 
 
 def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path,
@@ -333,16 +293,14 @@ def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path
     return write_campaign_report(directory, about, runs, worst)
 
 
-_SHRUNK_AT_MOST = 3
-
-
-# -- the optimiser's hunt for the smallest safety margin ----------------------------------------
+# -- the optimiser's search for the smallest safety margin --------------------------------------
 
 
 def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
-    """Search among the faults of a system, shrink what was found, and keep it."""
+    """Search among the faults of a system, and shrink and keep the counterexamples."""
     if not trial_class(spec).margins:
         raise UsageError(f"--search: {spec.name} has no judge that measures margins")
+    extra("search", "optuna")
     with refusing(ValueError):
         bases = with_content(_base_jobs(options, spec))
     space = Space(tuple(bases), _groups(options, spec), faults_of(spec).intruder,
@@ -361,8 +319,8 @@ def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
                         address=options.address)
                 made = {r.job.key: r.result for r in store.runs({job.key for job in jobs})}
             except (StoreError, JobError, BackendError) as error:
-                raise UsageError(f"{error}; what was finished is in {directory}, and the same "
-                                 "command goes on from there") from None
+                raise UsageError(f"{error}; the finished runs are in {directory}, and the same "
+                                 "command continues there") from None
             return [made[job.key] for job in jobs]
 
         smallest = math.inf
@@ -374,12 +332,8 @@ def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
                 bar.write(f"{smallest:8.3f} {unit}  {job.key}  {job.text()}", file=sys.stderr)
             bar.update()
 
-        try:
-            made = search(space, options.search, run, seed=options.seed,
-                          seeds=options.seeds or 1, at_once=workers, seen=seen)
-        except ImportError:
-            raise UsageError("--search: Optuna is not installed; pip install "
-                             "'rampart-robot[search]'") from None
+        made = search(space, options.search, run, seed=options.seed,
+                      seeds=options.seeds or 1, at_once=workers, seen=seen)
     unsafe = [job for job, result in made if not result.safe]
     store.close()
     shrunk = [_shrunk(job, directory) for job in unsafe[:_SHRUNK_AT_MOST]]
@@ -398,7 +352,7 @@ def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
 
 
 def _shrunk(job: Job, directory: Path) -> tuple[Job, Path | None]:
-    """Return what is left of a job, and its file; None if that cannot be written."""
+    """Return a job without the faults that do not matter, and its file, None if not written."""
     small = shrink(job, tried=lambda tried, found: print(
         f"shrinking {'to' if found else 'not to'} {tried.text()}", file=sys.stderr))
     path = directory / "counterexamples" / f"{small.key}.toml"

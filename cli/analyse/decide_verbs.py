@@ -1,17 +1,15 @@
-"""`rampart decide`: ask the arbiter, without any running system."""
+"""`rampart decide`: the decisions of a system's strategy, without a run."""
 
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 from collections.abc import Callable, Iterable
 from itertools import combinations
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import UsageError, print_json, print_table, refusing, say, say_text
-from rampart.cli.verbs import JSON_FORMAT, add_verb, flag, option, word
+from rampart.cli.output import UsageError, print_json, print_table, refusing, say
+from rampart.cli.verbs import JSON, add_verb, flag, option, several, word
 from rampart.manager.model.order import UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.decision import Decision
@@ -21,12 +19,10 @@ from rampart.manager.strategies.registry import UnknownStrategyError, decide, de
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     of_table = (
-        option("--strategy", metavar="NAME", action="append",
-               help="strategy (default: the system's); without FTM several can be compared"),
+        several("--strategy", "NAME",
+                "strategy (default: the system's); without FTM, repeat it to compare strategies"),
         flag("--differing", "without FTM: show only sets in which the strategies choose different "
-             "recoveries"),
-        option("--format", choices=("table", "csv", "json"), default="table",
-               help="without FTM: format of the table (default: table)"), JSON_FORMAT)
+             "recoveries"), JSON)
     add_verb(verbs, "decide", "show what the manager decides", show_decision,
              option("ftm", nargs="*", metavar="FTM", help="active mechanisms, for example FTM3; "
                     "without one, the table of all sets"), *of_table,
@@ -54,9 +50,8 @@ def show_decision(options: argparse.Namespace) -> int:
     if not options.ftm:
         return show_table(options)
     spec = systems.load(options.system)
-    if len(options.strategy or ()) > 1 or options.differing or options.format == "csv":
-        raise UsageError("several --strategy, --differing and --format csv: only without FTM, for "
-                         "the table")
+    if len(options.strategy) > 1 or options.differing:
+        raise UsageError("several --strategy, --differing: only without FTM, for the table")
     strategy = (options.strategy or [spec.strategy])[0]
     arbiter, mechanisms = _arbiter(spec, strategy), spec.build_mechanisms()
     decision = arbiter(options.ftm)
@@ -64,7 +59,7 @@ def show_decision(options: argparse.Namespace) -> int:
     explained = [name for name in decision.active if name not in acting]
     if explained:
         decision = arbiter(acting)
-    if options.format == "json":
+    if options.json:
         print_json({
             **_row(decision), "path": decision.path,
             "rejected": [{"name": name, "reason": why} for name, why in decision.rejected],
@@ -85,30 +80,28 @@ def show_table(options: argparse.Namespace) -> int:
     """Print the decision for all non-empty sets.
 
     Show the decision for every non-empty set of active mechanisms; with several
-    strategies, what each of them would run, side by side.
+    strategies, the recoveries that each of them chooses, side by side.
 
     Examples:
-      rampart table
-      rampart table --json | python3 -m json.tool
-      rampart table --system my_system.toml --format csv > decisions.csv
-      rampart table --strategy safety-first --strategy guarded-repair --differing
+      rampart decide --json
+      rampart decide --strategy safety-first --strategy guarded-repair --differing
     """
     spec = systems.load(options.system)
     strategies = tuple(dict.fromkeys(options.strategy or [spec.strategy]))
     if options.differing and len(strategies) < 2:
-        raise UsageError("--differing compares; give --strategy twice or more")
+        raise UsageError("--differing: expected two or more --strategy")
     arbiters = [_arbiter(spec, strategy) for strategy in strategies]
     names = [m.name for m in spec.mechanisms]
     if len(names) > 14:
         raise UsageError(f"{spec.name}: {len(names)} mechanisms have {2 ** len(names) - 1} sets; "
-                         "a table is for up to 14, ask `rampart decide` for the sets of interest")
+                         "expected at most 14 mechanisms: name those of interest")
     rows = [[arbiter(chosen) for arbiter in arbiters]
             for size in range(1, len(names) + 1) for chosen in combinations(names, size)]
     differing = [row for row in rows if len({frozenset(d.recoveries) for d in row}) > 1]
     head: tuple[str, ...] = ("active", *strategies)
     if len(strategies) == 1:
         alone = [decision for (decision,) in rows]
-        head = ("active", "block", "rm" if options.format == "csv" else "executed")
+        head = ("active", "block", "executed")
         cells: list[tuple[Any, ...]] = [
             (" ".join(d.active), d.rule, " ".join(d.recoveries)) for d in alone]
         data = [_row(d) for d in alone]
@@ -120,12 +113,8 @@ def show_table(options: argparse.Namespace) -> int:
                  "decisions": {strategy: {"block": d.rule, "rm": d.recoveries}
                                for strategy, d in zip(strategies, row, strict=True)}}
                 for row in shown]
-    if options.format == "json":
+    if options.json:
         print_json(data, indent=False)
-    elif options.format == "csv":
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([head, *cells])
-        say_text(text.getvalue().rstrip("\n"))
     else:
         print_table(head, cells)
         if len(strategies) > 1:
@@ -134,7 +123,7 @@ def show_table(options: argparse.Namespace) -> int:
 
 
 def _arbiter(spec: SystemSpec, strategy: str) -> Callable[[Iterable[str]], Decision]:
-    """Return what decides for a set of active mechanisms."""
+    """Return the decision as a function of the set of active mechanisms."""
     mechanisms, tree, order = spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order()
 
     @refusing(UnknownElementError, UnknownStrategyError)

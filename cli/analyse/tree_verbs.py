@@ -12,9 +12,9 @@ import msgspec
 
 from rampart.cli import systems
 from rampart.cli.analyse.tree_svg import to_svg
-from rampart.cli.analyse.tree_text import to_dot, to_text
+from rampart.cli.analyse.tree_text import to_text
 from rampart.cli.output import UsageError, refusing, say, unknown, using
-from rampart.cli.verbs import JSON_FORMAT, add_verb, option, word
+from rampart.cli.verbs import add_verb, option, word
 from rampart.files.plain_text import one_line
 from rampart.manager.drawing.diagram import WHATS, Diagram, Situation, draw
 from rampart.manager.model.order import CycleError, UnknownElementError
@@ -28,8 +28,8 @@ def to_json(diagrams: Sequence[Diagram]) -> str:
 
 
 FORMATS: dict[str, Callable[[Sequence[Diagram]], str]] = {
-    "text": to_text, "svg": to_svg, "dot": to_dot, "json": to_json}
-_ENDINGS = {".svg": "svg", ".dot": "dot", ".gv": "dot", ".json": "json", ".txt": "text"}
+    "text": to_text, "svg": to_svg, "json": to_json}
+_ENDINGS = {".svg": "svg", ".json": "json", ".txt": "text"}
 
 
 def add(verbs: Any) -> None:
@@ -39,11 +39,13 @@ def add(verbs: Any) -> None:
              option("--what", choices=(*WHATS, "all"), default="all",
                     help="which diagrams (default: all)"),
              option("--format", choices=tuple(FORMATS),
-                    help="format (default: by the ending of --output, else text)"), JSON_FORMAT,
+                    help="format (default: by the ending of --output, else text)"),
+             option("--json", action="store_const", dest="format", const="json",
+                    help="same as --format json"),
              word("--output", "FILE", "write to FILE instead of standard output"),
              option("--order", metavar="NAME", action="append",
-                    help="order of recoveries; repeatable: each decides what those before "
-                         "leave open (default: the system's)"),
+                    help="order of recoveries; repeatable: each decides the pairs that the "
+                         "previous ones leave open (default: the system's)"),
              option("--active", metavar="FTM", nargs="+", default=[],
                     help="active mechanisms, which are highlighted with the decision"),
              word("--strategy", "NAME", "strategy that decides (default: the system's)"))
@@ -60,12 +62,12 @@ def show_tree(options: argparse.Namespace) -> int:
       rampart tree my_system.toml
       rampart tree --what ftm-tree --active FTM3 FTM4
       rampart tree --what fault-tree --output fault_tree.svg
-      rampart tree --what order --format dot | dot -Tpdf > order.pdf
+      rampart tree --what order --json
     """
     ending = Path(options.output).suffix.lower() if options.output else ""
     if ending and not options.format and ending not in _ENDINGS:
-        raise UsageError(f"--output {options.output}: unknown ending; one of "
-                         f"{', '.join(_ENDINGS)} is right, or say --format")
+        raise UsageError(f"--output {options.output}: unknown ending; expected "
+                         f"{', '.join(_ENDINGS)}, or --format")
     form = options.format or _ENDINGS.get(ending, "text")
     spec = systems.load(options.system)
     diagrams = _draw(spec, WHATS if options.what == "all" else (options.what,), options)
@@ -91,7 +93,7 @@ def _draw(spec: SystemSpec, whats: Sequence[str], options: argparse.Namespace
     try:
         order = spec.build_order(*criteria)
     except CycleError as error:
-        raise UsageError(f"--order {' '.join(criteria)}: together they have a {error}") from None
+        raise UsageError(f"--order {' '.join(criteria)}: together they form a {error}") from None
     situation = Situation()
     if options.active or options.strategy:
         with refusing(UnknownElementError, UnknownStrategyError):
@@ -106,7 +108,7 @@ def _print(text: str) -> None:
     try:
         text.encode(sys.stdout.encoding or "utf-8")
     except UnicodeEncodeError:
-        raise UsageError(f"stdout takes {sys.stdout.encoding} only and a tree has other "
-                         "characters; write it with --output FILE") from None
+        raise UsageError(f"stdout: encoding {sys.stdout.encoding} lacks characters of the tree; "
+                         "use --output FILE") from None
     sys.stdout.write(text)
     sys.stdout.flush()

@@ -28,12 +28,17 @@ NEEDED_MB = 600
 """Proportional memory of the largest system that ships, with room."""
 
 EXTRAS = {
-    "cryptography": ("keys", "no run with keys"),
-    "rosbags": ("ros2", "no gateway to ROS 2, no bags of ROS 2"),
+    "keys": ("cryptography", "no run with --keys"),
+    "ros2": ("rosbags", "no gateway to ROS 2, no bags of ROS 2"),
     "foxglove": ("foxglove", "no `rampart live foxglove`"),
-    "prometheus_client": ("prometheus", "no `rampart live metrics`"),
-    "optuna": ("search", "no `rampart campaign --search`")}
-"""Module → the extra that it is in, and what is missing without it."""
+    "prometheus": ("prometheus_client", "no `rampart live metrics`"),
+    "export": ("pyarrow", "no `rampart bag export --to parquet`"),
+    "video": ("imageio_ffmpeg", "no `rampart replay --video`"),
+    "search": ("optuna", "no `rampart campaign --search`"),
+    "dask": ("distributed", "no `rampart campaign --backend dask`"),
+    "ray": ("ray", "no `rampart campaign --backend ray`"),
+    "fuzz": ("atheris", "`make fuzz` is not guided by coverage")}
+"""Extra → its module, and the consequence if it is not installed."""
 
 State = Literal["ok", "without", "missing"]
 _SHOWN: dict[State, str] = {"ok": "ok", "without": "-", "missing": "NO"}
@@ -136,7 +141,7 @@ def limits() -> Iterator[Finding]:
 
 def libraries() -> Iterator[Finding]:
     """Look at the libraries of extras."""
-    for module, (extra, cost) in EXTRAS.items():
+    for extra, (module, cost) in EXTRAS.items():
         there = importlib.util.find_spec(module) is not None
         yield _finding(f"extra {extra}", module if there else "not installed", there=there,
                        cost=cost)

@@ -1,11 +1,11 @@
-"""`rampart inject`: choose a fault of the catalogue, or describe one, and have it injected."""
+"""`rampart inject`: inject a fault of the catalogue, or one that the options describe."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import uuid
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
 from typing import Any
 
 import msgspec
@@ -17,10 +17,9 @@ from rampart.actors.runtime.corruption import InjectionError, field_type, is_arr
 from rampart.actors.runtime.fault_watch import Order
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.actors.system.layout import published_keys
-from rampart.actors.system.topics import find_topic
 from rampart.cli import completion, systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
-from rampart.cli.operate.injecting import hit_process, run_fault
+from rampart.cli.operate.injecting import hit_process, refuse_details, run_fault
 from rampart.cli.operate.operator_verbs import trigger
 from rampart.cli.output import UsageError, positive, print_json, print_table, refusing, say
 from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, several, word
@@ -33,9 +32,9 @@ from rampart.sim.faults.topic_faults import NONSENSE, modes_of, systematic_fault
 _DEFAULT_DURATION_S = 5.0
 TRIGGER = "trigger:"
 _SECONDS = "must be seconds above 0"
-_OF_MESSAGES = ("mode", "share", "on", "off", "seed", "delay", "stamp", "set", "add", "ramp",
-                "noise", "keep_ends")
-"""Options that say which messages of a topic are disturbed, and how."""
+_DETAILS = {"delay": "delay", "stamp": "restamp", "set": "corrupt", "add": "corrupt",
+            "ramp": "corrupt", "noise": "corrupt", "keep_ends": "corrupt"}
+"""Option → the mode that it details."""
 
 
 def add(verbs: Any) -> None:
@@ -44,7 +43,7 @@ def add(verbs: Any) -> None:
         verbs, "inject", "inject a fault", inject, PORT,
         option("fault", nargs="?", metavar="FAULT", completer=completion.faults,
                help="a name from --list, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE or "
-               "trigger:MODULE"),
+               f"trigger:MODULE; MODE is {', '.join(MODES)}, or a nonsense reading of --list"),
         flag("--list", "list the faults of the system; needs no run"),
         word("--system", "FILE", "for --list: system file (default: that of the run, else "
              "osmosis)"),
@@ -58,53 +57,49 @@ def add(verbs: Any) -> None:
               number("--off", "S", "with --on: then absent for S"),
               option("--seed", type=int, metavar="N", help="seed of random choices: share, "
                      "noise, and values of restamp:TOPIC and corrupt:TOPIC (default: 0)")),
-        group("a fault by its parts, instead of FAULT",
-              word("--topic", "KEY", "key of the topic, for example control/command"),
-              word("--mode", "MODE", f"one of {', '.join(MODES)}"),
-              number("--delay", "S", "for delay: by simulated seconds"),
-              number("--stamp", "S", "for restamp: add simulated seconds to each stamp; above 0 is "
-                     "ahead"),
+        group("details of MODE:TOPIC",
+              number("--delay", "S", "delay: simulated seconds (default: 1.5)"),
+              number("--stamp", "S", "restamp: simulated seconds that are added to each stamp "
+                     "(default: random)"),
               several("--set", "FIELD=VALUE",
-                      "for corrupt: overwrite a field; repeatable, as all below"),
+                      "corrupt: overwrite a field; repeatable, as all below"),
               several("--add", "FIELD=BIAS",
-                      "for corrupt: add BIAS to a number, or to each number of an array"),
-              several("--ramp", "FIELD=RATE", "for corrupt: add RATE per simulated second"),
+                      "corrupt: add BIAS to a number, or to each number of an array"),
+              several("--ramp", "FIELD=RATE", "corrupt: add RATE per simulated second"),
               several("--noise", "FIELD=SIGMA",
-                      "for corrupt: add Gaussian noise of this standard deviation"),
+                      "corrupt: add Gaussian noise of this standard deviation"),
               several("--keep-ends", "FIELD",
-                      "for corrupt: keep only the first and last element of a list")))
+                      "corrupt: keep only the first and last element of a list"),
+              option("--topic", help=argparse.SUPPRESS),  # old: --mode MODE --topic TOPIC
+              option("--mode", help=argparse.SUPPRESS)))
 
 
 def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     r"""List the catalogue, or inject a fault.
 
     Inject a fault by name, or disturb any topic, for some time. The node that
-    publishes the topic carries the fault out; faults of the robot, such as a weak
-    rotor, are carried out by the world. The verb waits for the end of the fault,
-    or for the first effect of a permanent one, and prints how many messages were
-    affected. Ctrl-C ends the fault at once.
+    publishes the topic carries the fault out; the world carries out faults of the
+    robot, such as a weak rotor. The verb waits for the end of the fault, or for the
+    first effect of a permanent one, and prints how many messages were affected.
+    Ctrl-C ends the fault at once.
 
     Examples:
       rampart inject --list                           # the faults of the system
       rampart inject FAULT --duration 3
-      rampart inject FAULT --at-once
       rampart inject stuck:TOPIC --duration inf       # until the node's process ends
       rampart inject drop:TOPIC --on 1 --off 4 --duration 30
                                                       # 1 s without messages, 4 s with
-      rampart inject corrupt:TOPIC --seed 7           # odd seeds: one number; even: all
+      rampart inject corrupt:TOPIC --seed 7           # odd seed: one number; even: all
       rampart inject drop:TOPIC --share 0.3           # lose three messages in ten
       rampart inject kill:NODE                        # end a process
       rampart inject stop:NODE --duration 2           # freeze a process for 2 s
       rampart inject trigger:MODULE                   # a stand-in detection module detects
-      rampart inject --topic KEY --mode delay --delay 0.8
-      rampart inject --topic KEY --mode restamp --stamp=-0.2
-                                                      # stamps 0.2 s too early
-      rampart inject --topic KEY --mode corrupt --ramp x_m=0.25
-      rampart inject --topic KEY --mode corrupt --set angular_radps=2.5
-      rampart inject --topic KEY --mode corrupt --add ranges_f32=0.4 \
-                     --noise ranges_f32=0.2
+      rampart inject delay:TOPIC --delay 0.8
+      rampart inject restamp:TOPIC --stamp=-0.2       # stamps 0.2 s too early
+      rampart inject corrupt:TOPIC --set pose.x_m=2.5
+      rampart inject corrupt:TOPIC --add ranges_f32=0.4 --noise ranges_f32=0.2
 
-    `rampart topic info TOPIC` lists the fields; a field of a field is written pose.x_m.
+    `rampart topic info TOPIC` lists the fields.
 
     exit code: 0 it had an effect, 1 it had none, 2 bad usage
     """
@@ -112,11 +107,15 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
         _print_catalogue(systems.at_hand(options.system, options.port), as_json=options.json)
         return 0
     if options.system is not None:
-        raise UsageError(f"--system {options.system}: goes with --list; a fault is injected into "
-                         "the run that there is")
-    if (options.fault or "").partition(":")[0] in PROCESS_FAULTS:
+        raise UsageError(f"--system {options.system}: only with --list; a fault is injected into "
+                         "the run")
+    if options.topic and options.mode and options.fault is None:
+        options.fault = f"{options.mode}:{options.topic}"
+    if not options.fault:
+        raise UsageError("expected FAULT; `rampart inject --list` lists the faults")
+    if options.fault.partition(":")[0] in PROCESS_FAULTS:
         return hit_process(options)
-    if (options.fault or "").startswith(TRIGGER):
+    if options.fault.startswith(TRIGGER):
         return trigger(argparse.Namespace(
             port=options.port, module=options.fault.removeprefix(TRIGGER),
             duration=options.duration or _DEFAULT_DURATION_S))
@@ -126,101 +125,76 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
 
 
 def orders_of(options: argparse.Namespace) -> tuple[str, tuple[Order, ...]]:
-    """Return the name of the fault that the options describe, and what the nodes are told to do.
+    """Return the name of the fault, and the orders to the nodes that carry it out.
 
     Raises:
-        UsageError: something in the options is wrong.
+        UsageError: there is no such fault, or an option does not fit it.
     """
     unique = uuid.uuid4().hex[:6]
-    if options.fault is not None and options.topic is None:
-        with refusing(ValueError):  # of which those are that a robot's faults raise
-            own = faults_of(systems.at_hand(None, options.port)).own(
-                options.fault, f"{options.fault}-{unique}", options.duration)
-        if own is not None:
-            return options.fault, _of_the_robot(own, options)
+    with refusing(ValueError):  # which the faults of a robot raise
+        own = faults_of(systems.at_hand(None, options.port)).own(
+            options.fault, f"{options.fault}-{unique}", options.duration)
+    if own is not None:
+        refuse_details(options)
+        if not isinstance(own, tuple):
+            raise UsageError(f"{options.fault}: can only be injected from the start of a run: "
+                             f"--fault {options.fault}@SECONDS")
+        return options.fault, own
     fault = choose(options)
     name = fault.name.replace(" ", "-").replace("/", "-")
     return fault.name, tuple(Order(bus_topics.INJECT, order) for order in fault.orders(
         f"{name}-{unique}", options.duration))
 
 
-def _of_the_robot(own: object, options: argparse.Namespace) -> tuple[Order, ...]:
-    for name in _OF_MESSAGES:
-        if getattr(options, name) not in (None, []):
-            raise UsageError(f"--{name.replace('_', '-')} goes with a fault of a topic, not with "
-                             f"{options.fault}")
-    if not isinstance(own, tuple):
-        raise UsageError(f"{options.fault}: carried out by what stands beside a run; start one "
-                         f"with --fault {options.fault}@SECONDS")
-    return own
-
-
 def choose(options: argparse.Namespace) -> Fault:
-    """Return the fault that the options describe.
+    """Return the fault of topics that the options describe.
 
     Raises:
-        UsageError: neither or both of FAULT and --topic, or something in them is wrong.
+        UsageError: there is no such fault, or an option does not fit it.
     """
-    if (options.fault is None) == (options.topic is None):
-        raise UsageError("give either a FAULT of the catalogue (rampart inject --list) or --topic")
     if options.share is not None and not 0 < options.share <= 1:
         raise UsageError(f"--share {options.share:g}: must be above 0, and at most 1")
     if (options.on is None) != (options.off is None):
-        raise UsageError("--on S and --off S go together")
+        raise UsageError("--on S and --off S: expected both or none")
     positive("--on", options.on, _SECONDS, math.inf)
     positive("--off", options.off, _SECONDS, math.inf)
-    fault = _own_fault(options) if options.fault is None else _known_fault(options)
+    mode, colon, key = options.fault.partition(":")
+    detailed = [name for name in _DETAILS if getattr(options, name) not in (None, [])]
+    for name in detailed:
+        if not colon or mode != _DETAILS[name]:
+            raise UsageError(f"--{name.replace('_', '-')}: only with {_DETAILS[name]}:TOPIC, not "
+                             f"with {options.fault}")
+    known = topics_for(key, options.port) if colon else ()
+    if detailed:
+        fault = _detailed(mode, key, known, options)
+    else:
+        with refusing(UnknownFaultError):
+            fault = faults_of(systems.at_hand(None, options.port)).find(
+                options.fault, options.seed or 0, known)
     return fault.varied(share=options.share, on_s=options.on, off_s=options.off)
 
 
-def _known_fault(options: argparse.Namespace) -> Fault:
-    for name in ("mode", "delay", "stamp", "set", "add", "ramp", "noise", "keep_ends"):
-        if getattr(options, name):
-            raise UsageError(f"--{name.replace('_', '-')} goes with --topic, not with a "
-                             "FAULT of the catalogue")
-    _, colon, key = options.fault.partition(":")
-    known = topics_for(key, options.port) if colon else ()
-    with refusing(UnknownFaultError):
-        faults = faults_of(systems.at_hand(None, options.port))
-        return faults.find(options.fault, options.seed or 0, known)
-
-
-def _own_fault(options: argparse.Namespace) -> Fault:
-    topic, key = resolve(options.topic, topics_for(options.topic, options.port))
-    if "*" in key:
-        spec = systems.at_hand(None, options.port)
-        with refusing(ValueError):
-            members = [k for k in published_keys(spec) if find_topic(k, (topic,))]
-        raise UsageError(f"--topic {options.topic}: name one member of the family, "
-                         f"e.g. {next(iter(members), topic.key)}")
-    if options.mode not in MODES:
-        raise UsageError(f"--mode {options.mode}: must be one of {', '.join(MODES)}")
-    changes = (options.set, options.add, options.ramp, options.noise, options.keep_ends)
-    for mode, needed, given in (
-            ("corrupt", "--set, --add, --ramp, --noise or --keep-ends", any(changes)),
-            ("delay", "--delay S", options.delay is not None),
-            ("restamp", "--stamp S", options.stamp is not None)):
-        if given != (options.mode == mode):
-            raise UsageError(f"--mode {mode} goes with {needed}, and no other mode does")
+def _detailed(mode: str, name: str, known: Sequence[Topic[Any]], options: argparse.Namespace
+              ) -> Fault:
+    topic, key = resolve(name, known)
     positive("--delay", options.delay, _SECONDS, math.inf)
     disturbance = Disturbance(
-        key.removeprefix(f"{ROOT}/"), options.mode, options.delay or 0.0,
+        key.removeprefix(f"{ROOT}/"), mode, options.delay or 0.0,
         set_fields=dict(_setting(text, topic) for text in options.set),
         add_fields=dict(_amount("--add", text, topic) for text in options.add),
         ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
         noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
         keep_ends=tuple(options.keep_ends), seed=options.seed or 0, stamp_s=options.stamp or 0.0)
-    reason = flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type)
-    if reason:
-        raise UsageError(f"--topic {options.topic}: {reason}")
-    return Fault(f"{options.mode} {disturbance.topic}", "", (disturbance,), (), _DEFAULT_DURATION_S)
+    if reason := flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type):
+        raise UsageError(f"{options.fault}: {reason}")
+    return Fault(f"{mode}:{disturbance.topic}", "", (disturbance,), (), _DEFAULT_DURATION_S)
 
 
 def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
-    """Return field, value as text, and the field's type."""
+    """Return field, value as text, and type of the field."""
     name, equals, value = text.partition("=")
     if not equals:
-        raise UsageError(f"{option} {text}: must be FIELD=VALUE")
+        raise UsageError(f"{option} {text}: expected FIELD=VALUE")
     with refusing(InjectionError):
         return name, value, field_type(topic.type, name).declared
 
@@ -246,7 +220,7 @@ def _amount(option: str, text: str, topic: Topic[Any]) -> tuple[str, float]:
     try:
         return name, float(value)
     except ValueError:
-        raise UsageError(f"{option} {text}: must be FIELD=NUMBER") from None
+        raise UsageError(f"{option} {text}: expected FIELD=NUMBER") from None
 
 
 def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
@@ -268,7 +242,7 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
                 for f in faults.offered() if f.group == kind]
         if rows:
             say(f"{title}:")
-            print_table(("fault", "seen by", "s", "what happens"), rows)
+            print_table(("fault", "detected by", "s", "effect"), rows)
             say()
     say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}:")
     print_table(("topic", "modes"), list(_modes_by_topic(keys, known).items()))
@@ -280,17 +254,16 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
     say()
     others = [name for names in faults.others.values() for name in names]
     if others:
-        say("of the robot, with details behind a colon:")
+        say("of the robot, with details after a colon:")
         for name in others:
             say(f"  {name}")
         say()
     say("any process: kill:NODE, stop:NODE, wedge:NODE; with --fault also hang:NODE and stop:all; "
-        "slow:NODE or slow:all in virtual time; NODE is one of")
-    say(f"  {', '.join(can_be_hit(spec))}")
+        f"slow:NODE or slow:all in virtual time; NODE is one of {', '.join(can_be_hit(spec))}")
 
 
 def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]) -> dict[str, str]:
-    """Return key of each declared topic → its modes in words; a family counts once."""
+    """Return key → modes in words, with one row for each family."""
     rows: dict[str, str] = {}
     for key in keys:
         if modes := modes_of(key, known):

@@ -1,4 +1,4 @@
-"""Ordering a fault in a run, and hearing from the nodes what came of it."""
+"""Injecting a fault into a run, and collecting the reports of its effect."""
 
 from __future__ import annotations
 
@@ -20,10 +20,22 @@ from rampart.cli.output import NoEffectError, UsageError, positive, print_json, 
 from rampart.cli.session import Session, connect, pause
 
 STOPPED_S = 5.0
-"""Simulated seconds for which `stop:NODE` stops a process unless told otherwise."""
+"""Simulated seconds for which `stop:NODE` stops a process by default."""
 
 _TAKE_HOLD_S = 1.5
-"""Real seconds within which a publisher answers, even when it is just being respawned."""
+"""Real seconds within which a publisher answers, also during its restart."""
+
+_OF_TOPICS = ("share", "on", "off", "seed", "delay", "stamp", "set", "add", "ramp", "noise",
+              "keep_ends")
+"""Options of a fault of a topic."""
+
+
+def refuse_details(options: argparse.Namespace) -> None:
+    """Refuse the options of a fault of a topic with any other fault."""
+    for name in _OF_TOPICS:
+        if getattr(options, name) not in (None, []):
+            raise UsageError(f"--{name.replace('_', '-')}: only with a fault of a topic, not with "
+                             f"{options.fault}")
 
 
 def _refused(watch: FaultWatch) -> str:
@@ -31,15 +43,15 @@ def _refused(watch: FaultWatch) -> str:
 
 
 async def run_fault(name: str, orders: Sequence[Order], options: argparse.Namespace) -> int:
-    """Inject a fault into the run, as the options of `rampart inject` say; return the exit code.
+    """Inject a fault into the run, and return the exit code.
 
     Args:
-        name: of the fault.
-        orders: to the nodes that carry it out.
-        options: of the verb.
+        name: name of the fault.
+        orders: orders to the nodes that carry it out.
+        options: options of `rampart inject`.
 
     Raises:
-        NoEffectError: the fault had no effect, or it is unknown whether it had.
+        NoEffectError: the fault had no effect, or its effect is unknown.
         UsageError: there is no run, or no such node in it.
     """
     watches = [FaultWatch((order,)) for order in orders]
@@ -80,42 +92,38 @@ async def run_fault(name: str, orders: Sequence[Order], options: argparse.Namesp
                 where = watch.orders[0].place if _is_of_topic(watch) else ", ".join(watch.nodes)
                 what = f"messages on {where} affected" if _is_of_topic(watch) else "ticks changed"
                 if watch.is_settled:
-                    say(f"{name}: affects {where}, and goes on" if watch.unfinished else
+                    say(f"{name}: affects {where}, continues" if watch.unfinished else
                         f"{name}: over, {watch.affected} {what}")
-                else:  # what was in force at a process ends with it
+                else:  # a fault ends with the process that carries it out
                     say(f"{name}: {watch.affected} {what}, until {', '.join(watch.nodes)} was "
                         "restarted")
     return 0
 
 
 async def hit_process(options: argparse.Namespace) -> int:
-    """Do to a process of the run what `kill:NODE`, `stop:NODE` or `wedge:NODE` says.
+    """Kill, stop or hang a process of the run: `kill:NODE`, `stop:NODE`, `wedge:NODE`.
 
     Raises:
         UsageError: there is no run or no such node, or an option does not go with it.
     """
     what, _, node = options.fault.partition(":")
     if "@" in node or "+" in node:
-        raise UsageError(f"{options.fault}: here it is injected now; --duration S says how long")
+        raise UsageError(f"{options.fault}: the fault is injected now; expected --duration S "
+                         "instead of @WHEN or +S")
     if what == "hang":
-        raise UsageError(f"{options.fault}: only of a run that is started with --fault "
-                         f"{options.fault}; here stop:{node} or wedge:{node}")
+        raise UsageError(f"{options.fault}: only from the start of a run, by --fault "
+                         f"{options.fault}; expected stop:{node} or wedge:{node}")
     if what == "slow":
         raise UsageError(f"{options.fault}: only in virtual time: --virtual --fault "
-                         f"{options.fault}; how slow a real process is, is up to the machine")
+                         f"{options.fault}")
     if what != "stop" and options.duration is not None:
-        raise UsageError(f"--duration {options.duration:g}: {what} has no end; whoever brings the "
-                         "node back says when")
-    for name in ("topic", "mode", "share", "on", "off", "seed", "delay", "stamp", "set", "add",
-                 "ramp", "noise", "keep_ends"):
-        if getattr(options, name) not in (None, []):
-            raise UsageError(f"--{name.replace('_', '-')} goes with a fault of a topic, not with "
-                             f"{options.fault}")
+        raise UsageError(f"--duration {options.duration:g}: {what} ends when the node is restarted")
+    refuse_details(options)
     positive("--duration", options.duration, "must be seconds above 0, or inf")
     lasts_s = math.inf if what != "stop" else options.duration or STOPPED_S
     if options.at_once and math.isfinite(lasts_s):
-        raise UsageError("--at-once: a process that is stopped has to be continued by somebody; "
-                         "leave it out, or say --duration inf")
+        raise UsageError("--at-once: this verb has to continue the stopped process; omit it, or "
+                         "use --duration inf")
     with refusing(NoRunError):
         run = find_run(options.port)
     with refusing(SignalError):
@@ -127,7 +135,7 @@ async def hit_process(options: argparse.Namespace) -> int:
         try:
             await asyncio.sleep(lasts_s / run.rate)
         finally:
-            with contextlib.suppress(SignalError):  # it was replaced meanwhile
+            with contextlib.suppress(SignalError):  # it has been replaced
                 await signal_anywhere(node, "CONT", run.base_port)
     if options.json:
         print_json({"fault": options.fault, "effective": True, "node": node, "pid": victim.pid,
@@ -139,14 +147,14 @@ async def _take_hold(session: Session, watch: FaultWatch) -> None:
     order = watch.orders[0]
     if not await session.command(order.topic, order.message, lambda: bool(watch.reports),
                                  _TAKE_HOLD_S):
-        does = "publishes" if _is_of_topic(watch) else "carries out what is ordered on"
+        does = "publishes" if _is_of_topic(watch) else "obeys orders on"
         raise NoEffectError(f"no effect: no node {does} {order.place} in this run")
     if _refused(watch) and watch.affected == 0:
         raise NoEffectError(f"no effect: refused by {_refused(watch)}")
 
 
 async def _end(session: Session, watches: list[FaultWatch]) -> None:
-    """End the injections now: an order of the same id with no duration."""
+    """End the injections by orders of the same ids with no duration."""
     for watch in watches:
         over = watch.orders[0].with_(duration_s=0.0)
         await session.command(over.topic, over.message, lambda w=watch: not w.unfinished, 0.5)  # type: ignore[misc]
@@ -160,21 +168,21 @@ def _judge(watch: FaultWatch) -> None:
         raise NoEffectError(f"{before}: refused by {_refused(watch)}")
     if not watch.is_settled and watch.affected == 0:
         raise NoEffectError(f"effect unknown: {where} did not report the end of "
-                            f"{order.injection}; it was probably restarted")
+                            f"{order.injection}, probably after a restart")
     if watch.affected == 0:
         raise NoEffectError(
-            f"no effect: {where} published nothing on {order.place} within {watch.waits_s:g} s, or "
-            "nothing that it changed" if _is_of_topic(watch) else
+            f"no effect: {where} published no message on {order.place} that it changed within "
+            f"{watch.waits_s:g} s" if _is_of_topic(watch) else
             f"no effect: {where} was not changed within {watch.waits_s:g} s")
 
 
 def _is_of_topic(watch: FaultWatch) -> bool:
-    """Whether it disturbs a topic; if not, it is carried out by a node of the robot."""
+    """Whether a fault disturbs a topic; a node of the robot carries out other faults."""
     return watch.orders[0].topic == bus_topics.INJECT
 
 
 def _print_result(name: str, watches: list[FaultWatch], *, at_once: bool) -> None:
-    """Print the result as JSON; the duration of a permanent fault is null."""
+    """Print the result as JSON, with null as the duration of a permanent fault."""
     print_json({
         "fault": name,
         "effective": None if at_once else all(w.affected > 0 for w in watches),

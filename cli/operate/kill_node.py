@@ -1,7 +1,7 @@
-"""`kill-node`: fault injection from the shell, on this host and others.
+"""`kill-node`: signals to nodes of this host and of other hosts.
 
-A process of this host is found in /proc and signalled. What runs on other hosts is listed and
-signalled by their supervisors, over the bus.
+A process of this host is found in /proc. The supervisors of other hosts list and signal their
+processes, over the bus.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ import json
 import os
 import sys
 import uuid
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from rampart.actors.bus.envelope import Header
@@ -52,50 +50,27 @@ _TABLE_S = 2.0
 _ANSWER_S = 5.0
 
 _LISTED_S = 1.0
-"""Simulated seconds that the other hosts' tables are waited for: each repeats its own twice."""
+"""Simulated seconds to wait for the tables of other hosts; each is published twice."""
 
 _GONE = (fm.NodeState.CRASHED, fm.NodeState.GIVEN_UP, fm.NodeState.UNREACHABLE)
-"""A row of a table that stands for no process: it has ended, or was given back."""
+"""States of a node without a process."""
 
 _PATIENCE_S = 3.0
-"""Real seconds that the bus is waited for, to list what runs on other hosts."""
+"""Real seconds to wait for the bus."""
+
+Row = dict[str, Any]
+"""A process: `name`, `pid`, `incarnation`, `port`, and `host` in a system of several."""
 
 
 class Signalled(NamedTuple):
-    """Which process got a signal."""
+    """The process that received a signal."""
 
     pid: int
     incarnation: int
-
-
-class OtherProcess(NamedTuple):
-    """A node's process on another machine."""
-
-    host: str
-    name: str
-    pid: int
-    incarnation: int
-
-
-@dataclass(frozen=True, slots=True)
-class RunElsewhere:
-    """What a run has on other machines.
-
-    Attributes:
-        port: its base port on this one.
-        host: name of this one.
-        processes: of the others.
-        missing: why which others' processes are not among them, in a line; "" if none are missing.
-    """
-
-    port: int
-    host: str
-    processes: tuple[OtherProcess, ...] = ()
-    missing: str = ""
 
 
 async def signal_anywhere(node: str, name: str, port: int | None) -> Signalled:
-    """Send a signal to a node of this host, or have it sent on another one.
+    """Send a signal to a node of this host or of another one.
 
     Raises:
         SignalError: there is no such node, or it cannot be signalled.
@@ -146,7 +121,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _signal_node(options: argparse.Namespace) -> list[str]:
     if options.node is None:
-        raise SignalError("no node given; --list shows what there is")
+        raise SignalError("expected the name of a node; --list shows the names")
     if options.signal not in SIGNALS:
         raise SignalError(f"--signal {options.signal}: unknown signal; known: {', '.join(SIGNALS)}")
     victim = asyncio.run(signal_anywhere(options.node, options.signal, options.port))
@@ -158,18 +133,18 @@ def _signal_node(options: argparse.Namespace) -> list[str]:
 
 
 def _list_nodes(options: argparse.Namespace) -> list[str]:
-    """Return the nodes of this machine as its kernel has them, and those that other hosts list."""
-    runs = [asyncio.run(_listed(run)) for run in find_runs()
-            if run.hosts and options.port in {None, run.base_port}]
-    own_hosts = {run.port: run.host for run in runs}
-    rows: list[dict[str, Any]] = [
+    """Return the processes of this machine, by its kernel, and those of other hosts."""
+    runs = {run.base_port: run for run in find_runs()
+            if run.hosts and options.port in {None, run.base_port}}
+    rows: list[Row] = [
         {"name": name, "pid": p.pid, "incarnation": p.incarnation, "port": p.port,
-         **({"host": own_hosts[p.port]} if p.port in own_hosts else {})}
+         **({"host": runs[p.port].own_host} if p.port in runs else {})}
         for p in find_processes(options.port) for name in p.names]
-    for run in runs:
-        rows += ({**one._asdict(), "port": run.port} for one in run.processes)
-        if run.missing:
-            print(f"kill-node: {one_line(run.missing)}", file=sys.stderr)
+    for run in runs.values():
+        others, missing = asyncio.run(_other_hosts(run))
+        rows += others
+        if missing:
+            print(f"kill-node: {one_line(missing)}", file=sys.stderr)
     if options.json:
         return [json.dumps(rows)]
     width = max((len(row.get("host", "")) for row in rows), default=0)
@@ -179,8 +154,8 @@ def _list_nodes(options: argparse.Namespace) -> list[str]:
 
 async def _signal(node: str, name: str, port: int | None) -> Signalled | None:
     async with connect(port) as session:
-        heard = await session.latest((topics.NODES,), _TABLE_S)
-        table: fm.NodeTable | None = heard.get(topics.NODES.key)
+        found = await session.latest((topics.NODES,), _TABLE_S)
+        table: fm.NodeTable | None = found.get(topics.NODES.key)
         host = next((row.host for row in table.nodes if row.name == node), None) if table else None
         if host is None:
             return None
@@ -201,15 +176,15 @@ async def _signal(node: str, name: str, port: int | None) -> Signalled | None:
     return Signalled(answer.pid, answer.incarnation)
 
 
-async def _listed(run: RunInfo) -> RunElsewhere:
-    """Return what the supervisors of the other hosts say they run, as far as they are heard."""
+async def _other_hosts(run: RunInfo) -> tuple[list[Row], str]:
+    """Return the processes that other supervisors publish, and which hosts are missing and why."""
     others = {supervisor: host for host, supervisor in run.hosts.items() if host != run.own_host}
     tables: dict[str, fm.NodeTable] = {}
-    complete, why = asyncio.Event(), "nothing was heard"
+    complete, why = asyncio.Event(), "no message arrived"
 
     def heard(_key: str, header: Header, table: fm.NodeTable) -> None:
         if header.source in others:
-            tables[header.source] = table
+            tables[others[header.source]] = table
         if len(tables) == len(others):
             complete.set()
 
@@ -224,24 +199,12 @@ async def _listed(run: RunInfo) -> RunElsewhere:
         why = str(error)
     except TimeoutError:
         pass
-    return listed(run, {others[supervisor]: table for supervisor, table in tables.items()}, why)
-
-
-def listed(run: RunInfo, tables: Mapping[str, fm.NodeTable], why: str) -> RunElsewhere:
-    """Return what runs on other hosts.
-
-    Args:
-        run: as this machine's launcher knows it.
-        tables: of those hosts that were heard, what the supervisor of each runs.
-        why: others were not.
-    """
-    missing = [host for host in run.hosts if host != run.own_host and host not in tables]
-    processes = tuple(OtherProcess(host, row.name, row.pid, row.incarnation)
-                      for host, table in tables.items() for row in table.nodes
-                      if row.pid and row.state not in _GONE)
-    return RunElsewhere(
-        run.base_port, run.own_host, processes,
-        f"the processes of {' and '.join(missing)} are missing: {why}" if missing else "")
+    rows = [{"host": host, "name": row.name, "pid": row.pid, "incarnation": row.incarnation,
+             "port": run.base_port}
+            for host, table in tables.items() for row in table.nodes
+            if row.pid and row.state not in _GONE]
+    missing = " and ".join(host for host in others.values() if host not in tables)
+    return rows, f"the processes of {missing} are missing: {why}" if missing else ""
 
 
 if __name__ == "__main__":

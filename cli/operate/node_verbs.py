@@ -1,4 +1,4 @@
-"""`rampart status`, `rampart node` and `rampart top`: what runs, and how it is.
+"""`rampart status`, `rampart node` and `rampart top`: the state of a run.
 
 Show the nodes of the run.
 
@@ -51,7 +51,7 @@ MOST_LINES = 1_000_000
 _LONGEST_LINE = 1 << 16
 _LOOK_S = 0.1
 _WAIT_S = 1.5
-"""Simulated seconds to collect states; the rarest comes twice a second."""
+"""Simulated seconds to collect states; the slowest is published twice a second."""
 
 
 def add(verbs: Any) -> None:
@@ -90,7 +90,9 @@ print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"
     else:
         fields = [name for name in fm.NodeInfo.__struct_fields__ if name not in {"host", "failing"}
                   or any(getattr(node, name) for node in table.nodes)]
-        print_table(fields, [[getattr(node, name) for name in fields] for node in table.nodes])
+        print_table(fields, [[round(value, 2) if isinstance(value, float) else value
+                              for value in (getattr(node, name) for name in fields)]
+                             for node in table.nodes])
     return 0
 
 
@@ -113,9 +115,9 @@ def node_log(options: argparse.Namespace) -> int:
         raise unknown("node", options.name, run.nodes)
     file = folder / f"{options.name}.log"
     if not file.is_file():
-        logs = sorted(one.stem for one in folder.glob("*.log"))
-        raise NoEffectError(f"{options.name}: no command, or its output is not kept; there is "
-                            f"output of: {', '.join(logs) or 'none'}")
+        logs = sorted(log.stem for log in folder.glob("*.log"))
+        raise NoEffectError(f"{options.name}: no command, or its output is not kept; nodes with "
+                            f"output: {', '.join(logs) or 'none'}")
     with contextlib.suppress(KeyboardInterrupt):
         for text in tail(file, options.lines, (lambda: not is_over(run)) if options.follow
                          else lambda: False):
@@ -124,12 +126,12 @@ def node_log(options: argparse.Namespace) -> int:
 
 
 def tail(file: Path, lines: int, follows: Callable[[], bool]) -> Iterator[str]:
-    """Yield the last lines of a log, made fit for a terminal, then what is added to it.
+    """Yield the last lines of a log, safe for a terminal, then the lines that are added.
 
     Args:
-        file: the log; the one before it is `FILE.1`.
-        lines: how many.
-        follows: asked whether to wait for more.
+        file: the log; the previous one is `FILE.1`.
+        lines: number of lines.
+        follows: whether to wait for more.
     """
     before = file.with_name(f"{file.name}.1")
     open_log = file.open("rb")
@@ -201,12 +203,12 @@ async def status(options: argparse.Namespace) -> int:
     if manager is not None or "manager" in kinds:
         say(f"manager   {manager_in_words(manager)}")
     for name, what in held.holders.items():
-        say(f"held      {' and '.join(what)} by {name}, no recovery module of this system; "
-            f"rampart reset {name} lets go")
+        say(f"held      {' and '.join(what)} by {name}, not a recovery module of this system; "
+            f"rampart reset {name} releases it")
     if has_gateway:
         say(f"ros2      {_in_ros2(graph)}")
     if left := first_to_expire(run):
-        say(f"keys      {max(left['days_left'], 0)} days left, of {left['name']} first, until "
+        say(f"keys      {max(left['days_left'], 0)} days left: {left['name']} expires first, at "
             f"{left['not_after'][:16].replace('T', ' ')} UTC")
     if run.recording:
         say(f"recording {run.recording_in_words}")
@@ -229,17 +231,17 @@ def top(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
       NO_COLOR=1 rampart top
       rampart top --json | python3 -m json.tool
     """
-    from rampart.cli.look import top_screen  # noqa: PLC0415 no other verb should wait for it
+    from rampart.cli.look import top_screen  # noqa: PLC0415 its import would slow other verbs
 
     return top_screen.top(options)
 
 
 def _lines(run: RunInfo) -> tuple[RobotLines, bool]:
-    """Return what the robot adds, and whether it has a gateway to ROS 2."""
+    """Return the lines of the robot, and whether it has a gateway to ROS 2."""
     try:
         spec = systems.load(run.system_file)
         return systems.lines_of(spec), any(node.actor == GATEWAY for node in spec.nodes)
-    except UsageError:  # of a run from elsewhere, say: what the engine tells is there
+    except UsageError:  # for example a run from another folder: show the engine's lines
         return RobotLines(), False
 
 

@@ -1,4 +1,4 @@
-"""`rampart reset`: what an operator does to a run."""
+"""`rampart reset`, and the old verb `rampart trigger`."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ STUB_DETECTION = "rampart.actors.detection.stub:StubDetection"
 _RESET_WAIT_S = 3.0
 """Simulated seconds within which the manager releases a recovery whose cause is gone."""
 
-_HEARD_S = 0.3
-"""Simulated seconds within which it is repeated (nominally each 0.2 s)."""
+_HOLDS_S = 0.3
+"""Simulated seconds within which each node repeats its holders (nominally each 0.2 s)."""
 
 _NODES = 16
-"""Which can be made to stand: more than there are."""
+"""Nodes that can be held, at most."""
 
 
 def add(verbs: Any) -> None:
@@ -52,6 +52,7 @@ async def reset(options: argparse.Namespace) -> int:
       rampart reset rampart-4711
     """
     async with connect(options.port) as session:
+        session.check_may_order()
         known = [r.name for r in systems.load(session.run.system_file).recoveries]
         if options.recovery not in known:
             return await _let_go(session, options.recovery, known)
@@ -75,11 +76,7 @@ async def reset(options: argparse.Namespace) -> int:
 
 
 async def _let_go(session: Session, name: str, known: list[str]) -> int:
-    """Let go in the place of a holder that is no recovery module.
-
-    Raises:
-        UsageError: nobody of that name holds anything.
-    """
+    """Release what a holder holds that is not a recovery module."""
     held = Holdings(session)
     await held.settle()
     what = held.by(name)
@@ -87,17 +84,17 @@ async def _let_go(session: Session, name: str, known: list[str]) -> int:
         raise unknown("recovery", name, [*known, *held.holders])
     if not await session.command(ftm_topics.RESET, fm.Reset(name, session.name),
                                  lambda: not held.by(name), session.real_s(_RESET_WAIT_S)):
-        raise NoEffectError(f"{name} was not made to let go of {' and '.join(held.by(name))}; it "
-                            "orders it again and again")
-    say(f"{name} holds no longer: {' and '.join(what)}")
+        raise NoEffectError(f"{name} still holds {' and '.join(held.by(name))}; it repeats its "
+                            "order")
+    say(f"{name} released: {' and '.join(what)}")
     return 0
 
 
 async def trigger(options: argparse.Namespace) -> int:
-    """Make a stand-in detect for a while.
+    """Activate a stand-in.
 
-    Make a stand-in for a detection module (`detection.stub`) active, for some
-    simulated seconds. What real modules detect is injected: rampart inject.
+    Activate a stand-in for a detection module (`detection.stub`) for some simulated
+    seconds. For other detection modules, inject a fault: rampart inject.
 
     Examples:
       rampart inject trigger:D_LEVEL
@@ -109,15 +106,14 @@ async def trigger(options: argparse.Namespace) -> int:
         stubs = [d.name for d in spec.detections if d.actor == STUB_DETECTION]
         if options.module not in stubs:
             raise unknown("stand-in detection module", options.module, stubs)
-        heard = Latest[fm.DetectionReport]()
-        session.listen(ftm_topics.DETECTION, ftm_topics.DETECTION.at(options.module), heard.keep)
+        report = Latest[fm.DetectionReport]()
+        session.listen(ftm_topics.DETECTION, ftm_topics.DETECTION.at(options.module), report.keep)
 
         async def bring(state: fm.DetectionState) -> bool:
-            active = state is fm.DetectionState.ACTIVE
             return await session.command(
-                ftm_topics.STUB_TRIGGER,
-                fm.StubTrigger(options.module, active, "triggered by hand"),
-                lambda: heard.value is not None and heard.value.state is state,
+                ftm_topics.STUB_TRIGGER, fm.StubTrigger(
+                    options.module, state is fm.DetectionState.ACTIVE, "triggered by hand"),
+                lambda: report.value is not None and report.value.state is state,
                 session.real_s(1.0))
 
         if not await bring(fm.DetectionState.ACTIVE):
@@ -133,9 +129,7 @@ async def trigger(options: argparse.Namespace) -> int:
 
 
 class Holdings:
-    """What is held by those who are no recovery modules, by the node that obeys them.
-
-    Listens from the start.
+    """What holders hold that are not recovery modules, from now on.
 
     Args:
         session: the connection to the run.
@@ -143,22 +137,22 @@ class Holdings:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._heard: Remembered[str, fm.Holds] = Remembered(_NODES)
+        self._held: Remembered[str, fm.Holds] = Remembered(_NODES)
         session.listen(ftm_topics.HOLDS, ftm_topics.HOLDS.pattern, self._keep)
 
     def _keep(self, _key: str, header: Header, body: fm.Holds) -> None:
-        self._heard[header.source] = body
+        self._held[header.source] = body
 
     async def settle(self) -> None:
-        """Wait until all that is held has been heard."""
-        await asyncio.sleep(self._session.real_s(_HEARD_S))
+        """Wait until each node has repeated its holders."""
+        await asyncio.sleep(self._session.real_s(_HOLDS_S))
 
     def by(self, name: str) -> tuple[str, ...]:
-        """Return what somebody holds."""
-        return tuple(holds.what for holds in self._heard.values() if name in holds.holders)
+        """Return what a client holds."""
+        return tuple(holds.what for holds in self._held.values() if name in holds.holders)
 
     @property
     def holders(self) -> dict[str, tuple[str, ...]]:
-        """Everybody who holds something, with what it is."""
-        names = dict.fromkeys(name for holds in self._heard.values() for name in holds.holders)
+        """Holder → what it holds."""
+        names = dict.fromkeys(name for holds in self._held.values() for name in holds.holders)
         return {name: self.by(name) for name in names}

@@ -1,4 +1,4 @@
-"""`rampart obstacle`: what the world does to a run.
+"""`rampart obstacle`: obstacles in the simulated world.
 
 Place an obstacle in the simulated world, move it, or remove it.
 
@@ -21,7 +21,15 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say, unknown
+from rampart.cli.output import (
+    NoEffectError,
+    UsageError,
+    positive,
+    print_json,
+    print_table,
+    say,
+    unknown,
+)
 from rampart.cli.session import Latest, Session, connect
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, number, option
 
@@ -72,8 +80,7 @@ async def obstacle_add(options: argparse.Namespace) -> int:
         value = getattr(options, name)
         if not math.isfinite(value):
             raise UsageError(f"{name} = {value}: must be a finite number of metres")
-    if options.radius <= 0:
-        raise UsageError(f"--radius {options.radius:g}: must be above 0")
+    positive("--radius", options.radius)
     order = m.ObstacleCommand(options.name, True, options.x, options.y, options.radius)
 
     def there(obstacle: m.ObstacleCommand | None) -> bool:
@@ -96,6 +103,7 @@ async def obstacle_remove(options: argparse.Namespace) -> int:
       rampart obstacle remove crate
     """
     async with connect(options.port) as session:
+        session.check_may_order()
         world = _World(session)
         present = await world.obstacles()
         if options.name not in present:
@@ -107,7 +115,7 @@ async def obstacle_remove(options: argparse.Namespace) -> int:
 
 
 class _World:
-    """The simulated world's obstacles, and its complaints."""
+    """The obstacles of the simulated world, and its diagnostics about this tool's orders."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -121,7 +129,7 @@ class _World:
             self._complaint = report.reason
 
     async def obstacles(self) -> dict[str, m.ObstacleCommand]:
-        """Return the obstacles that are there.
+        """Return the obstacles by name.
 
         Raises:
             NoEffectError: the world does not answer.
@@ -131,10 +139,10 @@ class _World:
 
     async def change(self, order: m.ObstacleCommand,
                      done: Callable[[m.ObstacleCommand | None], bool]) -> None:
-        """Order a change and wait until it shows.
+        """Order a change, and wait until the world lists it.
 
         Raises:
-            NoEffectError: the world refused, or does not answer.
+            NoEffectError: the world refuses, or does not answer.
         """
         await self.obstacles()
         changed = await self._session.command(
@@ -142,9 +150,9 @@ class _World:
             lambda: bool(self._complaint) or done(self._present().get(order.name)),
             self._session.real_s(2 * _OBSTACLES_PERIOD_S))
         if self._complaint or not changed:
-            raise NoEffectError(f"no effect: {self._complaint or 'the world did not take it'}")
+            raise NoEffectError(f"no effect: {self._complaint or 'the world does not list it'}")
 
     def _present(self) -> dict[str, m.ObstacleCommand]:
         if self._listed.value is None:
-            raise NoEffectError("the world does not answer: no list of obstacles was heard")
+            raise NoEffectError("the world does not answer: it published no list of obstacles")
         return {o.name: o for o in self._listed.value.obstacles if o.present}

@@ -55,14 +55,13 @@ def test_a_name_among_many_is_answered_by_the_nearest_three(capsys):
 
 
 @pytest.mark.parametrize(("arguments", "line"), [
-    (("slow:pump",), "slow:pump: only in virtual time: --virtual --fault slow:pump; how slow a "
-     "real process is, is up to the machine"),
-    (("kill:pump@3",), "kill:pump@3: here it is injected now; --duration S says how long"),
-    (("kill:pump", "--duration", "3"), "--duration 3: kill has no end; whoever brings the node "
-     "back says when"),
-    (("kill:pump", "--share", "0.5"), "--share goes with a fault of a topic, not with kill:pump"),
-    (("stop:pump", "--at-once"), "--at-once: a process that is stopped has to be continued by "
-     "somebody; leave it out, or say --duration inf"),
+    (("slow:pump",), "slow:pump: only in virtual time: --virtual --fault slow:pump"),
+    (("kill:pump@3",), "kill:pump@3: the fault is injected now; expected --duration S "
+     "instead of @WHEN or +S"),
+    (("kill:pump", "--duration", "3"), "--duration 3: kill ends when the node is restarted"),
+    (("kill:pump", "--share", "0.5"), "--share: only with a fault of a topic, not with kill:pump"),
+    (("stop:pump", "--at-once"), "--at-once: this verb has to continue the stopped process; "
+     "omit it, or use --duration inf"),
     (("stop:pump", "--duration", "-1"), "--duration -1: must be seconds above 0, or inf"),
 ])
 def test_a_fault_of_a_process_with_what_does_not_go_with_it(capsys, arguments, line):
@@ -80,7 +79,7 @@ def test_every_object_says_its_format(capsys):
 def test_the_list_of_faults_is_of_the_system_that_is_named(capsys):
     assert main(["inject", "--list", "--system", str(CELL)]) == 0
     told = capsys.readouterr().out
-    nodes = told.splitlines()[-1].strip().split(", ")
+    nodes = told.splitlines()[-1].partition("NODE is one of ")[2].split(", ")
     assert {"supervisor", "camera", "valve", "D_CURTAIN", "R_HOLD"} <= set(nodes)
     assert "simulator" not in nodes
     assert "gps" not in told

@@ -190,6 +190,27 @@ async def test_echo_prints_one_line_per_message(run, capsys):
     assert all("simulator#1 localization/pose {\"x_m\":1.0," in line for line in lines)
 
 
+async def test_node_list_shows_times_with_two_decimals(run, capsys, monkeypatch):
+    table = fm.NodeTable((fm.NodeInfo(
+        "hmi", "non-control", 42, fm.NodeState.RUNNING, 1, 0, heard_s=12.345678901),))
+    publish = run.node.publish
+    monkeypatch.setattr(run.node, "publish", lambda topic, body, **more: publish(
+        topic, table if topic is ftm_topics.NODES else body, **more))
+    await asyncio.sleep(0.2)
+    _, out, _ = await run.call(capsys, "node", "list")
+    assert "12.35" in out
+    assert "12.345" not in out
+
+
+async def test_a_viewer_is_refused_before_anything_else_is_checked(run, capsys, monkeypatch):
+    monkeypatch.setattr("rampart.cli.session.tools_credentials", lambda _run: (None, "viewer"))
+    run.node.latched = ()
+    for verb in (("reset", "RM1"), ("reset", "rampart-4711"), ("obstacle", "remove", "crate")):
+        code, _, err = await run.call(capsys, *verb)
+        assert code == 2
+        assert "viewer" in err
+
+
 NO_TEXT = b"\x95\xa1\xff\x01\x01\xcb" + bytes(8) + b"\x90"
 
 
@@ -318,7 +339,7 @@ async def test_a_fault_of_the_robot_s_own_is_carried_out_by_its_node(run, capsys
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["localization-not-updated", "--duration", "60", "--at-once"], "simulator for 60 s"),
-    (["stuck:localization/pose", "--duration", "inf"], "affects localization/pose, and goes on")])
+    (["stuck:localization/pose", "--duration", "inf"], "affects localization/pose, continues")])
 async def test_a_fault_at_once_or_without_end_goes_on_when_the_verb_returns(
         run, capsys, arguments, words):
     code, out, _ = await run.call(capsys, "inject", *arguments)
@@ -329,16 +350,16 @@ async def test_a_fault_at_once_or_without_end_goes_on_when_the_verb_returns(
     assert len({json.loads(line)["message"]["y_m"] for line in out.splitlines()}) == 1
 
 
-POSE = ["--topic", "localization/pose", "--mode", "corrupt", "--duration", "1"]
+POSE = ["corrupt:localization/pose", "--duration", "1"]
 
 
 @pytest.mark.parametrize(("arguments", "code", "words"), [
     (["inject", "command-not-updated", "--duration", "1"], 1,
      "no effect: no node publishes control/command in this run"),
     (["inject", "wrong-graph", "--duration", "1"], 1,
-     "no effect: simulator published nothing on plan/route within 1 s"),
+     "no effect: simulator published no message on plan/route that it changed within 1 s"),
     (["inject", *POSE, "--set", "x_m=1"], 1, "no effect: simulator"),  # it is 1 already
-    (["inject", "--topic", "detection/DM9", "--mode", "drop", "--duration", "1"], 2,
+    (["inject", "drop:detection/DM9", "--duration", "1"], 2,
      "unknown node 'DM9'"),
     (["topic", "echo", "detection/DM9"], 2, "unknown node 'DM9'; known: simulator, DM1")])
 async def test_what_has_no_effect_says_so_and_fails(run, capsys, arguments, code, words):
@@ -350,7 +371,7 @@ async def test_what_has_no_effect_says_so_and_fails(run, capsys, arguments, code
 async def test_a_permanent_fault_without_effect_is_ended_and_said_to_have_none(run, capsys):
     code, _, err = await run.call(capsys, "inject", "drop:plan/route", "--duration", "inf")
     assert code == 1
-    assert "no effect: simulator published nothing on plan/route within 10 s" in err
+    assert "no effect: simulator published no message on plan/route" in err
     assert run.node.orders[-1].duration_s == 0.0
 
 
@@ -358,7 +379,7 @@ async def test_a_fault_that_does_not_fit_its_messages_is_refused_by_the_node(
         run, capsys, monkeypatch):
     monkeypatch.setattr("rampart.cli.operate.inject_verbs.flaw", lambda *_: "")
     code, _, err = await run.call(
-        capsys, "inject", "--topic", "localization/pose", "--mode", "corrupt",
+        capsys, "inject", "corrupt:localization/pose",
         "--noise", "x_m=-1", "--duration", "1")
     assert code == 1
     assert "no effect: refused by simulator: noise_fields 'x_m' = -1" in err
@@ -378,17 +399,17 @@ async def test_reset_releases_a_latched_recovery_once(run, capsys):
 async def test_status_names_who_holds_the_brake_and_reset_lets_go_in_its_place(run, capsys):
     run.node.holders = ("x\x1b", "y")
     _, out, _ = await run.call(capsys, "status")
-    assert "held      brake by x\\u001b, no recovery module of this system" in out
+    assert "held      brake by x\\u001b, not a recovery module of this system" in out
     _, out, _ = await run.call(capsys, "status", "--json")
     assert json.loads(out)["holders"] == {"x\x1b": ["brake"], "y": ["brake"]}
     code, _, err = await run.call(capsys, "reset", "z")
     assert code == 2
     assert err.endswith(", x\\u001b, y\n")
-    assert (await run.call(capsys, "reset", "y"))[:2] == (0, "y holds no longer: brake\n")
+    assert (await run.call(capsys, "reset", "y"))[:2] == (0, "y released: brake\n")
     run.node.obstinate = True
     code, _, err = await run.call(capsys, "reset", "x\x1b")
     assert code == 1
-    assert "was not made to let go of brake" in err
+    assert "still holds brake" in err
 
 
 async def test_a_reset_while_the_cause_is_there_says_that_nothing_was_released(run, capsys):

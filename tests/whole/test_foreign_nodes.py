@@ -154,7 +154,7 @@ def test_what_is_killed_stopped_or_gone_comes_back_and_nothing_is_orphaned(tmp_p
         assert "wheels #3 ended: signal SIGSEGV" in log.stdout
         none = tug.tool("node", "log", "driver")
         assert (none.returncode, none.stderr) == (1, (
-            "rampart: driver: no command, or its output is not kept; there is output of: forking, "
+            "rampart: driver: no command, or its output is not kept; nodes with output: forking, "
             "wheels\n"))
         assert tug.story.count("wheels crashed, incarnation 1:") == 1
         exits = [line for line in tug.story.splitlines() if "wheels" in line and "SIGKILL" in line]

@@ -71,7 +71,7 @@ def test_tools_may_what_their_certificate_says(tmp_path, keys):
         assert looking.returncode == 0, looking.stderr
         refused = rampart(run, "inject", "drop:localization/pose", key=keys / "bob.pem")
         assert refused.returncode == 2
-        assert "a viewer's certificate is for looking" in refused.stderr
+        assert "a viewer's certificate cannot change a run" in refused.stderr
         as_node = rampart(run, "inject", "drop:localization/pose", key=keys / "DM4.pem")
         assert as_node.returncode == 1  # the router lets nothing through
         missing = rampart(run, "status", key=keys / "none.pem")

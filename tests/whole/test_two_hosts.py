@@ -139,7 +139,7 @@ def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_ba
         found, told = listed(net, "robot", robot)
         assert found["camera"] == "robot"
         assert "supervisor_ground" not in found
-        assert told == "kill-node: the processes of ground are missing: nothing was heard\n"
+        assert told == "kill-node: the processes of ground are missing: no message arrived\n"
         net.line = Line(**BAD)
         ground.wait_for("camera handed over")
         robot.wait_for("supervisor_ground back")

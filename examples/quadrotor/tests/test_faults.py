@@ -101,7 +101,7 @@ def test_on_processes_they_come_by_hand_and_as_planned(file, tmp_path, monkeypat
     assert {fault: done.stderr for fault, done in by_hand.items() if done.returncode} == {}
     assert "ticks changed" in by_hand["weak-rotor:2:0.95"].stdout
     assert "messages on sensors/battery affected" in by_hand["battery-gauge-high"].stdout
-    assert by_hand["battery-drain:1.1"].stdout.endswith("affects world, and goes on\n")
+    assert by_hand["battery-drain:1.1"].stdout.endswith("affects world, continues\n")
     assert {fault["fault"]: fault["effective"] for fault in result["faults"]} == {
         "weak-rotor:1:0.95@2+1": True, "battery-gauge-high@2+1": True}
     assert result["restarts"]["mission"] >= 1

@@ -266,7 +266,7 @@ async def test_kill_node_signals_one_node_and_names_what_it_does_not_know(witnes
             (["DM99", "--port", str(port)], "unknown node 'DM99'"),
             (["DM1", "--signal", "HUG", "--port", str(port)], "unknown signal"),
             (["DM1", "--port", "1"], "no run found on port 1"),
-            (["--port", str(port)], "no node given")):
+            (["--port", str(port)], "expected the name of a node")):
         assert await asyncio.to_thread(kill_node.main, arguments) == 2
         error = capsys.readouterr().err
         assert words in error

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import tomllib
 
 import pytest
 
 from rampart.cli.look import doctor_verb
 from rampart.cli.look.doctor_verb import Finding
 from rampart.cli.main import build_parser, main
+from tests import ROOT
 
 
 def test_this_machine_can_run_and_each_thing_that_is_missing_has_its_cost(capsys):
@@ -19,6 +21,13 @@ def test_this_machine_can_run_and_each_thing_that_is_missing_has_its_cost(capsys
     assert all(bool(one.cost) == (one.state != "ok") for one in found)
     assert main(["doctor"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 1 + len(found)
+
+
+def test_every_extra_of_the_package_is_looked_for(capsys):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    main(["doctor", "--json"])
+    found = {one["what"] for one in json.loads(capsys.readouterr().out)}
+    assert {f"extra {name}" for name in project["optional-dependencies"] if name != "dev"} <= found
 
 
 @pytest.mark.parametrize(("limit", "code", "state"), [(50, 1, "missing"), (4096, 0, "ok")])

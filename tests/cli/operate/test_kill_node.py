@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import socket
 import threading
-from contextlib import contextmanager
+from contextlib import asynccontextmanager, contextmanager
 
 import pytest
 
 from rampart.actors.bus import run_info
+from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.cli.operate import kill_node
-from rampart.cli.operate.kill_node import OtherProcess, RunElsewhere, listed
 from rampart.testing.ports import free_base_port
 
 HOSTS = {"robot": "supervisor", "ground": "supervisor_ground", "moon": "supervisor_moon"}
@@ -27,24 +28,49 @@ def row(name: str, pid: int, state: NodeState = NodeState.RUNNING, incarnation: 
     return NodeInfo(name, "control", pid, state, incarnation, 0, host=host)
 
 
-def test_processes_of_other_hosts_are_those_that_their_supervisors_say_they_run():
-    tables = {"ground": NodeTable((row("camera", 11), row("hmi", 0, NodeState.UNREACHABLE),
-                                   row("DM1", 12, NodeState.CRASHED),
-                                   row("DM2", 13, NodeState.WEDGED, 4))),
-              "moon": NodeTable((row("drill", 14, host="moon"),))}
-    assert listed(RUN, tables, "why") == RunElsewhere(7450, "robot", (
-        OtherProcess("ground", "camera", 11, 1), OtherProcess("ground", "DM2", 13, 4),
-        OtherProcess("moon", "drill", 14, 1)))
+class Tables:
+    """A session in which the supervisors of some hosts publish their tables."""
+
+    def __init__(self, tables: dict[str, NodeTable]) -> None:
+        self.tables = tables
+
+    def listen(self, _topic, key, heard) -> None:
+        for supervisor, table in self.tables.items():
+            if f"/{supervisor}/" in key:
+                heard("", Header(supervisor, 1, 1, 0.0), table)
+
+    def real_s(self, _simulated_s: float) -> float:
+        return 0.05
 
 
-def test_who_was_not_heard_is_named_with_the_reason():
-    found = listed(RUN, {"moon": NodeTable(())}, "no router answers")
-    assert found.missing == "the processes of ground are missing: no router answers"
-    ground = RunInfo(1, 7450, 1.0, 0.0, "x.toml", "/nowhere", (), "r", 0, "t", host="ground",
-                     hosts=HOSTS)
-    found = listed(ground, {}, "nothing was heard")
-    assert (found.host, found.missing) == (
-        "ground", "the processes of robot and moon are missing: nothing was heard")
+@pytest.fixture
+def bus(monkeypatch):
+    """Return a function that says which tables arrive."""
+    def has(**tables: NodeTable) -> None:
+        @asynccontextmanager
+        async def connect(_port):
+            yield Tables(tables)
+
+        monkeypatch.setattr(kill_node, "connect", connect)
+
+    return has
+
+
+def test_processes_of_other_hosts_are_those_that_their_supervisors_publish(bus):
+    bus(supervisor_ground=NodeTable((
+            row("camera", 11), row("hmi", 0, NodeState.UNREACHABLE),
+            row("DM1", 12, NodeState.CRASHED), row("DM2", 13, NodeState.WEDGED, 4))),
+        supervisor_moon=NodeTable((row("drill", 14, host="moon"),)))
+    rows, missing = asyncio.run(kill_node._other_hosts(RUN))
+    assert missing == ""
+    assert [(one["host"], one["name"], one["pid"], one["incarnation"]) for one in rows] == [
+        ("ground", "camera", 11, 1), ("ground", "DM2", 13, 4), ("moon", "drill", 14, 1)]
+
+
+def test_a_host_whose_table_does_not_arrive_is_named(bus):
+    bus(supervisor_moon=NodeTable(()))
+    _, missing = asyncio.run(kill_node._other_hosts(RUN))
+    assert missing.startswith("the processes of ground are missing: ")
 
 
 @pytest.fixture
@@ -54,12 +80,12 @@ def here(monkeypatch):
         RunProcess(21, 7450, 20, ("pilot",), 3), RunProcess(31, 7460, 30, ("a", "b"), 1)])
     monkeypatch.setattr(kill_node, "find_runs", list)
 
-    def has(elsewhere: RunElsewhere) -> None:
-        async def found(_run: RunInfo) -> RunElsewhere:
-            return elsewhere
+    def has(*rows, missing: str = "") -> None:
+        async def found(_run: RunInfo):
+            return list(rows), missing
 
         monkeypatch.setattr(kill_node, "find_runs", lambda: [RUN])
-        monkeypatch.setattr(kill_node, "_listed", found)
+        monkeypatch.setattr(kill_node, "_other_hosts", found)
 
     return has
 
@@ -74,7 +100,7 @@ def test_on_one_machine_the_list_is_as_it_was(here, capsys):
 
 
 def test_with_several_hosts_each_process_has_its_host(here, capsys):
-    here(RunElsewhere(7450, "robot", (OtherProcess("ground", "hmi", 12, 1),)))
+    here({"host": "ground", "name": "hmi", "pid": 12, "incarnation": 1, "port": 7450})
     assert kill_node.main(["--list"]) == 0
     assert capsys.readouterr() == (
         "  7450       21 #3    robot  pilot\n  7460       31 #1           a\n"
@@ -86,7 +112,7 @@ def test_with_several_hosts_each_process_has_its_host(here, capsys):
 
 
 def test_what_is_missing_is_told_in_a_line_beside_the_list_of_this_machine(here, capsys):
-    here(RunElsewhere(7450, "robot", (), "no\nground"))
+    here(missing="no\nground")
     assert kill_node.main(["--list"]) == 0
     told = capsys.readouterr()
     assert "robot pilot" in told.out
@@ -124,4 +150,4 @@ def test_without_a_bus_the_others_are_not_waited_for_long(tmp_path, monkeypatch,
     with launcher(info):
         assert kill_node.main(["--list", "--port", str(port)]) == 0
     assert capsys.readouterr().err == (
-        "kill-node: the processes of ground and moon are missing: nothing was heard\n")
+        "kill-node: the processes of ground and moon are missing: no message arrived\n")

@@ -204,7 +204,7 @@ def test_a_campaign_whose_disk_fills_up_says_so_in_one_line_and_goes_on_from_the
     told = [line for line in full.stderr.splitlines() if line.startswith("rampart: ")]
     assert len(told) == 1
     assert told[0].startswith(f"rampart: {tmp_path / 'runs.sqlite'}: ")
-    assert told[0].endswith("and the same command goes on from there")
+    assert told[0].endswith("and the same command continues there")
     assert "Traceback" not in full.stderr
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     row, = json.loads(done.stdout)
@@ -441,8 +441,8 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    ((), "give one of --paper, --runs N"),
-    (("--paper", "--runs", "3"), "give one of"),
+    ((), "expected one of --paper, --runs N"),
+    (("--paper", "--runs", "3"), "expected one of"),
     (("--full",), "--full: goes with --paper only"),
     (("--runs", "0"), "--runs 0: must be 1 or more"),
     (("--runs", "3", "--kinds", "gremlin"), "unknown kind 'gremlin'; known: paper, sensor"),
@@ -472,7 +472,7 @@ def test_a_run_is_replayed_by_its_key_and_recognised(tmp_path, capsys):
     replayed = json.loads(capsys.readouterr().out)
     assert (replayed["run"], replayed["same_trace"]) == (key, True)
     assert rampart(["campaign", "--replay", "0000", "--out", str(tmp_path)]) == 2
-    assert "no run, or several" in capsys.readouterr().err
+    assert "none or several match" in capsys.readouterr().err
 
 
 def test_patterns_choose_faults_by_name(capsys):
