@@ -48,12 +48,12 @@ _GRASS = (_POINT.x, _POINT.y)
 
 JOIN = """
 import sys, time, zenoh
-from rampart.actors.bus.zenoh_session import open_client
+from rampart.actors.bus.zenoh_session import open_session
 from rampart.actors.bus.run_info import find_runs
 from rampart.cli.session import tools_credentials
 def join():
     run = next(run for run in find_runs() if run.base_port == int(sys.argv[-1]))
-    return open_client(run.endpoints, tools_credentials(run)[0])
+    return open_session(run.endpoints, tools_credentials(run)[0])
 """
 """How a program becomes a member of the run whose base port is its last argument; with the key that
 `RAMPART_KEY` names, if the run has keys."""

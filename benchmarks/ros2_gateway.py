@@ -25,7 +25,7 @@ import psutil
 import zenoh
 
 from rampart.actors.bus.topic import ROOT
-from rampart.actors.bus.zenoh_session import endpoints, open_client
+from rampart.actors.bus.zenoh_session import endpoints, open_session
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.side import ZenohSide
 from rampart.actors.ros2.translation.types import Types
@@ -155,7 +155,7 @@ async def measure(seconds: float) -> None:
 
             while run.pid("gateway") is None:  # noqa: ASYNC110 polled for a moment
                 await asyncio.sleep(0.1)
-            ear = open_client(endpoints(run.info.folder))
+            ear = open_session(endpoints(run.info.folder))
             held = ear.declare_subscriber(f"{ROOT}/bench/*", zenoh.handlers.Callback(
                 arrived, indirect=False))
             await robot.go(2.0)

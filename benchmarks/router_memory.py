@@ -89,7 +89,7 @@ def client(folder: str, number: int) -> int:
         await bus.open()
         for k in range(6):
             key = f"rampart/t/{(number + k) % (CLIENTS + 1)}/0"
-            bus.subscribe(_SENSOR, key, lambda _key, _payload: None)
+            bus.subscribe(key, lambda _key, _payload: None)
         for k in range(4):
             bus.publish(_SENSOR, f"rampart/t/{number}/{k}", b"x" * 100)
         while True:

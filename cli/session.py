@@ -94,7 +94,7 @@ class Session:
                 return
             heard(short, header, body)
 
-        self._bus.subscribe(topic, key, deliver)
+        self._bus.subscribe(key, deliver)
 
     def overhear(self, topic: Topic[Any], arrived: Callable[[str, bytes], None]) -> None:
         """Subscribe to a topic without decoding, which takes most of the time of a message.
@@ -104,7 +104,7 @@ class Session:
             arrived: called with key (below the root) and payload.
         """
         start = len(f"{ROOT}/")
-        self._bus.subscribe(topic, topic.pattern, lambda key, load: arrived(key[start:], load))
+        self._bus.subscribe(topic.pattern, lambda key, load: arrived(key[start:], load))
 
     async def latest(self, topics: tuple[Topic[Any], ...], timeout_s: float) -> dict[str, Any]:
         """Return topic key → newest body, when all have arrived or after some real seconds."""

@@ -15,7 +15,6 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from typing import Protocol
 
 _HEAD = struct.Struct("<II")
 
@@ -24,32 +23,6 @@ MOST_BYTES = 60_000
 
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 _WRITE = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
-
-
-class Board(Protocol):
-    """The newest posting of each key."""
-
-    def post(self, key: str, payload: bytes) -> bool:
-        """Post a message, replacing the previous one; False if that fails."""
-
-    def read(self, key: str) -> bytes | None:
-        """Return the posted message; None if there is none, or if it is damaged."""
-
-
-class MemoryBoard:
-    """Board of a system that runs in one process."""
-
-    def __init__(self) -> None:
-        self._payloads: dict[str, bytes] = {}
-
-    def post(self, key: str, payload: bytes) -> bool:
-        """Post a message."""
-        self._payloads[key] = payload
-        return True
-
-    def read(self, key: str) -> bytes | None:
-        """Return the posted message, None if there is none."""
-        return self._payloads.get(key)
 
 
 class FileBoard:

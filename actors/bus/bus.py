@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from typing import Any, Protocol, cast
 
@@ -10,8 +9,6 @@ from rampart.actors.bus.topic import Topic
 
 Deliver = Callable[[str, bytes], None]
 """Called on the event loop with the concrete key and the payload."""
-
-_LOOK_S = 0.005
 
 
 class BusError(Exception):
@@ -26,10 +23,6 @@ class Bus(Protocol):
     """
 
     bursts: bool
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it is open."""
 
     async def open(self) -> None:
         """Join the bus; does nothing if it is open.
@@ -53,7 +46,7 @@ class Bus(Protocol):
     def has_readers(self, key: str) -> bool:
         """Whether a key has subscribers now; True if that cannot be known."""
 
-    def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:
+    def subscribe(self, key_expression: str, deliver: Deliver) -> None:
         """Call `deliver` for each message on matching keys."""
 
     def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
@@ -62,9 +55,6 @@ class Bus(Protocol):
         Only living publishers answer, and commands are not kept. `answered` is called after the
         last answer or at a timeout.
         """
-
-    def after_burst(self, call: Callable[[], None]) -> None:
-        """Call `call` when the present burst has been delivered, or soon if there is none."""
 
     def moved(self) -> bool:
         """Whether messages were lost since the last call because a router died.
@@ -77,15 +67,10 @@ class Bus(Protocol):
 
 
 class _SharedBus:
-    """Forwards everything to a bus that another actor opens and closes."""
+    """Forwards everything but `close`."""
 
     def __init__(self, owner: Bus) -> None:
         self._owner = owner
-
-    async def open(self) -> None:
-        """Wait until the owner has opened it."""
-        while not self._owner.is_open:  # noqa: ASYNC110 polled, some milliseconds at most
-            await asyncio.sleep(_LOOK_S)
 
     async def close(self) -> None:
         """Leave the session open."""
@@ -95,8 +80,5 @@ class _SharedBus:
 
 
 def shared(owner: Bus) -> Bus:
-    """Return a second actor's access to a session that another actor opens, perhaps later.
-
-    The second actor has to end first.
-    """
+    """Return a second actor's access to the bus of an actor that ends later."""
     return cast("Bus", _SharedBus(owner))

@@ -71,26 +71,13 @@ def encode(header: Header, body: msgspec.Struct) -> bytes:
     return pack((header.source, header.incarnation, header.sequence, header.stamp, body))
 
 
-def strange_value(body: msgspec.Struct) -> str:
-    """Return which field of a message cannot be encoded, and why; "" if all can."""
-    waiting: list[tuple[str, Any]] = [("", body)]
-    while waiting:
-        path, value = waiting.pop()
-        if isinstance(value, msgspec.Struct):
-            waiting += [(f"{path}.{name}".lstrip("."), getattr(value, name))
-                        for name in value.__struct_fields__]
-        elif isinstance(value, tuple | list):
-            waiting += [(f"{path}[{place}]", item) for place, item in enumerate(value)]
-        elif isinstance(value, dict):
-            waiting += [(f"{path}[{key!r}]", item) for key, item in value.items()]
-        else:
-            try:
-                msgspec.msgpack.encode(value)
-            except TypeError:
-                kind = type(value)
-                return (f"field {path}: {kind.__module__}.{kind.__qualname__} cannot be sent; "
-                        "expected plain values: float(), int(), bool() or .tolist() of numpy's")
-    return ""
+def unsendable_place(body: msgspec.Struct) -> str:
+    """Return where a message has a value that msgpack cannot encode, such as `$.cells[1]`."""
+    try:
+        msgspec.convert(msgspec.to_builtins(body, enc_hook=lambda _value: {}), type(body))
+    except msgspec.ValidationError as error:
+        return str(error).rpartition(" - at ")[2].strip("`")
+    return "$"
 
 
 def decode(topic: Topic[Any], payload: bytes) -> tuple[Header, Any]:

@@ -99,7 +99,3 @@ class ReportLimit:
     def left_out(self, now_s: float) -> int:
         """Return how many reports did not leave since the last time because there were too many."""
         return self._all.left_out(now_s)
-
-    def clear(self) -> None:
-        """Let whatever comes next pass."""
-        self.__init__()  # type: ignore[misc]

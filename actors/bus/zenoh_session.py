@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import os
 import socket
 from collections.abc import Mapping, Sequence
@@ -16,54 +18,55 @@ from rampart.actors.bus.run_folder import ROUTERS, socket_path
 from rampart.actors.machine.unix_peer import peer, process_state
 
 AUTHORITY = "ca.crt"
-"""In a folder of keys: the certificate of the authority."""
+"""Certificate of the authority in a folder of credentials."""
 
 NEAR_LEASE_MS, FAR_LEASE_MS = 86_400_000, 2000
-"""A link that is silent for so long is closed. Within a host the kernel closes the links of a
-process that ends, and the supervisor finds a stopped one. A shorter lease would only close all
-links in a pause of everybody, and the run would be deaf until they are open again. A session that
-is linked to another host has the far lease: a cut cable closes no link.
+"""Silence after which Zenoh closes a link. Within a host the kernel closes the links of a process
+that ends, and the supervisor finds a stopped one. A shorter lease would only close all links when
+the whole machine pauses. A session that is linked to another host has the far lease, because a cut
+cable closes no link.
 """
 
 HANDSHAKE_MS = 300
-"""A handshake that takes longer is given up on either side: what connects and says nothing holds
-one of the hundred places that Zenoh has for handshakes no longer than this."""
+"""Longest handshake. Zenoh has a hundred places for handshakes, and a silent client holds one."""
 
 FAR_HANDSHAKE_MS = 2000
-"""Of a router that other hosts are linked to: four messages, some of which may be lost."""
+"""Longest handshake of a router that is linked to other hosts: four messages may be lost."""
 
 _SOCKET_BYTES, _FAR_SOCKET_BYTES = 16_384, 65_536
-"""What the kernel keeps for a TCP socket on either side; it takes twice that. Left to itself it
-keeps megabytes: what a flooding member with a key had sent stood before an emergency stop for 0.4
-s. Between hosts it is what may be under way: with 0.1 s there and back 1 MB a second."""
+"""Kernel buffer of a TCP socket in each direction; the kernel doubles it. With the kernel's
+default of megabytes, the backlog of a flooding client with a key delayed an emergency stop by
+0.4 s. Between hosts the buffer limits throughput: 1 MB/s at a round-trip time of 0.1 s.
+"""
 
 _NOT_FATAL = "exit_on_failure=false"
 
 FULL_US = 20_000
-"""A link that takes nothing for so long is closed, microseconds, when there is something to be sent
-that may not be left out: declarations of who is new. While a router waits for one reader, which is
-stopped or cut off, no other hears anything, and by default it waits for 5 s."""
+"""Zenoh closes a link that takes nothing for this long, microseconds, if a message that must not be
+dropped is waiting for it, such as a declaration. While a router waits for one stopped reader, it
+serves no other client. Zenoh's default is 5 s.
+"""
 
 _ROOM = {"interactive_high": 16, "data": 16}
 _ROOM_US = 5_000
-"""How much may wait for a link, in batches of 64 kB, and how long what finds no room waits before
-it is left out. A message is a batch of its own, so that it goes at once: with the two batches that
-Zenoh has by default, 51 of 720 answers of 24 nodes to the same message were lost, now none. Once a
-link is full nobody waits for it until it has taken something.
+"""Queue of a link in batches of 64 kB, and how long one waits for room.
+
+A message is a batch, so that it leaves at once. With Zenoh's default of two batches, 51 of 720
+answers of 24 nodes to the same message were lost; with 16, none. Zenoh does not wait for a full
+link again until that link has taken something.
 """
 
 _RUNTIME = "ZENOH_RUNTIME"
 _THREADS = ("(app: (worker_threads: 1), tx: (worker_threads: 1), rx: (handover: app), "
             "acc: (handover: app), net: (handover: app))")
-"""Of Zenoh in a client: one that reads and one that writes. By default a thread that waits for
-sockets wakes one of two others for each message that has come, which reads it. Reading and writing
-on one thread is no choice: most nodes were never heard then.
+"""Zenoh's threads in a client: one reads and one writes. By default one thread waits for sockets
+and wakes another, which reads, for each message. With one thread for reading and writing, the
+messages of most nodes never arrived.
 """
 _ROUTER_THREADS = "(acc: (handover: rx))"
-"""Of Zenoh in a router: those that read wait for the sockets as well. By default another thread
-does, and wakes them for each message: a quarter of what a router costs. It keeps several threads
-for reading, and others for the rest: many links come and go there, and Zenoh holds locks while it
-waits for other tasks.
+"""Zenoh's threads in a router: those that read also wait for the sockets. By default a further
+thread does, and its wake-ups take a quarter of a router's processor time. Reading keeps several
+threads, because links come and go and Zenoh holds locks while it waits for other tasks.
 """
 
 _REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
@@ -72,7 +75,7 @@ _PROTOCOL = "unixsock-stream"
 
 
 def endpoint(folder: str, name: str) -> str:
-    """Return the Zenoh endpoint of a node in the folder of a run."""
+    """Return the Zenoh endpoint of a socket in the folder of a run."""
     return f"{_PROTOCOL}/{socket_path(folder, name)}"
 
 
@@ -83,13 +86,13 @@ def endpoints(folder: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """By what a session shows who it is, and knows whom it has reached: mutual TLS.
+    """Certificates for mutual TLS, by which a session authenticates itself and its router.
 
     Attributes:
-        authority: file with the certificate of the authority that everybody's has to be of.
-        own: file with the session's own private key and certificate.
-        doors: by the socket of a router in the folder of the run, where it is spoken with. The
-            socket says no more than that the router is there: by it nobody may anything.
+        authority: File with the certificate of the authority that issued all others.
+        own: File with the session's private key and certificate.
+        doors: TLS endpoint of a router by its socket in the run's folder. In a run with
+            credentials the socket only shows that the router exists and grants no right.
     """
 
     authority: str
@@ -97,11 +100,11 @@ class Credentials:
     doors: Mapping[str, str] = field(default_factory=dict)
 
     def door(self, where: str) -> str:
-        """Return where a router is spoken with."""
+        """Return the TLS endpoint of a router, or the endpoint itself if it has none."""
         return self.doors.get(where, where)
 
     def settings(self) -> dict[str, Any]:
-        """Return what Zenoh has to know."""
+        """Return the settings of Zenoh."""
         tls = "transport/link/tls"
         return {f"{tls}/root_ca_certificate": self.authority, f"{tls}/enable_mtls": True,
                 **{f"{tls}/{way}_{what}": self.own for way in ("listen", "connect")
@@ -111,13 +114,13 @@ class Credentials:
 
 def credentials_in(keys: str, name: str, folder: str = "",
                    ports: Sequence[int] = ()) -> Credentials | None:
-    """Return the credentials of an identity; None in a run without keys.
+    """Return the credentials of an identity; None in a run without credentials.
 
     Args:
-        keys: folder of keys; "" for none.
-        name: of the identity.
-        folder: of the run.
-        ports: of loopback, on which its routers are spoken with.
+        keys: Folder of credentials; "" for none.
+        name: Name of the identity.
+        folder: Folder of the run.
+        ports: Ports of the run's routers on loopback.
     """
     if not keys:
         return None
@@ -127,32 +130,32 @@ def credentials_in(keys: str, name: str, folder: str = "",
 
 
 def key_file(keys: str, name: str) -> str:
-    """Return the file in a folder of keys with the private key of an identity, and certificate."""
+    """Return the file with private key and certificate of an identity."""
     return f"{keys}/{name}.pem"
 
 
 def session_config(listen: Sequence[str], dial: Sequence[str],
                    credentials: Credentials | None = None,
                    access: Mapping[str, Any] | None = None) -> zenoh.Config:
-    """Return the configuration of a session that finds others only where it is told.
+    """Return the configuration of a session that connects only where it is told.
 
     Args:
-        listen: where a router listens, in the folder first; none for a client. It goes on
-            without the others: an address that is not there now may come.
-        dial: a client goes to the first of these that answers, a router to all, again and again.
-        credentials: None in a run without keys.
-        access: what a router lets through, as `rampart.actors.access.rules` has it; None for
-            everything.
+        listen: Endpoints of a router, the one in the run's folder first; none for a client. The
+            router starts without the others if their addresses do not exist yet.
+        dial: Routers. A client connects to the first one that answers, a router to all of them,
+            again and again. A session without routers is a peer without links.
+        credentials: None in a run without credentials.
+        access: Rules of a router, from `rampart.actors.access.rules`; None allows everything.
     """
     config = zenoh.Config()
     near = list(listen[:1])
-    is_far = len(listen) > 1 or any(one.startswith(("tcp/", "tls/")) for one in dial)
+    is_far = len(listen) > 1 or any(each.startswith(("tcp/", "tls/")) for each in dial)
     handshake_ms = FAR_HANDSHAKE_MS if is_far else HANDSHAKE_MS
     if credentials is not None:
         near = list(dict.fromkeys((*map(credentials.door, near), *near)))
-        dial = [credentials.door(one) for one in dial]
+        dial = [credentials.door(each) for each in dial]
     settings: dict[str, Any] = {
-        "mode": "router" if listen else "client",
+        "mode": "router" if listen else "client" if dial else "peer",
         "listen/endpoints": [*near, *(f"{far}#{_NOT_FATAL}" for far in listen[1:])],
         "listen/exit_on_failure": True,
         "connect/endpoints": list(dial),
@@ -179,53 +182,33 @@ def session_config(listen: Sequence[str], dial: Sequence[str],
     return config
 
 
-def answering(where: Sequence[str]) -> list[str]:
-    """Return the endpoints at which there is a process that is not stopped, the oldest first."""
-    found = []
-    for one in where:
-        path = one.removeprefix(f"{_PROTOCOL}/")
-        with socket.socket(socket.AF_UNIX) as probe:
+def answering_first(dial: Sequence[str]) -> list[str]:
+    """Return endpoints, those with a process that is not stopped first and the oldest in front.
+
+    The list is empty if none has such a process.
+    """
+    found: dict[str, int] = {}
+    for each in dial:
+        path = each.removeprefix(f"{_PROTOCOL}/")
+        with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
             probe.setblocking(False)
-            try:
-                probe.connect(path)
-                if process_state(peer(probe)[0]) not in "TtX":
-                    found.append((Path(path).stat().st_mtime_ns, one))
-            except OSError:  # none, or so many wait to be let in that none is
-                continue
-    return [one for _, one in sorted(found)]
+            probe.connect(path)  # raises also if the backlog is full
+            if process_state(peer(probe)[0]) not in "TtX":
+                found[each] = Path(path).stat().st_mtime_ns
+    return sorted(dial, key=lambda each: found.get(each, math.inf)) if found else []
 
 
-def open_client(dial: Sequence[str], credentials: Credentials | None = None) -> zenoh.Session:
-    """Open the session of a client of the first router that answers.
-
-    Raises:
-        ZError: none does.
-    """
-    return _open(session_config((), dial, credentials))
-
-
-def open_router(listen: Sequence[str], dial: Sequence[str], credentials: Credentials | None,
-                access: Mapping[str, Any] | None) -> zenoh.Session:
-    """Open the session of a router; see `session_config`.
+def open_session(dial: Sequence[str], credentials: Credentials | None = None,
+                 listen: Sequence[str] = (),
+                 access: Mapping[str, Any] | None = None) -> zenoh.Session:
+    """Open the session of a client, or of a router if it listens; see `session_config`.
 
     Raises:
-        ZError: an endpoint is in use, or invalid.
+        ZError: No router answers the client, or an endpoint is in use or invalid.
     """
-    return _open(session_config(listen, dial, credentials, access), _ROUTER_THREADS)
-
-
-def open_alone(credentials: Credentials | None = None) -> zenoh.Session:
-    """Open a session without any link; the next one of this process opens sooner."""
-    config = session_config((), [], credentials)
-    config.insert_json5("mode", '"peer"')
-    return _open(config)
-
-
-def _open(config: zenoh.Config, threads: str = _THREADS) -> zenoh.Session:
-    if _RUNTIME in os.environ:
-        return zenoh.open(config)
-    os.environ[_RUNTIME] = threads  # read when a process opens its first session
+    # Zenoh reads it when a process opens its first session.
+    os.environ[_RUNTIME] = _ROUTER_THREADS if listen else _THREADS
     try:
-        return zenoh.open(config)
+        return zenoh.open(session_config(listen, dial, credentials, access))
     finally:
-        del os.environ[_RUNTIME]  # commands that this process starts have their own
+        del os.environ[_RUNTIME]  # so that commands started by this process do not inherit it

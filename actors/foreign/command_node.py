@@ -22,7 +22,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.bounds import clip
-from rampart.actors.bus.topic import ROOT, Qos, Topic
+from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.foreign.channel import Channel
 from rampart.actors.foreign.output_log import OutputLog
@@ -36,7 +36,6 @@ from rampart.actors.runtime.parameters import TopicsHeard, TopicsPublished
 from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits
 
 _EXTEND, _STATUS = "EXTEND_TIMEOUT_USEC=", "STATUS="
-_ANYTHING = Topic("", msgspec.Struct, Qos.STATE, 0.0, "", "What is not decoded.")
 
 
 class CommandNode(Actor):
@@ -81,8 +80,8 @@ class CommandNode(Actor):
     def on_start(self) -> None:
         """Start the program."""
         if self._heartbeat.key:
-            self._bus.subscribe(_ANYTHING, f"{ROOT}/{self._heartbeat.key}",
-                                lambda _key, _load: self._alive())
+            self._bus.subscribe(
+                f"{ROOT}/{self._heartbeat.key}", lambda _key, _load: self._alive())
         self._make_log_folder()
         self._start()
 

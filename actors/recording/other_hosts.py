@@ -22,7 +22,7 @@ from zenoh.handlers import Callback
 
 from rampart.actors.access.rights import EVERYTHING, said_elsewhere
 from rampart.actors.bus.limits import Remembered
-from rampart.actors.bus.zenoh_session import Credentials, answering, open_client
+from rampart.actors.bus.zenoh_session import Credentials, answering_first, open_session
 from rampart.actors.recording.message_form import header_of
 from rampart.actors.system.layout import Layout
 
@@ -203,9 +203,8 @@ class Ear:
             return
         self._next_try_s = now_s + _RETRY_S
         with contextlib.suppress(zenoh.ZError, OSError):  # it has ended in this moment
-            if found := answering(self._dial):
-                both = [*found, *(one for one in self._dial if one not in found)]
-                self._session = open_client(both, self._shown)
+            if dial := answering_first(self._dial):
+                self._session = open_session(dial, self._shown)
                 self._held = [self._session.declare_subscriber(
                     key, Callback(self._hear, lambda: None, indirect=False))
                     for key in self._others.keys]

@@ -29,6 +29,10 @@ _pack, _unpack = msgspec.msgpack.encode, msgspec.msgpack.decode
 class WatchedBus(Bus, Protocol):
     """A bus that knows which nodes are there, as that of virtual time does."""
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it has joined, and not been cut off."""
+
     def watch(self, node: str, changed: Callable[[str, int, bool], None]) -> None:
         """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
 
@@ -49,7 +53,7 @@ class BusSide:
         self._seen: dict[str, tuple[int, set[str]]] = {}
         self._numbers = count(1)
         self._asked: dict[int, Answered] = {}
-        bus.subscribe(_PASSING, f"{ROS_SIDE}/answer/{self.id}", self._answer)
+        bus.subscribe(f"{ROS_SIDE}/answer/{self.id}", self._answer)
 
     def token(self, key: str) -> None:
         """See `Side.token`."""
@@ -86,7 +90,7 @@ class BusSide:
                 changed(token, alive)
 
         where = f"{ROS_SIDE}/tokens/*"
-        self._bus.subscribe(_KEPT, where, heard)
+        self._bus.subscribe(where, heard)
         self._bus.latest(where, heard, lambda: None)
         tell({token for token in self._tokens if token.startswith(above)}, alive=True)
 
@@ -100,7 +104,7 @@ class BusSide:
     def subscribe(self, key: str, qos: Qos, deliver: Deliver) -> None:
         """See `Side.subscribe`."""
         where = recorded_key(key)
-        self._bus.subscribe(_PASSING, where, lambda _key, whole: deliver(*_unpack(whole)))
+        self._bus.subscribe(where, lambda _key, whole: deliver(*_unpack(whole)))
         if qos.transient_local:
             self._bus.latest(
                 where, lambda _key, whole: deliver(*_unpack(whole)), lambda: None)
@@ -113,7 +117,7 @@ class BusSide:
             asked(payload, attachment, lambda answer, attached: self._bus.publish(
                 _PASSING, f"{ROS_SIDE}/answer/{who}", _pack((number, answer, attached))))
 
-        self._bus.subscribe(_PASSING, f"{ROS_SIDE}/ask/{chunk_of(key)}", heard)
+        self._bus.subscribe(f"{ROS_SIDE}/ask/{chunk_of(key)}", heard)
 
     def ask(self, key: str, payload: bytes, attachment: bytes, timeout_s: float,
             answered: Answered) -> None:

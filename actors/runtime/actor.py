@@ -26,13 +26,12 @@ from rampart.actors.bus.envelope import (
     Envelope,
     Header,
     pack,
-    strange_value,
     too_long,
+    unsendable_place,
 )
 from rampart.actors.bus.fields import Field
 from rampart.actors.bus.limits import ReportLimit
 from rampart.actors.bus.messages import ON_TIME, Diagnostic, Heartbeat, Injection
-from rampart.actors.bus.newcomer import PATIENCE_S, Questions, unless_silent
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, INJECT
 from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
@@ -50,6 +49,15 @@ _LATE_DIGITS = 3  # milliseconds
 
 _EARLY_S = 0.05
 """Simulated seconds by which what is repeated by a timer may be early."""
+
+_PATIENCE_S = 0.02
+"""Longest time, simulated seconds, that a restarted node waits for the last messages of its topics.
+"""
+
+_OFTEN_HZ, _PERIODS = 7.0, 3
+"""On topics this fast, a last message older than three periods is of no use: its publisher is
+silent, and only a new message shows that it is not.
+"""
 
 
 def _ignore(_key: str, _reason: str) -> None:
@@ -91,11 +99,9 @@ class Actor(Declared):
         self._keeper = Keeper(
             context.checkpoints, lambda line: self.report_diagnostic("checkpoint", line, self.name),
             context.clock.now, expected=context.incarnation > 1 or context.run.plan.part > 0)
-        self._dispatcher = Dispatcher(
-            context.bus.bursts, self._overflowed, context.bus.after_burst)
+        self._dispatcher = Dispatcher(context.bus.bursts, self._overflowed)
         self._timers = Timers(context.clock, self._dispatcher)
-        self._questions = Questions(
-            context.bus, lambda: self._dispatcher.put("go to work", self._go_to_work))
+        self._queries = 0
         self._is_at_work = False
         self._sequence = 0
         self._beat_due_s = math.inf
@@ -324,10 +330,10 @@ class Actor(Declared):
         self.on_start()
         self._beat()
         self._timers.every(self.context.heartbeat_period_s, "_beat", self._beat)
-        if self._incarnation == 1 or not self._questions.open:  # nothing is to be heard yet
+        if self._incarnation == 1 or not self._queries:  # nothing is to be heard yet
             self._go_to_work()
         else:
-            self.call_later(PATIENCE_S, self._go_to_work)
+            self.call_later(_PATIENCE_S, self._go_to_work)
 
     def _go_to_work(self) -> None:
         """Start the periodic work: of one that replaces another, at once."""
@@ -352,7 +358,7 @@ class Actor(Declared):
 
     def _fail(self, error: Exception) -> None:
         try:
-            self._reports.clear()
+            self._reports = ReportLimit()  # this report must leave
             self.report_diagnostic("handler failed", f"{type(error).__name__}: {error}", self.name)
             self._keeper.failed()
         except Exception as second:  # the first error is the one that counts
@@ -363,14 +369,33 @@ class Actor(Declared):
 
     def _hear(self, topic: Topic[Any], where: str, handler: Callable[[Any, Header], None]) -> None:
         """Hear what is published from now on, and what was published last if it is no command."""
-        self._bus.subscribe(topic, where, self._receiver(topic, handler))
+        self._bus.subscribe(where, self._receiver(topic, handler))
         if topic.resend_s:
             for key in self.reads(topic) if "*" in where else (where,):
                 self._postings[key] = self._guard.receiver(
                     topic, lambda _key, message: handler(message.body, message), _ignore)
         if topic.qos is not Qos.COMMAND:
-            self._questions.ask(where, self._receiver(
-                topic, unless_silent(topic, self.clock.now, handler)))
+            self._queries += 1
+            self._bus.latest(where, self._receiver(topic, self._unless_silent(topic, handler)),
+                             self._query_ended)
+
+    def _query_ended(self) -> None:
+        self._queries -= 1
+        if not self._queries:
+            self._dispatcher.put("go to work", self._go_to_work)
+
+    def _unless_silent(self, topic: Topic[Any],
+                       handler: Callable[[Any, Header], None]) -> Callable[[Any, Header], None]:
+        """Return a handler that ignores messages of publishers that have been silent since."""
+        if topic.rate_hz < _OFTEN_HZ:
+            return handler
+        oldest_s = _PERIODS / topic.rate_hz
+
+        def take(message: Any, header: Header) -> None:
+            if self.clock.now() - header.stamp <= oldest_s:
+                handler(message, header)
+
+        return take
 
     def _receiver(self, topic: Topic[Any],
                   handler: Callable[[Any, Header], None]) -> Callable[[str, bytes], None]:
@@ -406,7 +431,8 @@ class Actor(Declared):
         try:
             payload = pack((self.name, self._incarnation, sequence, stamp, body))
         except TypeError as error:
-            raise TypeError(f"topic {topic.key}: {strange_value(body) or error}") from None
+            raise TypeError(f"topic {topic.key}: {unsendable_place(body)}: {error}; expected plain "
+                            "values, such as float() or .tolist() of a numpy value") from None
         if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
             self.report_diagnostic("not sent", too_long(payload), key)
             return

@@ -43,7 +43,6 @@ class Dispatcher:
     Args:
         bursts: Whether messages arrive in bursts, see `Bus`.
         on_overflow: Called with a message that is refused because too many wait.
-        after_burst: See `Bus`.
 
     Attributes:
         stance: `RESTING`, `IDLE` or `AWAKE`.
@@ -52,8 +51,7 @@ class Dispatcher:
         overflowed: Messages refused because too many waited.
     """
 
-    def __init__(self, bursts: bool, on_overflow: Callable[[Any], None],
-                 after_burst: Callable[[Callable[[], None]], None]) -> None:
+    def __init__(self, bursts: bool, on_overflow: Callable[[Any], None]) -> None:
         self.stance = AWAKE
         self.progress = 0
         self.stopping = False
@@ -63,7 +61,6 @@ class Dispatcher:
         self._latest: dict[str, Any] = {}
         self._commands = 0
         self._bursts = bursts
-        self._after_burst = after_burst
         self._held = False
         self._pace_s = 0.0
         self._at_rest = RESTING if bursts else IDLE
@@ -155,7 +152,7 @@ class Dispatcher:
         if self.stance != AWAKE and self._ended is not None:
             self.stance = AWAKE
             if self._bursts:
-                self._after_burst(self.work)
+                asyncio.get_running_loop().call_soon(self.work)  # after the burst
             else:
                 self.work()
 

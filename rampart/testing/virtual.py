@@ -209,7 +209,7 @@ class VirtualSystem:
         def deliver(key: str, payload: bytes) -> None:
             heard.append(Heard(self.clock.now(), key, *decode(topic, payload)))
 
-        self.bus.subscribe(topic, topic.at(member) if member else topic.pattern, deliver)
+        self.bus.subscribe(topic.at(member) if member else topic.pattern, deliver)
         return heard
 
     def overhear(self, name: str) -> list[tuple[str, Any]]:

@@ -11,7 +11,6 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rampart.actors.bus.board import MemoryBoard
 from rampart.actors.bus.bus import Deliver
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.sim.virtual.virtual_loop import VirtualLoop
@@ -49,7 +48,7 @@ class Hub:
         self._link = link
         self.taps: list[Tap] = []
         self.several_hosts = several_hosts
-        self.board = MemoryBoard()
+        self.postings: dict[str, bytes] = {}
         self.alive: dict[str, set[int]] = {}
         self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
         self._routes: dict[str, dict[str, list[Route]]] = {}
@@ -177,7 +176,7 @@ class VirtualBus:
             return False
         if self._open:
             self.latest_sent[key] = payload
-            self._hub.board.post(key, payload)
+            self._hub.postings[key] = payload
         return True
 
     def record(self, key: str, payload: bytes) -> None:
@@ -185,7 +184,7 @@ class VirtualBus:
 
     def posted(self, key: str) -> bytes | None:
         """Return the newest message that was posted on a key."""
-        return self._hub.board.read(key)
+        return self._hub.postings.get(key)
 
     def answer(self, route: Route, key: str) -> None:
         """Send what was published last on a key by one route, past the taps."""
@@ -210,7 +209,7 @@ class VirtualBus:
         routes = self._routes.get(key)
         return bool(self._hub.route(self.node, key) if routes is None else routes)
 
-    def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:  # noqa: ARG002
+    def subscribe(self, key_expression: str, deliver: Deliver) -> None:
         """Have `deliver` called for each message on keys that match; no other bus may have it."""
         self._readers.append(deliver)
         self._hub.subscribe(key_expression, deliver, self)
@@ -231,10 +230,6 @@ class VirtualBus:
         self._hub.watch(node, changed, self)
         for incarnation in sorted(self._hub.alive.get(node, ())):
             self.soon(lambda i=incarnation: changed(node, i, True))  # type: ignore[misc]
-
-    def after_burst(self, call: Callable[[], None]) -> None:
-        """Make a call: each message arrives by itself."""
-        call()
 
     def moved(self) -> bool:
         """Never: there are no routers."""

@@ -451,7 +451,7 @@ async def test_it_shows_that_it_lives_to_who_looks_ten_times_a_second(system):
     stamps = set()
     for _ in range(200):
         await asyncio.sleep(0.01)
-        posted = system.hub.board.read(ftm_topics.MANAGER_STATUS.at())
+        posted = system.hub.postings.get(ftm_topics.MANAGER_STATUS.at())
         assert posted is not None
         stamps.add(decode(ftm_topics.MANAGER_STATUS, posted)[0].stamp)
     assert len(stamps) == pytest.approx(20, abs=1)

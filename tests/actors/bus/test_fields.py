@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated
 
 import numpy as np
@@ -41,16 +42,16 @@ class Gauge(Actor):
     outputs = (LEVEL,)
 
 
-@pytest.mark.parametrize(("message", "where"), [
-    (Level(np.float64(1.0)), "field height_m: numpy.float64"),
-    (Level(1.0, np.zeros(2)), "field cells: numpy.ndarray"),
-    (Level(1.0, (0.0, np.float32(1.0))), "field cells[1]: numpy.float32")])
-def test_a_value_of_numpy_is_refused_by_topic_and_field(message, where):
+@pytest.mark.parametrize(("message", "where", "kind"), [
+    (Level(np.float64(1.0)), "height_m", "numpy.float64"),
+    (Level(1.0, np.zeros(2)), "cells", "numpy.ndarray"),
+    (Level(1.0, (0.0, np.float32(1.0))), "cells[1]", "numpy.float32")])
+def test_a_value_of_numpy_is_refused_by_topic_and_field(message, where, kind):
     async def scenario() -> None:
         async with VirtualSystem(topics=TOPICS) as system:
-            with pytest.raises(TypeError, match=r"^topic tank/level: ") as caught:
+            with pytest.raises(
+                    TypeError, match=rf"^topic tank/level: \$\.{re.escape(where)}: .*{kind} "):
                 system.start("gauge", Gauge).publish(LEVEL, message)
-            assert where in str(caught.value)
 
     run(scenario)
 

@@ -107,7 +107,7 @@ def lived(kind, during=lambda _hub: None):
             during(system.bus)
             await asyncio.sleep(1.0)
             await system.stop("node")
-            posted = system.hub.board.read(bus_topics.HEARTBEAT.at("node"))
+            posted = system.hub.postings.get(bus_topics.HEARTBEAT.at("node"))
             assert posted is not None
             beat = msgspec.to_builtins(decode(bus_topics.HEARTBEAT, posted)[1])
             return [*sent, ("heartbeat/node", beat)]

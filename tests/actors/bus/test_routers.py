@@ -83,7 +83,7 @@ async def client(folder: str, name: str = "") -> AsyncIterator[ZenohBus]:
 
 def hear(bus: Bus) -> list[bytes]:
     heard: list[bytes] = []
-    bus.subscribe(topics.POSE, topics.POSE.at(), lambda _key, payload: heard.append(payload))
+    bus.subscribe(topics.POSE.at(), lambda _key, payload: heard.append(payload))
     return heard
 
 
@@ -220,7 +220,7 @@ def be_client(folder: str, ready) -> None:
     async def main() -> None:
         async with client(folder, "hung") as bus:
             for topic in (topics.POSE, topics.MISSION_ORDER):
-                bus.subscribe(topic, topic.at(), lambda _key, _payload: None)
+                bus.subscribe(topic.at(), lambda _key, _payload: None)
             bus.publish(topics.GOAL, topics.GOAL.at(), b"of one that hangs")
             await asyncio.sleep(0.2)
             ready.set()
@@ -275,7 +275,7 @@ async def test_who_is_stopped_and_reads_no_more_keeps_nobody_else_waiting(router
     async with (hung_client(sockets) as hung, client(sockets, "node") as writer,
                 client(sockets) as reader):
         heard, order = list[float](), topics.MISSION_ORDER
-        reader.subscribe(topics.POSE, topics.POSE.at(), lambda *_: heard.append(time.monotonic()))
+        reader.subscribe(topics.POSE.at(), lambda *_: heard.append(time.monotonic()))
         os.kill(hung, signal.SIGSTOP)
         for _ in range(600):  # 6 MB: more than all sockets and queues between them hold
             writer.publish(topics.POSE, topics.POSE.at(), b"x" * 10_000)

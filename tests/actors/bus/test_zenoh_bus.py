@@ -11,8 +11,9 @@ import zenoh
 
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.bus.zenoh_session import endpoints, open_client
+from rampart.actors.bus.zenoh_session import endpoints, open_session
 from rampart.actors.ftm import topics
+from rampart.testing import eventually
 
 MANY = 1500
 
@@ -27,8 +28,8 @@ async def test_who_is_flooded_gets_round_to_its_timers(bus_folder):
         begun.set()
         time.sleep(0.001)  # busy: it is nobody else's turn
 
-    reader.subscribe(topics.DETECTION, topics.DETECTION.at("DM1"), slow)
-    with open_client(endpoints(bus_folder)) as member:
+    reader.subscribe(topics.DETECTION.at("DM1"), slow)
+    with open_session(endpoints(bus_folder)) as member:
         flood = member.declare_publisher(topics.DETECTION.at("DM1"),
                                          congestion_control=zenoh.CongestionControl.BLOCK)
 
@@ -55,3 +56,27 @@ async def test_a_session_that_cannot_be_opened_says_why(monkeypatch):
     monkeypatch.setattr(zenoh, "open", fail)
     with pytest.raises(BusError, match=r"\(node one\): no memory left"):
         await ZenohBus("one", []).open()
+
+
+async def test_a_delivery_that_raises_keeps_no_other_message_back(bus_folder):
+    errors, received = [], []
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, told: errors.append(told))
+    reader, writer = (ZenohBus(name, endpoints(bus_folder)) for name in ("reader", "writer"))
+    await reader.open()
+    await writer.open()
+
+    def deliver(_key: str, payload: bytes) -> None:
+        received.append(payload)
+        time.sleep(0.1)  # the others arrive meanwhile
+        if payload == b"0":
+            raise ZeroDivisionError
+
+    key = topics.DETECTION.at("DM1")
+    reader.subscribe(key, deliver)
+    await asyncio.sleep(0.2)  # the subscription is known
+    for number in range(3):
+        writer.publish(topics.DETECTION, key, b"%d" % number)
+    await eventually(lambda: received == [b"0", b"1", b"2"])
+    assert len(errors) == 1
+    await reader.close()
+    await writer.close()

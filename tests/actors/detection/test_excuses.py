@@ -93,7 +93,7 @@ def test_one_that_concludes_nothing_yet_is_not_silent():
         module.hold(False)
         await publish(source, 1, stamp=system.clock.now() - 4.0)
         await asyncio.sleep(0.9 * GRACE_S - 0.05)
-        posted = system.hub.board.read(ftm_topics.DETECTION.at("DM6"))
+        posted = system.hub.postings.get(ftm_topics.DETECTION.at("DM6"))
         assert posted is not None
         report, _ = decode(ftm_topics.DETECTION, posted)
         assert system.clock.now() - report.stamp <= 0.2

@@ -88,7 +88,7 @@ async def reading(port, *keys):
     bus = ZenohBus("", found()[0].endpoints)
     await bus.open()
     for key in keys:
-        bus.subscribe(topics.POSE, key, lambda key, payload: heard.append((key, payload)))
+        bus.subscribe(key, lambda key, payload: heard.append((key, payload)))
     try:
         yield heard
     finally:

@@ -14,7 +14,6 @@ import pytest
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.bus.board import MemoryBoard
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.envelope import ArrivalGuard, encode
 from rampart.actors.bus.zenoh_bus import ZenohBus
@@ -351,17 +350,16 @@ def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(
 
 
 async def test_the_heart_beats_at_the_period_that_the_system_states():
-    hub, beats = Hub(), []
+    beats = []
 
-    class Noted(MemoryBoard):
+    class Noted(VirtualBus):
         def post(self, key: str, payload: bytes) -> bool:
             if key == bus_topics.HEARTBEAT.at("talker"):
                 beats.append(asyncio.get_running_loop().time())
             return super().post(key, payload)
 
-    hub.board = Noted()
     clock = Clock(asyncio.get_running_loop().time(), 100.0)
-    node = Talker(Context("talker", 1, clock, VirtualBus(hub, "talker"), heartbeat_period_s=3.0))
+    node = Talker(Context("talker", 1, clock, Noted(Hub(), "talker"), heartbeat_period_s=3.0))
     task = asyncio.create_task(node.run())
     await eventually(lambda: len(beats) >= 4)
     node.stop()

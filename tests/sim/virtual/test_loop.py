@@ -124,7 +124,7 @@ def test_what_is_on_its_way_to_a_node_that_is_killed_does_not_arrive():
         for name, bus in buses.items():
             await bus.open()
             if name != "talker":
-                bus.subscribe(topics.POSE, topics.POSE.at(),
+                bus.subscribe(topics.POSE.at(),
                               lambda _key, payload, name=name: seen.append((name, payload)))
         buses["talker"].publish(topics.POSE, topics.POSE.at(), b"first")
         await asyncio.sleep(1.5)
