@@ -16,7 +16,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.machine.patience import Usage
 from rampart.actors.machine.patience import usage as read_usage
 from rampart.actors.machine.process_usage import ProcessCount, read_count
-from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
+from rampart.actors.runtime.checkpoint import CheckpointStore
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 
@@ -53,7 +53,7 @@ class Context:
     parameters: Mapping[str, Any] | msgspec.Struct = field(default_factory=dict)
     run: RunContext = field(default_factory=RunContext)
     pid: int = field(default_factory=os.getpid)
-    checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
+    checkpoints: CheckpointStore | None = None
     heartbeat_period_s: float = 0.1
     renewed: Callable[[int], None] = lambda _incarnation: None
     failed: Callable[[Exception], None] = lambda _error: None

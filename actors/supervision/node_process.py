@@ -25,7 +25,7 @@ from rampart.actors.bus.run_folder import ROUTERS, board_of, is_here, issue, reg
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.runtime.actor import Actor, Context
-from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
+from rampart.actors.runtime.checkpoint import CheckpointStore
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 from rampart.actors.runtime.clock import clock_of
 from rampart.actors.runtime.run_context import RunContext
@@ -101,11 +101,11 @@ def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:
     return [*beside, *hosts.dials(number, protocol)], [own, *hosts.listens(number, protocol)]
 
 
-def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
+def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore | None:
     """Return where a node of the system keeps its state; nothing is opened yet."""
     plan = layout.plan
     if not (plan.checkpoints and layout.spec.layers.checkpoints):
-        return NoCheckpoints()
+        return None
     return FileCheckpoints(Path(plan.checkpoints), name, plan.run_id,
                            plan.part * OF_A_PART + incarnation)
 

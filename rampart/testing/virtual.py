@@ -22,7 +22,7 @@ from rampart.actors.ftm.messages import ProcessEvent
 from rampart.actors.ftm.topics import PROCESS_EVENT
 from rampart.actors.machine.patience import AT_LEISURE
 from rampart.actors.runtime.actor import Actor, Context
-from rampart.actors.runtime.checkpoint import MemoryCheckpoints, NoCheckpoints, Record
+from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Record
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan, load_system
@@ -132,7 +132,7 @@ class VirtualSystem:
     def context(self, name: str, parameters: dict[str, Any]) -> Context:
         """Return the context for the next incarnation of an actor."""
         incarnation = self.incarnations[name] = self.incarnations.get(name, 0) + 1
-        kept = NoCheckpoints() if self._shelves is None else MemoryCheckpoints(
+        kept = None if self._shelves is None else MemoryCheckpoints(
             self._shelves.setdefault(name, []), incarnation)
         return Context(name, incarnation, self.clock, VirtualBus(self.hub, name, incarnation),
                        parameters, self.run, checkpoints=kept, members=self.members,

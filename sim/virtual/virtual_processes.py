@@ -300,9 +300,9 @@ class VirtualMachine:
             process.actors.append((actor, bus, task))
             task.add_done_callback(partial(self._task_done, process, name))
 
-    def _store(self, name: str, incarnation: int) -> checkpoint.CheckpointStore:
+    def _store(self, name: str, incarnation: int) -> checkpoint.CheckpointStore | None:
         if not self._layout.spec.layers.checkpoints:
-            return checkpoint.NoCheckpoints()
+            return None
         shelf = self.shelves.setdefault(name, [])
         return checkpoint.MemoryCheckpoints(shelf, incarnation)
 
