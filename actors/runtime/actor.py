@@ -1,13 +1,13 @@
 """The actor: one mailbox, one message at a time, in three phases.
 
-Set-up opens the bus, subscribes, calls `on_start`. Running takes one item after the other from
-the mailbox: messages, timer ticks, changes of peers. Teardown calls `on_stop` and leaves the
-bus. Handlers are plain functions and run to their end before the next item, so an actor's state
-needs no lock and its code no `await`.
+Set-up opens the bus, subscribes and calls `on_start`. Running takes one item after the other from
+the mailbox: messages and timer ticks. Teardown calls `on_stop` and closes the bus. Handlers are
+plain functions and run to their end before the next item, so an actor's state needs no lock and its
+code no `await`.
 
 A handler that raises ends the actor: the error is reported on `diagnostic/NAME`, and the process
-exits non-zero so that its supervisor starts a fresh one. The heartbeat is an item of the same
-mailbox: a handler that never returns silences it, although the process is still there.
+exits non-zero, so that its supervisor starts a new one. The heartbeat is an item of the same
+mailbox, so a handler that never returns silences it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ __all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every",
 _LATE_DIGITS = 3  # milliseconds
 
 _EARLY_S = 0.05
-"""Simulated seconds by which what is repeated by a timer may be early."""
+"""Simulated seconds by which a repeated posting may be sent early."""
 
 _PATIENCE_S = 0.02
 """Longest time, simulated seconds, that a restarted node waits for the last messages of its topics.
@@ -61,11 +61,11 @@ silent, and only a new message shows that it is not.
 
 
 def _ignore(_key: str, _reason: str) -> None:
-    """Do nothing about a posting that is not to be believed: whoever posts it is silent."""
+    """A posting that is refused counts as silence."""
 
 
 def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any, Header], None]:
-    """Return a handler that calls some in order; a message is for one receiver of an actor."""
+    """Return one handler that calls several in order."""
     if len(handlers) == 1:
         return handlers[0]
 
@@ -124,51 +124,52 @@ class Actor(Declared):
     # -- what a subclass may override, besides what `Declared` has ---------------------------------
 
     def listens(self, topic: Topic[Any]) -> bool:  # noqa: ARG002
-        """Whether this process of the node has any use for one of its inputs."""
+        """Whether this process of the node subscribes to one of its inputs."""
         return True
 
     def reads(self, topic: Topic[Any]) -> Iterable[str]:  # noqa: ARG002
-        """Return the keys of a posted topic, all members of which it hears, that it reads too."""
+        """Return the keys whose postings it reads, of a family it subscribes to as a whole."""
         return ()
 
     def on_start(self) -> None:
-        """Runs on the loop when the bus is open, before the first message. A raise ends it."""
+        """Runs on the loop with the bus open, before the first message. Raising ends the actor."""
 
     def on_stop(self) -> None:
-        """Runs on the loop after the last item, bus still open, also after a failure."""
+        """Runs on the loop after the last item, with the bus still open; also after a failure."""
 
     def is_well(self) -> bool:
-        """Whether its heartbeat is to be sent; asked whenever one is due."""
+        """Whether to send the heartbeat that is due."""
         return True
 
     # -- what a subclass calls ------------------------------------------------------------------
 
     def hear_topic(self, key: str, handler: Callable[[Any, Header], None]) -> Topic[Any]:
-        """Hear a topic that the node's parameters name; to be called when it is made.
+        """Subscribe to a topic that a parameter names; to be called in `__init__`.
 
         Args:
-            key: of a parameter of type `TopicHeard`.
+            key: value of a parameter of type `TopicHeard`.
             handler: called with message and header.
 
-        Returns:
-            The topic.
-
         Raises:
-            ValueError: the system has no such topic.
+            ValueError: the system does not have the topic.
         """
         topic = self.chosen_topic(key)
         self._chosen.setdefault(key, []).append(handler)
         return topic
 
     def hear_after_all(self, topic: Topic[Any], handler: Callable[[Any, Header], None]) -> None:
-        """Hear from now on one of its inputs that `listens` has left out."""
+        """Subscribe from now on to an input that `listens` has left out."""
         self._hear(topic, topic.at(), handler)
 
     def hear_field(self, name: str, handler: Callable[[Any, Header], None]) -> None:
-        """Hear a field that the node's parameters name, likewise; of type `FieldName`.
+        """Subscribe to a field that a parameter names; to be called in `__init__`.
+
+        Args:
+            name: value of a parameter of type `FieldName`.
+            handler: called with the field's value and the header.
 
         Raises:
-            ValueError: there is no such topic, or its messages have no such field.
+            ValueError: the system does not have the topic, or its messages lack the field.
         """
         key, _, path = name.partition(":")
         field = Field(self.chosen_topic(key).type, path)
@@ -182,19 +183,19 @@ class Actor(Declared):
         self.hear_topic(key, take)
 
     def chosen_topic(self, key: str) -> Topic[Any]:
-        """Return a topic that the node's parameters name.
+        """Return the topic with a key that a parameter names.
 
         Raises:
-            ValueError: the system has none.
+            ValueError: the system does not have the topic.
         """
         try:
             return self.context.topics[key]
         except KeyError:
-            raise ValueError(f"{self.name}: no topic {key!r}") from None
+            raise ValueError(f"{self.name}: unknown topic {key!r}") from None
 
     def publish(self, topic: Topic[Any], body: msgspec.Struct, stamp: float | None = None,
                 name: str | None = None) -> None:
-        """Send a message.
+        """Publish a message.
 
         Args:
             topic: one of `outputs`.
@@ -203,7 +204,7 @@ class Actor(Declared):
             name: member of a topic family; this node's name if omitted.
 
         Raises:
-            ValueError: the topic is not declared in `outputs`.
+            ValueError: `outputs` does not declare the topic.
         """
         key = self._outlets.get(
             topic.key if name is None else (topic.key, name)) or self._outlet(topic, name)
@@ -212,7 +213,6 @@ class Actor(Declared):
         (self._injections.send if self._in_force else self.send)(topic, key, body, stamp)
 
     def _outlet(self, topic: Topic[Any], name: str | None) -> str:
-        """Return the key of a topic."""
         if topic.key not in self._may_publish:
             raise ValueError(f"{type(self).__name__} publishes {topic.key}, "
                              "which its outputs do not declare")
@@ -221,8 +221,8 @@ class Actor(Declared):
         return outlet
 
     def read_postings(self) -> None:
-        """Take what was posted for it; to be called before a conclusion is drawn from silence."""
-        if self._is_reading:  # a handler of one that is being read asks for more
+        """Handle new postings; to be called before a conclusion is drawn from silence."""
+        if self._is_reading:  # called by the handler of a posting
             return
         self._is_reading, self._has_read_s = True, self.clock.now()
         for key, receive in self._postings.items():
@@ -233,64 +233,63 @@ class Actor(Declared):
         self._is_reading = False
 
     def came_s(self, header: Header) -> float:
-        """Return when the message that is being handled came: what was read, when it was posted."""
+        """Return the arrival time of the message in hand; of a posting, when it was posted."""
         now_s = self.clock.now()
         return min(header.stamp, now_s) if self._is_reading else now_s
 
     def has_readers(self, topic: Topic[Any]) -> bool:
-        """Whether somebody may be listening to one of its topics, as far as the bus can know."""
+        """Whether one of its topics may have subscribers, as far as the bus knows."""
         key = self._outlets.get(topic.key) or self._outlet(topic, None)
         return self._bus.has_readers(key)
 
     def call_later(self, delay_s: float, call: Callable[[], None]) -> Timer:
-        """Have `call` made as a mailbox item after `delay_s` simulated seconds."""
+        """Call `call` as a mailbox item after `delay_s` simulated seconds."""
         return self._timers.later(delay_s, call)
 
     def kept(self, form: StateFormat[S]) -> S | None:
-        """Return the state to go on from, in `on_start`: the newest sound one, or None."""
+        """Return the newest sound state, or None; to be called in `on_start`."""
         return self._keeper.kept(form)
 
     def keep(self, form: StateFormat[S], state: S) -> None:
-        """Keep the whole state; to be called before the messages that follow from it are sent.
+        """Save the whole state; to be called before the messages that follow from it are sent.
 
-        On return it survives this process. What goes wrong is reported and does not raise: the
-        node goes on without.
+        After the return the state survives this process. A failure is reported and does not raise.
         """
         self._keeper.keep(form, state)
 
     def call_soon(self, slot: str, call: Callable[[], None]) -> None:
-        """Have `call` made as a mailbox item, in place of one in the same slot that still waits."""
+        """Call `call` as a mailbox item; it replaces a waiting item of the same slot."""
         self._dispatcher.put(slot, call)
 
     def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
-        """Publish an error report: one a second per context and offender, and few in all."""
+        """Publish an error report, at most once a second per context and offender."""
         count = self._reports.stands_for(f"{context} {offender}", self.clock.now())
         if count:
             self.publish(DIAGNOSTIC, Diagnostic(
                 self.name, clip(context), clip(reason), clip(offender), count))
 
     def stop(self) -> None:
-        """End the actor after the items that already wait."""
+        """End the actor after the items that are waiting."""
         self._dispatcher.stop()
 
     def renew(self, incarnation: int) -> None:
-        """Be another incarnation of the node, in the same process."""
+        """Become another incarnation of the node in the same process."""
         self._incarnation = incarnation
         self.context.renewed(incarnation)
 
     # -- what happens to its process ------------------------------------------------------------
 
     def abandon(self) -> None:
-        """Have nothing more run when its task is cancelled: what SIGKILL does."""
+        """Run no teardown when the task is cancelled, as after SIGKILL."""
         self._abandoned = True
         self._dispatcher.abandon()
 
     def hold(self, held: bool) -> None:
-        """Handle nothing while held: what SIGSTOP and a wedged loop do."""
+        """Handle nothing while held, as after SIGSTOP or in a hang."""
         self._dispatcher.hold(held)
 
     def slow_down(self, pace_s: float) -> None:
-        """Take so many virtual seconds for each item, as on a machine that is overloaded."""
+        """Take `pace_s` virtual seconds for each item, as on an overloaded machine."""
         self._dispatcher.slow_down(pace_s)
 
     # -- the three phases -----------------------------------------------------------------------
@@ -299,8 +298,8 @@ class Actor(Declared):
         """Run from set-up to teardown.
 
         Raises:
-            BusError: the bus could not be opened.
-            Exception: whatever a handler raised.
+            BusError: the bus cannot be opened.
+            Exception: raised by a handler.
         """
         await self._bus.open()
         try:
@@ -317,7 +316,7 @@ class Actor(Declared):
         for topic, method in self._handlers:
             if self.listens(topic):
                 declared.setdefault(topic.key, (topic, []))[1].append(getattr(self, method))
-        # A topic comes once, for all handlers that want it, those of its parameters included.
+        # One subscription serves all handlers of a topic, also those of `hear_topic`.
         for topic, handlers in declared.values():
             handler = _all_of([*handlers, *self._chosen.pop(topic.key, ())])
             names = self.names(topic, self.name, self.parameters) if topic.is_family else None
@@ -330,13 +329,13 @@ class Actor(Declared):
         self.on_start()
         self._beat()
         self._timers.every(self.context.heartbeat_period_s, "_beat", self._beat)
-        if self._incarnation == 1 or not self._queries:  # nothing is to be heard yet
+        if self._incarnation == 1 or not self._queries:  # no last messages are awaited
             self._go_to_work()
         else:
             self.call_later(_PATIENCE_S, self._go_to_work)
 
     def _go_to_work(self) -> None:
-        """Start the periodic work: of one that replaces another, at once."""
+        """Start the periodic calls; a restarted node makes the first ones at once."""
         if not self._is_at_work:
             self._is_at_work = True
             for period_s, method in self._periodic:
@@ -361,14 +360,14 @@ class Actor(Declared):
             self._reports = ReportLimit()  # this report must leave
             self.report_diagnostic("handler failed", f"{type(error).__name__}: {error}", self.name)
             self._keeper.failed()
-        except Exception as second:  # the first error is the one that counts
-            error.add_note(f"and while reporting it: {second!r}")
+        except Exception as second:  # `run` raises the first error
+            error.add_note(f"while reporting it: {second!r}")
         self.context.failed(error)
 
     # -- mail -----------------------------------------------------------------------------------
 
     def _hear(self, topic: Topic[Any], where: str, handler: Callable[[Any, Header], None]) -> None:
-        """Hear what is published from now on, and what was published last if it is no command."""
+        """Subscribe; unless the topic carries commands, ask for its last message too."""
         self._bus.subscribe(where, self._receiver(topic, handler))
         if topic.resend_s:
             for key in self.reads(topic) if "*" in where else (where,):
@@ -416,16 +415,16 @@ class Actor(Declared):
         self._rejected += 1
         self.report_diagnostic("payload rejected", reason, key)
 
-    def _overflowed(self, _item: Any) -> None:
+    def _overflowed(self) -> None:
         self.report_diagnostic("mailbox full", "a message was refused", self.name)
 
     def _crowded(self) -> None:
-        self.report_diagnostic("many sources", f"more than {STRANGERS} that are no nodes of the "
-                               "system; those heard first are forgotten", self.name)
+        self.report_diagnostic("many sources", f"more than {STRANGERS} sources outside the system; "
+                               "the oldest are forgotten", self.name)
 
     def send(self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float,
              copies: int = 1) -> None:
-        """Send a message as it is, past all fault injections; `publish` is what actors call."""
+        """Send a message past all injected faults; actors call `publish`."""
         self._sequence = sequence = self._sequence + 1
         self._last_sent[key] = (body, stamp)
         try:
@@ -433,7 +432,7 @@ class Actor(Declared):
         except TypeError as error:
             raise TypeError(f"topic {topic.key}: {unsendable_place(body)}: {error}; expected plain "
                             "values, such as float() or .tolist() of a numpy value") from None
-        if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
+        if len(payload) > MAX_PAYLOAD_BYTES:  # readers would refuse it
             self.report_diagnostic("not sent", too_long(payload), key)
             return
         if topic.resend_s and self._bus.post(key, payload):
@@ -452,9 +451,9 @@ class Actor(Declared):
             self.read_postings()
         for call in self._beside:
             call()
-        late_s = max(self._timers.lateness_s(), now_s - self._beat_due_s)  # it waits for mail, too
+        late_s = max(self._timers.lateness_s(), now_s - self._beat_due_s)  # it waited for mail too
         self._beat_due_s = now_s + context.heartbeat_period_s
-        late_s, self._late_s = max(late_s, self._late_s), late_s  # who reads may miss one
+        late_s, self._late_s = max(late_s, self._late_s), late_s  # a reader may miss one heartbeat
         if not self.is_well():
             return
         self.publish(HEARTBEAT, Heartbeat(

@@ -1,13 +1,13 @@
-"""What a system adds to the engine: its topics, and what its actors know of place and task.
+"""The part of a system that is not the engine's: its topics, its place, its task.
 
-The table `[application]` of a system names a class derived from `Application` as `class`; the other
-keys there, and what the command line says, are its options:
+The table `[application]` of a system names as `class` a class derived from `Application`. The other
+keys there, and the command line, are its options:
 
     [application]
     class = "rampart.actors.osmosis.application:Osmosis"
     airport = "vallombre"
 
-It is loaded once for a run, before its processes are forked, and read-only afterwards.
+It is loaded once for a run, before the processes are forked, and read-only afterwards.
 """
 
 from __future__ import annotations
@@ -24,32 +24,33 @@ from rampart.manager.spec.schema import SystemSpec
 
 
 class Application:
-    """The application of a system that names none: no topics, no options, nothing to know.
+    """Base of all applications, and the one of a system that names none.
+
+    Class paths below have the form `module:Class`; "" stands for none.
 
     Class attributes:
-        topics: what its actors publish and hear besides the engine's topics.
-        views: class that translates them for viewers, as `module:Class`, derived from this one.
-        lines: class that tells of them in `rampart status`, `top` and `metrics`, likewise.
-        model: class path of its `RobotModel`, which replays show; "" if it has none in MuJoCo.
-        faults: class path of its `Faults`; "" if it has none of its own.
-        observer: class path of who hears a run for judge and report.
-        examples: of the command line, for its help: options, and what they do.
-        trial: class path of the `Trial` that its runs are; "" if they have no verdict.
+        topics: topics of its actors besides the engine's.
+        views: path of the class that translates its topics for viewers.
+        lines: path of the class that shows its topics in `rampart status`, `top` and `metrics`.
+        model: path of its `RobotModel` in MuJoCo, which replays show.
+        faults: path of its `Faults`.
+        observer: path of the class that records a run for judge and report.
+        examples: examples for the help of the command line: options, and their effect.
+        trial: path of its `Trial`; without one its runs have no verdict.
 
     Attributes:
-        options: what was chosen for this run.
+        options: the options of this run.
 
     Raises:
-        ValueError: what the options name does not exist or is unsound; file, field and value.
+        ValueError: a file that an option names does not exist or is wrong; file, field and value.
     """
 
     class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-        """What a run can be told; fields are options of the command line, with their help.
+        """Options of a run; each field is an option of the command line, with its help.
 
-        The `extra` of a field's `msgspec.Meta` may say: `metavar`; `file`, that a value may be a
-        path; `alone`, the value of an option that is given without one; `campaign`, what a campaign
-        takes for it when the user says nothing, values separated by commas; `real`, that it is of
-        no use in virtual time.
+        Keys in the `extra` of a field's `msgspec.Meta`: `metavar`; `file`: the value may be a path;
+        `alone`: value of an option that is given without one; `campaign`: default in a campaign,
+        values separated by commas; `real`: the option has no use in virtual time.
         """
 
     topics: ClassVar[tuple[Topic[Any], ...]] = ()
@@ -65,32 +66,32 @@ class Application:
         self.options = options or self.Options()
 
     def world_parameters(self) -> Mapping[str, Any]:
-        """Return what the node that simulates the world has to know of the options."""
+        """Return parameters for the node that simulates the world."""
         return {}
 
     def documents(self) -> list[tuple[str, Path]]:
-        """Return the files that belong to a recording: `FOLDER/NAME` there, and where they are."""
+        """Return the files that a recording includes: `FOLDER/NAME` there, and path here."""
         return []
 
     @classmethod
     def restored(cls, directory: Path) -> Application:
-        """Return what a replay's page is to know, from the documents of a recording.
+        """Return the application for a replay's page, from the documents of a recording.
 
         Args:
-            directory: where the files are, by their name in the recording.
+            directory: contains the files, with their names in the recording.
 
         Raises:
-            OSError, ValueError: one of them cannot be read or is unsound.
+            OSError, ValueError: a file cannot be read or is wrong.
         """
         del directory
         return Application()
 
     def check(self, spec: SystemSpec, *, virtual: bool) -> str:
-        """Return what the user has to be told before the run starts, "" for nothing.
+        """Check the options; return a note for the user before the run starts, or "".
 
         Args:
             spec: the system.
-            virtual: whether it is run in virtual time.
+            virtual: whether time is virtual.
 
         Raises:
             ValueError: the options do not fit the system or the kind of run.
@@ -100,33 +101,33 @@ class Application:
 
     @classmethod
     def said(cls, name: str, value: Any) -> str:
-        """Return an option's value in words, as the report of a campaign names its conditions."""
+        """Return an option's value in words, as a condition in the report of a campaign."""
         return f"{name} {value}"
 
     @classmethod
     def simpler(cls, options: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return simpler options than these: what a search tries to find a smaller counterexample.
+        """Return simpler options, which a search tries to find a smaller counterexample.
 
         Args:
-            options: of an unsafe run.
+            options: options of an unsafe run.
         """
         del options
         return []
 
     @classmethod
     def of(cls, context: Any) -> Self:
-        """Return the application of the run in which an actor is started, by its `Context`.
+        """Return the application of the run of an actor, by its `Context`.
 
         Raises:
-            ValueError: it is another one.
+            ValueError: the run's application is of another class.
         """
         return cls.of_run(context.run)
 
     @classmethod
     def of_run(cls, run: Any) -> Self:
-        """Return the application of a run, by its `RunContext`; errors as of `of`."""
+        """Return the application of a run, by its `RunContext`; raises as `of`."""
         found = run.application
         if not isinstance(found, cls):
-            raise ValueError(f"needs an [application] of class {cls.__module__}:{cls.__name__}; "
-                             f"this system has {type(found).__name__}")
+            raise ValueError(f"[application] of class {type(found).__name__}, expected "
+                             f"{cls.__module__}:{cls.__name__}")
         return found

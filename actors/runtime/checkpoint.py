@@ -129,6 +129,9 @@ class MemoryCheckpoints(CheckpointStore):
         self._shelf.sort(key=lambda record: record.age, reverse=True)
         del self._shelf[GENERATIONS:]
 
+    def close(self) -> None:
+        """Nothing is open."""
+
 
 @dataclass(frozen=True, slots=True)
 class StateFormat(Generic[S]):

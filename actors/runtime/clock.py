@@ -1,8 +1,8 @@
 """Simulated time, the same in every process.
 
-All processes of a run share one origin on the machine's monotonic clock and one rate, so
-`now()` agrees between them without any message. On a virtual event loop the loop's own time is
-the simulated time (origin 0, rate 1) and the same class serves.
+All processes of a run share one origin on the machine's monotonic clock and one rate. So their
+`now()` agrees without any message. In virtual time the event loop's time is the simulated time
+(origin 0, rate 1).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Clock:
     def __init__(self, origin_s: float, rate: float = 1.0,
                  source: Callable[[], float] = time.monotonic) -> None:
         if not rate > 0:
-            raise ValueError(f"rate = {rate}: must be above 0")
+            raise ValueError(f"rate = {rate}: expected a number above 0")
         self._origin_s = origin_s
         self.rate = rate
         self._source = source
@@ -52,15 +52,15 @@ class Clock:
 
 
 class FollowedClock(Clock):
-    """The clock of a host that follows another one's: its origin is kept in a file, and changes.
+    """Clock of a host that follows the first host's; its origin is in a file, and changes.
 
     Args:
-        file: holds the origin.
-        rate: as of a `Clock`.
-        source: likewise.
+        file: contains the origin.
+        rate: see `Clock`.
+        source: see `Clock`.
 
     Raises:
-        OSError: there is no such file.
+        OSError: the file cannot be read.
     """
 
     __slots__ = ("_shared",)
@@ -93,25 +93,25 @@ _ORIGIN = struct.Struct("d")
 
 
 def keep_origin(file: Path, origin_s: float) -> None:
-    """Have all clocks that follow a file go by another origin.
+    """Set the origin of all clocks that follow a file.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
-        os.pwrite(descriptor, _ORIGIN.pack(origin_s), 0)  # of eight bytes a reader sees all or none
+        os.pwrite(descriptor, _ORIGIN.pack(origin_s), 0)  # readers see all eight bytes or none
     finally:
         os.close(descriptor)
 
 
 def origin_file(folder: str) -> Path:
-    """Return where the origin is kept in the folder of a run, on a host that follows another."""
+    """Return the file of the origin in a run folder, on a host that follows another."""
     return Path(folder, "origin")
 
 
 def clock_of(plan: RunPlan, source: Callable[[], float] = time.monotonic) -> Clock:
-    """Return the clock of a run as this host has it."""
+    """Return this host's clock of a run."""
     if plan.host:
         return FollowedClock(origin_file(plan.folder), plan.rate, source)
     return Clock(plan.origin_s, plan.rate, source)

@@ -1,4 +1,4 @@
-"""What an actor is given when it is made: name, clock, bus, parameters, where its state is kept."""
+"""Arguments of every actor: name, clock, bus, parameters, store of its states."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from rampart.actors.runtime.run_context import RunContext
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What an actor is given when it is made.
+    """Arguments of an actor.
 
     Attributes:
         name: the node's name, unique in the system.
-        incarnation: which process of the node this is, counted from 1.
+        incarnation: number of this process of the node, from 1.
         clock: simulated time.
         bus: this actor's access to the bus, not yet open.
-        parameters: the node's parameters, as the system spec gives them or read already.
-        run: what all actors of the run have in common, loaded once.
-        pid: number of the process that it runs in.
-        checkpoints: where this node's state is kept.
+        parameters: the node's parameters, as in the specification or already converted.
+        run: data that all actors of the run share, loaded once.
+        pid: id of the actor's process.
+        checkpoints: store of this node's states; None keeps nothing.
         heartbeat_period_s: simulated seconds between two heartbeats.
         renewed: called when this process becomes another incarnation of the node.
-        failed: told of the error that ends the actor, while its peers still see it alive.
-        register: returns the incarnation of a node that was issued last, None if it is not known.
-        members: names of all nodes of the system; what others make it remember is bounded.
-        command_age_s: commands that are older are not obeyed.
-        topics: those that parameters of the system's nodes name, by key.
-        usage: returns what a process has used of the machine.
-        scheduled: returns what the main thread of a process has run, and waited for a processor.
+        failed: called with the error that ends the actor, before its session closes.
+        register: returns a node's newest issued incarnation, None if it is not known.
+        members: names of all nodes of the system. The memory for other sources is bounded.
+        command_age_s: older commands are refused, simulated s.
+        topics: topics that parameters of the system's nodes name, by key.
+        usage: returns how much processor time and memory a process has used.
+        scheduled: returns how long a main thread has run and waited for a processor.
         is_here: whether the process of a node is on this machine.
     """
 
@@ -66,5 +66,5 @@ class Context:
     is_here: Callable[[str], bool] = lambda _node: True
 
     def local_pid(self, node: str, pid: int) -> int:
-        """Return the pid that a node has reported, -1 if it is a number of another machine."""
+        """Return the pid that a node has reported, -1 if it is on another machine."""
         return pid if self.is_here(node) else -1

@@ -1,16 +1,14 @@
-"""What a corruption does to the body of a message, and whether it fits the message at all.
+"""Corruption of the body of a message, and the check that it fits the message's type.
 
-A field is named by its path, `outer.inner`; a path through a sequence means that field of each
-element. A number is changed wherever it stands: alone, in (nested) sequences, and in `*_f32`
-fields, which are little-endian float32 arrays as bytes. A `*_rad` field is an angle and is
-brought back to (-pi, pi] when something was added to it; one that was set is left as it was set,
-so that an angle out of range can be injected too.
+A field is named by its path, `outer.inner`; a path through a sequence means the field of each
+element. Numbers are changed alone, in (nested) sequences, and in `*_f32` fields, which are
+little-endian float32 arrays as bytes. A `*_rad` field is an angle: after an addition it is wrapped
+to (-pi, pi]. A value that is set is not wrapped, so that an angle out of range can be injected too.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 from array import array
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -26,16 +24,16 @@ Change = Callable[[float], float]
 
 
 class InjectionError(ValueError):
-    """An injection does not fit the message it is for; the text is one line."""
+    """An injection does not fit its message; the text is one line."""
 
 
 class FieldType(NamedTuple):
-    """How a field of a message is declared.
+    """Type of a field of a message.
 
     Attributes:
-        declared: its type.
-        element: what a (nested) sequence holds; of any other field its type, without bounds.
-        metas: bounds of it and of its elements.
+        declared: the declared type.
+        element: type of the elements of a (nested) sequence; otherwise the type without bounds.
+        metas: bounds of the field and of its elements.
     """
 
     declared: Any
@@ -44,13 +42,13 @@ class FieldType(NamedTuple):
 
     @property
     def is_list(self) -> bool:
-        """Whether it is a sequence."""
+        """Whether the field is a sequence."""
         return self.element is not bare(self.declared)
 
 
 @cache
 def field_types(kind: Any) -> dict[str, FieldType]:
-    """Return the fields of a message type by their names; of what has none, none."""
+    """Return the fields of a message type by name; none for another type."""
     found: dict[str, FieldType] = {}
     for field in msgspec.structs.fields(kind) if isinstance(kind, type) and issubclass(
             kind, msgspec.Struct) else ():
@@ -67,16 +65,16 @@ def field_types(kind: Any) -> dict[str, FieldType]:
 
 
 def field_type(kind: type[Any], path: str) -> FieldType:
-    """Return how a field of a message type is declared.
+    """Return the type of a field of a message type.
 
     Raises:
-        InjectionError: the message has no such field.
+        InjectionError: the message lacks the field.
     """
     found = FieldType(kind, kind, ())
     for name in path.split("."):
         fields = field_types(found.element)
         if name not in fields:
-            raise InjectionError(f"field {path!r}: {kind.__name__} has no such field; "
+            raise InjectionError(f"field {path!r}: unknown in {kind.__name__}; "
                                  f"known: {', '.join(fields) or 'none'}")
         found = fields[name]
     return found
@@ -88,7 +86,7 @@ def is_array(name: str, kind: Any) -> bool:
 
 
 def check_fields(kind: type[Any], order: Injection) -> None:
-    """Check a corruption against the type of the messages that it is for.
+    """Check a corruption against the type of the messages.
 
     Raises:
         InjectionError: a field does not exist, or the change does not fit its type.
@@ -101,20 +99,20 @@ def check_fields(kind: type[Any], order: Injection) -> None:
     for path in order.keep_ends:
         field = field_type(kind, path)
         if not is_array(path, field.declared) and not field.is_list:
-            raise InjectionError(f"keep_ends {path!r}: not a list")
+            raise InjectionError(f"keep_ends {path!r}: expected a list")
 
 
 def corrupt(body: Any, order: Injection, elapsed_s: float, draw: Random) -> Any:
-    """Return the body changed as the order says: set, ramped, biased, made noisy, shortened.
+    """Return a changed copy of a body: fields set, ramped, biased, noisy or shortened.
 
     Args:
-        body: the message; it stays as it is.
-        order: what to change.
-        elapsed_s: since the injection began, s.
+        body: the message.
+        order: the changes.
+        elapsed_s: simulated seconds since the injection began.
         draw: source of the noise.
 
     Raises:
-        InjectionError: no such field, or the value does not fit it.
+        InjectionError: the message lacks a field, or the value does not fit it.
     """
     data = msgspec.to_builtins(body, builtin_types=(bytes,))
     kind: Any = type(body)
@@ -145,7 +143,7 @@ def corrupt(body: Any, order: Injection, elapsed_s: float, draw: Random) -> Any:
 
 
 def wrap(angle_rad: float) -> float:
-    """Return the angle in (-pi, pi]; what is no finite number stays what it is."""
+    """Return the angle in (-pi, pi]; infinity and NaN stay."""
     if not math.isfinite(angle_rad):
         return angle_rad
     turned = math.remainder(angle_rad, 2 * math.pi)
@@ -153,25 +151,25 @@ def wrap(angle_rad: float) -> float:
 
 
 def _turned(true: float, wrong: float, within: tuple[float, float] | None) -> float:
-    """Return a wrong number; one beyond its range is wrong in the other direction, within it."""
+    """Return a wrong number; beyond its range it errs in the other direction, within the range."""
     if within is None or within[0] <= wrong <= within[1] or not math.isfinite(wrong):
         return wrong
     return min(max(true - (wrong - true), within[0]), within[1])
 
 
 def _changed(name: str, value: Any, change: Change) -> Any:
-    """Return a value with the change made to each number in it."""
+    """Return a value with each of its numbers changed."""
     if isinstance(value, tuple | list):
         return [_changed(name, v, change) for v in value]
     if is_array(name, type(value)):
         return _changed_array(name, value, change)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InjectionError(f"field {name!r}: {type(value).__name__} is no number")
+        raise InjectionError(f"field {name!r}: expected a number, got {type(value).__name__}")
     changed = change(value)
     if isinstance(value, float):
         return wrap(changed) if name.endswith("_rad") else changed
     if not math.isfinite(changed):
-        raise InjectionError(f"field {name!r}: {changed:g} is no whole number")
+        raise InjectionError(f"field {name!r}: {changed:g}, expected a whole number")
     return round(changed)
 
 
@@ -181,13 +179,8 @@ def _changed_array(name: str, value: bytes, change: Change) -> bytes:
         numbers.frombytes(value)
     except ValueError:
         raise InjectionError(
-            f"field {name!r}: {len(value)} bytes are no whole number of float32") from None
-    if sys.byteorder == "big":
-        numbers.byteswap()
-    out = array("f", map(change, numbers))
-    if sys.byteorder == "big":
-        out.byteswap()
-    return out.tobytes()
+            f"field {name!r}: {len(value)} bytes, expected a multiple of 4 (float32)") from None
+    return array("f", map(change, numbers)).tobytes()
 
 
 def _places(data: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
@@ -203,7 +196,7 @@ def _places(data: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
 
 def _member(holder: Any, name: str, path: str) -> Any:
     if not isinstance(holder, dict) or name not in holder:
-        raise InjectionError(f"field {path!r}: no such field")
+        raise InjectionError(f"field {path!r}: unknown")
     return holder[name]
 
 
@@ -219,7 +212,7 @@ def _check_number(kind: type[Any], path: str, what: str, *, whole: bool) -> None
     leaf = field_type(kind, path).element
     if leaf is float or is_array(path, leaf) or (whole and leaf is int):
         return
-    raise InjectionError(f"{what} {path!r}: {getattr(leaf, '__name__', leaf)} is no "
+    raise InjectionError(f"{what} {path!r}: {getattr(leaf, '__name__', leaf)}, expected a "
                          f"{'number' if whole else 'float'}")
 
 
@@ -231,7 +224,7 @@ def _check_value(kind: type[Any], path: str, value: Any) -> None:
     field = field_type(kind, path)
     if is_array(path, field.declared):
         if isinstance(value, bool) or not isinstance(value, bytes | int | float):
-            raise InjectionError(f"set_fields {path!r} = {value!r}: must be a number that fills "
+            raise InjectionError(f"set_fields {path!r} = {value!r}: expected a number that fills "
                                  "the array, or its bytes")
         return
     try:  # a number fills a sequence

@@ -1,6 +1,7 @@
-"""What the class of an actor declares: the topics it hears and publishes, its timers, its peers.
+"""Declarations of an actor's class: its topics, timers and peers.
 
-`rampart.actors.system.members` computes from it who talks with whom, before any actor is made.
+`rampart.actors.system.members` computes the connections of a system from them, before any actor is
+made.
 """
 
 from __future__ import annotations
@@ -21,20 +22,20 @@ F = TypeVar("F", bound=Callable[..., None])
 
 
 BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, DIAGNOSTIC, INJECTION_REPORT)
-"""What every actor publishes besides its own outputs."""
+"""Topics that every actor publishes besides its outputs."""
 
 BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT,)
-"""What every actor hears besides its own inputs: injections from tools."""
+"""Topics that every actor subscribes to besides its inputs: injections from tools."""
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
     """Declare a method as the handler of a topic: `handler(self, message, header)`.
 
     Raises:
-        TypeError: what it is given is no topic.
+        TypeError: the argument is not a topic.
     """
     if not isinstance(topic, Topic):
-        raise TypeError(f"@on({getattr(topic, '__name__', topic)}): a Topic is right")
+        raise TypeError(f"@on({getattr(topic, '__name__', topic)}): expected a Topic")
 
     def mark(function: F) -> F:
         function.__dict__.setdefault("_rampart_topics", []).append(topic)
@@ -44,19 +45,19 @@ def on(topic: Topic[Any]) -> Callable[[F], F]:
 
 
 def every(period_s: float, *, with_heartbeat: bool = False) -> Callable[[F], F]:
-    """Declare a method to be called each `period_s` simulated seconds, first after one period.
+    """Declare a method to be called every `period_s` simulated seconds, first after one period.
 
     Args:
         period_s: simulated seconds.
-        with_heartbeat: it may be called more often: with each heartbeat, if these come as often as
-            `period_s`. That wakes the process once instead of twice.
+        with_heartbeat: whether to call it with each heartbeat instead, if the period of heartbeats
+            is not longer than `period_s`. Then the process wakes up once instead of twice.
 
     Raises:
-        ValueError: the period is no time that can pass.
+        ValueError: the period is not a finite number above 0.
     """
     if not isinstance(period_s, int | float) or not 0 < period_s < math.inf:
-        raise ValueError(f"@every({getattr(period_s, '__name__', period_s)}): a period above 0, in "
-                         "simulated seconds, is right")
+        raise ValueError(f"@every({getattr(period_s, '__name__', period_s)}): expected a period "
+                         "above 0, in simulated seconds")
 
     def mark(function: F) -> F:
         function.__dict__["_rampart_period_s"] = period_s
@@ -71,18 +72,18 @@ def _is_marked(member: object) -> bool:
 
 
 def _has_unmarked(base: type, name: str) -> bool:
-    """Whether a class has something of a name, or promises it, that is no handler."""
+    """Whether a class defines or annotates a name that is not a handler."""
     found = vars(base)
     return (name in found and not _is_marked(found[name])) or name in found.get(
         "__annotations__", {})
 
 
 class Handlers:
-    """Base of what hears topics by methods that are marked with `on`, or acts by `every`.
+    """Base of classes with methods that are marked by `on` or `every`.
 
     Class attributes:
-        optional_inputs: topics that it hears where somebody publishes them, and does without where
-            nobody does. Of all others that is refused before a run: it is a typo.
+        optional_inputs: inputs that no node of the system needs to publish. An unpublished input
+            that is not listed here is refused before a run, as a typo.
     """
 
     optional_inputs: ClassVar[tuple[Topic[Any], ...]] = ()
@@ -95,8 +96,8 @@ class Handlers:
         for name, member in vars(cls).items():
             if _is_marked(member) and (base := next(
                     (b for b in cls.__mro__[1:] if _has_unmarked(b, name)), None)):
-                raise TypeError(f"{cls.__name__}.{name}: {base.__name__} has something of this "
-                                "name already; call the handler something else")
+                raise TypeError(f"{cls.__name__}.{name}: {base.__name__} has this name already; "
+                                "expected another name for the handler")
         handlers: dict[tuple[str, str], tuple[Topic[Any], str]] = {}
         periodic: dict[str, float] = {}
         beside: set[str] = set()
@@ -117,45 +118,41 @@ class Handlers:
 
     @classmethod
     def inputs(cls) -> tuple[Topic[Any], ...]:
-        """Topics it has handlers for, of an actor those that every actor hears included."""
+        """Return the topics with handlers; of an actor, `BASE_INPUTS` are among them."""
         return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
 
 
-_OF_HANDLER = {1: "(self)", 3: "(self, message, header)"}
+_SIGNATURES = {1: "(self)", 3: "(self, message, header)"}
 
 
 def _check_call(cls: type, name: str, arguments: int) -> None:
-    """Refuse a handler that does nothing when it is called, or cannot be called.
-
-    Raises:
-        TypeError: it is one.
-    """
+    """Raise TypeError for a handler that cannot be called, or never runs when it is called."""
     function = getattr(cls, name)
     what = f"{cls.__name__}.{name}"
     if inspect.iscoroutinefunction(function):
-        raise TypeError(f"{what} is an async def, which would never run; a handler is a plain def")
+        raise TypeError(f"{what} is an async def and would never run; expected a plain def")
     if inspect.isgeneratorfunction(function) or inspect.isasyncgenfunction(function):
-        raise TypeError(f"{what} has a yield, and would never run; a handler is a plain def")
+        raise TypeError(f"{what} has a yield and would never run; expected a plain def")
     try:
         inspect.signature(function).bind(*range(arguments))
     except TypeError:
-        raise TypeError(f"{what}: def {name}{_OF_HANDLER[arguments]} is right") from None
+        raise TypeError(f"{what}: expected def {name}{_SIGNATURES[arguments]}") from None
 
 
 class Declared(Handlers):
-    """Base of all actors, as far as their classes alone tell.
+    """Declarations that all actors have.
 
     Class attributes:
         outputs: topics it publishes; publishing another one raises.
-        node_kind: what a node of this class has to be, "" for anything.
-        tables: those of a specification whose rows it is given.
-        is_page: whether an operator works with it.
-        Parameters: what the system spec may say of it, by field: type, range and default. A class
-            that takes more derives its own from that of its base class.
+        node_kind: the `kind` that its nodes must have, or "".
+        tables: tables of a specification whose rows become its parameters, by `given`.
+        is_page: whether it is an operator's page.
+        Parameters: parameters in the specification, with type, range and default. A class with
+            more parameters derives its own from its base class's.
     """
 
     class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-        """None, unless a subclass declares some."""
+        """No parameters."""
 
     parameters: Parameters
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
@@ -165,77 +162,81 @@ class Declared(Handlers):
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
-        """Which members of an input family a node hears, None for all.
+        """Return the members of an input family that a node subscribes to, None for all.
 
         Args:
             topic: one of its inputs.
-            name: of the node.
-            parameters: of the node, as its class's `Parameters`.
+            name: name of the node.
+            parameters: the node's `Parameters`.
         """
         return None
 
     @classmethod
     def output_names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
-        """Which members of an output family a node publishes, likewise; None for any."""
+        """Return the members of an output family that a node publishes, None for any."""
         return (name,)
 
     @classmethod
     def own_keys(cls, parameters: Any) -> tuple[str, ...]:  # noqa: ARG003
-        """Keys below `rampart/` that are no topics, between the node and what it has started."""
+        """Return the keys below `rampart/` between the node and a program that it starts."""
         return ()
 
     @classmethod
     def own_topics(cls, parameters: Any) -> tuple[Topic[Any], ...]:  # noqa: ARG003
-        """Topics that there are because its parameters say so, unless another class has them.
+        """Return the topics that its parameters define, unless another class defines them.
 
         Raises:
-            ValueError: they make no sense.
+            ValueError: a definition is wrong.
         """
         return ()
 
     @classmethod
     def given(cls, name: str, spec: SystemSpec, file: str) -> Mapping[str, Any]:  # noqa: ARG003
-        """Parameters of the node `name` that are made of rows of the specification.
+        """Return the parameters that a node gets from rows of the specification.
 
         Args:
-            name: of the node.
+            name: name of the node.
             spec: the system.
             file: name of the specification, for messages.
 
         Raises:
-            ValueError: a row makes no sense; one line with file and path.
+            ValueError: a row is wrong; one line with file and path.
         """
         return {}
 
     @classmethod
     def completed(cls, parameters: Any, topics: Iterable[Topic[Any]],
                   ordered: Iterable[str]) -> Any:
-        """Return its parameters as they are in the whole system.
+        """Return its parameters, completed by the whole system.
 
         Args:
-            parameters: of the node.
-            topics: what the nodes of the system publish that are no pages.
-            ordered: keys of topics on which faults of the run are ordered.
+            parameters: the node's `Parameters`.
+            topics: topics that the system's other nodes publish, pages excepted.
+            ordered: keys of topics on which the run orders faults.
         """
         del topics, ordered
         return parameters
 
     @classmethod
     def named(cls, parameters: Any) -> dict[str, list[Named]]:
-        """Topics that its parameters have it hear and publish, by "heard", "published"."""
+        """Return the topics that its parameters name, by "heard" and "published"."""
         return topics_named(parameters)
 
     @classmethod
     def alone_on(cls, parameters: Any) -> Mapping[str, str]:  # noqa: ARG003
-        """Keys on which no other node may publish, each with what says so, for messages."""
+        """Return the keys on which no other node may publish; each with its cause, for messages."""
         return {}
 
     @classmethod
     def check_topics(cls, parameters: Any, topics: Mapping[str, Topic[Any]]) -> None:
-        """Refuse parameters that do not fit the topics that they name, which are given by key.
+        """Check parameters against the topics that they name.
+
+        Args:
+            parameters: the node's `Parameters`.
+            topics: topics of the system, by key.
 
         Raises:
-            ValueError: they do not.
+            ValueError: a parameter does not fit its topic.
         """
 
     @classmethod

@@ -1,4 +1,4 @@
-"""A fault as ordered, and what the nodes report of it until it is over or had no effect. Pure."""
+"""An ordered fault, and the nodes' reports on it until it ends or proves ineffective. Pure."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ FIRST_EFFECT_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """A message to send, and where: an injection, or a fault of another kind.
+    """A message that orders an injection or another fault, and its topic.
 
-    The message has the fields `injection`, by which it is reported on, and `duration_s`.
+    The message has the fields `injection`, the id that reports name, and `duration_s`.
     """
 
     topic: Topic[Any]
@@ -39,7 +39,7 @@ class Order:
 
     @property
     def place(self) -> str:
-        """What is disturbed: a topic's key, or that on which another fault is ordered."""
+        """Key of the disturbed topic, or of the topic on which another fault is ordered."""
         return str(getattr(self.message, "topic", self.topic.key))
 
 
@@ -48,8 +48,8 @@ class FaultWatch:
     """The orders that make up a fault, and the reports on them.
 
     Attributes:
-        orders: all of one fault, with the same duration.
-        reports: the last report on an injection of each incarnation of a node; counts never fall.
+        orders: all orders of one fault, with the same duration.
+        reports: last report by injection, node and incarnation. Counts never decrease.
     """
 
     orders: Sequence[Order]
@@ -60,8 +60,8 @@ class FaultWatch:
         """Take a report and return whether it is on this fault.
 
         Args:
-            report: of a node.
-            incarnation: of that node; a restarted one counts anew.
+            report: a node's report.
+            incarnation: of the node; each incarnation counts from zero.
         """
         if report.injection not in {order.injection for order in self.orders}:
             return False
@@ -76,12 +76,12 @@ class FaultWatch:
 
     @property
     def is_permanent(self) -> bool:
-        """Whether it lasts as long as what it hits."""
+        """Whether it lasts as long as the process that it disturbs."""
         return math.isinf(self.orders[0].message.duration_s)
 
     @property
     def affected(self) -> int:
-        """How many messages (or ticks of an actuator) it has changed, as far as reported."""
+        """Number of messages (or ticks of an actuator) that it has changed, as reported."""
         return sum(report.affected for report in self.reports.values())
 
     @property
@@ -91,28 +91,28 @@ class FaultWatch:
 
     @property
     def refused(self) -> Mapping[str, str]:
-        """Why nodes did not do as ordered, or not to the end."""
+        """Reason by node, if a node refused the fault or ended it early."""
         return {report.node: report.reason for report in self.reports.values() if report.reason}
 
     @property
     def unanswered(self) -> tuple[Order, ...]:
-        """The orders on which no node has reported."""
+        """Orders without a report."""
         answered = {injection for injection, _, _ in self.reports}
         return tuple(order for order in self.orders if order.injection not in answered)
 
     @property
     def unfinished(self) -> tuple[Order, ...]:
-        """The orders whose end not all nodes that answered have reported."""
+        """Orders whose end some node has yet to report."""
         going_on = {r.injection for r in self.reports.values() if not r.finished}
         return tuple(order for order in self.orders
                      if order.injection in going_on or order in self.unanswered)
 
     @property
     def is_settled(self) -> bool:
-        """Whether there is nothing left to wait for: it is over, or permanent and has an effect."""
+        """Whether it is over, or permanent and effective."""
         return not self.unfinished or (self.is_permanent and self.affected > 0)
 
     @property
     def waits_s(self) -> float:
-        """How long that may take, simulated seconds."""
+        """How long `is_settled` may take, simulated seconds."""
         return FIRST_EFFECT_S if self.is_permanent else self.orders[0].message.duration_s

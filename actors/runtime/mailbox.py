@@ -1,11 +1,8 @@
 """One mailbox per actor, and the dispatcher that handles its items, one at a time.
 
-Latest wins for sensors and states; commands wait in a bounded queue. A slow actor thus never works
-through a backlog of old samples, and never loses a command silently: a full queue is counted and
-handed to `on_overflow`.
-
-Every item, whether message, tick or change of a peer, in real and in virtual time, is handled by
-`Dispatcher.work` and nowhere else.
+Of sensors and states the latest wins; commands wait in a bounded queue. So a slow actor never works
+through a backlog of old samples, and never loses a command silently: each message that is refused
+is counted and reported. `Dispatcher.work` handles every item, in real and in virtual time.
 """
 
 from __future__ import annotations
@@ -16,49 +13,49 @@ from collections.abc import Callable
 from typing import Any
 
 COMMAND_CAPACITY = 256
-"""Commands that may wait per actor; a node that is this far behind is not keeping up."""
+"""Commands that may wait per actor."""
 
 MESSAGE_SLOTS = 1024
-"""Keys of sensors and states of which a message may wait per actor."""
+"""Keys of sensors and states with a waiting message, per actor."""
 
 _OPEN_SHARE = 0.5
-"""Of either, for senders that are no nodes of the system; the rest is reserved for its nodes."""
+"""Share of both that senders outside the system may fill; its nodes may fill all."""
 
-# What a dispatcher is doing. Numbers, because they are compared and set for each item.
+# States of a dispatcher. Plain numbers, because each item compares and sets them.
 RESTING = 0
-"""Nothing, and what comes goes through the mailbox."""
+"""Not handling an item; the next one goes through the mailbox."""
 IDLE = 1
-"""Nothing, and what comes may be given to `Dispatcher.work` without a stay in the mailbox."""
+"""Not handling an item; the next one may be given to `Dispatcher.work` at once."""
 AWAKE = 2
-"""It handles an item, is about to, has not started yet, or has ended."""
+"""Handling an item or about to; also before the start and after the end."""
 
 
 class Dispatcher:
     """Holds an actor's items in order of first arrival, and handles one after the other.
 
-    A newer item with the same slot takes the old one's place. Messages that arrive in bursts all
-    wait until the burst is over: what is overtaken within one need not be handled. What arrives by
-    itself is handled at once. All methods run on the actor's event loop.
+    A newer item takes the place of an older one of the same slot. Messages of a burst wait until
+    the burst is over, since later ones may replace them. A single message is handled at once. All
+    methods run on the actor's event loop.
 
     Args:
-        bursts: Whether messages arrive in bursts, see `Bus`.
-        on_overflow: Called with a message that is refused because too many wait.
+        bursts: whether messages arrive in bursts, see `Bus`.
+        on_overflow: called when a message is refused because too many wait.
 
     Attributes:
         stance: `RESTING`, `IDLE` or `AWAKE`.
-        progress: Items handled so far.
-        stopping: It was asked to end, and handles nothing more.
-        overflowed: Messages refused because too many waited.
+        progress: number of items handled.
+        stopping: whether `stop` was handled.
+        overflowed: number of messages refused because too many waited.
     """
 
-    def __init__(self, bursts: bool, on_overflow: Callable[[Any], None]) -> None:
+    def __init__(self, bursts: bool, on_overflow: Callable[[], None]) -> None:
         self.stance = AWAKE
         self.progress = 0
         self.stopping = False
         self.overflowed = 0
         self._on_overflow = on_overflow
         self._waiting: deque[tuple[str | None, Any]] = deque()
-        self._latest: dict[str, Any] = {}
+        self._latest: dict[str, Callable[[], None]] = {}
         self._commands = 0
         self._bursts = bursts
         self._held = False
@@ -72,19 +69,20 @@ class Dispatcher:
     # -- the mailbox ----------------------------------------------------------------------------
 
     def put(self, slot: str, item: Callable[[], None]) -> None:
-        """Handle an item of the actor's own; one that waits is replaced by the next of its slot."""
+        """Handle an item of the actor itself; a waiting item of the same slot is replaced."""
         if self.stance == AWAKE or self._held:
             self._put_latest(slot, item)
         else:
             self.work(item)
 
-    def put_message(self, slot: str | None, item: Any, *, reserved: bool = True) -> bool:
-        """Have a message handled; False if too many others wait.
+    def put_message(self, slot: str | None, item: Callable[[], None], *,
+                    reserved: bool = True) -> None:
+        """Handle a message, unless too many others wait.
 
         Args:
-            slot: of its key, if only the latest counts; None for a command, all of which count.
-            item: the message.
-            reserved: the sender may use all of the room, not only what is open to everybody.
+            slot: key, if only the latest message counts; None for a command.
+            item: handles the message.
+            reserved: whether the sender may use the room that is reserved for the system's nodes.
         """
         share = 1.0 if reserved else _OPEN_SHARE
         if slot is None:
@@ -93,16 +91,15 @@ class Dispatcher:
             fits = slot in self._latest or len(self._latest) < MESSAGE_SLOTS * share
         if not fits:
             self.overflowed += 1
-            self._on_overflow(item)
+            self._on_overflow()
         elif slot is None:
             self._commands += 1
             self._waiting.append((None, item))
             self._wake()
         else:
             self._put_latest(slot, item)
-        return fits
 
-    def _put_latest(self, slot: str, item: Any) -> None:
+    def _put_latest(self, slot: str, item: Callable[[], None]) -> None:
         if slot not in self._latest:
             self._waiting.append((slot, None))
         self._latest[slot] = item
@@ -118,10 +115,10 @@ class Dispatcher:
     # -- handling -------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Handle items until `stop` was handled.
+        """Handle items until `stop` is handled.
 
         Raises:
-            Exception: whatever an item raised.
+            Exception: raised by an item.
         """
         self._ended = asyncio.get_running_loop().create_future()
         self.stance = RESTING
@@ -129,11 +126,11 @@ class Dispatcher:
         await self._ended
 
     def stop(self) -> None:
-        """End after the items that already wait."""
+        """End after the items that are waiting."""
         self._put_latest("stop", self._stop)
 
     def abandon(self) -> None:
-        """Handle nothing more, not even what waits."""
+        """Handle nothing more, not even waiting items."""
         self.stance = AWAKE
 
     def hold(self, held: bool) -> None:
@@ -143,12 +140,11 @@ class Dispatcher:
         self._wake()
 
     def slow_down(self, pace_s: float) -> None:
-        """Take so many seconds of the loop's clock for each item."""
+        """Take `pace_s` seconds of the loop's clock for each item."""
         self._pace_s = pace_s
         self._change_rest()
 
     def _wake(self) -> None:
-        """See to it that the mailbox is worked off."""
         if self.stance != AWAKE and self._ended is not None:
             self.stance = AWAKE
             if self._bursts:
@@ -157,7 +153,7 @@ class Dispatcher:
                 self.work()
 
     def work(self, item: Callable[[], None] | None = None) -> None:
-        """Handle an item, which may be given while `IDLE` only, and then all that wait."""
+        """Handle an item, given only while `IDLE`, and then all that wait."""
         self.stance = AWAKE
         waiting = self._waiting
         if item is None:

@@ -1,8 +1,7 @@
-"""A node's parameters from the system spec, read as its actor's class declares them.
+"""A node's parameters from the specification, converted to its class's `Parameters`.
 
-The class has a nested `class Parameters`, see `rampart.actors.runtime.actor.Actor`. What a type
-alone cannot say of a value is marked on it: that it names nodes of the system, or how often that
-comes for which a timeout waits.
+The types below carry marks for checks that need the whole system: that a value names a node or a
+topic, or with which period the messages come for which a timeout waits.
 """
 
 from __future__ import annotations
@@ -25,50 +24,50 @@ P = TypeVar("P", bound=msgspec.Struct)
 NodeName = Annotated[Name, msgspec.Meta(extra={"names": "node"})]
 NodeNames = Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, extra={"names": "node"})]
 Suspects = Annotated[tuple[Name, ...], msgspec.Meta(extra={"names": "node"})]
-"""Nodes that a detection module names while it is active, for a recovery that respawns."""
+"""Nodes that an active detection module names, for a recovery that restarts them."""
 RecoveryNames = Annotated[tuple[Name, ...], msgspec.Meta(extra={"names": "recovery module"})]
 
 TopicHeard = Annotated[str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "heard"})]
-"""Key of a topic, below `rampart/`, that the node hears because its parameters say so."""
+"""Key, below `rampart/`, of a topic that the node subscribes to."""
 TopicsHeard = Annotated[tuple[str, ...], msgspec.Meta(extra={"names": "topic", "way": "heard"})]
 TopicPublished = Annotated[
     str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "published"})]
-"""Key of a topic that the node publishes because its parameters say so."""
+"""Key, below `rampart/`, of a topic that the node publishes."""
 TopicsPublished = Annotated[tuple[str, ...], msgspec.Meta(
     extra={"names": "topic", "way": "published"})]
 FieldName = Annotated[str, msgspec.Meta(
     pattern=r"^[^:]+:[^:]+\Z", extra={"names": "field", "way": "heard"})]
-"""A field of the messages of a topic, "topic:field", as of `rampart.actors.bus.fields`."""
+"""A field of a topic's messages, "topic:field"; see `rampart.actors.bus.fields`."""
 OptionalFieldName = Annotated[str, msgspec.Meta(
     pattern=r"^([^:]+:[^:]+)?\Z", extra={"names": "field", "way": "heard"})]
 FieldNames = Annotated[tuple[FieldName, ...], msgspec.Meta(min_length=1, extra={
     "names": "field", "way": "heard"})]
 
 MessageOf = Annotated[dict[str, Any], msgspec.Meta(extra={"message_of": "topic"})]
-"""Fields of a message on the topic that the parameter `topic` names."""
+"""Fields of a message on the topic in the parameter `topic`."""
 MessagesOf = Annotated[tuple[dict[str, Any], ...], msgspec.Meta(
     min_length=1, max_length=100, extra={"message_of": "topic"})]
-"""The same of several."""
+"""Fields of several such messages."""
 
 ControlTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "control_period_s"})]
-"""How long, s, to wait for what comes as often as commands, poses and scans."""
+"""Timeout, s, of messages with the control period: commands, poses, scans."""
 HeartbeatTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "heartbeat_period_s"})]
-"""How long, s, to wait for a heartbeat."""
+"""Timeout, s, of heartbeats."""
 
 
 def read_parameters(kind: type[P], given: Mapping[str, Any] | msgspec.Struct, file: str, path: str,
                     spec: SystemSpec | None = None) -> P:
-    """Return parameters as the type that declares them; those that are of it already, as they are.
+    """Convert parameters to the `Parameters` of an actor's class.
 
     Args:
-        kind: Nested class of the actor.
-        given: As the spec gives them, names of times replaced by the times.
-        file: Name of the spec, for messages.
-        path: Where in it they are.
-        spec: The system, if what they say of it is to be checked.
+        kind: the nested class `Parameters`.
+        given: parameters from the specification, names of times replaced by the times.
+        file: name of the specification, for messages.
+        path: path of the parameters in it, for messages.
+        spec: the system, to check names and timeouts against; None leaves them unchecked.
 
     Raises:
-        SpecificationError: One is unknown, missing, or has a value that makes no sense.
+        SpecificationError: a parameter is unknown, missing, or has a wrong value.
     """
     if not isinstance(given, Mapping):
         return msgspec.convert(given, kind)
@@ -86,11 +85,11 @@ class Named(NamedTuple):
     """A topic that a parameter names.
 
     Attributes:
-        name: of the parameter, or of what in a row of a table names it.
-        key: of the topic.
-        field: of its messages, or "".
-        kinds: of which the field may be.
-        row: which row that is, for messages; "" of a parameter.
+        name: name of the parameter, or of the entry in a row of a table.
+        key: key of the topic.
+        field: field of its messages, or "".
+        kinds: types that the field may have.
+        row: the table's row, for messages; "" for a parameter.
     """
 
     name: str
@@ -101,45 +100,45 @@ class Named(NamedTuple):
 
 
 def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
-    """Return which topics a node's parameters have it hear and publish, by "heard", "published"."""
+    """Return the topics that a node's parameters name, by "heard" and "published"."""
     found: dict[str, list[Named]] = {"heard": [], "published": []}
     for name, marks in _marks(type(parameters)).items():
-        said = getattr(parameters, name)
-        if "way" in marks and said:
+        value = getattr(parameters, name)
+        if "way" in marks and value:
             found[marks["way"]] += [named(name, text)
-                                    for text in ([said] if isinstance(said, str) else said)]
+                                    for text in ([value] if isinstance(value, str) else value)]
     return found
 
 
 def named(name: str, text: str, **more: Any) -> Named:
-    """Return what is named by "topic" or "topic:field"."""
+    """Return the topic, and the field if there is one, of "topic" or "topic:field"."""
     key, _, field = text.partition(":")
     return Named(name, key, field, **more)
 
 
-class Said(NamedTuple):
-    """A message that a parameter says: the topic's key, and the fields."""
+class GivenMessage(NamedTuple):
+    """A message that a parameter contains: the topic's key, and the fields."""
 
     topic: str
     fields: dict[str, Any]
 
 
-def messages_said(parameters: msgspec.Struct) -> dict[str, Said]:
-    """Return the messages that a node's parameters say, by the name of the parameter."""
-    found: dict[str, Said] = {}
+def given_messages(parameters: msgspec.Struct) -> dict[str, GivenMessage]:
+    """Return the messages that a node's parameters contain, by the path of the parameter."""
+    found: dict[str, GivenMessage] = {}
     for name, marks in _marks(type(parameters)).items():
-        said = getattr(parameters, name)
-        if "message_of" in marks and said is not None:
+        value = getattr(parameters, name)
+        if "message_of" in marks and value is not None:
             topic = getattr(parameters, marks["message_of"])
-            each = {name: said} if isinstance(said, dict) else {
-                f"{name}[{place}]": one for place, one in enumerate(said)}
-            found |= {where: Said(topic, fields) for where, fields in each.items()}
+            each = {name: value} if isinstance(value, dict) else {
+                f"{name}[{index}]": fields for index, fields in enumerate(value)}
+            found |= {path: GivenMessage(topic, fields) for path, fields in each.items()}
     return found
 
 
 @cache
 def _marks(kind: type[msgspec.Struct]) -> dict[str, dict[str, str]]:
-    """Return what is marked on the fields, by their names."""
+    """Return the marks of a struct's fields, by field."""
     infos = {f.name: inspect.type_info(f.type) for f in msgspec.structs.fields(kind)}
     return {name: info.extra for name, info in infos.items()
             if isinstance(info, inspect.Metadata) and info.extra}
@@ -147,7 +146,7 @@ def _marks(kind: type[msgspec.Struct]) -> dict[str, dict[str, str]]:
 
 def _misfits(kind: type[msgspec.Struct], given: Mapping[str, Any],
              spec: SystemSpec) -> Iterator[tuple[str, str]]:
-    """Find names that the system has not, and timeouts that it trips when all is well."""
+    """Find unknown names, and timeouts that would raise false alarms."""
     for field, marks in _marks(kind).items():
         if field not in given:
             continue

@@ -1,4 +1,4 @@
-"""What all actors of a run have in common: plan, system, application. Read-only."""
+"""Data that all actors of a run share: plan, system, application. Read-only."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ NO_SYSTEM = SystemSpec("none", "an actor without a system")
 
 @dataclass(frozen=True, slots=True)
 class RunContext:
-    """What is loaded once for a run, before its processes are forked.
+    """Data of a run, loaded once before its processes are forked.
 
     Attributes:
-        plan: what was chosen for the run.
-        system: the spec, as it was changed while running, with the layers that the plan leaves on.
-        document: the same as TOML, as the manager changes it; empty without a file.
-        application: what the robot's own actors know of place and task.
-        adapted: the last change of the system; None if there was none.
-        known_incarnations: for a restarted supervisor, those that were issued.
-        root: for a supervisor, descriptor of its connection to the root; -1 without one.
+        plan: the choices for the run.
+        system: specification with all changes made while running, and without disabled layers.
+        document: the specification as TOML data, which the manager changes; empty without a file.
+        application: the robot's place and task.
+        adapted: the last change of the system, or None.
+        known_incarnations: newest issued incarnation by node, for a restarted supervisor.
+        root: descriptor of a supervisor's connection to the root; -1 without one.
     """
 
     plan: RunPlan = field(default_factory=RunPlan)

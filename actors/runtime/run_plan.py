@@ -1,7 +1,6 @@
-"""The plan of one run: which system, with what choices, and what all its processes need to know.
+"""The plan of one run: its system, its choices, and the data that all its processes need.
 
-The launcher makes it, the spawner receives it once and hands it on through `fork`. It is plain
-data (JSON), so that any process can be given it.
+The launcher makes it, and the processes inherit it by `fork`. It is plain data (JSON).
 """
 
 from __future__ import annotations
@@ -27,38 +26,38 @@ DEFAULT_PORT = 7450
 
 
 def on_host(name: str, host: str) -> str:
-    """Return what is called `name` on the first host as it is called on another one."""
+    """Return the name that `name` of the first host has on a host."""
     return f"{name}_{host}" if host else name
 
 
 class RunPlan(msgspec.Struct, frozen=True):
-    """What all processes of a run have in common.
+    """Data that all processes of a run share.
 
     Attributes:
         run_id: unique name of the run.
-        base_port: number that tells the runs of this machine apart.
+        base_port: distinguishes the runs of this machine.
         rate: simulated seconds per second.
-        seed: for everything random.
-        system_file: path of the system spec.
-        strategy: name that replaces the spec's strategy; "" for the spec's.
-        shadow: name of a strategy to run in shadow; "" for the spec's.
+        seed: seed of all random numbers.
+        system_file: path of the specification.
+        strategy: strategy in place of the specification's, or "".
+        shadow: shadow strategy in place of the specification's, or "".
         ftm: False runs the paper's unprotected baseline.
         page: the operator's page of this host.
-        launcher_pid: process id of the launcher; set by it.
-        folder: folder of the run's sockets, which only its user can enter; made by the launcher.
-        error_log: file that collects tracebacks of failed nodes; "" for none.
+        launcher_pid: process id of the launcher, which sets it.
+        folder: run folder, of mode 0700; the launcher makes it.
+        error_log: file that collects tracebacks of failed nodes, or "".
         origin_s: reading of the monotonic clock at simulated time 0; set when all is loaded.
-        checkpoints: directory for the nodes' checkpoints; "" keeps none, whatever the spec says.
-        faults: what the page offers to inject by name.
-        waits: True has the mission wait until the operator starts it from the page.
-        virtual: whether time is virtual: nothing outside of the process is used.
-        keys: folder of keys, "" for a run without.
-        ports: of loopback, on which the routers are spoken with in a run with keys; the launcher's.
-        options: of the system's application, in place of what the spec says.
-        host: name of the machine that this is the plan of; "" on the first, and on the only one.
-        incarnations: of the supervisor and the routers of this host begin above this number.
-        part: how often the run was resumed.
-        begins_s: simulated time at which this part of the run begins; before, it is starting.
+        checkpoints: directory of the nodes' checkpoints; "" keeps none.
+        faults: faults that the page offers by name.
+        waits: whether the mission waits until the operator starts it from the page.
+        virtual: whether time is virtual, with nothing outside the process.
+        keys: folder of credentials, "" for a run without.
+        ports: the routers' loopback ports in a run with credentials; the launcher sets them.
+        options: options of the application, in place of the specification's.
+        host: name of this plan's host; "" on the first one.
+        incarnations: incarnations of this host's supervisor and routers are above this number.
+        part: number of times the run was resumed.
+        begins_s: simulated time at which this part of the run begins, after start-up.
     """
 
     run_id: str = "run"
@@ -88,40 +87,40 @@ class RunPlan(msgspec.Struct, frozen=True):
 
     @property
     def supervisor(self) -> str:
-        """Name of this host's supervisor."""
+        """The name of this host's supervisor."""
         return on_host(SUPERVISOR, self.host)
 
     @property
     def routers(self) -> dict[str, str]:
-        """Names of this host's routers, each with that of its socket."""
+        """The names of this host's routers, each with the name of its socket."""
         return {on_host(name, self.host): name for name in ROUTERS}
 
     @property
     def description(self) -> dict[str, Any]:
-        """What a recording keeps of it: no secrets, and nothing that is true of one run only."""
+        """The part that a recording includes: no secrets, and nothing about one run only."""
         return {**self.options, **{name: getattr(self, name) for name in (
             "system_file", "strategy", "shadow", "seed", "ftm")}}
 
     def credentials(self, name: str) -> Credentials | None:
-        """Return those of one of its processes; None in a run without keys."""
+        """Return the credentials of a process; None in a run without."""
         return credentials_in(self.keys, name, self.folder, self.ports)
 
 
 def load_system(plan: RunPlan) -> SystemSpec:
-    """Read the plan's system spec, with the baseline's layers off where the plan says so.
+    """Read the plan's specification, and tailor it to the plan.
 
     Raises:
-        SpecificationError: the spec is unsound.
+        SpecificationError: the specification is wrong.
         OSError: it cannot be read.
     """
     return tailor(plan, check_document(load_document(plan), plan.system_file))
 
 
 def load_document(plan: RunPlan) -> dict[str, Any]:
-    """Read the plan's system spec as TOML, with the plan's choice of strategies.
+    """Read the plan's specification as TOML data, with the plan's strategies.
 
     Raises:
-        SpecificationError: it is no TOML, or no text at all.
+        SpecificationError: the file is not TOML.
         OSError: it cannot be read.
     """
     try:
@@ -133,18 +132,18 @@ def load_document(plan: RunPlan) -> dict[str, Any]:
 
 
 def tailor(plan: RunPlan, spec: SystemSpec) -> SystemSpec:
-    """Return a spec with the baseline's layers off, and commands played, where the plan says so.
+    """Return a specification for virtual time or the unprotected baseline, if the plan asks for it.
 
     Raises:
-        SpecificationError: time is virtual, and a node is a command that nothing plays.
+        SpecificationError: time is virtual, and a command has no `stand_in`.
     """
     if plan.virtual:
         nodes = tuple(node.in_virtual_time() for node in spec.nodes)
         for node in nodes:
             if node.command:
                 raise SpecificationError(
-                    plan.system_file, f"{node.name}: command", "there are no processes in virtual "
-                    "time; name with stand_in = 'module:Class' the actor that plays it there",
+                    plan.system_file, f"{node.name}: command", "virtual time has no processes; "
+                    "expected stand_in = 'module:Class', an actor in its place",
                     list(node.command))
         spec = msgspec.structs.replace(spec, nodes=nodes, hosts=())
     return spec if plan.ftm else msgspec.structs.replace(spec, layers=Layers(

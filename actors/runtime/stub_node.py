@@ -1,4 +1,4 @@
-"""A node that does nothing: its loop turns, its heart beats, and it can be killed."""
+"""A node that only sends heartbeats."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from rampart.actors.runtime.actor import Actor
 
 
 class StubNode(Actor):
-    """Stands for a functional node that is not written yet."""
+    """Stands in for a functional node that is not written yet."""

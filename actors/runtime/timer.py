@@ -1,6 +1,6 @@
-"""Timers of an actor: calls that are made once and can be taken back, and periodic ones.
+"""Timers of an actor: single calls that can be cancelled, and periodic calls.
 
-All are made as items of the actor's mailbox.
+All calls are items of the actor's mailbox.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Timer:
         self.handle: asyncio.TimerHandle | None = None
 
     def cancel(self) -> None:
-        """Make sure the call does not happen (any more)."""
+        """Prevent the call."""
         self._call = None
         self._pending.discard(self)
         if self.handle is not None:
@@ -40,8 +40,8 @@ class Timers:
     """The timers of one actor; `len` counts the pending calls, without the periodic ones.
 
     Args:
-        clock: Simulated time.
-        dispatcher: Handles the calls.
+        clock: simulated time.
+        dispatcher: handles the calls.
     """
 
     def __init__(self, clock: Clock, dispatcher: Dispatcher) -> None:
@@ -56,7 +56,7 @@ class Timers:
         return len(self._pending)
 
     def later(self, delay_s: float, call: Callable[[], None]) -> Timer:
-        """Have `call` made after `delay_s` simulated seconds."""
+        """Call `call` after `delay_s` simulated seconds."""
         timer = Timer(call, self._pending)
         self._pending.add(timer)
         self._count += 1
@@ -72,9 +72,9 @@ class Timers:
 
     def every(self, period_s: float, name: str, call: Callable[[], None], *,
               at_once: bool = False) -> None:
-        """Have `call` made each `period_s` simulated seconds, first after one period or at once.
+        """Call `call` every `period_s` simulated seconds, first after one period or at once.
 
-        A call that is late skips; it does not catch up.
+        Missed calls are skipped.
         """
         loop, clock, slot = asyncio.get_running_loop(), self._clock, f"timer {name}"
         post_at = getattr(loop, "post_at", loop.call_at)  # cheaper, on a virtual loop
@@ -92,12 +92,12 @@ class Timers:
         post_at(clock.source_time(due_s), tick, None, None)
 
     def lateness_s(self) -> float:
-        """Return how late a periodic call came at most since this was asked last."""
+        """Return the largest delay of a periodic call since the last question, simulated s."""
         late_s, self._late_s = self._late_s, 0.0
         return late_s
 
     def cancel(self) -> None:
-        """Make none of the calls any more."""
+        """Prevent all further calls."""
         self._ended = True
         for timer in list(self._pending):
             timer.cancel()

@@ -26,7 +26,7 @@ from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor
 from rampart.actors.runtime.application import Application
-from rampart.actors.runtime.parameters import Named, messages_said, read_parameters
+from rampart.actors.runtime.parameters import Named, given_messages, read_parameters
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_document, on_host, tailor
 from rampart.actors.system.hosts import Hosts
@@ -296,7 +296,7 @@ class Connections:
                 ways[way][topic.key] = (*(there or ()), name) if name else None
         with self._checking(member):
             member.actor.check_topics(member.parameters, self.named)
-            for parameter, said in messages_said(member.parameters).items():
+            for parameter, said in given_messages(member.parameters).items():
                 topic = self.named[said.topic]
                 try:
                     msgspec.convert(said.fields, topic.type)

@@ -275,7 +275,7 @@ async def test_a_field_that_is_not_known_is_said_and_the_rest_is_shown(world):
     strange = (Panel(title="Strange", text="no/topic:x"), *PANELS)
     async with world.running(hmi(world, strange)) as page:
         await eventually(lambda: any(d.context == "panel" for d in world.others.diagnostics))
-        assert "hmi: no topic 'no/topic'" in {d.reason for d in world.others.diagnostics}
+        assert "hmi: unknown topic 'no/topic'" in {d.reason for d in world.others.diagnostics}
         assert page._hello()["panels"][0]["title"] == "Strange"
 
 

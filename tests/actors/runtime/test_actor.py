@@ -372,7 +372,7 @@ async def test_the_heart_beats_at_the_period_that_the_system_states():
     (RecoveryModule, "activated"), (RecoveryModule, "act")])
 def test_a_handler_with_a_name_that_the_base_class_has_is_refused(base, name):
     """Before, the base class's value took its place, or it that of the base class, in silence."""
-    with pytest.raises(TypeError, match=rf"^Own\.{name}: \w+ has something of this name already"):
+    with pytest.raises(TypeError, match=rf"^Own\.{name}: \w+ has this name already"):
         type("Own", (base,), {name: every(1.0)(lambda self: None)})
 
 

@@ -164,7 +164,7 @@ async def test_a_fault_that_does_not_fit_its_topic_is_refused_when_it_is_ordered
     await asyncio.sleep(1.05)
     ((affected, finished, reason),) = scene.listener.told
     assert (affected, finished) == (0, True)
-    assert "'z_m': Pose has no such field; known: x_m, y_m, yaw_rad" in reason
+    assert "'z_m': unknown in Pose; known: x_m, y_m, yaw_rad" in reason
     assert len(scene.listener.poses) == 10
 
 

@@ -304,7 +304,7 @@ def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
     ("drop", {"duration_s": math.nan}, "duration_s = nan"),
     ("delay", {"delay_s": -0.1}, "delay_s = -0.1"),
     ("delay", {"delay_s": math.inf}, "delay_s = inf"),
-    ("delay", {}, "delay_s = 0: must be above 0"),
+    ("delay", {}, "delay_s = 0"),
     ("restamp", {}, "stamp_s = 0"),
     ("drop", {"stamp_s": -math.inf}, "stamp_s = -inf"),
     ("drop", {"share": 1.1}, "share = 1.1"),
@@ -315,11 +315,11 @@ def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
     ("corrupt", {}, "mode = 'corrupt'"),
     ("corrupt", {"add_fields": {"x_m": math.inf}}, "add_fields 'x_m' = inf"),
     ("corrupt", {"noise_fields": {"x_m": -1.0}}, "noise_fields 'x_m' = -1"),
-    ("corrupt", {"set_fields": {"z_m": 1.0}}, "'z_m': Odometry has no such field; known: pose"),
-    ("corrupt", {"set_fields": {"pose.x_m.a": 1.0}}, "'pose.x_m.a': Odometry has no such field"),
+    ("corrupt", {"set_fields": {"z_m": 1.0}}, "'z_m': unknown in Odometry; known: pose"),
+    ("corrupt", {"set_fields": {"pose.x_m.a": 1.0}}, "'pose.x_m.a': unknown in Odometry"),
     ("corrupt", {"set_fields": {"pose.x_m": "far"}}, "'pose.x_m' = 'far': Expected `float`"),
-    ("corrupt", {"add_fields": {"pose": 1.0}}, "'pose': Pose is no number"),
-    ("corrupt", {"keep_ends": ("pose",)}, "keep_ends 'pose': not a list"),
+    ("corrupt", {"add_fields": {"pose": 1.0}}, "'pose': Pose, expected a number"),
+    ("corrupt", {"keep_ends": ("pose",)}, "keep_ends 'pose'"),
 ])
 def test_what_makes_no_sense_is_refused_for_one_reason_and_nothing_happens(mode, fields, words):
     order = Injection(**{"injection": "i", "topic": "summit_xl/odom", "mode": mode,
@@ -351,10 +351,10 @@ def test_whether_a_change_fits_is_known_from_the_type_of_the_field(kind, fields,
 
 
 @pytest.mark.parametrize(("fields", "body", "words"), [
-    ({"set_fields": {"z_m": 1.0}}, POSE, "'z_m': no such field"),
+    ({"set_fields": {"z_m": 1.0}}, POSE, "'z_m': unknown"),
     ({"set_fields": {"x_m": "far"}}, POSE, "corrupt Pose"),
     ({"add_fields": {"ranges_f32": 1.0}}, LaserScan(0.0, 0.1, 8.0, b"12345"), "5 bytes"),
-    ({"add_fields": {"reason": 1.0}}, Route("", 0, Mode.TAXI, True, (), ""), "str is no number"),
+    ({"add_fields": {"reason": 1.0}}, Route("", 0, Mode.TAXI, True, (), ""), "got str"),
 ])
 def test_a_misfit_that_only_the_message_shows_ends_the_injection_and_leaves_the_message(
         fields, body, words):

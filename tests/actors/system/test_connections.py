@@ -171,10 +171,11 @@ def test_two_publishers_of_what_is_one_node_s_to_say(tank):
     ("class Reader(Pump):\n    async def level(self, message, header): pass\n",
      "TypeError: Reader.level is an async def"),
     (HEARS.format("LEVEL").replace("pass", "yield"), "TypeError: Reader.level has a yield"),
-    (HEARS.format("LEVEL").replace(", header", ""), "TypeError: Reader.level: def level(self, "),
-    (HEARS.format("Level"), "TypeError: @on(Level): a Topic"),
+    (HEARS.format("LEVEL").replace(", header", ""),
+     "TypeError: Reader.level: expected def level(self, "),
+    (HEARS.format("Level"), "TypeError: @on(Level): expected a Topic"),
     *((f"class Reader(Actor):\n    @every{period}\n    def tick(self): pass\n",
-       f"ValueError: @every({shown}): a period above 0") for period, shown in (
+       f"ValueError: @every({shown}): expected a period above 0") for period, shown in (
            ("(0)", "0"), ("(-0.5)", "-0.5"), ("", "tick"))),
 ])
 def test_a_handler_that_would_never_run(tank, code, cause):

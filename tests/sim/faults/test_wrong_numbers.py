@@ -99,14 +99,14 @@ def test_a_fault_that_the_specification_names_is_found_listed_and_drawn():
 
 
 @pytest.mark.parametrize(("change", "line"), [
-    (('"stuck"', '"stcuk"'), "fault trigger-lost: mode = 'stcuk': must be one of drop, freeze, "
+    (('"stuck"', '"stcuk"'), "fault trigger-lost: mode = 'stcuk': expected one of drop, freeze, "
      "stuck, delay, duplicate, restamp, corrupt"),
     (('"detection/D_LEVEL"', '"detecton/D_LEVEL"'), "fault trigger-lost: topic = 'detecton/D_LEVEL'"
      ": no node publishes it; the nearest: detection/D_LEVEL, "),
     (('"detection/D_LEVEL"', '"inject/order"'), "fault trigger-lost: it carries the injections "
      "themselves"),
     (('mode = "stuck"', 'mode = "corrupt"\nadd = { levl_m = 1.0 }'), "fault trigger-lost: field "
-     "'levl_m': DetectionReport has no such field; known: "),
+     "'levl_m': unknown in DetectionReport; known: "),
 ])
 def test_a_fault_that_makes_no_sense_in_the_system(change, line):
     with pytest.raises(ValueError, match=r".") as caught:
