@@ -87,7 +87,7 @@ class Scene:
         tap = VirtualBus(self.system.hub, "tap")
         await tap.open()
         for topic in (topics.POSE, ftm_topics.RESET):
-            tap.subscribe(topic, topic.at(), lambda _key, payload: self.wire.append(payload))
+            tap.subscribe(topic.at(), lambda _key, payload: self.wire.append(payload))
         await self.system.settle()
 
     def inject(self, mode: str, duration_s: float, topic: str = "localization/pose",
