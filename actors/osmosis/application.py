@@ -13,8 +13,7 @@ from rampart.actors.runtime.application import Application
 from rampart.manager.spec.schema import SystemSpec
 
 if TYPE_CHECKING:
-    from rampart.actors.osmosis.airport.model import Airport, Mission
-    from rampart.actors.osmosis.airport.world import WorldTruth
+    from rampart.actors.osmosis.airport.model import Airport, Mission, WorldTruth
 
 _AIRPORT = "airport"
 """Folder of a recording with the airport's files."""
@@ -49,7 +48,7 @@ class Osmosis(Application):
             extra={"metavar": "DEVICE", "alone": "auto", "real": True})] = ""
 
     topics = topics.ROBOT
-    views = "rampart.actors.osmosis.recording.views:OsmosisViews"
+    views = "rampart.actors.osmosis.views:OsmosisViews"
     lines = "rampart.cli.osmosis.lines:OsmosisLines"
     model = "rampart.sim.osmosis.camera:AirportModel"
     faults = "rampart.sim.osmosis.trial.faults:OsmosisFaults"
@@ -77,8 +76,7 @@ class Osmosis(Application):
     def on_map(cls, airport: Airport, mission: Mission | None = None,
                world: WorldTruth | None = None) -> Osmosis:
         """Return an application of what is loaded already; without a mission, of none."""
-        from rampart.actors.osmosis.airport.model import Mission  # noqa: PLC0415 heavy for a tool
-        from rampart.actors.osmosis.airport.world import WorldTruth  # noqa: PLC0415
+        from rampart.actors.osmosis.airport.model import Mission, WorldTruth  # noqa: PLC0415 heavy
 
         found = cls.__new__(cls)
         found.options = cls.Options(airport=airport.source, mission="")

@@ -1,17 +1,23 @@
-"""The driver of a Summit XL that speaks ROS 2, and the world behind it: MuJoCo, as ever.
+"""A simulated driver of a Summit XL that uses ROS 2.
 
-In the place of `Simulator`: the same world, whose sensors are topics of ROS 2 and which hears its
-commands there. Only what a judge is told passes by the system's own bus.
+It replaces `Simulator`: the same world, but sensors and commands are ROS 2 topics. Only the ground
+truth for the judge uses the system's own bus.
+
+Its encoding follows the specifications (OMG DDSI-RTPS 10.2, CDR little-endian; rmw_zenoh's
+`docs/design.md`) and shares no code with the gateway, so that an error in one shows against the
+other.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Any
 
 import msgspec
+import xxhash
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics as ftm_topics
@@ -22,7 +28,6 @@ from rampart.actors.ros2.stand_in import side_of, wall_ns
 from rampart.actors.ros2.translation.tables import ROUTER
 from rampart.actors.ros2.wire import Qos
 from rampart.actors.runtime.actor import Context, Header
-from rampart.sim.osmosis.ros_format import Graph, Reader, Writer, attachment
 from rampart.sim.osmosis.simulator import Simulator
 
 NODE = "summit_xl_driver"
@@ -30,7 +35,7 @@ DATUM_DEG = (43.635, 1.368)
 """Latitude and longitude of the origin of the map: Toulouse-Blagnac, the paper's airport."""
 
 _METRES_PER_DEGREE = (111_105.117740, 80_696.255885)
-"""North and east there, on the ellipsoid WGS 84."""
+"""North and east at the datum, on the ellipsoid WGS 84."""
 
 _HASHES = {
     "nav_msgs/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
@@ -47,17 +52,133 @@ _HASHES = {
     "summit_xl_msgs/BaseStatus": "38a792a9e78eb0f25e7aa66ddaffea94f3c666a5d49915cf8059dc7067125498",
     "summit_xl_msgs/Brake": "be8230859cd383cfdd385a23fe67941120fe045851e828f31fbc9c41d32200e1",
 }
-"""Official hashes (REP-2016) of Jazzy and Kilted, and those of the driver's own messages."""
+"""Official hashes (REP-2016) of Jazzy and Kilted, and hashes of the driver's own messages."""
+
+
+_STEPS = {"?": 1, "b": 1, "B": 1, "H": 2, "i": 4, "I": 4, "f": 4, "d": 8}
+
+
+class Writer:
+    """Writes CDR fields in sequence, each aligned to its size."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+
+    def put(self, kind: str, *values: float) -> Writer:
+        """Write numbers or booleans of one kind, a format character of `struct`."""
+        size = _STEPS[kind]
+        self._data += bytes(-len(self._data) % size)
+        self._data += struct.pack(f"<{len(values)}{kind}", *values)
+        return self
+
+    def text(self, text: str) -> Writer:
+        """Write a string with its length and a final zero."""
+        data = text.encode() + b"\0"
+        self.put("I", len(data))
+        self._data += data
+        return self
+
+    def list(self, kind: str, values: Sequence[float]) -> Writer:
+        """Write a sequence with its length."""
+        self.put("I", len(values))
+        return self.put(kind, *values) if len(values) else self
+
+    def header(self, stamp_ns: int, frame: str) -> Writer:
+        """Write a std_msgs/Header."""
+        return self.put("i", stamp_ns // 10**9).put("I", stamp_ns % 10**9).text(frame)
+
+    def zeros(self, count: int) -> Writer:
+        """Write zeros of 8 bytes, such as an unknown covariance."""
+        return self.put("d", *[0.0] * count)
+
+    def done(self) -> bytes:
+        """Return the encapsulation header and the fields."""
+        return b"\0\1\0\0" + bytes(self._data)
+
+
+class Reader:
+    """Reads CDR fields in sequence.
+
+    Args:
+        data: a message on the wire.
+
+    Raises:
+        ValueError: the message is not little-endian CDR.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        if data[:2] != b"\0\1" or len(data) < 4:
+            raise ValueError("not little-endian CDR")
+        self._data, self._at = data[4:], 0
+
+    def get(self, kind: str) -> float:
+        """Read a number or boolean.
+
+        Raises:
+            ValueError: the message is truncated.
+        """
+        size = _STEPS[kind]
+        self._at += -self._at % size
+        try:
+            value, = struct.unpack_from(f"<{kind}", self._data, self._at)
+        except struct.error:
+            raise ValueError("truncated message") from None
+        self._at += size
+        return float(value)
+
+    def text(self) -> str:
+        """Read a string.
+
+        Raises:
+            ValueError: the message is truncated.
+        """
+        size = int(self.get("I"))
+        data = self._data[self._at:self._at + size]
+        if len(data) < size:
+            raise ValueError("truncated message")
+        self._at += size
+        return data[:-1].decode("utf-8", "replace")
+
+
+class Graph:
+    """Keys and liveliness tokens of a ROS 2 node.
+
+    Args:
+        session: id of its session.
+        node: name of the node.
+        domain: ROS_DOMAIN_ID.
+    """
+
+    def __init__(self, session: str, node: str, domain: int = 0) -> None:
+        self._above = f"@ros2_lv/{domain}/{session}"
+        self._node, self._domain, self._count = node, domain, 0
+        self.token = f"{self._above}/0/0/NN/%/%/{node}"
+
+    def endpoint(self, kind: str, topic: str, of: str, digest: str, *, depth: int = 10
+                 ) -> tuple[str, str, bytes]:
+        """Return key, token and gid of a publisher ("MP") or subscription ("MS")."""
+        self._count += 1
+        package, name = of.split("/")
+        dds = f"{package}::msg::dds_::{name}_"
+        token = (f"{self._above}/0/{self._count}/{kind}/%/%/{self._node}/"
+                 f"{topic.replace('/', '%')}/{dds}/{digest}/::,{depth}:,:,:,,")
+        gid = xxhash.xxh3_128_digest(token.encode())[::-1]
+        return f"{self._domain}/{topic[1:]}/{dds}/{digest}", token, gid
+
+
+def attachment(number: int, stamp_ns: int, gid: bytes) -> bytes:
+    """Return the attachment of a message."""
+    return struct.pack("<qqB", number, stamp_ns, len(gid)) + gid
 
 
 class RosDriver(Simulator):
-    """The world of a Summit XL, as a node of ROS 2."""
+    """The world of a Summit XL as a ROS 2 node."""
 
     class Parameters(Simulator.Parameters, frozen=True):
         """Robot and world; see `Simulator.Parameters`.
 
         Attributes:
-            connect: endpoints of the routers of ROS 2.
+            connect: endpoints of the ROS 2 routers.
             domain: ROS_DOMAIN_ID.
         """
 
@@ -70,14 +191,14 @@ class RosDriver(Simulator):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self._side: Side | None = None
-        self._said: dict[str, Callable[[bytes], None]] = {}
+        self._publishers: dict[str, Callable[[bytes], None]] = {}
 
     def listens(self, topic: Topic[Any]) -> bool:
-        """Whether it hears a topic of the system: it is commanded from ROS 2."""
+        """Whether it subscribes to a topic: commands come from ROS 2."""
         return topic not in {topics.BASE_COMMAND, topics.BRAKE}
 
     def on_start(self) -> None:
-        """Build the world, and enter the graph."""
+        """Build the world and join the ROS graph."""
         super().on_start()
         side = self._side = side_of(self, self._bus, self.parameters.connect, "peer")
         graph = self._graph = Graph(side.id, NODE, self.parameters.domain)
@@ -92,12 +213,12 @@ class RosDriver(Simulator):
                 (topics.LIGHT, "/illuminance", "sensor_msgs/Illuminance"),
                 (topics.ABSOLUTE_POSE, "/absolute_pose", "geometry_msgs/PoseStamped"),
                 (topics.BASE_STATUS, "/base_status", "summit_xl_msgs/BaseStatus")):
-            self._said[topic.key if topic else where] = self._publisher(where, of)
+            self._publishers[topic.key if topic else where] = self._publisher(where, of)
         self._subscribe("/cmd_vel", "geometry_msgs/TwistStamped", self._commanded)
         self._subscribe("/brake", "summit_xl_msgs/Brake", self._braked_by)
 
     def on_stop(self) -> None:
-        """Leave the graph."""
+        """Leave the ROS graph."""
         if self._side is not None:
             self._side.close()
 
@@ -124,7 +245,7 @@ class RosDriver(Simulator):
         except ValueError as error:
             self.report_diagnostic("ros2", str(error), where)
 
-    # -- what it hears ----------------------------------------------------------------------------
+    # -- commands ---------------------------------------------------------------------------------
 
     def _commanded(self, data: Reader) -> None:
         stamp_ns = int(data.get("i")) * 10**9 + int(data.get("I"))
@@ -137,31 +258,31 @@ class RosDriver(Simulator):
         self.brake(m.BrakeCommand(engaged, reason), self._from(holder, wall_ns(self)))
 
     def _from(self, source: str, stamp_ns: int) -> Header:
-        """Return the header of what came from ROS 2."""
+        """Return the header for a message from ROS 2."""
         behind_s = (wall_ns(self) - stamp_ns) / 1e9 * self.clock.rate
         return Header(source, 0, 0, self.clock.now() - behind_s)
 
-    # -- what it says -----------------------------------------------------------------------------
+    # -- sensors ----------------------------------------------------------------------------------
 
     def has_readers(self, topic: Topic[Any]) -> bool:
-        """Whether somebody may be listening: in ROS 2 that is not asked."""
-        return topic.key in self._said or super().has_readers(topic)
+        """Whether a topic may have subscribers; assumed for topics of ROS 2."""
+        return topic.key in self._publishers or super().has_readers(topic)
 
     def publish(self, topic: Topic[Any], body: msgspec.Struct, stamp: float | None = None,
                 name: str | None = None) -> None:
-        """Say a reading to ROS 2, and what is no sensor's to the system."""
-        say = self._said.get(topic.key)
-        if say is None:
+        """Publish a reading to ROS 2, and all else to the system."""
+        send = self._publishers.get(topic.key)
+        if send is None:
             super().publish(topic, body, stamp, name)
             return
         stamp_ns = wall_ns(self) - int(
             (self.clock.now() - (self.clock.now() if stamp is None else stamp))
             / self.clock.rate * 1e9)
-        if isinstance(body, m.GpsFix):  # a receiver says its velocity on a topic of its own
-            self._said["/fix_velocity"](
+        if isinstance(body, m.GpsFix):  # the velocity has its own topic
+            self._publishers["/fix_velocity"](
                 Writer().header(stamp_ns, "map").put(
                     "d", body.velocity_x_mps, body.velocity_y_mps, 0, 0, 0, 0).zeros(36).done())
-        say(_WRITE[type(body)](body, Writer(), stamp_ns))
+        send(_WRITE[type(body)](body, Writer(), stamp_ns))
 
 
 def _turn(writer: Writer, yaw_rad: float) -> Writer:

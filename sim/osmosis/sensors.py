@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.airport.model import Airport, WorldTruth
 from rampart.actors.osmosis.airport.photometry import SENSOR_HEIGHT_M, sensor_position
-from rampart.actors.osmosis.airport.world import WorldTruth
 from rampart.sim.osmosis.robot import WheelSpeeds, twist_from_wheels
 from rampart.sim.osmosis.scene import SOLID_GROUP
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import mujoco
@@ -15,12 +17,11 @@ import numpy as np
 import shapely
 
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.airport.model import Airport
-from rampart.actors.osmosis.airport.world import WorldTruth
+from rampart.actors.osmosis.airport.model import Airport, WorldTruth, rectangle
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.sim.osmosis import robot, sensors
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, motor_of
-from rampart.sim.osmosis.clearance import Clearance, Pose, footprint
+from rampart.sim.osmosis.robot import CIRCUMRADIUS_M, LENGTH_M, WIDTH_M
 from rampart.sim.osmosis.scene import Scene, Solid, WorldError
 
 TICK_S = 0.01
@@ -40,6 +41,12 @@ SAME_CONTACT_S = 0.5
 
 LOCKED_DAMPING = 300.0
 """Wheel damping, N m s/rad, of a blocked wheel, braked or stuck: all that moves is the tyre."""
+
+EXACT_BELOW_M = 1.0
+"""Clearances are exact below this; above it they may be lower bounds."""
+
+Pose = tuple[float, float, float]
+"""x m, y m, yaw rad in `map`."""
 
 
 class WorldKept(msgspec.Struct, frozen=True):
@@ -358,7 +365,7 @@ class World:
         `obstacle_clearance_m` is from the footprint to the nearest obstacle or building
         (`rampart.sim.osmosis.scene.NOTHING_M` if there is none), `prohibited_clearance_m` from the
         footprint's nearest corner to the prohibited area, negative in it. Both are exact below 1 m
-        and lower bounds above (see `rampart.sim.osmosis.clearance`).
+        and lower bounds above (see `rampart.sim.osmosis.world`).
         """
         x_m, y_m, yaw_rad = self.pose
         vx, vy, *_ = self._base_v.tolist()
@@ -395,3 +402,36 @@ def _four(wheels: sensors.Floats) -> robot.WheelSpeeds:
     """Return a view of what MuJoCo has of the wheels as plain numbers."""
     fl, fr, rl, rr = wheels.tolist()
     return fl, fr, rl, rr
+
+
+class Clearance:
+    """A distance from the footprint to something that stands still until `forget` is called.
+
+    Args:
+        exact: distance for a pose, m.
+    """
+
+    def __init__(self, exact: Callable[[Pose], float]) -> None:
+        self._exact = exact
+        self._pose: Pose = (0.0, 0.0, 0.0)
+        self._distance_m = -math.inf
+
+    def forget(self) -> None:
+        """Make the next look an exact one."""
+        self._distance_m = -math.inf
+
+    def measure(self, pose: Pose) -> float:
+        """Return the distance for a pose: exact below `EXACT_BELOW_M`, else a lower bound, m."""
+        x_m, y_m, yaw_rad = self._pose
+        turned_rad = abs(math.remainder(pose[2] - yaw_rad, math.tau))
+        moved_m = math.dist(pose[:2], (x_m, y_m)) + turned_rad * CIRCUMRADIUS_M
+        bound_m = self._distance_m - moved_m
+        if bound_m > EXACT_BELOW_M:
+            return bound_m
+        self._pose, self._distance_m = pose, self._exact(pose)
+        return self._distance_m
+
+
+def footprint(pose: Pose) -> Any:
+    """Return the robot's outline on the ground as a shapely polygon in `map`."""
+    return rectangle(*pose, LENGTH_M, WIDTH_M)

@@ -38,7 +38,7 @@ from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests import CELL, ROOT
-from tests.actors.osmosis.airport.test_formats import GRAPH, SCALE, TOML
+from tests.actors.osmosis.airport.test_formats import GRAPH, TOML
 from tests.actors.recording.samples import documents, pose
 from tests.fuzz.samples import sample
 from tests.fuzz.target import target
@@ -149,21 +149,21 @@ def _field() -> Any:
             "edges": [["N1", "N2"], ["N2", "N3"]]}).encode()])
 def graph(data: bytes) -> None:
     if not (folder() / "foreign/field.png").exists():
-        written("foreign/field.png", _image("PNG"))
-    load_airport(written("foreign/field.graph", data), SCALE)
+        written("foreign/field.png", _image("PNG", size=480))
+    load_airport(written("foreign/field.graph", data))
 
 
 @target("mask", refuses=(AirportError,), kind="png", says_one_line=True, suite_runs=100,
         samples=lambda: [_image("PNG"), _image("PNG", "P"), _image("PNG", "RGBA"),
                          _image("JPEG")])
 def mask(data: bytes) -> None:
-    allowed_area(written("mask.png", data), SCALE)
+    allowed_area(written("mask.png", data))
 
 
-def _image(form: str, mode: str = "RGB") -> bytes:
-    pixels = np.zeros((48, 48, 3), dtype=np.uint8)
+def _image(form: str, mode: str = "RGB", size: int = 48) -> bytes:
+    pixels = np.zeros((size, size, 3), dtype=np.uint8)
     pixels[..., 0] = 255
-    pixels[8:40, 8:40] = (0, 255, 0)
+    pixels[8:size - 8, 8:size - 8] = (0, 255, 0)
     out = io.BytesIO()
     Image.fromarray(np.kron(pixels, np.ones((2, 2, 1), dtype=np.uint8))).convert(mode).save(
         out, form)

@@ -33,7 +33,7 @@ from rampart.actors.bus.envelope import UNREADABLE, Header, decode
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.machine.patience import AT_LEISURE, Usage
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.recording.views import OsmosisViews
+from rampart.actors.osmosis.views import OsmosisViews
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Record
 from rampart.actors.runtime.run_context import RunContext

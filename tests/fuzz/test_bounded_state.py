@@ -24,7 +24,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.recording.views import OsmosisViews
+from rampart.actors.osmosis.views import OsmosisViews
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.injection import MAX_DELAYED, MAX_IN_FORCE
 from rampart.actors.runtime.run_plan import SUPERVISOR

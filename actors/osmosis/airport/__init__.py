@@ -1,1 +1,1 @@
-"""Airports as data: graph, lights, pavement, missions, and the formats they come in."""
+"""Airports as data: graph, lights, pavement, missions, and their file formats."""

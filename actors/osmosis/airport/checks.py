@@ -1,4 +1,4 @@
-"""What must hold of an airport, checked once at load."""
+"""Checks of an airport at load."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rampart.actors.osmosis.airport.errors import Problem
 from rampart.actors.osmosis.airport.model import GRAPH_REACH_M, Airport, Mission, repeated
 
 MIN_EDGE_CLEARANCE_M = 0.5
-"""An edge nearer than this to the prohibited area cannot be driven (half the robot's width)."""
+"""Least distance of an edge to the prohibited area: half the robot's width, and a margin."""
 
 
 def problems(airport: Airport) -> Iterator[Problem]:
-    """Yield everything that is wrong, the fundamental first; later checks trust earlier ones."""
+    """Yield all problems; if the graph is broken, only its own, since later checks rely on it."""
     fundamental = list(_graph(airport))
     yield from fundamental
     if any(not found.tolerable for found in fundamental):
@@ -34,11 +34,11 @@ def _graph(airport: Airport) -> Iterator[Problem]:
     for i, (a, b) in enumerate(airport.edges):
         for name in (a, b):
             if name not in airport.nodes:
-                yield Problem(f"edges[{i}]", repr(name), "unknown node; name one from nodes")
+                yield Problem(f"edges[{i}]", repr(name), "unknown node; expected one of nodes")
         if a == b:
-            yield Problem(f"edges[{i}]", f"{a!r} to {b!r}", "an edge joins two different nodes")
+            yield Problem(f"edges[{i}]", f"{a!r} to {b!r}", "expected two different nodes")
     for pair in repeated(frozenset(edge) for edge in airport.edges if edge[0] != edge[1]):
-        yield Problem("edges", " to ".join(sorted(pair)), "edge given twice; once is enough",
+        yield Problem("edges", " to ".join(sorted(pair)), "duplicate edge",
                       tolerable=True)
 
 
@@ -49,7 +49,7 @@ def _ground(airport: Airport) -> Iterator[Problem]:
     start = airport.start
     if airport.prohibited_distance_m(start.x_m, start.y_m) <= 0:
         yield Problem("start", f"({start.x_m:g}, {start.y_m:g})",
-                      "in the prohibited area; put it on the pavement", tolerable=True)
+                      "in the prohibited area; expected on the pavement", tolerable=True)
     off_m = airport.nearest_on_graph(start.x_m, start.y_m).distance_m
     if off_m > GRAPH_REACH_M:
         yield Problem("start", f"({start.x_m:g}, {start.y_m:g})",
@@ -59,12 +59,12 @@ def _ground(airport: Airport) -> Iterator[Problem]:
     for name in inside:
         x_m, y_m = airport.nodes[name]
         yield Problem(f"nodes.{name}", f"({x_m:g}, {y_m:g})",
-                      "in the prohibited area; put it on the pavement", tolerable=True)
+                      "in the prohibited area; expected on the pavement", tolerable=True)
     yield from _edges(airport, set(inside))
 
 
 def _edges(airport: Airport, inside: set[str]) -> Iterator[Problem]:
-    """Yield edges that lead over grass or near it; those of nodes that are on it go without."""
+    """Yield edges over or near the prohibited area, except those of the nodes `inside` it."""
     edges = [(i, *edge) for i, edge in enumerate(airport.edges) if not inside & {*edge}]
     lines = shapely.linestrings(
         np.reshape([(airport.nodes[a], airport.nodes[b]) for _, a, b in edges], (-1, 2, 2)))
@@ -78,34 +78,34 @@ def _edges(airport: Airport, inside: set[str]) -> Iterator[Problem]:
     for (i, a, b), is_paved, distance_m in zip(edges, paved, clear_m, strict=True):
         if not is_paved:
             yield Problem(f"edges[{i}]", f"{a} to {b}", "passes through the prohibited area; "
-                          "lead it over pavement", tolerable=True)
+                          "expected pavement", tolerable=True)
         elif distance_m < MIN_EDGE_CLEARANCE_M:
-            yield Problem(f"edges[{i}]", f"{a} to {b}", "nearer to the prohibited area than "
-                          f"{MIN_EDGE_CLEARANCE_M:g} m; the robot needs more room", tolerable=True)
+            yield Problem(f"edges[{i}]", f"{a} to {b}", "too near to the prohibited area; expected "
+                          f"at least {MIN_EDGE_CLEARANCE_M:g} m", tolerable=True)
 
 
 def _off_pavement(airport: Airport, points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Tell of each point whether it lies in the prohibited area or on its boundary."""
+    """Return for each point whether it lies in the prohibited area or on its boundary."""
     x_m, y_m = np.reshape(points, (-1, 2)).T
     return [not paved for paved in shapely.contains_xy(airport.allowed, x_m, y_m).tolist()]
 
 
 def _lights(airport: Airport) -> Iterator[Problem]:
     for name in repeated(light.name for light in airport.lights):
-        yield Problem("row", repr(name), "two lights of this name; names must be unique")
+        yield Problem("row", repr(name), "duplicate name of a light")
     off = _off_pavement(airport, [(light.x_m, light.y_m) for light in airport.lights])
     for light, is_off in zip(airport.lights, off, strict=True):
         if not light.nominal_cd > 0:
             yield Problem(f"row.{light.name}.nominal_cd", f"{light.nominal_cd:g}",
-                          "the nominal intensity must be positive")
+                          "must be positive")
         if is_off:
             yield Problem(f"row.{light.name}", f"({light.x_m:g}, {light.y_m:g})",
-                          "off the pavement; inset lights lie in it", tolerable=True)
+                          "off the pavement; expected on it", tolerable=True)
 
 
 def _obstacles(airport: Airport) -> Iterator[Problem]:
     for name in repeated(preset.name for preset in airport.obstacles):
-        yield Problem("obstacle", repr(name), "two obstacles of this name; must be unique")
+        yield Problem("obstacle", repr(name), "duplicate name of an obstacle")
     for preset in airport.obstacles:
         where = f"obstacle.{preset.name}"
         if not 0.05 <= preset.radius_m <= 5.0:
@@ -113,7 +113,7 @@ def _obstacles(airport: Airport) -> Iterator[Problem]:
         near_m = math.dist((preset.x_m, preset.y_m), (airport.start.x_m, airport.start.y_m))
         if preset.appears_within_m is None and near_m < preset.radius_m + 0.5:
             yield Problem(where, f"({preset.x_m:g}, {preset.y_m:g})",
-                          "stands on the start pose; move it at least 0.5 m clear")
+                          "on the start pose; expected at least 0.5 m beside it")
         for name in ("present_from_s", "appears_within_m", "gone_after_s"):
             value = getattr(preset, name)
             if value is not None and value < 0:
@@ -121,7 +121,7 @@ def _obstacles(airport: Airport) -> Iterator[Problem]:
 
 
 def mission_problems(mission: Mission, airport: Airport) -> Iterator[Problem]:
-    """Yield what is wrong with one mission at an airport whose graph is sound."""
+    """Yield the problems of a mission at an airport with a sound graph."""
     where = f"missions.{mission.name}"
     if not mission.goals:
         yield Problem(where, "empty", "a mission needs at least one goal")
@@ -134,7 +134,7 @@ def mission_problems(mission: Mission, airport: Airport) -> Iterator[Problem]:
             yield Problem(spot, at, f"{nearest.distance_m:.1f} m from the graph; a mission point "
                           f"must be within {GRAPH_REACH_M:g} m of it")
         elif nearest.a not in airport.within_reach:
-            yield Problem(spot, at, "no way there from the start; connect the graph")
+            yield Problem(spot, at, "not connected to the start; expected a connected graph")
         if off[i]:
-            yield Problem(spot, at, "in the prohibited area; put it on the pavement",
+            yield Problem(spot, at, "in the prohibited area; expected on the pavement",
                           tolerable=True)

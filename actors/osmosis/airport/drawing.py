@@ -1,8 +1,7 @@
 """An airport as lines and rings to draw: for the operator's page and the inspection report.
 
-Everything stays in the `map` frame (metres, y north); whoever draws turns y over. The pavement
-and the prohibited area come as SVG path data, because only a path with holes can show a taxiway
-that runs round a patch of grass.
+Coordinates are in the `map` frame (metres, y north); the reader flips y. Pavement and prohibited
+area are SVG path data, because only a path with holes can show a taxiway around a patch of grass.
 """
 
 from __future__ import annotations
@@ -15,24 +14,24 @@ import shapely
 from rampart.actors.osmosis.airport.model import Airport, Light
 
 FRAME_M = 4.0
-"""Strip of prohibited ground that is drawn round the airport."""
+"""Width of the prohibited strip drawn around the airport."""
 
 _DECIMALS = 2
 
 
 class AirportDrawing(msgspec.Struct, frozen=True):
-    """What there is to draw of an airport.
+    """The drawing of an airport.
 
     Args:
-        name: of the airport.
+        name: name of the airport.
         bounds_m: (min x, min y, max x, max y) of the drawing.
         prohibited: SVG path of the prohibited area within the bounds (fill rule evenodd).
-        surfaces: kind and SVG path of each piece of pavement; runways last, thus on top.
+        surfaces: kind and SVG path of each surface; runways last, so that they are on top.
         buildings: name and SVG path of each building.
         nodes: graph node name to (x, y).
         edges: (x1, y1, x2, y2) of each edge of the graph.
         lights: all inset lights.
-        start: (x, y) where the robot stands at first.
+        start: initial position (x, y).
     """
 
     name: str
@@ -47,7 +46,7 @@ class AirportDrawing(msgspec.Struct, frozen=True):
 
 
 def draw(airport: Airport, tolerance_m: float = 0.02) -> AirportDrawing:
-    """Return the drawing of an airport; what is rounder than the tolerance has more points."""
+    """Return the drawing of an airport, simplified within the tolerance."""
     x0, y0, x1, y1 = airport.bounds_m
     nodes = {name: (round(float(x), _DECIMALS), round(float(y), _DECIMALS))
              for name, (x, y) in airport.nodes.items()}
@@ -66,8 +65,8 @@ def draw(airport: Airport, tolerance_m: float = 0.02) -> AirportDrawing:
 def svg_path(shape: Any, tolerance_m: float = 0.02) -> str:
     """Return SVG path data, in metres, of a shapely geometry made of polygons.
 
-    Parts without area (a union may leave lines) are not drawn, nor parts and holes that are smaller
-    than a square of the tolerance.
+    Parts and holes smaller than a square of the tolerance are left out, as are lines that a union
+    may leave.
     """
     rings: list[str] = []
     for part in shapely.get_parts(shapely.simplify(shape, tolerance_m)):

@@ -1,4 +1,4 @@
-"""The one exception of this package, and the way its messages are built."""
+"""The exception of this package and the form of its messages."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from rampart.files.reading import FileError
 
 
 class AirportError(ValueError):
-    """An airport or mission file is wrong: one line naming file, field, value and the remedy."""
+    """An airport or mission file is invalid: one line with file, field, value and remedy."""
 
     def __init__(self, line: str) -> None:
         super().__init__(one_line(line))
 
 
 class Problem(msgspec.Struct, frozen=True):
-    """One finding about an airport.
+    """A problem of an airport.
 
     Args:
-        field: where, as a path into the file (`missions.AB.goals[2]`).
-        value: the offending value, as text.
-        remedy: what would be right.
-        tolerable: a foreign file may have it; it becomes a warning there.
+        field: path into the file, such as `missions.AB.goals[2]`.
+        value: the invalid value, as text.
+        remedy: what is expected.
+        tolerable: only a warning in the formats of the paper's authors.
     """
 
     field: str
@@ -41,17 +41,17 @@ class Problem(msgspec.Struct, frozen=True):
 
 @contextlib.contextmanager
 def readable(file: str | Path, remedy: str, what: str = "file") -> Iterator[None]:
-    """Have a file that cannot be read, or is not what it should be, refused like all else.
+    """Turn the errors of reading a file into `AirportError`.
 
     Args:
-        file: for the message.
-        remedy: for what is not as it should be.
-        what: is read.
+        file: named in the message.
+        remedy: what is expected of the content.
+        what: kind of file.
     """
     try:
         yield
     except OSError as error:
-        raise AirportError(f"{file}: cannot be read: {error.strerror}: give a readable file"
+        raise AirportError(f"{file}: cannot be read: {error.strerror}: expected a readable file"
                            ) from None
     except FileError as error:
         raise AirportError(f"{file}: {what}: {error}: {remedy}") from None

@@ -1,4 +1,4 @@
-"""Loads airports and missions by name or file, in our own format or the paper authors'."""
+"""Loads airports and missions by name or file, in Rampart's format or the paper authors'."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from rampart.actors.osmosis.airport import graph_format as foreign
 from rampart.actors.osmosis.airport import toml_format
 from rampart.actors.osmosis.airport.checks import mission_problems, problems
 from rampart.actors.osmosis.airport.errors import AirportError, readable
-from rampart.actors.osmosis.airport.limits import MAX_WARNINGS
-from rampart.actors.osmosis.airport.mask import MaskScale
-from rampart.actors.osmosis.airport.model import Airport, Mission
-from rampart.actors.osmosis.airport.world import WorldTruth
+from rampart.actors.osmosis.airport.model import Airport, Mission, WorldTruth
 
 SHIPPED = Path(__file__).resolve().parents[3] / "systems" / "airports"
 """Folder of the shipped airports."""
+
+MAX_WARNINGS = 50
+"""Most warnings about one file."""
 
 
 def shipped_airports() -> tuple[str, ...]:
@@ -24,29 +24,28 @@ def shipped_airports() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))
 
 
-def load_airport(name_or_path: str | Path, scale: MaskScale | None = None) -> Airport:
+def load_airport(name_or_path: str | Path) -> Airport:
     """Load and check an airport.
 
     Args:
         name_or_path: a shipped name, a `.toml` file, a `.graph` file with its image beside it,
             or a folder that holds one `.toml` or one `.graph`.
-        scale: pixels to metres of an area image; default the authors'.
 
     Returns:
-        The airport; for the authors' formats with `warnings` about what was tolerated.
+        The airport; in the authors' formats, tolerable problems become its `warnings`.
 
     Raises:
-        AirportError: one line that names file, field, value and what would be right.
+        AirportError: one line with file, field, value and what is expected.
     """
-    return load_with_truth(name_or_path, scale)[0]
+    return load_with_truth(name_or_path)[0]
 
 
 def load_mission(name_or_path: str | Path, airport: Airport) -> Mission:
-    """Load a mission and check that it can be driven at `airport`.
+    """Load a mission and check it at `airport`.
 
     Args:
         name_or_path: a mission of the airport, or a `.miss` or `.toml` file.
-        airport: where it is to be driven.
+        airport: where the robot drives it.
 
     Raises:
         AirportError: as `load_airport`.
@@ -62,28 +61,23 @@ def load_mission(name_or_path: str | Path, airport: Airport) -> Mission:
 
 
 def files_of(source: Path) -> list[Path]:
-    """Return all files that an airport is read from: itself, and of a graph what lies beside it.
-
-    Args:
-        source: the airport's file.
-    """
+    """Return the files of an airport: `source`, and the images and missions beside a graph."""
     if source.suffix != ".graph":
         return [source]
     return [source, *sorted([*foreign.images_beside(source), *source.parent.glob("*.miss")])]
 
 
-def load_with_truth(name_or_path: str | Path,
-                    scale: MaskScale | None = None) -> tuple[Airport, WorldTruth]:
-    """Load an airport as `load_airport`, and the truth about its lights, for the simulator only.
+def load_with_truth(name_or_path: str | Path) -> tuple[Airport, WorldTruth]:
+    """Load an airport, and for the simulator the real intensities of its lights.
 
     Raises:
         AirportError: as `load_airport`.
     """
-    with readable(name_or_path, "give a file that exists"):
+    with readable(name_or_path, "expected an existing file"):
         path = _find(name_or_path)
         own = path.suffix == ".toml"
         airport, truth = toml_format.read_airport(path) if own else (
-            foreign.read_airport(path, scale), WorldTruth())
+            foreign.read_airport(path), WorldTruth())
     warnings = []
     for problem in problems(airport):
         if own or not problem.tolerable:
@@ -91,9 +85,9 @@ def load_with_truth(name_or_path: str | Path,
         warnings.append(problem.line(path.name))
     if len(warnings) > MAX_WARNINGS:
         warnings[MAX_WARNINGS:] = [
-            f"{path.name}: and {len(warnings) - MAX_WARNINGS} more: mend these first"]
+            f"{path.name}: {len(warnings) - MAX_WARNINGS} more warnings"]
     if not airport.lights:
-        warnings.append(f"{path.name}: lights: none: nothing will be measured")
+        warnings.append(f"{path.name}: lights: none: there is nothing to inspect")
     return dataclasses.replace(airport, warnings=tuple(warnings), source=str(path)), truth
 
 
@@ -106,13 +100,14 @@ def _find(name_or_path: str | Path) -> Path:
         found = sorted([*path.glob("*.toml"), *path.glob("*.graph")])
         if len(found) != 1:
             listed = ", ".join(p.name for p in found) or "none"
-            raise AirportError(f"{path}: airport file: {listed}: need exactly one .toml or .graph")
+            raise AirportError(
+                f"{path}: airport file: {listed}: expected exactly one .toml or .graph")
         return found[0]
     if path.suffix in (".toml", ".graph"):
         if not path.is_file():
-            raise AirportError(f"{path}: file: missing: give a file that exists")
+            raise AirportError(f"{path}: file: missing: expected an existing file")
         return path
     known = shipped_airports()
     near = difflib.get_close_matches(text, known, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"shipped are: {', '.join(known)}"
-    raise AirportError(f"{text}: airport: no such name, folder, .toml or .graph: {hint}")
+    hint = f"did you mean {near[0]!r}?" if near else f"shipped: {', '.join(known)}"
+    raise AirportError(f"{text}: airport: unknown name, folder, .toml or .graph: {hint}")

@@ -1,8 +1,8 @@
-"""What an airport is: graph, lights, pavement, buildings, missions. Pure data and geometry.
+"""An airport: graph, lights, pavement, buildings, missions. Pure data and geometry.
 
 Everything is in the `map` frame: local east-north-up, metres, yaw counter-clockwise from east.
-The ground is described by what is allowed: the pavement less the prohibited polygons. All the
-rest of the world is prohibited (paper, section V: the robot must not leave the pavement).
+The allowed area is the pavement without the prohibited polygons. Everything else is prohibited
+(paper, section V: the robot must not leave the pavement).
 """
 
 from __future__ import annotations
@@ -21,7 +21,17 @@ import shapely
 from shapely.geometry import box
 
 from rampart.actors.osmosis.airport.errors import AirportError
-from rampart.actors.osmosis.airport.limits import MAX_NAME
+
+# Bounds of an airport's files, far above real airports.
+MAX_FILE_BYTES = 4 << 20
+MAX_LIGHTS = 100_000
+"""Lights of all rows; a row of a few characters can define any number."""
+
+MAX_NUMBER = 1e6
+"""Largest number: 1,000 km from the origin, 1,000,000 cd, eleven days."""
+
+MAX_NAME = 200
+"""Characters of a name."""
 
 Name = Annotated[str, msgspec.Meta(max_length=MAX_NAME)]
 Point = tuple[float, float]
@@ -29,18 +39,18 @@ GoalMode = Literal["taxi", "light verification"]
 GOAL_MODES: tuple[GoalMode, ...] = ("taxi", "light verification")
 ObstacleShape = Literal["cylinder", "box"]
 GRAPH_REACH_M = 3.0
-"""A point farther than this from the graph cannot be a mission point."""
+"""Largest distance of a mission point from the graph."""
 SIMPLIFICATION_M = 0.02
-"""Accuracy of curved edges of the pavement: the fewer points, the faster the checks."""
+"""Accuracy of the pavement's curved edges: fewer points make the checks faster."""
 H = TypeVar("H", bound=Hashable)
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of what airport files hold as it is; a misspelt key is an error, not silence."""
+    """Base of the tables of airport files; an unknown key is an error."""
 
 
 class MissionGoal(Record, frozen=True):
-    """One mission point and the mode in which it is reached (paper, section III)."""
+    """A mission point and the mode in which the robot reaches it (paper, section III)."""
 
     x_m: float
     y_m: float
@@ -55,7 +65,7 @@ class Mission(Record, frozen=True):
 
 
 class StartPose(Record, frozen=True):
-    """Where the robot stands at the start."""
+    """Initial pose of the robot."""
 
     x_m: float
     y_m: float
@@ -63,7 +73,7 @@ class StartPose(Record, frozen=True):
 
 
 class Light(msgspec.Struct, frozen=True):
-    """An inset light; `nominal_cd` is the intensity it should have."""
+    """An inset light with its nominal intensity."""
 
     name: str
     row: str
@@ -81,7 +91,7 @@ class Surface(msgspec.Struct, frozen=True):
 
 
 class Building(Record, frozen=True):
-    """A box on the ground: `length_m` along its own x axis, which is turned by `yaw_rad`."""
+    """A box on the ground; `length_m` is along its x axis, which is rotated by `yaw_rad`."""
 
     name: str
     x_m: float
@@ -93,12 +103,12 @@ class Building(Record, frozen=True):
 
     @property
     def polygon(self) -> Any:
-        """Its ground plan."""
+        """Ground plan."""
         return rectangle(self.x_m, self.y_m, self.yaw_rad, self.length_m, self.width_m)
 
 
 class ObstaclePreset(Record, frozen=True):
-    """An obstacle that can be put in the robot's way.
+    """An obstacle that a run can place in the robot's way.
 
     Args:
         name: its name in `world/obstacle` messages.
@@ -106,9 +116,9 @@ class ObstaclePreset(Record, frozen=True):
         x_m: centre, east.
         y_m: centre, north.
         radius_m: radius or half side.
-        present_from_s: not there before this time, s from the start of the world.
-        appears_within_m: not there before the robot is as near as this; None: no such condition.
-        gone_after_s: goes away this long after it appeared; None: stays.
+        present_from_s: earliest appearance, s from the start of the world.
+        appears_within_m: appears when the robot is this near; None: at any distance.
+        gone_after_s: disappears this long after it appeared; None: stays.
     """
 
     name: str
@@ -122,7 +132,7 @@ class ObstaclePreset(Record, frozen=True):
 
 
 class Attachment(msgspec.Struct, frozen=True):
-    """The place on the graph nearest to a point: on edge (`a`, `b`); a == b for a lone node."""
+    """Nearest place on the graph to a point: on edge (`a`, `b`), or on a node if a == b."""
 
     point: Point
     distance_m: float
@@ -132,21 +142,21 @@ class Attachment(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Airport:
-    """An airport. Build it with `formats.load_airport`, which checks it.
+    """An airport. `formats.load_airport` loads and checks one.
 
     Args:
-        name: for people and file names.
+        name: display name, also used in file names.
         nodes: node name to (x, y), m.
-        edges: pairs of node names; traffic in both directions.
-        allowed: where the robot may be, as a shapely (multi)polygon.
+        edges: pairs of node names, undirected.
+        allowed: allowed area as a shapely (multi)polygon.
         surfaces: named pieces of pavement, for maps.
         buildings: solid boxes.
         lights: inset lights with nominal intensities.
         start: initial pose.
         missions: missions by name.
-        obstacles: presets, the first ones are used first.
-        warnings: what was tolerated at load, one line each.
-        source: the file it was read from; empty if it was made in memory.
+        obstacles: presets; a run uses the first ones.
+        warnings: problems tolerated at load, one line each.
+        source: file of the airport; empty if it was made in memory.
     """
 
     name: str
@@ -169,7 +179,7 @@ class Airport:
 
     @cached_property
     def neighbours(self) -> Mapping[str, tuple[tuple[str, float], ...]]:
-        """For each node its neighbours with the length of the edge, m."""
+        """Neighbours of each node with the length of the edge, m."""
         table: dict[str, list[tuple[str, float]]] = {name: [] for name in self.nodes}
         for a, b in self.edges:
             length_m = math.dist(self.nodes[a], self.nodes[b])
@@ -178,7 +188,7 @@ class Airport:
         return {name: tuple(found) for name, found in table.items()}
 
     def nearest_on_graph(self, x_m: float, y_m: float) -> Attachment:
-        """Return the place on an edge, or lone node, nearest to a point."""
+        """Return the place on an edge or node nearest to a point."""
         at, nodes = (x_m, y_m), self.nodes
         name = min(nodes, key=lambda node: math.dist(nodes[node], at))
         best = Attachment(nodes[name], math.dist(nodes[name], at), name, name)
@@ -191,7 +201,7 @@ class Airport:
 
     @cached_property
     def within_reach(self) -> frozenset[str]:
-        """All nodes that can be reached from the start pose."""
+        """Nodes that can be reached from the start pose."""
         todo = [self.nearest_on_graph(self.start.x_m, self.start.y_m).a]
         reached = set(todo)
         while todo:
@@ -203,10 +213,7 @@ class Airport:
     # -- ground ---------------------------------------------------------------------------------
 
     def prohibited_distance_m(self, x_m: float, y_m: float) -> float:
-        """Distance from a point to the prohibited area: positive outside it, negative inside.
-
-        Inside, the magnitude is the way back to the pavement.
-        """
+        """Signed distance from a point to the boundary of the prohibited area; negative inside."""
         return float(self.prohibited_distances_m(((x_m, y_m),))[0])
 
     def prohibited_distances_m(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -223,7 +230,7 @@ class Airport:
 
     @cached_property
     def _boundary(self) -> tuple[npt.NDArray[np.float64], ...]:
-        """Segments of the boundary: start, direction, squared length. GEOS is slower here."""
+        """Segments of the boundary: start, direction, squared length; faster than GEOS."""
         rings = shapely.get_rings(shapely.get_parts(self.allowed))
         points = [shapely.get_coordinates(ring) for ring in rings]
         a = np.concatenate([ring[:-1] for ring in points])
@@ -232,17 +239,17 @@ class Airport:
         return tuple(np.ascontiguousarray(v) for v in (*a.T, *d.T, square))
 
     def footprint_in_prohibited(self, polygon: Any) -> bool:
-        """Whether any part of a footprint (shapely polygon in `map`) is in the prohibited area."""
+        """Whether a footprint (shapely polygon in `map`) overlaps the prohibited area."""
         return not shapely.covers(self.allowed, polygon)
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
-        """Smallest rectangle round pavement and buildings: (min x, min y, max x, max y)."""
+        """Bounding box of pavement and buildings: (min x, min y, max x, max y)."""
         shapes = [self.allowed, *(building.polygon for building in self.buildings)]
         return tuple(float(v) for v in shapely.total_bounds(shapes))  # type: ignore[return-value]
 
     def prohibited_polygon(self, margin_m: float = 5.0) -> Any:
-        """The prohibited area as a polygon, cut `margin_m` round the airport; for maps."""
+        """The prohibited area as a polygon, clipped `margin_m` beyond the airport; for maps."""
         x0, y0, x1, y1 = self.bounds_m
         frame = box(x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
         return frame.difference(self.allowed)
@@ -256,17 +263,17 @@ class Airport:
         if name not in self.missions:
             known = ", ".join(self.missions) or "none"
             raise AirportError(
-                f"{self.name}: missions: {name!r}: no such mission, there are: {known}")
+                f"{self.name}: missions: {name!r}: unknown mission; known: {known}")
         return self.missions[name]
 
 
 def repeated(names: Iterable[H]) -> list[H]:
-    """Return what is given more than once."""
+    """Return the items that occur more than once."""
     return [name for name, times in Counter(names).items() if times > 1]
 
 
 def foot(point: Point, a: Point, b: Point) -> Point:
-    """Return the place on the way from a to b that is nearest to a point."""
+    """Return the point of the segment from a to b that is nearest to a point."""
     along = (b[0] - a[0], b[1] - a[1])
     square = along[0] ** 2 + along[1] ** 2
     if square == 0.0:
@@ -277,12 +284,12 @@ def foot(point: Point, a: Point, b: Point) -> Point:
 
 
 def show(point: Point) -> str:
-    """Return a point as text for messages."""
+    """Return a point as text."""
     return f"({point[0]:.1f}, {point[1]:.1f})"
 
 
 def rectangle(x_m: float, y_m: float, yaw_rad: float, length_m: float, width_m: float) -> Any:
-    """Return a rectangle about (x, y), `length_m` along its own x axis, as a shapely polygon."""
+    """Return a rectangle centred at (x, y), with `length_m` along its x axis, as a polygon."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     half = ((length_m / 2, width_m / 2), (-length_m / 2, width_m / 2),
             (-length_m / 2, -width_m / 2), (length_m / 2, -width_m / 2))
@@ -290,7 +297,20 @@ def rectangle(x_m: float, y_m: float, yaw_rad: float, length_m: float, width_m: 
 
 
 def rounded(area: Any, fillet_radius_m: float) -> Any:
-    """Round inner corners sharper than the fillet radius, as on taxiways, and simplify."""
+    """Round inner corners to the fillet radius, as on taxiways, and simplify."""
     if fillet_radius_m > 0:
         area = area.buffer(fillet_radius_m).buffer(-fillet_radius_m)
     return area.simplify(SIMPLIFICATION_M)
+
+class WorldTruth(msgspec.Struct, frozen=True):
+    """Real intensity of the lights, as factors of the nominal ones; 1 if not listed.
+
+    Only the simulator reads it, from the section `[world]` of the airport's file.
+    """
+
+    light_factors: Mapping[str, float] = {}
+
+    def intensity_cd(self, airport: Airport) -> dict[str, float]:
+        """Return the real intensity of each light by name, cd."""
+        return {light.name: light.nominal_cd * self.light_factors.get(light.name, 1.0)
+                for light in airport.lights}

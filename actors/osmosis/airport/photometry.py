@@ -1,14 +1,14 @@
-"""Light sensor and inset lights: what the sensor sees of a light.
+"""Light sensor and inset lights: the illuminance that a light causes at the sensor.
 
-An inset light lies flush in the pavement and shines upwards; near the zenith its intensity I
-(candela) is taken as constant. The sensor is a horizontal receiver that looks down, at height h
+An inset light is flush with the pavement and shines upwards; near the zenith its intensity I
+(candela) is modelled as constant. The sensor is horizontal and faces down, at height h
 above the ground and horizontal distance d from the light. With slant range r = sqrt(d^2 + h^2),
 the inverse square law and the cosine law (cos = h / r) give the illuminance in lux
 
     E = (I / r^2) * (h / r) = I * h / (d^2 + h^2)^(3/2)
 
-The illuminances of several lights add up. At h = 0.35 m a light 4 m away contributes less than
-0.1 % of one straight below, so a light is measured alone in passing.
+Illuminances add up. At h = 0.35 m a light 4 m away contributes less than 0.1 % of a light straight
+below, so lights can be measured one by one.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 SENSOR_FORWARD_M = 0.45
-"""The sensor sits on a bracket this far ahead of `base_link`, on the robot's centre line."""
+"""Distance of the sensor ahead of `base_link`, on the robot's centre line."""
 
 SENSOR_HEIGHT_M = 0.35
 """Height of the sensor above the ground."""
 
 
 def sensor_position(x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
-    """Return the sensor's place in `map` for a pose of `base_link` in `map`."""
+    """Return the sensor's position in `map` for a pose of `base_link` in `map`."""
     return (x_m + SENSOR_FORWARD_M * math.cos(yaw_rad), y_m + SENSOR_FORWARD_M * math.sin(yaw_rad))
 
 

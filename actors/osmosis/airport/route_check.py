@@ -1,10 +1,9 @@
-"""Route check: may this route be driven? Asked before it is used, by whoever is going to use it.
+"""Checks whether a route may be driven, before a node uses it.
 
-A route is a promise by the Graph Planner that can be checked without planning: it begins where the
-robot is, ends at the goal, runs along edges of the graph, and keeps clear of the prohibited area.
-Only the way to the graph and the way off it to the goal have no edge to lie on; they are short, and
-the area is looked at there too. The check has the airport's map and graph and no state, so that
-Osmosis Control and a detection module with a copy of its own can both ask it.
+A route can be checked without planning: it begins at the robot, ends at the goal, follows edges of
+the graph, and keeps clear of the prohibited area. Only the approach to the graph and the turn-off
+to the goal follow no edge; they are short and checked against the prohibited area too. The check
+needs the airport alone, so Osmosis Control and DM10 each have an independent instance.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from rampart.actors.osmosis.airport.model import Airport, Point, show
 
 Points = npt.NDArray[np.float64]
 
-# What a good route keeps to, in metres.
+# Limits of a valid route, in metres.
 CLEARANCE_M = 0.6
-"""From each leg to the prohibited area; half the robot's diagonal and a little."""
+"""From each leg to the prohibited area: half the robot's diagonal and a margin."""
 
 START_M = 3.0
 """From the robot to the nearest point of the route."""
@@ -36,21 +35,21 @@ ASIDE_M = 0.6
 """From a leg to the nearest edge; a straightened row is off by up to half a metre."""
 
 LAST_ASIDE_M = 1.6
-"""The same for the last leg: a goal within a metre of the graph is headed for from the last node
-on."""
+"""The same for the last leg: the planner goes from the last node straight to a goal within a metre
+of the graph."""
 
 APPROACH_M = 12.5
-"""Longest way from the robot to the graph."""
+"""Longest approach from the robot to the graph."""
 
 TURNOFF_M = 3.2
-"""Longest way from the graph to the goal."""
+"""Longest turn-off from the graph to the goal."""
 
 STEP_M = 0.5
-"""How densely legs are looked at."""
+"""Spacing of the samples on a leg."""
 
 
 class RouteCheck:
-    """Checks routes on one airport. It keeps no state but the last answers.
+    """Checks routes on one airport; stateless but for a cache.
 
     Args:
         airport: map and graph.
@@ -65,17 +64,17 @@ class RouteCheck:
         self._of_shape = lru_cache(maxsize=8)(self._find_in_shape)
 
     def fault(self, waypoints: tuple[Point, ...], robot: Point | None, goal: Point | None) -> str:
-        """Return what is wrong with a route, or "".
+        """Return the fault of a route, or "".
 
         Args:
             waypoints: in `map`.
-            robot: where the robot is; None leaves the route's beginning unchecked.
-            goal: where it shall go; None leaves the route's end unchecked.
+            robot: position of the robot; None: the beginning is not checked.
+            goal: the goal; None: the end is not checked.
         """
         if not waypoints:
             return "the route has no waypoints"
         if not all(is_sane(*waypoint) for waypoint in waypoints):
-            return "a waypoint is not finite, or farther away than anything can be"
+            return "a waypoint is not finite or implausibly far away"
         if goal is not None and not math.dist(waypoints[-1], goal) <= END_M:
             return (f"the route ends at {show(waypoints[-1])},"
                     f" {math.dist(waypoints[-1], goal):.1f} m from the goal {show(goal)}")
@@ -102,11 +101,11 @@ class RouteCheck:
         clearance_m = float(shapely.distance(self._boundary, line))
         if clearance_m < CLEARANCE_M:
             return (f"passes {clearance_m:.2f} m from the prohibited area,"
-                    f" {CLEARANCE_M:.2f} m is the least")
+                    f" expected at least {CLEARANCE_M:.2f} m")
         return ""
 
     def _off_graph(self, a: Point, b: Point, *, first: bool, last: bool) -> str:
-        """Why a leg is no part of the graph: it leaves it for longer than it may."""
+        """Return how a leg leaves the graph for longer than allowed, or ""."""
         length_m = math.dist(a, b)
         count = 1 + max(1, math.ceil(length_m / STEP_M))
         share = np.linspace(0.0, 1.0, count)[:, None]
@@ -115,9 +114,9 @@ class RouteCheck:
         if bool(on.all()):
             return ""
         if not bool(on.any()):
-            # From off the graph straight to a goal off the graph: both at the same edge.
+            # From beside the graph straight to a goal beside it, at the same edge.
             most_m = TURNOFF_M if first and last else 0.0
-            return "" if length_m <= most_m else "lies on no edge of the graph"
+            return "" if length_m <= most_m else "follows no edge of the graph"
         begins, ends = int(np.argmax(on)), count - 1 - int(np.argmax(on[::-1]))
         if not bool(on[begins:ends + 1].all()):
             return "leaves the graph on the way"
@@ -129,7 +128,7 @@ class RouteCheck:
         return ""
 
     def _aside_m(self, points: Points) -> Points:
-        """Distance of points to the nearest edge, shape (n,)."""
+        """Return the distance of each point to the nearest edge, shape (n,)."""
         if not len(self._from):
             return np.full(len(points), math.inf)
         relative = points[:, None, :] - self._from[None, :, :]

@@ -1,4 +1,4 @@
-"""The project's own airport format: one TOML file. `systems/airports/` holds examples."""
+"""Rampart's airport format: one TOML file, as in `systems/airports/`."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ import shapely
 from shapely.geometry import LineString, Polygon
 from shapely.validation import explain_validity
 
-from rampart.actors.osmosis.airport import limits, model
+from rampart.actors.osmosis.airport import model
 from rampart.actors.osmosis.airport.errors import AirportError, Problem, readable
-from rampart.actors.osmosis.airport.model import Name, Point, Record
-from rampart.actors.osmosis.airport.world import WorldTruth
+from rampart.actors.osmosis.airport.model import Name, Point, Record, WorldTruth
 from rampart.files import toml
 from rampart.files.plain_text import shown
 from rampart.files.reading import read_text
@@ -75,15 +74,15 @@ class _File(Record, frozen=True):
 
 
 def read_airport(path: Path) -> tuple[model.Airport, WorldTruth]:
-    """Read an airport and the truth about its lights; geometry is checked by the caller.
+    """Read an airport and the real intensities of its lights; the caller checks the geometry.
 
     Raises:
-        AirportError: unreadable, not TOML, a wrong field, or a shape that is none.
+        AirportError: unreadable, not TOML, or an invalid field or shape.
     """
     file, name = _convert(path, _File), str(path)
     lights = sum(max(row.count or 0, len(row.positions or ())) for row in file.row)
-    if lights > limits.MAX_LIGHTS:
-        raise _error(name, "row", f"{lights} lights", f"at most {limits.MAX_LIGHTS} in all rows")
+    if lights > model.MAX_LIGHTS:
+        raise _error(name, "row", f"{lights} lights", f"expected at most {model.MAX_LIGHTS}")
     surfaces = _surfaces(file.surface, name)
     prohibited = [_polygon(area.polygon, f"prohibited[{i}].polygon", name)
                   for i, area in enumerate(file.prohibited)]
@@ -91,11 +90,10 @@ def read_airport(path: Path) -> tuple[model.Airport, WorldTruth]:
         raise _error(name, "fillet_radius_m", file.fillet_radius_m, "must not be negative")
     for table in ("surface", "prohibited", "building", "row"):
         for twice in model.repeated(part.name for part in getattr(file, table)):
-            raise _error(name, table, repr(twice), "name given twice; names must be unique")
+            raise _error(name, table, repr(twice), "duplicate name")
     for building in file.building:
         if min(building.length_m, building.width_m, building.height_m) <= 0:
-            raise _error(name, f"building.{building.name}", "size", "sides must be positive")
-    # A building stands on no pavement the robot may use, wherever it stands.
+            raise _error(name, f"building.{building.name}", "size", "must be positive")
     solid = [building.polygon for building in file.building]
     pavement = [part.polygon for part in surfaces]
     allowed = shapely.unary_union(pavement)
@@ -120,7 +118,7 @@ def read_mission(path: Path) -> model.Mission:
 
 def _convert(path: Path, kind: Any) -> Any:
     with readable(path, "see https://toml.io"):
-        table = toml.parse(read_text(path, limits.MAX_FILE_BYTES), limits.MAX_FILE_BYTES)
+        table = toml.parse(read_text(path, model.MAX_FILE_BYTES), model.MAX_FILE_BYTES)
     _check_numbers(table, "", str(path))
     try:
         return msgspec.convert(table, kind)
@@ -141,10 +139,10 @@ def _convert(path: Path, kind: Any) -> Any:
 
 
 def _locate(table: Any, path: str, message: str) -> tuple[str, str]:
-    """Return path and value of an offending field, the value as short text.
+    """Return path and value of an invalid field, the value as short text.
 
-    Where a table has free keys msgspec's path says `[...]`: the first key is taken whose value
-    fits the message, by itself or by its type.
+    In msgspec's path `[...]` stands for any key of a table: the first key counts whose value or
+    type occurs in the message.
     """
     found = list(_resolve(table, "", _KEY.findall(path))) or [(path, table)]
     fitting = [
@@ -155,14 +153,14 @@ def _locate(table: Any, path: str, message: str) -> tuple[str, str]:
 
 
 def _resolve(value: Any, where: str, keys: list[str]) -> Iterator[tuple[str, Any]]:
-    """Yield every (path, value) that a path with wildcards can mean; it may end beyond the data."""
+    """Yield each (path, value) that matches a path with wildcards; it may end beyond the data."""
     key = keys[0] if keys else ""
     index = key.strip("[]")
     if key == "[...]" and isinstance(value, dict):
         for name, part in value.items():
             yield from _resolve(part, f"{where}.{name}", keys[1:])
     elif key.startswith("[") and isinstance(value, list) and index.isdigit() \
-            and int(index) < len(value):  # another member of a table may be shorter than the one
+            and int(index) < len(value):  # an array under another key may be shorter
         yield from _resolve(value[int(index)], where + key, keys[1:])
     elif isinstance(value, dict) and key in value:
         yield from _resolve(value[key], f"{where}.{key}", keys[1:])
@@ -171,12 +169,12 @@ def _resolve(value: Any, where: str, keys: list[str]) -> Iterator[tuple[str, Any
 
 
 def _check_numbers(value: Any, path: str, file: str) -> None:
-    """Refuse NaN and infinities anywhere, TOML can write both, and what no airport measures."""
+    """Refuse NaN, infinities and implausibly large numbers."""
     if isinstance(value, float) and not math.isfinite(value):
         raise _error(file, path.lstrip("."), value, "must be a finite number")
-    if isinstance(value, (int, float)) and abs(value) > limits.MAX_NUMBER:
+    if isinstance(value, (int, float)) and abs(value) > model.MAX_NUMBER:
         raise _error(file, path.lstrip("."), shown(value),
-                     f"must be between -{limits.MAX_NUMBER:g} and {limits.MAX_NUMBER:g}")
+                     f"must be between -{model.MAX_NUMBER:g} and {model.MAX_NUMBER:g}")
     if isinstance(value, dict):
         for key, part in value.items():
             _check_numbers(part, f"{path}.{key}", file)
@@ -190,12 +188,12 @@ def _surfaces(parts: list[_Surface], file: str) -> tuple[model.Surface, ...]:
     for i, part in enumerate(parts):
         where, half_m = f"surface[{i}]", part.half_width_m
         if (part.polygon is None) == (part.centre_line is None):
-            raise _error(file, where, part.name, "give either polygon or centre_line, not both")
+            raise _error(file, where, part.name, "expected either polygon or centre_line")
         if part.polygon is not None:
             shape = _polygon(part.polygon, f"{where}.polygon", file)
         elif part.centre_line is None or len(part.centre_line) < 2:
             raise _error(file, f"{where}.centre_line", shown(part.centre_line),
-                         "needs two points or more")
+                         "expected two or more points")
         elif half_m is None or half_m <= 0:
             raise _error(file, f"{where}.half_width_m", half_m, "must be positive")
         else:
@@ -207,10 +205,10 @@ def _surfaces(parts: list[_Surface], file: str) -> tuple[model.Surface, ...]:
 
 def _polygon(points: list[Point], where: str, file: str) -> Any:
     if len(points) < 3:
-        raise _error(file, where, shown(points), "a polygon needs three points or more")
+        raise _error(file, where, shown(points), "expected three or more points")
     shape = Polygon(points)
     if not shape.is_valid or shape.area == 0:
-        raise _error(file, where, explain_validity(shape), "the outline must not cross itself")
+        raise _error(file, where, explain_validity(shape), "must not cross itself")
     return shape
 
 
@@ -218,11 +216,11 @@ def _lights(row: _Row, i: int, file: str) -> list[model.Light]:
     where = f"row[{i}]"
     spaced = row.first is not None and row.last is not None and row.count is not None
     if spaced == (row.positions is not None):
-        raise _error(file, where, row.name, "give either first, last and count, or positions")
+        raise _error(file, where, row.name, "expected either first, last and count, or positions")
     points = row.positions or []
     if row.first is not None and row.last is not None and row.count is not None:
         if row.count < 2:
-            raise _error(file, f"{where}.count", row.count, "a row needs two lights or more")
+            raise _error(file, f"{where}.count", row.count, "expected two or more lights")
         (ax, ay), (bx, by), gaps = row.first, row.last, row.count - 1
         points = [(ax + (bx - ax) * k / gaps, ay + (by - ay) * k / gaps) for k in range(row.count)]
     return [model.Light(f"{row.name}{k:02d}", row.name, x_m, y_m, row.nominal_cd)
@@ -234,9 +232,9 @@ def _truth(world: _World, airport: model.Airport, file: str) -> WorldTruth:
     for name, factor in world.light_factors.items():
         where = f"world.light_factors.{name}"
         if name not in known:
-            raise _error(file, where, repr(name), "unknown light; name one of a row, e.g. A01")
+            raise _error(file, where, repr(name), "unknown light; expected one of a row, e.g. A01")
         if not 0 <= factor <= 2:
-            raise _error(file, where, factor, "a share of the nominal intensity, 0 to 2")
+            raise _error(file, where, factor, "expected a factor of the nominal intensity, 0 to 2")
     return WorldTruth(world.light_factors)
 
 

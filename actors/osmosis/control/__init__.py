@@ -1,1 +1,1 @@
-"""The control nodes: pure cores, and the thin actors that wire them to topics."""
+"""The control nodes: pure cores and thin actors."""

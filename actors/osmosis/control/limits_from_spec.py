@@ -1,6 +1,6 @@
-"""From the system spec to the settings of the control cores: one place, no numbers of its own.
+"""Converts the system spec to the settings of the control cores.
 
-What a spec does not say (gains, look-ahead distances) keeps the default of its core.
+Settings that a spec does not have, such as gains and look-ahead distances, keep their defaults.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from rampart.actors.osmosis.control.polyline import Hull
 from rampart.manager.spec.specification import SystemSpec
 
 COMFORT_MPS2 = 0.8
-"""Acceleration and braking that the controller plans with; the pilot counts on the robot's own."""
+"""Acceleration and braking of the controller; the Safety Pilot uses those of the robot."""
 
 
 def hull_of(system: SystemSpec) -> Hull:
@@ -22,7 +22,7 @@ def hull_of(system: SystemSpec) -> Hull:
 
 
 def motion_of(system: SystemSpec) -> MotionLimits:
-    """Return what Osmosis Control asks of the robot at most."""
+    """Return the limits of Osmosis Control's commands."""
     robot = system.robot
     return MotionLimits(
         robot.top_speed_mps, robot.top_turn_rate_radps,
@@ -31,7 +31,7 @@ def motion_of(system: SystemSpec) -> MotionLimits:
 
 
 def gate_of(system: SystemSpec) -> GateLimits:
-    """Return the bounds and ages that the Safety Pilot enforces."""
+    """Return the bounds and timeouts that the Safety Pilot enforces."""
     robot, timing = system.robot, system.timing
     room = StoppingRoom(
         hull_of(system), robot.top_speed_mps, robot.stop_distance_m, robot.lateral_distance_m,
@@ -43,7 +43,7 @@ def gate_of(system: SystemSpec) -> GateLimits:
 
 
 def reach_of(system: SystemSpec) -> LaserReach:
-    """Return what every sweep of a laser has to cover."""
+    """Return the least coverage of a laser sweep."""
     robot = system.robot
     within_m = min(robot.length_m, robot.width_m) / 2 - TOLERANCE_M
     return LaserReach(robot.sensing_range_m, robot.sensing_field_rad, robot.sensing_gap_rad,
@@ -51,6 +51,6 @@ def reach_of(system: SystemSpec) -> LaserReach:
 
 
 def checks_of(system: SystemSpec) -> Checks:
-    """Return which of the Safety Pilot's checks the spec's layers leave in force."""
+    """Return which checks of the Safety Pilot the spec's layers enable."""
     layers = system.layers
     return Checks(layers.safety_pilot_checks, layers.manager_watch and layers.ftm)

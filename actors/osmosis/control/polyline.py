@@ -1,8 +1,8 @@
 """Planar geometry of the control nodes: angles, polylines, laser points, the robot's hull.
 
-Frames follow REP-103 and REP-105: `map` for routes and poses, `base_link` (x forward, y left)
-for laser points. Along a polyline a point has the coordinates (s, n): arc length from the start
-and signed lateral offset, positive to the left.
+Frames follow REP-103 and REP-105: `map` for routes and poses, `base_link` (x forward, y left) for
+laser points. Route coordinates are (s, n): arc length from the start and lateral offset, left
+positive.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def wrap_angle(angle_rad: float) -> float:
 
 
 class Hull(msgspec.Struct, frozen=True):
-    """The robot's footprint, a rectangle centred on `base_link` (Summit XL: 0.72 m by 0.614 m)."""
+    """Footprint of the robot: a rectangle centred on `base_link` (Summit XL: 0.72 m by 0.614 m)."""
 
     length_m: float = 0.72
     width_m: float = 0.614
@@ -49,11 +49,11 @@ class Hull(msgspec.Struct, frozen=True):
 
     @property
     def turning_radius_m(self) -> float:
-        """Radius of the circle swept when turning in place."""
+        """Radius of the disc swept when turning in place."""
         return math.hypot(self.half_length_m, self.half_width_m)
 
     def distance(self, points: Array) -> Array:
-        """Signed distance of points in `base_link` to the hull in metres, negative inside.
+        """Return the signed distance of points in `base_link` to the hull, m; negative inside.
 
         Args:
             points: shape (..., 2).
@@ -72,15 +72,15 @@ def ray_directions(count: int, angle_min_rad: float, angle_increment_rad: float)
 
 
 def to_map(points: Array, x_m: float, y_m: float, yaw_rad: float) -> Array:
-    """Move points from `base_link` at the given pose into `map`."""
-    if not len(points):  # as most of the time
+    """Transform points from `base_link` at a pose to `map`."""
+    if not len(points):
         return points
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(points @ np.array(((cos, sin), (-sin, cos))) + (x_m, y_m))
 
 
 class Projection(msgspec.Struct, frozen=True, gc=False):
-    """Foot of a point on a polyline: arc length, lateral offset (left positive), its segment."""
+    """Projection of a point on a polyline: arc length, lateral offset (left positive), segment."""
 
     s_m: float
     n_m: float
@@ -94,9 +94,9 @@ class Polyline:
         points: at least one point; repeated points are merged.
 
     Attributes:
-        points: those that are left.
-        end: the last of them.
-        length_m: of the whole polyline.
+        points: the distinct points.
+        end: the last point.
+        length_m: length of the polyline.
 
     Raises:
         ValueError: no points.
@@ -104,7 +104,7 @@ class Polyline:
 
     def __init__(self, points: Sequence[Point]) -> None:
         if not points:
-            raise ValueError("polyline: points: got none, at least one is needed")
+            raise ValueError("polyline: points: empty, expected at least one")
         kept = [points[0]]
         for point in points[1:]:
             if math.dist(point, kept[-1]) > 1e-9:
@@ -119,21 +119,21 @@ class Polyline:
         self._starts = vertices[:-1]
         self._directions = steps / self._lengths[:, None]
         self._arc = np.concatenate(((0.0,), np.cumsum(self._lengths)))
-        # The same as plain numbers: for one point at a time they are ten times as fast.
+        # Plain numbers are ten times as fast for single points.
         self._arc_m: list[float] = self._arc.tolist()
         self.length_m = self._arc_m[-1]
         self._segments: list[list[float]] = np.column_stack(
             (self._starts, self._directions, self._lengths)).tolist()
 
     def point_at(self, s_m: float) -> Point:
-        """Return the point at an arc length; beyond the ends the outer segments go on straight."""
+        """Return the point at an arc length; the outer segments extend beyond the ends."""
         index = self._segment_at(s_m)
         x_m, y_m, along_x, along_y, _ = self._segments[index]
         beyond_m = s_m - self._arc_m[index]
         return x_m + along_x * beyond_m, y_m + along_y * beyond_m
 
     def part(self, s_from_m: float, s_to_m: float) -> tuple[Point, ...]:
-        """Return the way between two arc lengths, backwards if the second is the smaller one."""
+        """Return the part between two arc lengths, reversed if the second is smaller."""
         low_m, high_m = min(s_from_m, s_to_m), max(s_from_m, s_to_m)
         corners = [self.point_at(s_m) for s_m in self._arc_m if low_m < s_m < high_m]
         way = (self.point_at(low_m), *corners, self.point_at(high_m))
@@ -145,7 +145,7 @@ class Polyline:
         return math.atan2(along_y, along_x)
 
     def smooth_heading_at(self, s_m: float, span_m: float = 0.6) -> float:
-        """Return the direction of travel, turning gradually within `span_m` of a corner."""
+        """Return the direction of travel, which turns gradually within `span_m` of a corner."""
         x_from, y_from = self.point_at(max(s_m - span_m, 0.0))
         x_to, y_to = self.point_at(min(s_m, self.length_m) + span_m)
         if math.hypot(x_to - x_from, y_to - y_from) < 1e-3:
@@ -156,7 +156,7 @@ class Polyline:
         return min(max(bisect_right(self._arc_m, s_m) - 1, 0), len(self._segments) - 1)
 
     def _stretch(self, s_from_m: float, s_to_m: float) -> tuple[int, int]:
-        """Return the segments of a stretch, which is cut to the route: first, and one past."""
+        """Return the segments of a stretch within the route, as a half-open range."""
         low = self._segment_at(min(max(s_from_m, 0.0), self.length_m))
         high = self._segment_at(min(max(s_to_m, 0.0), self.length_m - 1e-9)) + 1
         return low, max(high, low + 1)
@@ -164,12 +164,12 @@ class Polyline:
     def coordinates(self, points: Array, s_from_m: float, s_to_m: float) -> Array:
         """Return (s, n) of points in `map`, shape (k, 2), by the nearest segment of a stretch.
 
-        The offset of a point beside a corner is its distance to the corner, with the side's sign.
+        Beside a corner the offset is the signed distance to the corner.
 
         Args:
             points: shape (k, 2).
-            s_from_m: start of the stretch of route looked at.
-            s_to_m: end of that stretch; it is cut to the route.
+            s_from_m: start of the stretch.
+            s_to_m: end of the stretch; clipped to the route.
         """
         if not len(points):
             return NO_POINTS
@@ -189,14 +189,13 @@ class Polyline:
         return found
 
     def project(self, x_m: float, y_m: float, near_s_m: float | None = None) -> Projection:
-        """Return the foot of a point.
+        """Return the projection of a point.
 
         Args:
             x_m: position in `map`.
             y_m: position in `map`.
-            near_s_m: earlier progress; the foot is then sought from 2 m before to 4 m after it,
-                so that a route which comes near itself again is not short-cut. None seeks
-                everywhere, which is how a respawned follower resumes.
+            near_s_m: last progress; limits the search to 2 m before and 4 m after it, so that a
+                route that comes near itself is not short-cut. None searches the whole route.
         """
         reach = (0.0, self.length_m) if near_s_m is None else (near_s_m - 2.0, near_s_m + 4.0)
         low, high = self._stretch(*reach)

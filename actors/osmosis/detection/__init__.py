@@ -1,1 +1,1 @@
-"""The detection modules of Osmosis: pure monitors, and the thin actors round them."""
+"""The detection modules of Osmosis: pure monitors and thin actors."""

@@ -1,18 +1,17 @@
-"""DM13: actuator failure: does the base move, and brake, as it is told?
+"""DM13: actuator failure: the base does not move or brake as commanded.
 
-Three questions, each asked only when its answer is sure:
+Three checks, each only while its result is certain:
 
-* *Do the two wheels of a side turn alike?* They are told the same speed, always, also in a curve
-  and while accelerating; slip does not come between an encoder and its motor. One that lags behind
-  its neighbour is stuck or weak. No model of the base is needed.
-* *Is the speed over ground what was commanded?* Asked while the command has not changed for a
-  while: during a change it is the ramp's business.
-* *Does the brake brake?* Asked whenever it is on, by whomever. It is the only time at which this
-  can be known: a brake that nobody uses looks like a sound one, and the base takes no velocity
-  command against its brake by which one could test it standing.
+* *The two wheels of a side turn at the same speed.* Their commands are equal, also in a curve and
+  during acceleration, and slip does not affect an encoder. A wheel that lags behind its neighbour
+  is stuck or weak. This needs no model of the base.
+* *The speed over ground is the commanded one.* It is checked while the command is constant, since
+  the ramp determines the speed during a change.
+* *The brake decelerates the base.* It is checked while the brake is engaged by any source. An
+  unused brake cannot be checked, since the base executes no command against its brake.
 
-What was found stays for `hold_s`: a recovery that makes the failure invisible (a weak motor keeps
-up at low speed) must not be ended by its own success at once.
+A finding is held for `hold_s`: a recovery that hides the failure (a weak motor keeps up at low
+speed) must not be released at once by its own success.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.readings import is_base_status, is_fix
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.manager.spec.tables import NonNegative
 
 WHEELS = ("front left", "front right", "rear left", "rear right")
 _SIDES = ((0, 2), (1, 3))
@@ -34,21 +32,21 @@ _SIDES = ((0, 2), (1, 3))
 
 @dataclass(frozen=True, slots=True)
 class MotionLimits:
-    """What a sound base does. Speeds of wheels are at their treads.
+    """Behaviour of a healthy base. Wheel speeds are at the treads.
 
     Args:
-        wheel_radius_m: of the base.
-        pair_mps: by which a wheel may lag behind its neighbour, and ...
-        pair_share: ... as a share of the neighbour's speed; the larger counts.
-        short_mps, short_share: by which the speed over ground may fall short of the command.
-        steady_s: how long a command must not have changed.
-        steady_mps, steady_radps: what is no change.
-        turning_radps: with a larger turn rate the speed over ground is not judged.
-        lasts_s: how long the evidence has to last.
-        braking_mps2: deceleration that is certain.
-        brake_share: share of it with which a brake still counts as sound.
-        brake_lag_s: until the brake bites.
-        hold_s: how long a finding stays without new evidence.
+        wheel_radius_m: radius of the wheels.
+        pair_mps: largest lag of a wheel behind its neighbour, or ...
+        pair_share: ... as a share of the neighbour's speed; the larger one applies.
+        short_mps, short_share: the same for the speed over ground behind the command.
+        steady_s: time after which a command is constant.
+        steady_mps, steady_radps: largest change of a constant command.
+        turning_radps: largest turn rate for the check of the speed over ground.
+        lasts_s: time that the evidence has to last.
+        braking_mps2: guaranteed deceleration.
+        brake_share: least share of it for a healthy brake.
+        brake_lag_s: time until the brake acts.
+        hold_s: time that a finding is held without new evidence.
     """
 
     wheel_radius_m: float = 0.1175
@@ -68,11 +66,11 @@ class MotionLimits:
 
 
 class ActuatorMonitor(Finding):
-    """Active while the base does not do as it is told, and for a while after.
+    """Active while the base does not follow its commands, and for `hold_s` after.
 
     Args:
-        limits: what a sound base does.
-        known_after_s: when idle may be claimed without anything heard; -inf for at once.
+        limits: behaviour of a healthy base.
+        known_after_s: time from which it may be idle without input; -inf for at once.
     """
 
     def __init__(self, limits: MotionLimits | None = None, known_after_s: float = -math.inf
@@ -89,11 +87,11 @@ class ActuatorMonitor(Finding):
 
     @property
     def due_s(self) -> float:
-        """When time alone changes the finding."""
+        """Time of the next change without input."""
         return self._evidence_s + self.limits.hold_s if self.active else super().due_s
 
     def expire(self, now_s: float) -> None:
-        """Forget old evidence."""
+        """Drop old evidence."""
         super().expire(now_s)
         if now_s >= self._evidence_s + self.limits.hold_s:
             self.clear()
@@ -108,12 +106,12 @@ class ActuatorMonitor(Finding):
             self._command = (linear_mps, angular_radps)
 
     def moved(self, velocity_x_mps: float, velocity_y_mps: float, now_s: float) -> None:
-        """Take a velocity over ground, measured without the wheels (GPS, Doppler)."""
+        """Take a velocity over ground that is independent of the wheels (GPS, Doppler)."""
         self._speed_mps, self._speed_s = math.hypot(velocity_x_mps, velocity_y_mps), now_s
 
     def status(self, wheels_radps: tuple[float, float, float, float], *, braking: bool,
                now_s: float) -> None:
-        """Take the state of the base: wheel speeds in the order of `WHEELS`, brake."""
+        """Take wheel speeds, in the order of `WHEELS`, and the state of the brake."""
         self.known = True
         treads = [speed * self.limits.wheel_radius_m for speed in wheels_radps]
         found = self._brake(treads, now_s) if braking else self._drive(treads, now_s)
@@ -131,13 +129,13 @@ class ActuatorMonitor(Finding):
             slow, fast = sorted(pair, key=lambda wheel: abs(treads[wheel]))
             lag_mps = abs(treads[fast] - treads[slow])
             if lag_mps > max(limits.pair_mps, limits.pair_share * abs(treads[fast])):
-                found.append(f"the {WHEELS[slow]} wheel does not keep up with its neighbour")
+                found.append(f"the {WHEELS[slow]} wheel lags behind its neighbour")
         linear_mps, angular_radps = self._command
         steady = now_s - self._steady_since_s >= limits.steady_s
         if steady and now_s - self._speed_s <= 0.3 and abs(angular_radps) <= limits.turning_radps:
             short_mps = abs(linear_mps) - self._speed_mps
             if abs(short_mps) > max(limits.short_mps, limits.short_share * abs(linear_mps)):
-                found.append("the speed over ground is not the one commanded")
+                found.append("the speed over ground differs from the command")
         return found
 
     def _brake(self, treads: list[float], now_s: float) -> list[str]:
@@ -154,46 +152,31 @@ class ActuatorMonitor(Finding):
 
 
 _FIRST_STATUS_S = 0.3
-"""A respawned module waits this long for a first status of the base before it says idle."""
+"""Time that a restarted module waits for a status of the base before it reports idle."""
 
 
 class ActuatorFailure(DetectionModule):
-    """Active while wheels do not turn, or brakes do not brake, as the base was told."""
-
-    class Parameters(DetectionModule.Parameters, frozen=True):
-        """The base, and patience.
-
-        Attributes:
-            wheel_radius_m: of the base.
-            hold_s: how long a finding stays without new evidence, s.
-        """
-
-        wheel_radius_m: NonNegative = MotionLimits().wheel_radius_m
-        hold_s: NonNegative = MotionLimits().hold_s
-
-    parameters: Parameters
+    """Active while wheels or brake do not follow the commands."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        limits = MotionLimits(
-            wheel_radius_m=self.parameters.wheel_radius_m, hold_s=self.parameters.hold_s,
-            braking_mps2=context.run.system.robot.braking_mps2)
+        limits = MotionLimits(braking_mps2=context.run.system.robot.braking_mps2)
         self.monitor = self.judged_by(ActuatorMonitor(limits, self.known_after_s(_FIRST_STATUS_S)))
 
     @on(topics.BASE_COMMAND)
     def command(self, message: m.BaseCommand, _header: Header) -> None:
-        """Hear what the base is told."""
+        """Take a command for the base."""
         self.monitor.commanded(message.linear_mps, message.angular_radps, self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, _header: Header) -> None:
-        """Hear how fast it is over ground."""
+        """Take the speed over ground."""
         if is_fix(message):
             self.monitor.moved(message.velocity_x_mps, message.velocity_y_mps, self.clock.now())
 
     @on(topics.BASE_STATUS)
     def status(self, message: m.BaseStatus, _header: Header) -> None:
-        """Hear how the wheels turn, and judge."""
+        """Take the state of the base and check it."""
         if is_base_status(message):
             self.monitor.status(message.wheel_speeds_radps, braking=message.brake_engaged,
                                 now_s=self.clock.now())

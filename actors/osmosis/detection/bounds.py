@@ -1,4 +1,4 @@
-"""DM3: wrong command value (paper, table I): no velocity that the robot could be meant to drive."""
+"""DM3: wrong command value (paper, table I): a velocity beyond the robot's limits."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import NodeNames
-from rampart.manager.spec.tables import NonNegative
 
 _ROUNDING = 1e-6
-"""A command clamped to the limit elsewhere, in float32 perhaps, is within it."""
+"""Rounding of a command that was clamped to the limit in float32."""
 
 
 def beyond(linear_mps: float, angular_radps: float, top_mps: float, top_radps: float) -> str:
-    """Return which bound a command breaks, "" if none.
+    """Return which bound a command exceeds, or "".
 
     Args:
         linear_mps: commanded speed, m/s.
@@ -35,27 +34,27 @@ def beyond(linear_mps: float, angular_radps: float, top_mps: float, top_radps: f
 
 
 _FIRST_COMMAND_S = 0.2
-"""A respawned module waits this long for a first command, four periods, before it says idle."""
+"""Time that a restarted module waits for a command, four periods, before it reports idle."""
+
+_HOLD_S = 0.5
+"""Time that commands must have been valid again before the module is idle."""
 
 
 class Bounds(DetectionModule):
-    """Active while Osmosis Control commands what the robot was never meant to drive.
+    """Active while Osmosis Control's command exceeds the robot's top speed or top turn rate.
 
-    The limits are the robot's top speed and top turn rate in the system spec. Active from the first
-    bad command until they have been good for `hold_s`; a source that sent nonsense and then nothing
-    is not cured.
+    It is active from the first wrong command until commands have been valid for a while; silence
+    after a wrong command does not end it.
     """
 
     class Parameters(DetectionModule.Parameters, frozen=True):
-        """What it reports, and for how long.
+        """Parameters.
 
         Attributes:
-            hold_s: how long commands must have been good again before the module is idle, s.
-            suspects: whom to name when it is active, for a recovery that respawns: Osmosis
-                Control, by the incarnation that sent the bad command. By default nobody is named.
+            suspects: nodes to name for a recovery that restarts, with the incarnation that sent
+                the wrong command: Osmosis Control. None by default.
         """
 
-        hold_s: NonNegative = 0.5
         suspects: NodeNames = ()
 
     parameters: Parameters
@@ -64,7 +63,7 @@ class Bounds(DetectionModule):
         super().__init__(context)
         self._robot = context.run.system.robot
         self.monitor = self.judged_by(Sustained(
-            0.0, self.parameters.hold_s, self.known_after_s(_FIRST_COMMAND_S)))
+            0.0, _HOLD_S, self.known_after_s(_FIRST_COMMAND_S)))
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, header: Header) -> None:
@@ -72,7 +71,7 @@ class Bounds(DetectionModule):
         fault = beyond(message.linear_mps, message.angular_radps,
                        self._robot.top_speed_mps, self._robot.top_turn_rate_radps)
         self.monitor.note(fault, self.clock.now())
-        if fault:  # the newest that is bad is named, by the first one's reason
+        if fault:  # names the newest wrong incarnation, with the first reason
             self.monitor.nodes = tuple(
                 f"{n}#{header.incarnation}" for n in self.parameters.suspects)
         self.follow()

@@ -1,12 +1,11 @@
 """DM9: command calculation error, by comparison of Osmosis Control with its hot standby.
 
-The comparison cannot tell who is wrong. It accuses one after the other, the one whose restart
-costs least first; if they still differ when that one has come back, it was the other. Meanwhile
-the Safety Pilot drives what is safe whoever is right
-(`rampart.actors.osmosis.control.pilot.command_pair`).
+The comparison cannot identify the wrong instance. It names the one with the cheaper restart first,
+and the other one if they still disagree after that restart. Meanwhile the Safety Pilot drives the
+safer values (`rampart.actors.osmosis.control.pilot.command_pair`).
 
-A turn rate that is wrong leads out of the lane and is not waited for. A speed may differ for as
-long as a respawned follower needs to accelerate; the slower one drives meanwhile.
+A wrong turn rate leads out of the lane, so it is detected soon. Speeds may differ while a restarted
+follower accelerates; the slower one drives meanwhile.
 """
 
 from __future__ import annotations
@@ -23,35 +22,33 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import NodeNames
-from rampart.manager.spec.tables import NonNegative
 
 
 class ComparisonLimits(msgspec.Struct, frozen=True):
-    """What is a disagreement.
+    """Limits of agreement.
 
     Args:
-        linear_mps: difference of speed that is none.
-        angular_radps: difference of turn rate that is none.
-        linear_s: how long speeds may differ: the ramp of a follower that begins anew, and more.
-        angular_s: how long turn rates may differ.
-        hold_s: how long they must have agreed again.
-        fresh_s: an older command is not compared.
-        forget_s: without anything to compare for so long, nothing is claimed: that the silent one
-            is missing is said by others.
+        linear_mps: tolerated difference of speeds.
+        angular_radps: tolerated difference of turn rates.
+        linear_s: longest difference of speeds; more than the ramp of a restarted follower.
+        angular_s: longest difference of turn rates.
+        hold_s: time that they must have agreed again.
+        fresh_s: greatest age of a compared command.
+        forget_s: time without a comparison that ends the finding; other modules detect silence.
     """
 
-    linear_mps: NonNegative = 0.25
-    angular_radps: NonNegative = 0.35
-    linear_s: NonNegative = 2.0
-    angular_s: NonNegative = 0.4
-    hold_s: NonNegative = 0.5
-    fresh_s: NonNegative = 0.2
-    forget_s: NonNegative = 3.0
+    linear_mps: float = 0.25
+    angular_radps: float = 0.35
+    linear_s: float = 2.0
+    angular_s: float = 0.4
+    hold_s: float = 0.5
+    fresh_s: float = 0.2
+    forget_s: float = 3.0
 
 
 @dataclass(slots=True)
 class _Source:
-    """One of the two. `stamp_s` is when its command was true."""
+    """Newest command of one instance."""
 
     linear_mps: float = 0.0
     angular_radps: float = 0.0
@@ -60,12 +57,12 @@ class _Source:
 
 
 class CommandComparison(Finding):
-    """Active while two sources of one command disagree; accuses them in turn.
+    """Active while two instances disagree; names one, then the other.
 
     Args:
-        sources: names of the nodes, in the order in which they are accused.
-        limits: what is a disagreement.
-        known_after_s: when idle may be claimed without anything heard; -inf for at once.
+        sources: names of the nodes in the order in which they are named.
+        limits: limits of agreement.
+        known_after_s: time from which it may be idle without input; -inf for at once.
     """
 
     def __init__(self, sources: tuple[str, str], limits: ComparisonLimits | None = None,
@@ -81,27 +78,27 @@ class CommandComparison(Finding):
 
     @property
     def due_s(self) -> float:
-        """When it gives up waiting for something to compare."""
+        """Time at which a finding without comparison ends."""
         return self._compared_s + self.limits.forget_s if self.active else super().due_s
 
     def expire(self, now_s: float) -> None:
-        """Claim nothing when there has been nothing to compare."""
+        """End a finding without comparison."""
         super().expire(now_s)
         if now_s >= self._compared_s + self.limits.forget_s:
             self.clear()
 
-    def heard(self, source: str, command: tuple[float, float], stamp_s: float, incarnation: int,
-              now_s: float) -> None:
-        """Take a command, (m/s, rad/s), that was computed at `stamp_s`; then compare."""
-        one = self._sources[source]
-        if incarnation != one.incarnation:
-            one.incarnation = incarnation
+    def take(self, source: str, command: tuple[float, float], stamp_s: float, incarnation: int,
+             now_s: float) -> None:
+        """Take a command, (m/s, rad/s), of the time `stamp_s`, and compare."""
+        sender = self._sources[source]
+        if incarnation != sender.incarnation:
+            sender.incarnation = incarnation
             self._linear.forget()
             self._angular.forget()
         if not all(map(math.isfinite, command)) or not is_possible(stamp_s, now_s):
-            return  # the subject of others
-        one.linear_mps, one.angular_radps = command
-        one.stamp_s = stamp_s
+            return  # other modules detect invalid commands
+        sender.linear_mps, sender.angular_radps = command
+        sender.stamp_s = stamp_s
         a, b = self._sources.values()
         if now_s - min(a.stamp_s, b.stamp_s) <= self.limits.fresh_s:
             self._compare(a, b, now_s)
@@ -112,7 +109,7 @@ class CommandComparison(Finding):
         self._compared_s = now_s
         faster = abs(a.linear_mps - b.linear_mps) > limits.linear_mps
         turning = abs(a.angular_radps - b.angular_radps) > limits.angular_radps
-        # Both are told, always: `or` alone would leave the second one out.
+        # Both timers run: `or` would skip the second.
         too_long = [self._linear.note(faster, now_s), self._angular.note(turning, now_s)]
         if any(too_long):
             self._disagree(a, b)
@@ -138,24 +135,24 @@ class CommandComparison(Finding):
 
 
 _FIRST_PAIR_S = 0.3
-"""A respawned module waits this long for two commands before it says idle."""
+"""Time that a restarted module waits for two commands before it reports idle."""
 
 
 class CommandDisagreement(DetectionModule):
-    """Active while the two computers of the command disagree; names who is to be respawned."""
+    """Active while Osmosis Control and its standby disagree; names the one to restart."""
 
-    class Parameters(DetectionModule.Parameters, ComparisonLimits, frozen=True):
-        """Whom it compares; what it lets pass as of `ComparisonLimits`.
+    class Parameters(DetectionModule.Parameters, frozen=True):
+        """Parameters.
 
         Attributes:
-            suspects: names of the two nodes in the order in which they are accused; by default
-                the standby first, whose restart costs nothing.
+            suspects: the two nodes in the order in which they are named; by default the standby
+                first, whose restart costs nothing.
         """
 
         suspects: NodeNames = ("standby_control", "osmosis_control")
 
         def __post_init__(self) -> None:
-            """Check what a type cannot say."""
+            """Check the names."""
             if not len(set(self.suspects)) == len(self.suspects) == 2 \
                     or "osmosis_control" not in self.suspects:
                 raise ValueError("suspects: expected osmosis_control and its standby")
@@ -167,19 +164,19 @@ class CommandDisagreement(DetectionModule):
         first, second = self.parameters.suspects
         self._standby = second if first == "osmosis_control" else first
         self.monitor = self.judged_by(CommandComparison(
-            (first, second), self.parameters, self.known_after_s(_FIRST_PAIR_S)))
+            (first, second), known_after_s=self.known_after_s(_FIRST_PAIR_S)))
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, header: Header) -> None:
-        """Hear the active one."""
-        self._heard("osmosis_control", message, header)
+        """Take the active command."""
+        self._take("osmosis_control", message, header)
 
     @on(topics.STANDBY_COMMAND)
     def standby(self, message: m.Twist, header: Header) -> None:
-        """Hear the standby."""
-        self._heard(self._standby, message, header)
+        """Take the standby's command."""
+        self._take(self._standby, message, header)
 
-    def _heard(self, source: str, message: m.Twist, header: Header) -> None:
-        self.monitor.heard(source, (message.linear_mps, message.angular_radps), header.stamp,
-                           header.incarnation, self.clock.now())
+    def _take(self, source: str, message: m.Twist, header: Header) -> None:
+        self.monitor.take(source, (message.linear_mps, message.angular_radps), header.stamp,
+                          header.incarnation, self.clock.now())
         self.follow()

@@ -1,16 +1,15 @@
-"""DM10: erroneous graph, seen by the route that comes of it, before the robot has driven it.
+"""DM10: erroneous graph, detected by its routes before the robot drives them.
 
-The paper's fault tree has the event and no mechanism on it but the last, the prohibited area
-itself. This module is independent of what it guards: it does not plan. It checks each route on the
-map and the graph that it has loaded for itself, so that a Graph Planner whose graph, search or
-message went wrong is found out by the first route.
+The paper's fault tree has this event without a mechanism but DM1. This module does not plan: it
+checks each route on its own copy of the map and the graph. So the first route shows an error in the
+graph, the search or the message of the Graph Planner.
 
-One bad route is enough; it is an error the moment it is published. Good ones have to come for a
-while before the monitor is idle again, so that a planner that is wrong now and then does not look
-cured each time in between. A planner that was respawned is believed with its first good route.
+A single wrong route is an error. Valid routes have to come for a while before the module is idle
+again, so that an intermittent planner does not count as cured. A restarted planner is trusted with
+its first valid route.
 
-A planner that was given a wrong goal is not to blame: if the goal is another point than the
-mission's status has at that step, it is the one who gave the goal.
+If the goal of the route is not the mission's at that step, the module names the node that
+published the goal instead of the planner.
 """
 
 from __future__ import annotations
@@ -25,19 +24,18 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.manager.spec.tables import NonNegative
 
 RouteFault = Callable[[tuple[tuple[float, float], ...], tuple[float, float] | None], str]
-"""Returns what is wrong with waypoints that shall lead to a goal, or ""."""
+"""Returns the fault of waypoints to a goal, or ""."""
 
 
 class RouteMonitor(Finding):
-    """Active while the routes are bad.
+    """Active while routes are wrong.
 
     Args:
-        fault: says what is wrong with a route.
-        hold_s: how long routes must have been good again, s.
-        known_after_s: when idle may be claimed without a route heard; -inf for at once.
+        fault: check of a route.
+        hold_s: time that routes must have been valid again, s.
+        known_after_s: time from which it may be idle without a route; -inf for at once.
     """
 
     def __init__(self, fault: RouteFault, hold_s: float, known_after_s: float = -math.inf) -> None:
@@ -50,15 +48,15 @@ class RouteMonitor(Finding):
         self._good = Lasting(hold_s)
 
     def mission(self, status: m.MissionStatus) -> None:
-        """Take note of the mission's own goals."""
+        """Take the mission's goals."""
         self._status = status
 
     def goal(self, order: m.GoalOrder, source: str, incarnation: int) -> None:
-        """Take note of the goal that routes shall lead to, and who gave it."""
+        """Take the goal of the routes and its sender."""
         self._goal, self._giver = order, (source, incarnation)
 
     def route(self, route: m.Route, source: str, incarnation: int, now_s: float) -> None:
-        """Check a route and remember who gave it."""
+        """Check a route and store its sender."""
         self.known = True
         fault = self._fault_of(route)
         cured = self._good.note(not fault, now_s)
@@ -67,9 +65,9 @@ class RouteMonitor(Finding):
             self._blamed = self._giver if self._wrong_goal(route) else (source, incarnation)
             self.nodes = (f"{self._blamed[0]}#{self._blamed[1]}",)
         elif self.active:
-            reborn = any(node == self._blamed[0] and life > self._blamed[1]
-                         for node, life in ((source, incarnation), self._giver))
-            if reborn or cured:
+            restarted = any(node == self._blamed[0] and number > self._blamed[1]
+                            for node, number in ((source, incarnation), self._giver))
+            if restarted or cured:
                 self.clear()
 
     def _fault_of(self, route: m.Route) -> str:
@@ -92,29 +90,21 @@ class RouteMonitor(Finding):
 
 
 _FIRST_ROUTE_S = 0.5
-"""A respawned module waits this long for a first route, two periods, before it says idle."""
+"""Time that a restarted module waits for a route, two periods, before it reports idle."""
+
+_HOLD_S = 0.5
+"""Time that routes must have been valid again before the module is idle."""
 
 
 class ErroneousRoute(DetectionModule):
-    """Active while the Graph Planner gives routes that must not be driven; names it as failed."""
-
-    class Parameters(DetectionModule.Parameters, frozen=True):
-        """Patience.
-
-        Attributes:
-            hold_s: how long routes must have been good again before the module is idle, s.
-        """
-
-        hold_s: NonNegative = 0.5
-
-    parameters: Parameters
+    """Active while routes must not be driven; names the Graph Planner or the sender of the goal."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         check = RouteCheck(Osmosis.of(context).airport)
         self.monitor = self.judged_by(RouteMonitor(
             lambda waypoints, goal: check.fault(waypoints, None, goal),
-            self.parameters.hold_s, self.known_after_s(_FIRST_ROUTE_S)))
+            _HOLD_S, self.known_after_s(_FIRST_ROUTE_S)))
 
     @on(topics.MISSION_STATUS)
     def mission(self, message: m.MissionStatus, _header: Header) -> None:

@@ -24,10 +24,16 @@ from rampart.actors.osmosis.airport.model import Airport, Mission
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.page.driving import Driving
 from rampart.actors.osmosis.page.map import PageMap, lights_shown, page_map
-from rampart.actors.osmosis.page.orders import Orders
-from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS, OrderRequest, StartRequest
+from rampart.actors.osmosis.page.missions import (
+    OSMOSIS_REQUESTS,
+    OrderRequest,
+    Orders,
+    StartRequest,
+    Submission,
+    first_request,
+    system_is_up,
+)
 from rampart.actors.osmosis.page.state import OsmosisState
-from rampart.actors.osmosis.page.submission import Submission, first_request, system_is_up
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.files.plain_text import one_line
 

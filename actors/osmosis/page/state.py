@@ -1,4 +1,4 @@
-"""What the page of Osmosis shows besides what every page does: the airport, the mission. Pure."""
+"""State that the page of Osmosis shows in addition: pose, lasers, route, mission, lights. Pure."""
 
 from __future__ import annotations
 
@@ -7,14 +7,23 @@ from collections import deque
 from collections.abc import Collection, Sequence
 from typing import Any
 
+import numpy as np
+
 from rampart.actors.operator.bounds import MAX_NAME, Bounds
 from rampart.actors.operator.state import Heard, HmiState, as_heard
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.page.laser import thin
+from rampart.actors.osmosis.messages import LaserScan
 from rampart.actors.osmosis.page.map import MAX_LIGHTS
+from rampart.actors.osmosis.readings import ray_distances
+
+POINTS = 91
+"""Most points of a sweep on the page."""
+
+MAX_RANGE_M = 1000.0
+"""Largest plausible echo."""
 
 TRACK_STEP_M = 0.25
-"""A track point is kept when the robot has moved this far."""
+"""Distance between two points of the track."""
 
 TRACK_POINTS = 4000
 
@@ -22,13 +31,13 @@ _ROUTE = Bounds(items=1000, room=30_000)
 
 
 class OsmosisState(HmiState):
-    """The operator's picture of Osmosis.
+    """The state of Osmosis as the operator sees it.
 
     Args:
-        lights: names of the lights that are shown; None for any, up to `MAX_LIGHTS`.
+        lights: names of the lights on the map; None for any, up to `MAX_LIGHTS`.
 
     Attributes:
-        track: where the robot was, (x, y) in `map`.
+        track: past positions, (x, y) in `map`.
     """
 
     def __init__(self, lights: Collection[str] | None = None) -> None:
@@ -53,15 +62,15 @@ class OsmosisState(HmiState):
             self.track.append((round(pose.x_m, 2), round(pose.y_m, 2)))
 
     def laser(self, which: str, scan: m.LaserScan, now_s: float) -> None:
-        """Keep a sweep of "laser" or "upper_laser"; it may wait for the next pose."""
+        """Keep a sweep of "laser" or "upper_laser"."""
         self.put(which, Heard(scan), now_s)
 
     def route(self, route: m.Route) -> None:
-        """Keep the way to the goal; none while there is no goal."""
+        """Keep the route to the goal, if there is a goal."""
         self.picture.put("route", route.waypoints if route.active else ())
 
     def obstacles(self, obstacles: m.ObstacleList) -> None:
-        """Keep the obstacles that are there."""
+        """Keep the present obstacles."""
         self.picture.put("obstacles", tuple(o for o in obstacles.obstacles if o.present))
 
     def mission(self, status: m.MissionStatus, now_s: float) -> None:
@@ -75,7 +84,7 @@ class OsmosisState(HmiState):
             self.light(light)
 
     def light(self, measured: m.LightMeasurement) -> None:
-        """Keep the measurement of a light that is shown."""
+        """Keep the measurement of a light on the map."""
         name = measured.light
         if len(name) <= MAX_NAME and (self._lights is None or name in self._lights):
             self.picture.put_row("lights", name, {
@@ -102,3 +111,30 @@ def _mission(heard: Heard | None) -> dict[str, Any] | None:
     return {"name": status.name, "phase": status.phase, "step": status.step, "goals": status.goals,
             "times_s": status.step_times_s, "reason": status.reason, "stale": heard.stale,
             "orders": status.orders, "skipped": status.skipped}
+
+
+def thin(scan: LaserScan | None) -> dict[str, Any] | None:
+    """Return a sweep reduced to `POINTS` for the page, in `base_link`.
+
+    A point is the nearest echo of neighbouring rays and not their mean: an obstacle that only one
+    ray has hit must not vanish.
+
+    Returns:
+        `from_rad` and `step_rad`, the angle of the first point and between two; `max_m`, the range
+        of the laser; `cm`, the ranges in whole centimetres, -1 without an echo. None for an invalid
+        sweep and for no sweep.
+    """
+    if scan is None or len(scan.ranges_f32) % 4 or len(scan.ranges_f32) < 8 \
+            or not all(map(math.isfinite, (scan.angle_min_rad, scan.angle_increment_rad))) \
+            or not 0 < scan.range_max_m < math.inf:
+        return None
+    ranges = ray_distances(scan.ranges_f32, scan.range_max_m)
+    rays = -(-len(ranges) // POINTS)
+    padded = np.full(-(-len(ranges) // rays) * rays, np.inf)
+    padded[:len(ranges)] = np.nan_to_num(ranges, nan=np.inf, posinf=np.inf)
+    nearest = padded.reshape(-1, rays).min(axis=1)
+    echo = nearest < min(scan.range_max_m, MAX_RANGE_M) - 0.005
+    centimetres = np.where(echo, np.round(100 * np.where(echo, nearest, 0)), -1).astype(int)
+    return {"from_rad": round(scan.angle_min_rad + scan.angle_increment_rad * (rays - 1) / 2, 5),
+            "step_rad": round(scan.angle_increment_rad * rays, 6), "max_m": scan.range_max_m,
+            "cm": centimetres.tolist()}

@@ -16,11 +16,11 @@ from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.manager.spec.schema import Kind, SystemSpec
-from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
 from rampart.sim.osmosis.trial.report import headline, render
 from rampart.sim.osmosis.trial.run_end import RunEnd
+from rampart.sim.osmosis.world import EXACT_BELOW_M
 from rampart.sim.runs.console import Console
 from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.observer import Sink

@@ -10,8 +10,8 @@ from pathlib import Path
 from markupsafe import Markup
 
 from rampart.actors.osmosis.airport.drawing import AirportDrawing
-from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.record import LightResult, MissionRecord
+from rampart.sim.osmosis.world import EXACT_BELOW_M
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import Moment, RunPictures, clock, environment, lanes_of, ticks_of
 

@@ -132,12 +132,13 @@ async def test_an_order_is_given_from_the_page_if_it_makes_sense_and_its_answer_
         at = await served(hmi)
         async with websockets.connect(f"ws://{at}/ws") as page:
             await page.send('{"type": "order", "action": "pause"}')
-            assert (await hear(page, "error"))["text"] == "the Mission Manager was not heard yet"
+            assert (await hear(page, "error"))["text"] == (
+                "no status of the Mission Manager was received yet")
             world.say(m.MissionPhase.RUNNING, m.MissionAction.PAUSE)
             await eventually(lambda: hmi._state.picture.value("mission") is not None)
             await page.send('{"type": "order", "action": "resume"}')
             assert (await hear(page, "error"))["text"] == (
-                "resume makes no sense while the mission is running; possible: pause")
+                "resume is not possible while the mission is running; possible: pause")
             await page.send('{"type": "order", "action": "pause", "reason": "runway in use"}')
             assert (await hear(page, "done"))["text"] == "pause asked for"
             await eventually(lambda: bool(world.others.orders))

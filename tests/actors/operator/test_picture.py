@@ -17,8 +17,7 @@ from rampart.actors.operator.feed import Feed
 from rampart.actors.operator.picture import JOURNAL_LINES, Picture
 from rampart.actors.operator.state import STALE_S
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.page.laser import POINTS, thin
-from rampart.actors.osmosis.page.state import OsmosisState
+from rampart.actors.osmosis.page.state import POINTS, OsmosisState, thin
 
 
 def as_json(value: object) -> dict:

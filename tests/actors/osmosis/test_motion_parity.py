@@ -7,8 +7,8 @@ import math
 import pytest
 
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.motion_parity import (
-    BACK_AFTER_S,
+from rampart.actors.osmosis.motion_check import (
+    AGREED_AFTER_S,
     TURNING_TRACK_M,
     WHEEL_RADIUS_M,
     MotionParity,
@@ -75,7 +75,7 @@ def test_what_agrees_again_is_confirmed_after_a_while():
     parity = MotionParity()
     end_s = drive(parity, 5.0, wheels=(0.5, 1.0, 0.5, 1.0))
     assert not parity.sure(end_s)
-    assert parity.sure(drive(parity, BACK_AFTER_S + 13.0, start_s=end_s))
+    assert parity.sure(drive(parity, AGREED_AFTER_S + 13.0, start_s=end_s))
 
 
 @pytest.mark.parametrize("silent", ["odometry", "encoders"])

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.control.limits_from_spec import reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
-from rampart.actors.osmosis.page.laser import thin
+from rampart.actors.osmosis.page.state import thin
 from rampart.actors.osmosis.readings import (
     is_base_status,
     is_fix,
@@ -79,8 +79,8 @@ def test_rays_that_mean_nothing_hide_no_echo_of_the_other_laser(bad, range_m):
 @pytest.mark.parametrize("where", [slice(None), slice(85, 95), slice(0, 3), slice(-3, None), 90])
 def test_where_no_laser_knows_anything_there_is_no_view(where, range_m):
     wrong = with_rays(full_sweep(8.0, 1), (where, range_m))
-    assert "mean nothing" in view_of(wrong).fault
-    assert "mean nothing" in view_of(wrong, with_rays(full_sweep(8.0, 2), (where, -1.0))).fault
+    assert "no valid range" in view_of(wrong).fault
+    assert "no valid range" in view_of(wrong, with_rays(full_sweep(8.0, 2), (where, -1.0))).fault
 
 
 def test_two_lasers_with_holes_in_different_places_make_a_whole_view():
@@ -94,7 +94,7 @@ def test_two_lasers_with_holes_in_different_places_make_a_whole_view():
 def test_a_finer_laser_may_lose_rays_between_which_nothing_can_hide():
     fine = m.LaserScan(-2.4, 0.01, 8.0, as_bytes(np.full(481, 8.0)), 0.1)
     assert view_of(with_rays(fine, (slice(0, None, 2), 0.0))).fault == ""
-    assert "mean nothing" in view_of(with_rays(fine, (slice(200, 203), 0.0))).fault
+    assert "no valid range" in view_of(with_rays(fine, (slice(200, 203), 0.0))).fault
 
 
 def test_lasers_whose_rays_differ_fill_each_other_s_holes():
@@ -102,7 +102,7 @@ def test_lasers_whose_rays_differ_fill_each_other_s_holes():
     upper = m.LaserScan(-2.4, 0.01, 8.0, as_bytes(np.full(481, 5.0)), 0.1)
     assert (view_of(lower, upper).fault, len(view_of(lower, upper).points)) == ("", 481)
     holed = with_rays(upper, (slice(100, 200), math.nan))
-    assert "mean nothing" in view_of(lower, holed).fault
+    assert "no valid range" in view_of(lower, holed).fault
     filled = with_rays(lower, (slice(None), 8.0))
     assert view_of(filled, holed).fault == ""
 

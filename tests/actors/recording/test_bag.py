@@ -20,7 +20,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.recording.views import OsmosisViews
+from rampart.actors.osmosis.views import OsmosisViews
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of, repair
 from rampart.actors.recording.bag_writer import (

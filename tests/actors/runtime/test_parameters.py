@@ -88,7 +88,8 @@ def test_what_plan_and_spec_say_is_given_to_the_actors_that_take_it():
     ("nodes", "osmosis_control", {"yaw_loop": 1}, "yaw_loop = 1: expected true or false"),
     ("nodes", "hmi", {"camera": 3}, "camera = 3: expected a text"),
     ("nodes", "teleoperation", {"left_axis": 256}, "left_axis = 256: .* 0 or more, at most 255"),
-    ("nodes", "teleoperation", {"left_axis": 1}, "left_axis = 1: is the forward axis already"),
+    ("nodes", "teleoperation", {"left_axis": 1},
+     "left_axis = 1: expected another axis than forward_axis"),
 ])
 def test_what_an_actor_does_not_take_is_refused_with_file_path_and_what_would_be_right(
         table, name, parameters, words):

@@ -104,9 +104,9 @@ async def test_an_order_that_makes_no_sense_is_refused_with_the_reason_and_exit_
     code, out, err = await run.call(capsys, "mission", "resume", "--json")
     told = json.loads(out)
     assert (code, told["accepted"]) == (1, False)
-    assert told["reason"] == "it is not paused but running"
+    assert told["reason"] == "the mission is not paused but running"
     assert told["mission"]["phase"] == "running"
-    assert err == "rampart: resume refused: it is not paused but running\n"
+    assert err == "rampart: resume refused: the mission is not paused but running\n"
 
 
 async def test_a_robot_that_a_recovery_holds_is_not_released_by_an_order(run, capsys):
@@ -114,7 +114,7 @@ async def test_a_robot_that_a_recovery_holds_is_not_released_by_an_order(run, ca
     run.node.manager(fm.ManagerStatus((), (), ("RM2",), (), "safety-first", 1), None)
     code, _, err = await run.call(capsys, "mission", "resume")
     assert code == 1
-    assert err == ("rampart: resume refused: held by RM2; it goes on by itself when the robot is "
+    assert err == ("rampart: resume refused: held by RM2; it continues when the robot is "
                    "released\n")
 
 

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 import shapely
 
-from rampart.actors.osmosis.airport.model import Airport, Building, Light, ObstaclePreset, StartPose
+from rampart.actors.osmosis.airport.model import (
+    Airport,
+    Building,
+    Light,
+    ObstaclePreset,
+    StartPose,
+    WorldTruth,
+)
 from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M, illuminance_per_candela
-from rampart.actors.osmosis.airport.world import WorldTruth
 from rampart.sim.osmosis.sensors import LaserSpec, LightSensor, wrap
 from rampart.sim.osmosis.world import World
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rampart.sim.osmosis.trial.record import Judge
+from rampart.sim.osmosis.trial.judge import Judge
 from rampart.sim.osmosis.world import World
 from rampart.sim.runs.judge import Verdict
 from rampart.testing import virtual_run

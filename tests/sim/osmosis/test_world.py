@@ -16,9 +16,8 @@ from rampart.actors.osmosis.airport.model import (
     rectangle,
 )
 from rampart.actors.runtime.checkpoint import StateError
-from rampart.sim.osmosis.clearance import Clearance
 from rampart.sim.osmosis.scene import SPARE_OBSTACLES, WorldError
-from rampart.sim.osmosis.world import WORLD_STATE, World
+from rampart.sim.osmosis.world import WORLD_STATE, Clearance, World
 
 # A road 40 m long and 4 m wide, eastward; the robot starts in its west.
 ROAD = shapely.box(-2, -2, 38, 2)

@@ -1,1 +1,1 @@
-"""Osmosis Control: follows a route, inspects lights, drives round obstacles."""
+"""Osmosis Control: follows a route, inspects lights, passes obstacles."""

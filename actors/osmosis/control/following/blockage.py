@@ -1,8 +1,8 @@
-"""Blockage: has the robot come to stand before something on its way, and since when?
+"""Detects whether something on the route blocks the robot, and since when.
 
-What counts is progress along the route, not what the follower or the Safety Pilot says about it:
-a robot that turns to and fro before a crate is blocked as well as one that waits for it. And it
-takes something to see: one that is held by a recovery on an empty runway is not blocked.
+The criterion is progress along the route, and not the state of the follower or the Safety Pilot: a
+robot that turns back and forth in front of a crate is blocked too. An echo ahead is required: a
+robot that a recovery holds on an empty runway is not blocked.
 """
 
 from __future__ import annotations
@@ -14,34 +14,33 @@ import numpy as np
 from rampart.actors.osmosis.control.polyline import Array, Point, Pose2, to_map
 from rampart.actors.osmosis.messages import Blockage
 
-# When a robot counts as blocked.
 AFTER_S = 3.0
-"""So long without progress."""
+"""Time without progress."""
 
 PROGRESS_M = 0.3
-"""So much nearer to the goal along the route is progress."""
+"""Least progress along the route."""
 
 REACH_M = 3.0
-"""What blocks is at most so far from the robot's centre."""
+"""Greatest distance of the echo from the robot's centre."""
 
 HALF_ANGLE_RAD = math.radians(60)
-"""And at most so far to a side of straight ahead."""
+"""Greatest bearing of the echo."""
 
 
 class BlockageWatch:
-    """Watches one route. All times in simulated seconds."""
+    """Watches one route. Times are simulated seconds."""
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew, for another route."""
+        """Restart for another route."""
         self._best_m = math.inf
         self._since_s: float | None = None
         self._place: Point | None = None
 
     def update(self, to_go_m: float, pose: Pose2, points: Array, now_s: float) -> Blockage | None:
-        """Return what blocks the robot, or None.
+        """Return the blockage, or None.
 
         Args:
             to_go_m: distance to the goal along the route.
@@ -54,7 +53,7 @@ class BlockageWatch:
             return None
         if now_s - self._since_s < AFTER_S:
             return None
-        # What was seen first stays what blocks, lest the place wander as the robot turns.
+        # The first echo stays the blockage, so that its place is stable while the robot turns.
         self._place = self._place or nearest_ahead(points, pose)
         if self._place is None:
             return None

@@ -1,10 +1,9 @@
-"""Bridging a stale pose where it is used, by odometry, for a bounded distance.
+"""Bridges a stale pose by odometry for a bounded distance, in the node that uses the pose.
 
-While localization is dead, frozen or late, its reader still hears the wheels. The last pose plus
-the way that odometry measured since *the pose's stamp* is where the robot is now: wheels and a
-straight way are good to a few millimetres per metre, a turn of a skid-steer robot to a tenth of a
-radian (docs/case-study/localization.md). That holds for some metres only. Beyond the bound there
-is no pose, and its reader has to stop.
+While localization is dead, frozen or late, odometry is still received. The pose now is the last
+pose plus the motion by odometry since *the stamp of the pose*. Odometry is accurate to a few
+millimetres per metre straight ahead, and to a tenth of a radian in a turn of a skid-steer robot
+(docs/case-study/localization.md). Beyond the bound there is no pose, and the reader has to stop.
 """
 
 from __future__ import annotations
@@ -18,24 +17,24 @@ from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis.control.polyline import Pose2
 
 AFTER_S = 0.15
-"""Three periods of the pose: an older one is stale."""
+"""Age of a stale pose: three periods."""
 
 _ODOMETRY_FRESH_S = 0.2
 _KEPT = 125
-"""Readings of odometry, 2.5 s: a pose may be stamped that much earlier."""
+"""Readings of odometry: 2.5 s, the greatest age of a pose that can be bridged."""
 
 
 class DeadReckoning:
     """Keeps the newest pose and the odometry since. Times are simulated seconds.
 
     Args:
-        bridge_m: longest way from the last pose, m.
-        after_s: age of a pose from which on it is bridged, s.
+        bridge_m: longest distance from the last pose, m.
+        after_s: age at which a pose is stale, s.
     """
 
     def __init__(self, bridge_m: float, after_s: float = AFTER_S) -> None:
         if not 0 < bridge_m < math.inf:
-            raise ValueError(f"bridge_m = {bridge_m!r}: must be metres, above 0")
+            raise ValueError(f"bridge_m = {bridge_m!r}: must be positive and finite")
         self.bridge_m = bridge_m
         self.after_s = after_s
         self._pose: Pose2 | None = None
@@ -44,7 +43,7 @@ class DeadReckoning:
         self._start: tuple[float, Pose2, float] | None = None
 
     def pose(self, stamp_s: float, pose: Pose2, now_s: float) -> None:
-        """Take a pose in `map`; one not newer, of the future, or no number changes nothing."""
+        """Take a pose in `map`; one that is old, invalid or from the future is ignored."""
         if stamp_s > self._stamp_s and is_possible(stamp_s, now_s) and is_sane(*pose):
             self._pose, self._stamp_s, self._start = pose, stamp_s, None
 
@@ -56,7 +55,7 @@ class DeadReckoning:
             self._way.append((stamp_s, pose, made_m))
 
     def estimate(self, now_s: float) -> Pose2 | None:
-        """Return the pose in `map`, bridged if need be; None if it is not known any more."""
+        """Return the pose in `map`, bridged if stale; None if it is unknown."""
         if self._pose is None or now_s - self._stamp_s <= self.after_s:
             return self._pose
         way = self._way
@@ -76,6 +75,6 @@ class DeadReckoning:
                 math.remainder(yaw + turn, math.tau))
 
     def _find_start(self) -> tuple[float, Pose2, float] | None:
-        """Return the odometry at the pose's stamp; None if it is older than what is kept."""
+        """Return the odometry at the pose's stamp; None if that is no longer kept."""
         after = bisect_right(self._way, self._stamp_s + 1e-6, key=itemgetter(0))
         return self._way[after - 1] if after else None

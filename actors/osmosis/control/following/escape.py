@@ -1,11 +1,11 @@
-"""Tangential escape: on which side to pass an obstacle, and how far aside.
+"""Tangential escape: chooses the side and the lateral offset for passing an obstacle.
 
-Works in route coordinates (s, n), see `rampart.actors.osmosis.control.polyline`. Every echo forbids
-an interval of lateral offsets, as wide as the robot and its clearance. Zero is where the robot
-wants to be; if it is forbidden, the nearest free offset to the right or the left is taken, and the
-side is kept until the obstacle is behind: that commitment is what leaves no local minimum in front
-of an obstacle exactly on the line. A robot that starts in the middle of an escape picks the side it
-is already on. If neither side is free within the corridor there is no way, and the robot waits.
+It works in route coordinates (s, n), see `rampart.actors.osmosis.control.polyline`. Each echo
+forbids an interval of offsets, as wide as the robot and its clearance. If offset 0 is forbidden,
+the nearest free offset to the right or left is chosen, and the side is kept until the obstacle is
+behind. This commitment avoids a local minimum in front of an obstacle exactly on the line. A
+restarted robot beside an obstacle chooses the side where it is. If neither side is free within the
+corridor, the robot waits.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ class EscapeLimits(msgspec.Struct, frozen=True):
     """Room for the escape, in metres.
 
     Args:
-        range_m: how far ahead along the route, from the robot's centre, an escape begins.
-        depth_m: how far beyond it echoes are taken into account: a side chosen by the tip of an
-            obstacle would be the wrong one for its body.
+        range_m: distance ahead along the route, from the robot's centre, at which an escape begins.
+        depth_m: further distance of echoes that are considered, since the tip of an obstacle alone
+            may suggest the wrong side.
         clearance_m: preferred distance of the hull's side to an obstacle.
-        least_clearance_m: smallest distance accepted where the corridor is narrow.
+        least_clearance_m: least distance where the corridor is narrow.
         max_deviation_m: largest offset from the route. With 2.5 m of pavement on each side it
-            leaves DM1 the 1.07 m it wants between the robot's centre and the grass.
-        group_m: obstacles nearer to each other than this along the route are passed as one.
-        detour_m: obstacles farther apart are still passed as one if it costs no more than this.
-        yielding_m: how much narrower and farther out the side once taken may turn out to be.
-        turning_room_m: the side is changed only with this much way left before the obstacle.
-        return_slope: metres back to the line per metre along the route, once clear.
+            leaves the 1.07 m between the robot's centre and the grass that DM1 requires.
+        group_m: obstacles closer to each other along the route are passed as one.
+        detour_m: additional offset for which more distant obstacles are passed as one.
+        yielding_m: tolerance in clearance and offset for the chosen side.
+        turning_room_m: least distance to the obstacle for a change of side.
+        return_slope: lateral metres back to the line per metre along the route.
     """
 
     range_m: float = 3.0
@@ -49,10 +49,10 @@ class EscapeLimits(msgspec.Struct, frozen=True):
 
 
 class Deviation(msgspec.Struct, frozen=True, gc=False):
-    """Where to pass: the offset from the route (left positive), and the distance to be there.
+    """Lateral offset from the route, left positive.
 
     `gap_m` is the distance along the route from the robot's centre to the first echo in its
-    present lane, infinite if the lane is free. `possible` False means neither side is free.
+    present lane, infinite if the lane is free. `possible` is False if neither side is free.
     """
 
     offset_m: float
@@ -61,7 +61,7 @@ class Deviation(msgspec.Struct, frozen=True, gc=False):
 
 
 class Escape:
-    """Chooses a side once per obstacle. State: the side (-1 right, 1 left, 0 none), the offset."""
+    """Chooses a side once per obstacle: -1 right, 1 left, 0 none."""
 
     def __init__(self, hull: Hull, limits: EscapeLimits) -> None:
         self._hull = hull
@@ -79,7 +79,7 @@ class Escape:
             s_m: the robot's progress along the route.
             n_m: its lateral offset, left positive.
         """
-        if math.isnan(self._s_m):  # first look: return from where the robot is, not at once
+        if math.isnan(self._s_m):  # first step: return gradually from the present offset
             self._s_m = s_m
             reach = self._limits.max_deviation_m
             self.offset_m = min(max(n_m, -reach), reach)
@@ -96,7 +96,7 @@ class Escape:
         return Deviation(offset_m, self._gap(near, s_m, n_m), possible)
 
     def _relevant(self, echoes: Array, s_m: float) -> Array:
-        """Echoes not yet behind, and near enough to the corridor to matter; sorted by s."""
+        """Return the echoes that are not behind and near the corridor, sorted by s."""
         if not len(echoes):
             return echoes
         behind_m = self._hull.half_length_m + 0.15
@@ -107,11 +107,10 @@ class Escape:
         return np.asarray(kept[np.argsort(kept[:, 0], kind="stable")])
 
     def _with_bodies(self, near: Array, s_m: float, n_m: float) -> Array:
-        """Add, at the line, the unseen body of what is being passed.
+        """Add the unseen body of a passed obstacle at the line.
 
-        Beside an obstacle only its flank shows. An echo between the robot and the line belongs
-        to something whose far side may reach the line, so the line is not free before it is
-        behind.
+        Beside an obstacle only its flank is visible. The far side of an echo between the robot and
+        the line may reach the line, so the line is not free until the obstacle is behind.
         """
         if not len(near) or abs(n_m) < self._hull.half_width_m:
             return near
@@ -132,7 +131,7 @@ class Escape:
         return float(ahead.min()) - s_m if len(ahead) else math.inf
 
     def _choose(self, near: Array, s_m: float, n_m: float) -> tuple[float, bool]:
-        """Return offset and whether there is a way; keep or pick the side."""
+        """Keep or choose the side; return the offset and whether it is free."""
         keep_off_m = self._hull.half_width_m + self._limits.least_clearance_m
         if not len(near) or self._is_free(
                 near[near[:, 0] - s_m < self._limits.range_m], 0.0, keep_off_m):
@@ -144,14 +143,14 @@ class Escape:
         group = next(part for part in groups if not self._is_free(part, 0.0, keep_off_m))
         first_m = float(group[np.abs(group[:, 1]) < keep_off_m, 0].min())
         if first_m > self._until_m + self._limits.group_m / 2:
-            self.side = 0  # the obstacle that the side was chosen for is passed
+            self.side = 0  # the obstacle of this side is passed
         kept = self.side
         for side in (kept, -kept) if kept else self._preferred(group, n_m):
             offset_m = self._offset(group, side, yielding=side == kept)
             if offset_m is None:
                 continue
             if kept == -side and first_m - s_m < self._limits.turning_room_m:
-                continue  # too late to change sides: better to wait
+                continue  # too late for a change of side: wait
             farther_m = self._offset(near, side, yielding=side == kept)
             if farther_m is not None and abs(farther_m - offset_m) <= self._limits.detour_m:
                 offset_m = farther_m
@@ -161,7 +160,7 @@ class Escape:
         return self.offset_m, False
 
     def _preferred(self, group: Array, n_m: float) -> tuple[int, int]:
-        """Sides in order of preference: the shorter detour from where the robot is, the right."""
+        """Return the sides by preference: the shorter detour from the robot, then the right."""
 
         def cost(side: int) -> float:
             offset_m = self._offset(group, side, yielding=False)
@@ -172,7 +171,7 @@ class Escape:
         return (1, -1) if cost(1) < cost(-1) - 0.1 else (-1, 1)
 
     def _offset(self, echoes: Array, side: int, *, yielding: bool) -> float | None:
-        """Nearest free offset on a side, with as much clearance as the corridor has; or None."""
+        """Return the nearest free offset on a side with the best clearance available, or None."""
         slack_m = self._limits.yielding_m if yielding else 0.0
         reach_m = self._limits.max_deviation_m + slack_m
         least_m = self._hull.half_width_m + self._limits.least_clearance_m - slack_m
@@ -192,7 +191,7 @@ class Escape:
 
     @staticmethod
     def _free_from(echoes: Array, side: int, keep_off_m: float) -> float:
-        """Smallest offset of that side, as a positive number, which no echo forbids."""
+        """Return the magnitude of the smallest offset of a side that no echo forbids."""
         offset_m = 0.0
         for n_m in np.sort(echoes[:, 1] * side):
             if abs(n_m - offset_m) < keep_off_m - 1e-9:

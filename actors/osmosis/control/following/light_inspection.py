@@ -1,14 +1,14 @@
-"""Light inspection: the intensity of each light of a row, measured in passing.
+"""Measures the intensity of each light of a row in passing.
 
-The illuminance under the sensor is linear in the intensities of the lights near it,
-E = sum(I_j * g(d_j)), with g the photometric model of `rampart.actors.osmosis.airport.photometry`.
-Samples are matched to poses by their stamps, the intensity is the least-squares fit over the
-samples near a light, and what is left of a pose error along the way is fitted too, as a shift. So
-neither noise nor a late pose makes a good light look dim.
+The illuminance at the sensor is linear in the intensities of the lights near it,
+E = sum(I_j * g(d_j)), with the photometric model g of `rampart.actors.osmosis.airport.photometry`.
+Samples are matched to poses by stamp. The intensity is the least-squares fit of the samples near a
+light; a remaining pose error along the row is fitted too, as a shift. So neither noise nor a late
+pose makes a good light look dim.
 
-A light is judged once, when the sensor has passed it with samples before, over and behind it.
-With samples missing it is not judged: no result rather than a false accusation. Below half its
-nominal intensity a light is unserviceable (ICAO Annex 14, 10.4).
+A light is judged once, when the sensor has passed it with samples before, over and behind it. With
+missing samples it is not judged, since no result is better than a wrong one. Below half its nominal
+intensity a light is unserviceable (ICAO Annex 14, 10.4).
 """
 
 from __future__ import annotations
@@ -32,51 +32,51 @@ DIM_BELOW = 0.5
 OUT_BELOW = 0.05
 """Ratio below which it is out."""
 
-# What a measurement needs.
+# Requirements of a measurement.
 FIT_RADIUS_M = 0.8
-"""Samples within this horizontal distance of a light enter its fit."""
+"""Horizontal distance of the samples in the fit of a light."""
 
 SPAN_M = 0.3
-"""Samples at least this far before and behind the light are needed."""
+"""Samples must reach this far before and behind the light."""
 
 ASIDE_M = 0.35
-"""The sensor passes at most this far beside the light."""
+"""Greatest lateral distance of the sensor to the light."""
 
 LARGEST_GAP_M = 0.15
-"""Neighbouring samples of a fit are at most this far apart."""
+"""Greatest distance between neighbouring samples of a fit."""
 
 LEAST_SAMPLES = 8
-"""Fewer make no fit."""
+"""Least number of samples of a fit."""
 
 PASSED_M = 0.9
-"""A light is passed when the sensor is this far from it again."""
+"""Distance of the sensor to a light that is passed."""
 
 NEIGHBOUR_M = 4.0
-"""Lights nearer to each other than this are fitted together."""
+"""Lights closer to each other are fitted together."""
 
 SHIFT_M = 0.15
-"""Largest shift along the way that is tried, for a pose error."""
+"""Largest shift along the row for a pose error."""
 
 POSE_GAP_S = 0.3
-"""A sample between two poses farther apart than this is not used."""
+"""Greatest time between the two poses around a sample."""
 
 KEEP_S = 120.0
-"""Samples older than this are forgotten: a robot that waited is no longer sure."""
+"""Older samples are dropped: the pose of a robot that waited may have changed."""
 
 
 def verdict(ratio: float) -> LightVerdict:
-    """Return the verdict for a ratio of measured to nominal intensity."""
+    """Return the verdict on a ratio of measured to nominal intensity."""
     if ratio < OUT_BELOW:
         return LightVerdict.OUT
     return LightVerdict.DIM if ratio < DIM_BELOW else LightVerdict.OK
 
 
 class LightInspection:
-    """Collects poses and samples; gives each light one measurement once it is passed.
+    """Collects poses and samples, and measures each passed light once.
 
     Args:
-        lights: the lights that may be met.
-        judged: names of lights that have their measurement already.
+        lights: lights that may be passed.
+        judged: names of measured lights.
     """
 
     def __init__(self, lights: Iterable[Light], judged: Iterable[str] = ()) -> None:
@@ -89,20 +89,19 @@ class LightInspection:
         self._samples: dict[int, list[tuple[float, float, float, float]]] = {}
 
     def pose(self, stamp_s: float, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Take a pose of `base_link` in `map` and when it was true; older ones are ignored."""
+        """Take a pose of `base_link` in `map` of a time; older ones are ignored."""
         if not self._poses or stamp_s > self._poses[-1][0]:
             self._poses.append((stamp_s, x_m, y_m, yaw_rad))
 
     def sample(self, stamp_s: float, illuminance_lux: float) -> None:
-        """Take a reading of the light sensor and when it was measured."""
+        """Take a reading of the light sensor."""
         self._waiting.append((stamp_s, illuminance_lux))
 
     def take(self, *, ended: bool = False) -> list[LightMeasurement]:
         """Return the measurements of lights passed since the last call.
 
         Args:
-            ended: the row is at its end: also judge lights that the sensor is past, but not yet
-                by the full distance.
+            ended: the row has ended: also judge lights that are not passed by `PASSED_M`.
         """
         self._place_samples()
         found: list[LightMeasurement] = []
@@ -124,7 +123,7 @@ class LightInspection:
         return found
 
     def _place_samples(self) -> None:
-        """Give each sample whose time is between two poses its place, and to the lights near."""
+        """Assign each sample between two poses its position, and the sample to the lights near."""
         while self._waiting and self._poses and self._waiting[0][0] <= self._poses[-1][0]:
             stamp_s, lux = self._waiting.popleft()
             place = self._sensor_at(stamp_s)
@@ -176,7 +175,7 @@ class LightInspection:
             moved = places + shift_m * along
             offsets = moved[:, None, :] - self._places[None, columns, :]
             kernel = illuminance_per_candela(np.hypot(offsets[:, :, 0], offsets[:, :, 1]))
-            # Neighbours farther off than the fit's radius hardly show: damping keeps them sane.
+            # Neighbours beyond the fit's radius contribute little: damping keeps them bounded.
             normal = kernel.T @ kernel + np.diag([0.0] + [1e-4] * (len(columns) - 1))
             solution = np.linalg.solve(normal, kernel.T @ lux)
             misfit = float(np.sum((kernel @ solution - lux) ** 2))
@@ -186,7 +185,7 @@ class LightInspection:
 
     @staticmethod
     def _way(places: Array) -> Array:
-        """Unit vector of the direction in which the samples lie."""
+        """Return the unit vector of the direction of motion."""
         centred = places - places.mean(axis=0)
         _, _, axes = np.linalg.svd(centred, full_matrices=False)
         along: Array = axes[0]

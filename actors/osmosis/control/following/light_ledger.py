@@ -1,21 +1,18 @@
-"""Which lights of a mission are measured, who knows it, and which one has to be gone back for.
+"""Ledger of the lights of a mission: measured, confirmed, or to be passed again. Pure.
 
-Three promises, whatever dies when:
+It gives three guarantees, whichever node crashes at any time:
 
-*None is lost.* A measurement is kept before it is sent, and sent again until the Mission Manager's
-status shows it; the Mission Manager shows it when it has kept it in its turn.
+*No measurement is lost.* A measurement is saved before it is sent, and sent again until the Mission
+Manager's status contains it. The Mission Manager saves it before it publishes that status.
 
-*None is measured twice.* A light is judged if it is in this ledger or in that status. Both survive
-their nodes; either is enough.
+*No light is measured twice.* A light counts as measured if it is in this ledger or in that status.
+Both survive a restart.
 
-*None is skipped.* A measurement needs the whole pass over a light. If the pass was cut, because
-Osmosis Control died or no pose came, half the samples are missing for good. (To keep the samples
-would not help: those of the time in which nobody listened are missing too.) So the robot drives
-back and passes the light again. If it cannot be measured then either, as with a sensor that has
-failed, it is given up, and so is every other that is missed before one has been measured again: a
-dead sensor costs one detour, not one for each light.
-
-Pure: no clock, no messages sent, no bus.
+*No light is skipped.* A measurement needs the whole pass over a light. If Osmosis Control crashed
+or poses were missing, half of the samples are missing. (Saved samples would not help: there are
+none from the time of the restart.) So the robot drives back and passes the light again. If that
+fails too, as with a failed sensor, the light is given up, and so is every further one until a light
+is measured again: a failed sensor costs one detour and not one per light.
 """
 
 from __future__ import annotations
@@ -39,23 +36,23 @@ from rampart.actors.osmosis.control.polyline import Polyline
 from rampart.actors.osmosis.messages import LightMeasurement, MissionStatus, Mode, Route
 
 _OVER_M = 0.5
-"""A light this near to the row's line is one of the row."""
+"""Greatest distance of a light to the line of its row."""
 
 RESEND_S = 0.5
-"""A measurement that the Mission Manager does not show is sent again after so long."""
+"""Period in which an unconfirmed measurement is sent again."""
 
 ROOM_M = 1.0
-"""The robot turns round so far before the place where the sensor has to begin."""
+"""Distance before the first sample at which the robot turns around."""
 
 
 class LightsKept(msgspec.Struct, frozen=True):
-    """What the ledger must not forget.
+    """Saved state of the ledger.
 
     Attributes:
-        mission_id: whose lights these are.
-        measured: in order of measurement.
-        given_up: names of lights that could not be measured in the second pass either.
-        blind: no light was measured since the last one was given up.
+        mission_id: the mission of these lights.
+        measured: measurements in order.
+        given_up: names of lights that the second pass did not measure either.
+        blind: whether no light was measured since the last one was given up.
     """
 
     mission_id: str = ""
@@ -65,7 +62,7 @@ class LightsKept(msgspec.Struct, frozen=True):
 
 
 class Detour(msgspec.Struct, frozen=True):
-    """Where to go back to on a row, as arc length, and for which light."""
+    """A light to pass again, and the arc length to drive back to."""
 
     light: str
     to_s_m: float
@@ -75,7 +72,7 @@ class LightLedger:
     """The lights of one mission at a time.
 
     Args:
-        lights: of the airport.
+        lights: lights of the airport.
     """
 
     def __init__(self, lights: Sequence[Light]) -> None:
@@ -89,37 +86,37 @@ class LightLedger:
 
     @property
     def judged(self) -> frozenset[str]:
-        """Names of the lights that have their measurement."""
+        """Names of the measured lights."""
         return frozenset(li.light for li in self.kept.measured) | (self._shown or frozenset())
 
     def begin(self, mission_id: str) -> None:
-        """Begin a mission, unless it is the one that is under way."""
+        """Begin a mission, unless it is under way."""
         if mission_id != self.kept.mission_id:
             self.restore(LightsKept(mission_id))
 
     def restore(self, kept: LightsKept) -> None:
-        """Go on from what was kept; who knows of it has to be heard anew."""
+        """Continue from a saved state; confirmations are received again."""
         self.kept = kept
         self._sent_s.clear()
         self._shown = None
         self._gone_back_for = ""
 
     def add(self, found: LightMeasurement, now: float) -> bool:
-        """Take a measurement that is about to be sent; return whether the light had none."""
+        """Add a measurement to send; return whether the light had none."""
         if found.light in self.judged:
             return False
         self.kept = replace(self.kept, measured=(*self.kept.measured, found), blind=False)
         self._sent_s[found.light] = now
         return True
 
-    def hear(self, status: MissionStatus) -> None:
-        """Take note of what the Mission Manager has."""
+    def confirm(self, status: MissionStatus) -> None:
+        """Take the measurements that the Mission Manager has."""
         self._shown = None
         if status.mission_id == self.kept.mission_id:
             self._shown = self._names.intersection(light.light for light in status.lights)
 
     def to_send_again(self, now: float) -> list[LightMeasurement]:
-        """Return what the Mission Manager should have and does not show."""
+        """Return the measurements that are due again, since the status does not contain them."""
         if self._shown is None:
             return []
         due = [m for m in self.kept.measured if m.light not in self._shown
@@ -128,14 +125,14 @@ class LightLedger:
         return due
 
     def on_row(self, line: Polyline) -> tuple[tuple[float, str], ...]:
-        """Return the lights that a row passes over, each with its arc length, in order."""
+        """Return the lights of a row with their arc lengths, in order."""
         feet = line.coordinates(self._places, 0.0, line.length_m)
         return tuple(sorted(
             (float(s), light.name) for (s, n), light in zip(feet, self._lights, strict=True)
             if abs(n) <= ASIDE_M and 0.0 < s < line.length_m))
 
     def leave_out(self, row: Iterable[tuple[float, str]], s_m: float) -> None:
-        """Give up the lights under the sensor of a robot that drives round an obstacle there."""
+        """Give up the lights under the sensor while the robot passes an obstacle."""
         sensor_m = s_m + SENSOR_FORWARD_M
         out = tuple(name for at_m, name in row if abs(at_m - sensor_m) <= FIT_RADIUS_M
                     and name not in self.judged and name not in self.kept.given_up)
@@ -143,19 +140,19 @@ class LightLedger:
             self.kept = replace(self.kept, given_up=(*self.kept.given_up, *out))
 
     def is_complete(self, row: Iterable[tuple[float, str]]) -> bool:
-        """Whether every light of a row is measured, or given up."""
+        """Whether every light of a row is measured or given up."""
         done = self.judged.union(self.kept.given_up)
         return all(name in done for _, name in row)
 
     def detour(self, row: Iterable[tuple[float, str]], s_m: float, *, ended: bool) -> Detour | None:
-        """Return where to go back to, if a light was passed that has no measurement.
+        """Return the detour for a light that was passed without a measurement, or None.
 
-        Nothing before the Mission Manager was heard: it may have lights that are not kept here.
+        There is none before the first status of the Mission Manager, which may have more lights.
 
         Args:
             row: lights of the row, from `on_row`.
             s_m: arc length of the robot on the row, driving forward.
-            ended: the row is at its end: also lights that are not passed by the full distance.
+            ended: the row has ended: lights count as passed at once.
         """
         if self._shown is None:
             return None
@@ -169,23 +166,23 @@ class LightLedger:
                     self.kept, given_up=(*self.kept.given_up, name), blind=True)
                 continue
             self._gone_back_for = name
-            # Turned forward again there, the sensor has the whole of the pass before it.
+            # From there the sensor makes the whole pass.
             to_s_m = at_m - FIT_RADIUS_M - SENSOR_FORWARD_M - ROOM_M
             return Detour(name, max(to_s_m, 0.0))
         return None
 
 
 class RowInspection:
-    """Holds inspection and ledger to the row that is driven; one mission at a time.
+    """Inspection and ledger of the row that the robot drives; one mission at a time.
 
     Args:
-        lights: of the airport.
-        goes_back: whether the robot drives back for a light that it has missed.
+        lights: lights of the airport.
+        goes_back: whether the robot drives back for a missed light.
 
     Attributes:
-        inspection: measures.
-        ledger: who knows of which measurement.
-        is_incomplete: the row's end is reached and a light of it is neither measured nor given up.
+        inspection: the measurements.
+        ledger: the ledger of the mission.
+        is_incomplete: whether the row has ended with a light neither measured nor given up.
     """
 
     def __init__(self, lights: tuple[Light, ...], *, goes_back: bool) -> None:
@@ -199,14 +196,14 @@ class RowInspection:
         self.ledger = LightLedger(lights)
         self.is_incomplete = False
 
-    def hear(self, status: MissionStatus) -> None:
-        """Take note of which lights the Mission Manager has, to go back for none of them."""
+    def confirm(self, status: MissionStatus) -> None:
+        """Take the measurements that the Mission Manager has."""
         if self._goes_back:
-            self.ledger.hear(status)
+            self.ledger.confirm(status)
             self.inspection.judged |= self.ledger.judged
 
     def begin(self, route: Route, row: LightRow | None) -> None:
-        """Take note of another route, and of the row along it that is driven now, if one is."""
+        """Begin another route, and the row along it in light verification."""
         if route.mission_id != self._mission_id:
             self._mission_id = route.mission_id
             self.ledger.begin(route.mission_id)
@@ -224,19 +221,19 @@ class RowInspection:
             self._row = self.ledger.on_row(row.line)
 
     def measure(self, now_s: float, *, arrived: bool) -> list[LightMeasurement]:
-        """Return the new measurements; once each, to be kept before they are sent."""
+        """Return the new measurements, to be saved before they are sent."""
         return [found for found in self.inspection.take(ended=arrived)
                 if self.ledger.add(found, now_s)]
 
     def look_back(self, row: LightRow, *, arrived: bool) -> str:
-        """Send the robot back for a light that it passed without a measurement.
+        """Send the robot back for a light that was passed without a measurement.
 
         Args:
-            row: what it follows.
-            arrived: it is at the row's end, and about to leave it.
+            row: the follower of the row.
+            arrived: whether the robot has reached the end of the row.
 
         Returns:
-            The light's name if it turns round now, or "".
+            The light's name if the robot turns around now, or "".
         """
         self.is_incomplete = False
         s_m = row.progress_m
@@ -248,15 +245,14 @@ class RowInspection:
         detour = self.ledger.detour(self._row, s_m, ended=arrived)
         if detour is not None:
             row.go_back(detour.to_s_m)
-        # Without a word from the Mission Manager it is not known whether a light is missing.
         self.is_incomplete = arrived and not self.ledger.is_complete(self._row)
         return detour.light if detour is not None else ""
 
     def to_send_again(self, now_s: float) -> list[LightMeasurement]:
-        """Return what the Mission Manager should have and does not show."""
+        """Return the unconfirmed measurements that are due again."""
         return self.ledger.to_send_again(now_s) if self._goes_back else []
 
     @property
     def missed(self) -> tuple[str, ...]:
-        """The lights along all ways to this goal that were not measured."""
+        """The unmeasured lights along all routes to this goal."""
         return tuple(name for name in self._due if name not in self.inspection.judged)

@@ -1,15 +1,14 @@
-"""Light verification: follow the row of lights straight on, wait in front of obstacles.
+"""Follower of light verification: follows a row of lights and waits in front of obstacles.
 
-Unlike in taxi mode the robot does not leave the row: a light is measured only if the sensor passes
-over it. In front of an obstacle it stops, and goes on when the way has been free for a moment
-(paper, section III). That is a wait for ever in front of one that stays, so it may be told to pass
-after a while: it drives round as in taxi mode, if the pavement has room, and comes back to the row
-behind. The lights that it thereby misses remain unmeasured.
+Unlike in taxi mode the robot stays on the row, since a light is measured only if the sensor passes
+over it. It stops in front of an obstacle and continues when the lane has been free for a moment
+(paper, section III). With `pass_after_s` it does not wait permanently: it passes the obstacle as in
+taxi mode, if the pavement is wide enough, and returns to the row. Lights beside the obstacle remain
+unmeasured.
 
-A light that was missed for another reason can be had by going back
-(`rampart.actors.osmosis.control.following.light_ledger` decides that): the robot turns round,
-drives back as far as it is told, and turns round again. It never drives in reverse, because the
-laser looks ahead.
+For a light that was missed for another reason the robot goes back (`following.light_ledger`
+decides): it turns around, drives back, and turns around again. It never drives in reverse, because
+the laser looks ahead.
 """
 
 from __future__ import annotations
@@ -44,21 +43,21 @@ _BEHIND_RAD = 2.8
 
 
 class RowLimits(Struct, frozen=True):
-    """How a row is followed.
+    """Parameters for following a row.
 
     Args:
         speed_mps: speed along the row.
-        lookahead_m: distance of the point steered at.
-        stop_distance_m: free distance kept to an obstacle ahead of the hull; larger than what
-            the Safety Pilot keeps, so that the stop is the controller's own.
-        lane_margin_m: width added to the hull on each side when looking for obstacles.
-        clear_s: how long the way has to be free before going on.
-        overrun_m: the goal is reached within this distance of abeam.
-        goal_reach_m: farthest lateral distance at which the goal still counts as reached.
-        pass_after_s: how long the robot waits before it drives round an obstacle; infinite for
-            never, as in the paper.
-        edge_m: distance of the robot's centre to the prohibited area that driving round leaves.
-        give_up_s: how long it may be at a standstill while it drives round, before it waits again.
+        lookahead_m: distance of the target point on the row.
+        stop_distance_m: free distance from the hull to an obstacle ahead; larger than the Safety
+            Pilot's, so that the controller stops first.
+        lane_margin_m: width of the lane beyond each side of the hull.
+        clear_s: time that the lane has to be free before the robot continues.
+        overrun_m: distance along the row at which the goal is reached.
+        goal_reach_m: greatest lateral distance at which the goal is reached.
+        pass_after_s: waiting time before the robot passes an obstacle; infinite for never, as in
+            the paper.
+        edge_m: least distance of the robot's centre to the prohibited area while passing.
+        give_up_s: longest standstill while passing or going back.
     """
 
     speed_mps: float = 0.8
@@ -76,17 +75,14 @@ class RowLimits(Struct, frozen=True):
 class LightRow(Follower):
     """Follows one row.
 
-    State: progress, how long it has waited, how long the way has been free, and the follower of
-    taxi mode while it drives round an obstacle.
-
     Args:
         waypoints: the row in `map`, at least one point; usually start and goal.
         hull: footprint of the robot.
         motion: acceleration and turn limits.
-        limits: how the row is followed.
-        edge_m: distance from a point in `map` to the prohibited area, for driving round obstacles;
-            without it there is no room to.
-        near_s_m: arc length at which the robot was last known to be, for one that resumes.
+        limits: parameters.
+        edge_m: distance from a point in `map` to the prohibited area; without it the robot does
+            not pass obstacles.
+        near_s_m: last known arc length, if it resumes.
     """
 
     def __init__(self, waypoints: tuple[Point, ...], hull: Hull | None = None,
@@ -104,18 +100,18 @@ class LightRow(Follower):
 
     @property
     def is_off_course(self) -> bool:
-        """Whether it drives round an obstacle, or back."""
+        """Whether it passes an obstacle or goes back."""
         return self._passing is not None or self._back is not None
 
     @property
     def back_to(self) -> Point | None:
-        """Where in `map` it is driving back to; None while it is not."""
+        """Point in `map` to which it goes back, or None."""
         return self._back.line.end if self._back is not None else None
 
     def go_back(self, to_s_m: float) -> None:
-        """Turn round, drive back to an arc length, turn round and go on from there.
+        """Go back to an arc length and follow the row from there.
 
-        Given up if something stands in the way for `give_up_s`.
+        It gives up if an obstacle blocks the way back for `give_up_s`.
         """
         if self.progress_m is None:
             return
@@ -124,15 +120,15 @@ class LightRow(Follower):
         self._stood_s = 0.0
         self._back = LightRow(self.line.part(self.progress_m, to_s_m), self._hull, self._motion,
                               replace(self._limits, pass_after_s=math.inf))
-        self._back._ramp = self._ramp  # it is the same robot
+        self._back._ramp = self._ramp  # the same robot
 
     @property
     def is_passing(self) -> bool:
-        """Whether it drives round an obstacle."""
+        """Whether it passes an obstacle."""
         return self._passing is not None
 
     def adopt(self, back_to: Point | None, *, passing: bool) -> None:
-        """Go back, drive round, or neither, as another follower of the same row does."""
+        """Take over the intent of another follower of the same row: go back, pass, or neither."""
         if self.progress_m is None:
             return
         if back_to is None:
@@ -145,7 +141,7 @@ class LightRow(Follower):
             self._passing = None
 
     def step(self, x_m: float, y_m: float, yaw_rad: float, points: Array, dt_s: float) -> Motion:
-        """Return the command for now; arguments as for `PathFollower.step`."""
+        """Return the command; arguments as for `PathFollower.step`."""
         line, limits = self.line, self._limits
         foot = self._advance(x_m, y_m)
         to_go_m = line.length_m - foot.s_m
@@ -166,11 +162,11 @@ class LightRow(Follower):
         allowed = self._motion.braking_speed(free_m - limits.stop_distance_m)
         self._free_for_s = self._free_for_s + dt_s if allowed >= cruise else 0.0
         if self._free_for_s < limits.clear_s:
-            allowed = min(allowed, self._ramp.last[0])  # an echo that comes and goes is there
+            allowed = min(allowed, self._ramp.last[0])  # an intermittent echo counts
         waiting = allowed == 0.0
         x_to, y_to = line.point_at(foot.s_m + limits.lookahead_m)
         bearing = wrap_angle(math.atan2(y_to - y_m, x_to - x_m) - yaw_rad)
-        if abs(bearing) > _BEHIND_RAD:  # either way round is as short: do not waver between them
+        if abs(bearing) > _BEHIND_RAD:  # both turns are as short: keep the present one
             turning = self._ramp.last[1]
             bearing = math.copysign(bearing, turning if abs(turning) > _TURNS_RADPS else 1.0)
         speed = 0.0
@@ -187,7 +183,7 @@ class LightRow(Follower):
         return Motion(linear, angular, False, stands, foot.segment, to_go_m)
 
     def _begin_to_pass(self, s_m: float) -> None:
-        """Take the follower of taxi mode, if the pavement is wide enough along the next metres."""
+        """Start a follower of taxi mode if the pavement ahead is wide enough."""
         if self._edge_m is None:
             return
         usual = EscapeLimits()
@@ -202,7 +198,7 @@ class LightRow(Follower):
 
     def _pass(self, follower: PathFollower, pose: Pose2, foot: Projection, points: Array,
               dt_s: float) -> Motion:
-        """Drive round, and hand back when on the row again with nothing in the way."""
+        """Pass the obstacle; end when the robot is back on a free row."""
         motion = follower.step(*pose, points, dt_s)
         self._ramp.last = (motion.linear_mps, motion.angular_radps)
         self._arrived = motion.arrived
@@ -216,7 +212,7 @@ class LightRow(Follower):
         return motion
 
     def _free(self, x_m: float, y_m: float, yaw_rad: float, points: Array, s_m: float) -> float:
-        """Free distance ahead of the hull in the lane along the row; infinite if all is free."""
+        """Return the free distance ahead of the hull in the lane, infinite without an echo."""
         if not len(points):
             return math.inf
         reach_m = 2.0 * self._limits.stop_distance_m + 4.0

@@ -1,60 +1,58 @@
-"""Closed loop on the yaw rate: what the base turns is what the follower meant. Pure.
+"""Closed loop on the yaw rate: integral action against a dragging wheel. Pure.
 
-The follower steers by heading error alone. Against a wheel that drags (blocked, or too weak for its
-speed) the base turns by itself, and a proportional controller answers a constant disturbance with
-a constant error: the robot drives beside its line, too far to measure the lights. So the difference
-between the yaw rate that was commanded and the one that the poses show is integrated and added
-(feed-forward plus integral action, e.g. Astrom and Murray, *Feedback Systems*, ch. 11).
+The follower steers by heading error alone. A dragging wheel (blocked, or too weak for its speed)
+turns the base, and a proportional controller has a constant error under a constant disturbance: the
+robot drives beside its line, too far to measure the lights. So the difference between commanded and
+measured yaw rate is integrated and added (feed-forward plus integral action, e.g. Astrom and
+Murray, *Feedback Systems*, ch. 11).
 
-What keeps it harmless:
+Safeguards:
 
-* A difference as small as a healthy base's is none (`DEAD_BAND_RADPS`): without a fault nothing is
-  added, and the commands are the same to the bit.
-* The reference is what a healthy base would do, delayed and ramped, so accelerating is no error.
-* Bounded, and the sum stays within the turn rate's bound. While the robot stands, because it is
-  stopped, braked or blocked, or the sum is at its bound, nothing more is added (anti-windup). What
-  was added leaks away, so that a fault that is over is forgotten.
+* A dead band covers the differences of a healthy base: without a fault the commands are unchanged
+  to the bit.
+* The reference is the delayed and ramped response of a healthy base, so acceleration is no error.
+* The correction and its sum with the command are bounded. While the robot stands or the sum is at
+  its bound, the integral is frozen (anti-windup). It leaks, so that it vanishes after a fault.
 
-The speed is left open. A blocked wheel costs speed, and a base that is driven harder against it
-gains little and wears its tyres; the mission takes longer instead.
+The speed has no loop. A base driven harder against a blocked wheel gains little and wears its
+tyres; the mission takes longer instead.
 """
 
 from __future__ import annotations
 
 import math
 
-# How the loop behaves.
 GAIN_PER_S = 1.5
-"""Of the integral."""
+"""Gain of the integral."""
 
 MOST_RADPS = 0.8
-"""It adds at most this."""
+"""Largest correction."""
 
 DEAD_BAND_RADPS = 0.12
-"""A smaller difference is that of a healthy base."""
+"""Largest difference of a healthy base."""
 
 LEAK_S = 20.0
-"""Time constant in which what was added is forgotten."""
+"""Time constant of the leak."""
 
 LAG_S = 0.2
-"""Time constant of a healthy base and of the way to it."""
+"""Time constant of a healthy base, with communication."""
 
 STANDING_MPS = 0.05
 STANDING_RADPS = 0.05
-"""Slower, the robot stands."""
+"""The robot stands below both."""
 
 GAP_S = 0.5
-"""Poses farther apart than this say nothing about a rate."""
+"""Longest time between two poses of a rate."""
 
 WINDOW_S = 0.15
-"""Over which the yaw rate is measured."""
+"""Time over which the yaw rate is measured."""
 
 
 class MotionLoop:
-    """Adds to the turn rate what the base is short of.
+    """Corrects the commanded turn rate.
 
     Args:
-        max_angular_radps: bound of the sum.
+        max_angular_radps: bound of the corrected turn rate.
     """
 
     def __init__(self, max_angular_radps: float) -> None:
@@ -68,15 +66,15 @@ class MotionLoop:
         self.added_radps = 0.0
 
     def adopt(self, added_radps: float, until_s: float) -> None:
-        """Add what another loop does, which sees its own commands executed, until `until_s`.
+        """Use the correction of the active loop until `until_s`.
 
-        One that is not in the loop would wind up: what it commands is not what the base does.
+        A loop whose commands are not executed would wind up.
         """
         self.added_radps = max(-MOST_RADPS, min(MOST_RADPS, added_radps))
         self._adopted_until_s = until_s
 
     def pose(self, stamp_s: float, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Take a pose in `map`, true at `stamp_s`."""
+        """Take a pose in `map` of the time `stamp_s`."""
         poses = self._poses
         if poses and not stamp_s > poses[-1][0]:
             return
@@ -94,12 +92,12 @@ class MotionLoop:
             self._measured = True
 
     def turn(self, linear_mps: float, angular_radps: float, dt_s: float) -> float:
-        """Return the turn rate to command for one that is meant, rad/s.
+        """Return the corrected turn rate, rad/s.
 
         Args:
-            linear_mps: speed that is commanded with it.
-            angular_radps: turn rate that is meant.
-            dt_s: since the last call.
+            linear_mps: commanded speed.
+            angular_radps: intended turn rate.
+            dt_s: time since the last call.
         """
         follow = 1.0 - math.exp(-dt_s / LAG_S)
         self._expected_radps += follow * (angular_radps - self._expected_radps)

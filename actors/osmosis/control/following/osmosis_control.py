@@ -1,6 +1,6 @@
-"""Osmosis Control: from route, pose and scan to the velocity command, 20 times a second.
+"""Osmosis Control: computes the velocity command from route, pose and scan, 20 times a second.
 
-It commands always, zero without a route, because silence is for DM2 to detect.
+It always publishes a command, zero without a route, since DM2 treats silence as an error.
 """
 
 from __future__ import annotations
@@ -32,22 +32,20 @@ class OsmosisControl(Actor):
     """Wires `RouteControl` to topics and timers.
 
     Class attributes:
-        command_topic: where the command goes; a standby's has a topic of its own.
+        command_topic: topic of the command; a standby has its own.
     """
 
     class Parameters(Actor.Parameters, frozen=True):
-        """What it does beyond the paper's.
+        """Extensions to the paper's node.
 
         Attributes:
             check_route: whether a route is checked before it is followed.
-            pass_after_s: how long the robot waits in a row before it drives round an obstacle, s;
-                for ever if 0.
-            has_standby: whether a standby listens, which is told at once where the robot means to
-                be.
-            yaw_loop: whether the turn rate is controlled in a closed loop (`motion_loop`); if not,
-                the base is trusted to turn as it is told.
-            bridge_m: how far it drives by odometry without a fresh pose, m; if 0, it goes on
-                computing from the last pose it has, and does not ask for odometry.
+            pass_after_s: waiting time in a row before the robot passes an obstacle, s; 0: never.
+            has_standby: whether a standby follows, which needs changes of the lateral offset at
+                once.
+            yaw_loop: whether the turn rate has a closed loop (`motion_loop`).
+            bridge_m: distance driven by odometry without a fresh pose, m; 0: it computes from the
+                last pose, however old, and does not subscribe to odometry.
         """
 
         check_route: bool = False
@@ -78,18 +76,18 @@ class OsmosisControl(Actor):
             has_standby=parameters.has_standby)
 
     def listens(self, topic: Topic[Any]) -> bool:
-        """Whether it hears a topic: the base publishes odometry only if somebody does."""
+        """Whether it subscribes to a topic: odometry only if it bridges."""
         return self.parameters.bridge_m > 0 or topic is not topics.ODOMETRY
 
     def on_start(self) -> None:
-        """Find out what was measured; the robot goes on when the route is there."""
+        """Restore the checkpoint; the robot continues when the route arrives."""
         if (kept := self.kept(CONTROL_STATE)) is not None:
             self.core.restore(kept)
 
     @on(topics.MISSION_STATUS)
     def mission(self, message: m.MissionStatus, _header: Header) -> None:
-        """Hear which lights the Mission Manager has."""
-        self._lights.hear(message)
+        """Take the lights that the Mission Manager has."""
+        self._lights.confirm(message)
 
     @on(topics.POSE)
     def pose(self, message: m.Pose, header: Header) -> None:
@@ -99,13 +97,13 @@ class OsmosisControl(Actor):
 
     @on(topics.SCAN)
     def scan(self, message: m.LaserScan, header: Header) -> None:
-        """See."""
+        """Take a sweep."""
         self.core.scan(LOWER, message, header.stamp, self.clock.now())
         self._begin()
 
     @on(topics.UPPER_SCAN)
     def upper_scan(self, message: m.LaserScan, header: Header) -> None:
-        """See with the second laser, on a robot that has one."""
+        """Take a sweep of the second laser, if the robot has one."""
         self.core.scan(UPPER, message, header.stamp, self.clock.now())
         self._begin()
 
@@ -129,7 +127,7 @@ class OsmosisControl(Actor):
 
     @on(topics.ODOMETRY)
     def odometry(self, message: m.Odometry, header: Header) -> None:
-        """Take the way that the wheels make."""
+        """Take odometry."""
         self.core.odometry(message, header.stamp, self.clock.now())
 
     def _set_out(self) -> None:
@@ -142,19 +140,19 @@ class OsmosisControl(Actor):
 
     @every(0.5)
     def _remember(self) -> None:
-        """Keep what a successor needs; before what follows from it is sent."""
+        """Save the checkpoint, always before its consequences are published."""
         if (kept := self.core.kept) is not None:
             self.keep(CONTROL_STATE, kept)
 
     @every(PERIOD_S)
     def control(self) -> None:
-        """Publish the command for now."""
+        """Publish the command."""
         now_s = self.clock.now()
         self.publish(self.command_topic, self.core.step(now_s))
         self.inform(now_s)
 
     def inform(self, now_s: float) -> None:
-        """Publish what was measured, and the status if it has changed."""
+        """Publish measurements, and the status if it has changed."""
         lights = self.core.measure(now_s)
         if lights:
             self._remember()
@@ -165,7 +163,7 @@ class OsmosisControl(Actor):
 
     @every(0.2)
     def repeat(self) -> None:
-        """Repeat the status for whoever joined late."""
+        """Repeat the status and unconfirmed measurements."""
         self.publish(topics.CONTROL_STATUS, self.core.status)
         for light in self._lights.to_send_again(self.clock.now()):
             self.publish(topics.LIGHT_MEASURED, light)

@@ -1,10 +1,16 @@
 """Path follower of taxi mode: from pose, route and laser echoes to a velocity command.
 
-The robot is tracked by projecting its pose on the route, and nothing else is needed to know how
-far it is: a respawned Osmosis Control that is given the same route and a pose in the middle goes
-on from there. The point of attraction runs ahead on the route, moved aside by the tangential
-escape; the potential field turns that into a direction; speed yields to everything that speaks
-against it (heading error, curves, obstacles, the goal), and changes within acceleration limits.
+Progress is the projection of the pose on the route. Nothing else is stored, so a restarted Osmosis
+Control with the same route continues from the pose. The point of attraction is ahead on the route,
+offset by the tangential escape (`following.escape`). The potential field turns it into a direction.
+The speed is the lowest that heading error, curves, obstacles, goal and acceleration limits allow.
+
+The field lives in `base_link`. The paper's field repels from the robot's centre with
+4*alpha*(d_s^2 - d^2). Here distances are those of the hull and the repulsion is Khatib's
+alpha*(1/d - 1/d_s) (Khatib 1986), which grows without bound towards contact. A field alone has a
+local minimum in front of an obstacle exactly on the line. So the tangential escape is a choice and
+not a force: it moves the point of attraction to one side and keeps it there. The field handles the
+last half metre.
 """
 
 from __future__ import annotations
@@ -15,7 +21,6 @@ import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.control.following.escape import Deviation, Escape, EscapeLimits
-from rampart.actors.osmosis.control.following.potential_field import field
 from rampart.actors.osmosis.control.polyline import (
     Array,
     Hull,
@@ -29,7 +34,7 @@ from rampart.actors.osmosis.control.polyline import (
 
 
 class MotionLimits(msgspec.Struct, frozen=True):
-    """What the robot is asked at most, and how it follows.
+    """Limits and gains of the motion.
 
     Args:
         max_linear_mps: top speed (paper's code: 1.0 m/s).
@@ -38,12 +43,11 @@ class MotionLimits(msgspec.Struct, frozen=True):
         deceleration_mps2: fall of the speed, planned and commanded.
         angular_acceleration_radps2: change of the turn rate.
         heading_gain_per_s: turn rate per heading error.
-        turn_in_place_rad: with a larger heading error the robot turns before it goes.
+        turn_in_place_rad: heading error above which the robot turns in place.
         lookahead_m: distance of the point of attraction along the route.
-        arrival_radius_m: a goal is reached within this distance, or once passed abeam at most
-            `abeam_m` aside.
-        abeam_m: see `arrival_radius_m`; the paper's arrival radius.
-        obstacle_stop_m: free space in front of the hull at which forward speed is zero.
+        arrival_radius_m: distance at which a goal is reached.
+        abeam_m: lateral distance at which a passed goal is reached; the paper's arrival radius.
+        obstacle_stop_m: free distance ahead of the hull at which the speed is zero.
     """
 
     max_linear_mps: float = 1.0
@@ -59,15 +63,14 @@ class MotionLimits(msgspec.Struct, frozen=True):
     obstacle_stop_m: float = 0.3
 
     def braking_speed(self, distance_m: float) -> float:
-        """Speed from which the robot stops within a distance; 0 for none left."""
+        """Return the speed from which the robot stops within a distance."""
         return math.sqrt(2.0 * self.deceleration_mps2 * max(distance_m, 0.0))
 
 
 class Motion(msgspec.Struct, frozen=True, gc=False):
-    """Result of one control step: the command, and how far the robot is.
+    """Result of a control step: the command and the progress.
 
-    `waiting` means stopped by an obstacle; `arrived` that the goal is reached; `waypoint` is the
-    index of the route's waypoint last passed.
+    `waiting`: stopped by an obstacle; `waypoint`: index of the route's last waypoint passed.
     """
 
     linear_mps: float
@@ -81,17 +84,17 @@ class Motion(msgspec.Struct, frozen=True, gc=False):
 _ASTRAY_M = 1.0
 
 STANDSTILL = (0.0, 0.0)
-"""The command of a robot that stands."""
+"""Command for standing still."""
 
 
 class Ramp(msgspec.Struct):
-    """Acceleration limits on a command: remembers the last one."""
+    """Acceleration limits relative to the last command."""
 
     limits: MotionLimits
     last: tuple[float, float] = STANDSTILL
 
     def towards(self, linear_mps: float, angular_radps: float, dt_s: float) -> tuple[float, float]:
-        """Return the command nearest to what is asked for that the limits allow after `dt_s`."""
+        """Return the nearest command to the requested one within the limits after `dt_s`."""
         limits, (linear, angular) = self.limits, self.last
         top, turn = limits.max_linear_mps, limits.max_angular_radps
         rise, fall = limits.acceleration_mps2 * dt_s, limits.deceleration_mps2 * dt_s * 1.5
@@ -103,24 +106,24 @@ class Ramp(msgspec.Struct):
 
 
 def free_ahead(points: Array, hull: Hull, margin_m: float) -> float:
-    """Free distance in metres straight ahead of the hull, in a lane `margin_m` wider a side."""
+    """Return the free distance ahead of the hull, m, in a lane wider by `margin_m` per side."""
     lane = (np.abs(points[:, 1]) < hull.half_width_m + margin_m) & (points[:, 0] > 0.0)
     ahead = points[lane, 0]
     return float(ahead.min()) - hull.half_length_m if len(ahead) else math.inf
 
 
 class Follower:
-    """What following in either mode has in common: the line, the robot, and how far it is.
+    """Common base of the followers of both modes: the route and the progress along it.
 
     Args:
         waypoints: the route in `map`, at least one point.
         hull: footprint of the robot.
         motion: speeds and distances.
-        near_s_m: arc length at which the robot was last known to be, for one that resumes.
+        near_s_m: last known arc length, if it resumes.
 
     Attributes:
         line: the route.
-        progress_m: arc length at which the robot is; None before the first step.
+        progress_m: arc length of the robot; None before the first step.
     """
 
     def __init__(self, waypoints: tuple[Point, ...], hull: Hull | None,
@@ -134,10 +137,10 @@ class Follower:
         self._arrived = False
 
     def _advance(self, x_m: float, y_m: float) -> Projection:
-        """Return where on the route the robot is.
+        """Update the progress and return the projection of the position on the route.
 
-        Where it was last known to be says which leg it is on, if the route comes near itself; of
-        one that resumes it is not believed if another leg is much nearer: it may have moved since.
+        The last progress selects the leg if the route comes near itself. After a restart another
+        leg is selected if it is much nearer, since the robot may have moved.
         """
         line = self.line
         foot = line.project(x_m, y_m, self.progress_m)
@@ -148,10 +151,81 @@ class Follower:
         return foot
 
     def _arrive(self) -> Motion:
-        """Stand at the end of the route."""
+        """Stop at the end of the route."""
         self._arrived = True
         self._ramp.last = STANDSTILL
         return Motion(0.0, 0.0, True, False, len(self.line.points) - 1, 0.0)
+
+
+_NEAR_M = 0.1
+"""Distance to the target below which the attraction fades."""
+
+# Shape of the field.
+INFLUENCE_M = 0.9
+"""Distance d_s from the hull at which repulsion begins."""
+
+REPULSION = 0.06
+"""At 0.06 an echo 0.1 m beside the hull deflects the direction by 28 degrees."""
+
+LEAST_DISTANCE_M = 0.05
+"""Below this distance the repulsion is constant."""
+
+LEAST_ADVANCE = 0.15
+"""Share of the attraction that repulsion leaves, so that the field never turns the robot around."""
+
+
+def clusters(points: Array, gap_m: float = 0.5) -> list[Array]:
+    """Split echoes, in the order of the sweep, into obstacles where the gap is larger."""
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    return np.split(points, np.flatnonzero(steps > gap_m) + 1)
+
+
+def repulsion(points: Array, hull: Hull) -> tuple[float, float]:
+    """Return the sum of the repulsion of each obstacle's nearest echo, in `base_link`.
+
+    Only one echo per obstacle counts, so that the result does not depend on the laser's resolution.
+    """
+    push_x = push_y = 0.0
+    if not len(points) or float(hull.distance(points).min()) >= INFLUENCE_M:
+        return push_x, push_y
+    for cluster in clusters(points):
+        distances = hull.distance(cluster)
+        nearest = int(np.argmin(distances))
+        distance_m = max(float(distances[nearest]), LEAST_DISTANCE_M)
+        if distance_m >= INFLUENCE_M:
+            continue
+        x_m, y_m = (float(v) for v in cluster[nearest])
+        away_x = min(max(x_m, -hull.half_length_m), hull.half_length_m) - x_m
+        away_y = min(max(y_m, -hull.half_width_m), hull.half_width_m) - y_m
+        norm = math.hypot(away_x, away_y)
+        if norm < 1e-9:  # inside the hull: away from the centre
+            away_x, away_y, norm = -x_m, -y_m, max(math.hypot(x_m, y_m), 1e-9)
+        size = REPULSION * (1.0 / distance_m - 1.0 / INFLUENCE_M)
+        push_x += size * away_x / norm
+        push_y += size * away_y / norm
+    return push_x, push_y
+
+
+def field(target_x_m: float, target_y_m: float, points: Array, hull: Hull) -> tuple[float, float]:
+    """Return the field's vector at the robot, in `base_link`; its direction is the heading to take.
+
+    Args:
+        target_x_m: point of attraction in `base_link`.
+        target_y_m: point of attraction in `base_link`.
+        points: laser echoes in `base_link`, shape (n, 2), in the order of the sweep.
+        hull: footprint of the robot.
+    """
+    # A unit vector to the target, linear near it (the paper's conic-quadratic).
+    scale = max(math.hypot(target_x_m, target_y_m), _NEAR_M)
+    pull_x, pull_y = target_x_m / scale, target_y_m / scale
+    push_x, push_y = repulsion(points, hull)
+    pull = math.hypot(pull_x, pull_y)
+    if pull < 1e-9:
+        return push_x, push_y
+    ahead_x, ahead_y = pull_x / pull, pull_y / pull
+    along = max(pull + push_x * ahead_x + push_y * ahead_y, LEAST_ADVANCE * pull)
+    aside = ahead_x * push_y - ahead_y * push_x
+    return along * ahead_x - aside * ahead_y, along * ahead_y + aside * ahead_x
 
 
 class PathFollower(Follower):
@@ -162,7 +236,7 @@ class PathFollower(Follower):
         hull: footprint of the robot.
         limits: speeds and distances.
         escape: room for passing obstacles.
-        near_s_m: arc length at which the robot was last known to be, for one that resumes.
+        near_s_m: last known arc length, if it resumes.
     """
 
     def __init__(self, waypoints: tuple[Point, ...], hull: Hull | None = None,
@@ -174,16 +248,16 @@ class PathFollower(Follower):
 
     @property
     def aside_m(self) -> float:
-        """The offset from the route at which the robot is to pass now, left positive."""
+        """Current lateral offset from the route, left positive, m."""
         return self._escape.offset_m
 
     def adopt_aside(self, aside_m: float) -> None:
-        """Return to the route from where another follower of it returns from."""
+        """Take the offset from which another follower returns to the route."""
         if self._escape.side == 0:
             self._escape.offset_m = aside_m
 
     def step(self, x_m: float, y_m: float, yaw_rad: float, points: Array, dt_s: float) -> Motion:
-        """Return the command for now.
+        """Return the command.
 
         Args:
             x_m: pose of `base_link` in `map`.
@@ -211,24 +285,24 @@ class PathFollower(Follower):
         return Motion(linear, angular, False, waiting, foot.segment, to_go_m)
 
     def _bearing(self, pose: Pose2, foot: Projection, way: Deviation, points: Array) -> float:
-        """Direction of the field, relative to the robot's heading."""
+        """Return the direction of the field relative to the robot's heading."""
         (x_m, y_m, yaw_rad), s_m, n_m = pose, foot.s_m, foot.n_m
         aside_m = abs(way.offset_m - n_m)
         reach_m = self._motion.lookahead_m
         if aside_m > 0.05:
-            # Be aside before the obstacle begins: the nearer it is, the steeper the way there.
+            # The offset must be reached before the obstacle: the nearer it is, the steeper.
             room_m = way.gap_m - self._hull.half_length_m - 0.2
             reach_m = min(reach_m, max(room_m, 0.6 - aside_m, 0.15))
         heading = self.line.smooth_heading_at(s_m)
         while reach_m > 0.3:
-            # Outside a bend the way aside is longer than the route: look less far ahead on it.
+            # On the outside of a bend the offset path is longer: look less far ahead.
             bend = wrap_angle(self.line.smooth_heading_at(s_m + reach_m) - heading)
             if reach_m - way.offset_m * bend <= self._motion.lookahead_m + 0.1:
                 break
             reach_m -= 0.1
         dx, dy = self._beside(s_m + reach_m, way.offset_m, x_m, y_m)
         while math.hypot(dx, dy) < 0.5 and reach_m < 2.0 * self._motion.lookahead_m:
-            reach_m += 0.1  # inside a bend it is shorter: never aim at one's own feet
+            reach_m += 0.1  # on the inside of a bend it is shorter: never aim at the robot itself
             dx, dy = self._beside(s_m + reach_m, way.offset_m, x_m, y_m)
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         target_x, target_y = cos * dx + sin * dy, cos * dy - sin * dx
@@ -237,18 +311,18 @@ class PathFollower(Follower):
         along = wrap_angle(heading - yaw_rad)
         outwards = wrap_angle(bearing - along) * n_m > 0.0
         if outwards and abs(n_m) > self._room.max_deviation_m:
-            return along  # the corridor's edge: repulsion may not push beyond it
+            return along  # repulsion must not push beyond the corridor
         return bearing
 
     def _beside(self, s_m: float, n_m: float, x_m: float, y_m: float) -> tuple[float, float]:
-        """Vector in `map` from (x, y) to the point (s, n) of the route, at most to its end."""
+        """Return the vector in `map` from (x, y) to (s, n), at most to the route's end."""
         s_m = min(s_m, self.line.length_m)
         x_line, y_line = self.line.point_at(s_m)
         heading = self.line.smooth_heading_at(s_m)
         return x_line - n_m * math.sin(heading) - x_m, y_line + n_m * math.cos(heading) - y_m
 
     def _speed(self, bearing: float, s_m: float, direct_m: float, points: Array) -> float:
-        """The lowest of the speeds that heading, curve, goal and obstacles allow."""
+        """Return the lowest of the speeds that heading, curve, goal and obstacles allow."""
         limits = self._motion
         if abs(bearing) > limits.turn_in_place_rad:
             return 0.0

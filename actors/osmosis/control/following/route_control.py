@@ -1,12 +1,11 @@
-"""From route, pose and sweep to the velocity command, and what there is to say about it.
+"""Core of Osmosis Control and its standby: from route, pose and sweep to the command. Pure.
 
-The core of Osmosis Control and of its standby. It takes messages and the time, and gives commands,
-measurements and the status; no bus, no clock. What a system wants beyond the paper's is a part that
-it is given or not: a check of routes, dead reckoning, a loop on the turn rate, the lights.
+It takes messages and the time, and returns commands, measurements and the status. Extensions to the
+paper's node are optional parts: a check of routes, dead reckoning, a loop on the turn rate.
 
-What is kept of it: the lights, which must not be forgotten, and the route with the progress along
-it. The Graph Planner repeats the route; but it tells a route that is resumed from another one, and
-where the row of lights began that a new route may join in the middle.
+Its checkpoint holds the lights and the route with its progress. The Graph Planner repeats the
+route, but the saved one identifies a resumed route, and the start of a row of lights that a new
+route joins in the middle.
 """
 
 from __future__ import annotations
@@ -37,21 +36,21 @@ from rampart.manager.spec.schema import SystemSpec
 PERIOD_S = 0.05
 
 _ASIDE_M = 0.1
-"""A step of the way aside by this much is told at once, where a standby has to know."""
+"""Change of the lateral offset that is published at once if there is a standby."""
 _ACTIVE_SILENT_S = 0.6
-"""After so long without a status, three periods, the standby is the one in the loop."""
+"""Time without a status, three periods, after which the standby's loop is the active one."""
 JOIN_M = 0.5
-"""A row is prolonged to where it began if that lies within this distance of its straight line."""
+"""Greatest distance of the row's start from the line of a route that joins the row later."""
 
 
 class ControlKept(msgspec.Struct, frozen=True):
     """State of Osmosis Control.
 
     Attributes:
-        lights: of the mission.
-        route: the one being followed.
+        lights: ledger of the mission.
+        route: current route.
         progress_m: arc length along it; None before the first step.
-        row_start: first waypoint of the first route to the present goal, in `map`.
+        row_start: first waypoint of the first route to the current goal, in `map`.
     """
 
     lights: LightsKept = LightsKept()
@@ -79,7 +78,7 @@ CONTROL_STATE = StateFormat(ControlKept, version=1, objection=_objection)
 
 
 def whole_row(row_start: Point | None, waypoints: tuple[Point, ...]) -> tuple[Point, ...]:
-    """Return a row from where it began, if the route joins it further on; else the route."""
+    """Return the row from its start if the route joins it later, else the route."""
     if row_start is None or len(waypoints) < 2:
         return waypoints
     line = Polyline(waypoints)
@@ -92,35 +91,35 @@ def whole_row(row_start: Point | None, waypoints: tuple[Point, ...]) -> tuple[Po
 
 
 class RouteControl:
-    """Follows the route that it is given. Times are simulated seconds.
+    """Follows the current route. Times are simulated seconds.
 
-    It goes on computing from the last pose it has, however old, as the paper's does, unless it has
-    `bridge`: that a stale pose stops the robot is the business of FTM6, not something to hide here.
+    Without `bridge` it computes from the last pose, however old, as in the paper: FTM6 handles a
+    stale pose.
 
     Args:
-        system: the robot, and whether states are kept.
-        airport: where it drives.
-        tell: reports what is wrong: context, reason, and of what.
+        system: the robot, and whether checkpoints are used.
+        airport: the airport.
+        report: reports a problem: context, reason, offender.
         now_s: now.
-        row: how rows of lights are followed.
-        lights: measures lights; of none for a standby, which leaves them to the active one.
-        check: checks a route before it is followed. A bad one is refused: the robot stands, or
-            follows the good one that it has for the same goal.
-        bridge: knows where the robot is while the pose is stale; beyond its bound the robot stops.
-        loop: controls the turn rate; without it the base is trusted to turn as it is told.
-        has_standby: a standby listens, which is told at once where the robot means to be.
+        row: parameters for rows of lights.
+        lights: the inspection; without lights for a standby.
+        check: checks a route before it is followed. After a refusal the robot stands, or keeps its
+            good route to the same goal.
+        bridge: gives the pose while localization is stale; beyond its bound the robot stops.
+        loop: corrects the turn rate.
+        has_standby: whether a standby follows, which needs changes of the lateral offset at once.
 
     Attributes:
-        status: the newest.
+        status: the newest status.
     """
 
     def __init__(
-        self, system: SystemSpec, airport: Airport, tell: Callable[[str, str, str], None],
+        self, system: SystemSpec, airport: Airport, report: Callable[[str, str, str], None],
         now_s: float, row: RowLimits, *, lights: RowInspection,
         check: RouteCheck | None = None, bridge: DeadReckoning | None = None,
         loop: MotionLoop | None = None, has_standby: bool = False,
     ) -> None:
-        self._airport, self._tell = airport, tell
+        self._airport, self._report = airport, report
         self._hull, self._limits, self._row = hull_of(system), motion_of(system), row
         self._resumes = system.layers.checkpoints
         self._lights, self._check, self._bridge, self._loop = lights, check, bridge, loop
@@ -142,11 +141,11 @@ class RouteControl:
         self._begun = False
         self.status = m.ControlStatus("", 0, m.ControlPhase.IDLE, 0, 0.0)
 
-    # -- what survives a restart ----------------------------------------------------------------
+    # -- checkpoint -----------------------------------------------------------------------------
 
     @property
     def kept(self) -> ControlKept | None:
-        """What a successor needs; None if there is nothing to keep."""
+        """State for a successor; None if there is nothing to save."""
         route = self._route
         if route is None or not self._resumes:
             return None
@@ -155,11 +154,11 @@ class RouteControl:
             self._follower.progress_m if self._follower else None, self._row_start)
 
     def restore(self, kept: ControlKept) -> None:
-        """Know what a predecessor knew; the robot goes on when the route is there."""
+        """Restore the state of a predecessor; the robot continues when the route arrives."""
         self._last, self._row_start = kept, kept.row_start
         self._lights.ledger.restore(kept.lights)
 
-    # -- what it hears --------------------------------------------------------------------------
+    # -- inputs ---------------------------------------------------------------------------------
 
     def pose(self, pose: m.Pose, stamp_s: float, now_s: float) -> None:
         """Take a pose in `map`."""
@@ -174,7 +173,7 @@ class RouteControl:
             self._loop.pose(stamp_s, *place)
 
     def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> None:
-        """Take the way that the wheels make."""
+        """Take odometry."""
         pose = odometry.pose
         if self._bridge and is_odometry(odometry):
             self._bridge.odometry(stamp_s, (pose.x_m, pose.y_m, pose.yaw_rad), now_s)
@@ -182,14 +181,14 @@ class RouteControl:
     def scan(self, laser: int, sweep: m.LaserScan, stamp_s: float, now_s: float) -> None:
         """Take a sweep of one laser."""
         view = self._lasers.take(laser, sweep, stamp_s, now_s)
-        if view is not None and not view.fault:  # the Safety Pilot stops who sees nothing
+        if view is not None and not view.fault:  # without a view the Safety Pilot stops the robot
             self._points = view.points
 
     def goal(self, order: m.GoalOrder) -> bool:
-        """Take the goal, to check the route's end by; a route refused for it is looked at again.
+        """Take the goal, and check a refused route again against it.
 
         Returns:
-            As `route`.
+            Whether the route changes.
         """
         if order == self._goal:
             return False
@@ -197,26 +196,26 @@ class RouteControl:
         return self._refused is not None and self.route(self._refused)
 
     def route(self, route: m.Route) -> bool:
-        """Take a route; the follower finds its place on it by itself.
+        """Take a route; after a refusal the robot may stand.
 
         Returns:
-            Whether it takes the place of the one before; a refused one may, and the robot stands.
+            Whether the route changes.
         """
         previous = self._route
         if route == previous:
             self._why_refused, self._refused = "", None
             return False
         if not all(is_sane(*waypoint) for waypoint in route.waypoints):
-            self._tell("route", "a waypoint is not finite, or farther away than anything can be",
-                       route.mission_id)
+            self._report("route", "a waypoint is not finite or implausibly far away",
+                         route.mission_id)
             return False
         self._why_refused = clip(self._fault_of(route))
         self._refused = route if self._why_refused else None
         if self._refused is not None:
-            self._tell("route refused", self._why_refused, route.mission_id)
+            self._report("route refused", self._why_refused, route.mission_id)
             if previous is not None and previous.active and _same_goal(previous, route):
-                return False  # the way that is being followed leads there as well
-            # The mission and step are the new ones, and the robot stands.
+                return False  # the current route leads to the same goal
+            # The robot stands; mission and step are the new ones.
             route = msgspec.structs.replace(route, active=False, waypoints=())
         before = previous or self._last.route
         if before is None or not _same_goal(before, route):
@@ -253,7 +252,7 @@ class RouteControl:
                                  (order.goal.x_m, order.goal.y_m) if known and order else None)
 
     def adopt(self, active: m.ControlStatus, stamp_s: float) -> None:
-        """Do as the active one does, by its status of `stamp_s`."""
+        """Take over the intent of the active instance from its status of `stamp_s`."""
         if self._loop and math.isfinite(active.turn_added_radps):
             self._loop.adopt(active.turn_added_radps, stamp_s + _ACTIVE_SILENT_S)
         route, follower = self._route, self._follower
@@ -264,10 +263,10 @@ class RouteControl:
         elif isinstance(follower, PathFollower) and active.phase is m.ControlPhase.FOLLOWING:
             follower.adopt_aside(active.aside_m)
 
-    # -- what comes of it -----------------------------------------------------------------------
+    # -- outputs --------------------------------------------------------------------------------
 
     def begins(self) -> bool:
-        """Whether all inputs are there for the first time, so that a respawn costs no period."""
+        """Whether all inputs are present for the first time, so that a restart costs no period."""
         blind = self._pose is None or self._points is None
         if self._begun or self._route is None or (self._follower is not None and blind):
             return False
@@ -275,7 +274,7 @@ class RouteControl:
         return True
 
     def step(self, now_s: float) -> m.Twist:
-        """Return the command for now: zero without a route, because silence is a failure."""
+        """Return the command; zero without a route."""
         dt_s = min(max(now_s - self._stepped_s, PERIOD_S / 5), PERIOD_S * 4)
         self._stepped_s = now_s
         self._motion = motion = self._follow(dt_s, now_s)
@@ -293,25 +292,25 @@ class RouteControl:
             return None
         motion = follower.step(*pose, points, dt_s)
         if isinstance(follower, LightRow) and follower.back_to is not None:
-            self._watch.restart()  # no progress is meant
+            self._watch.restart()  # no progress is expected
         self._blocked = None if motion.arrived else self._watch.update(
             motion.distance_to_go_m, pose, points, now_s)
         return motion
 
     def measure(self, now_s: float) -> list[m.LightMeasurement]:
-        """Return the measurements of the last step, to be kept before they are sent.
+        """Return the measurements of the last step, to be saved before they are sent.
 
-        They are sent before the arrival is, so that none comes too late.
+        They are sent before the arrival is reported.
         """
         if self._motion is None or not isinstance(self._follower, LightRow):
             return []
         return self._lights.measure(now_s, arrived=self._motion.arrived)
 
     def report(self) -> bool:
-        """Bring the status up to date, and go back for a light that the last step has missed.
+        """Update the status, and go back for a light that the last step has missed.
 
         Returns:
-            Whether the status is to be told at once.
+            Whether the status is to be published at once.
         """
         is_incomplete = self._look_back()
         before, self.status = self.status, self._status(is_incomplete=is_incomplete)
@@ -319,13 +318,13 @@ class RouteControl:
             self._has_standby and abs(before.aside_m - self.status.aside_m) > _ASIDE_M)
 
     def _look_back(self) -> bool:
-        """Go back for a light that was missed; return whether one of the row is missing yet."""
+        """Go back for a missed light; return whether a light of the row is still missing."""
         motion, row, lights = self._motion, self._follower, self._lights
         if motion is None or not isinstance(row, LightRow):
             return False
         light = lights.look_back(row, arrived=motion.arrived)
         if light:
-            self._tell("light inspection", "passed without a measurement, going back", light)
+            self._report("light inspection", "passed without a measurement, going back", light)
         return lights.is_incomplete
 
     def _status(self, *, is_incomplete: bool) -> m.ControlStatus:

@@ -1,1 +1,1 @@
-"""Localization: a pose from one sensor, or from four that check each other."""
+"""Localization: the pose from one sensor, or from four that check each other."""

@@ -1,9 +1,9 @@
-"""Localization by fusion: odometry, IMU, GPS and the absolute pose, any one of which may fail.
+"""Localization by fusion of odometry, IMU, GPS and absolute pose, any one of which may fail.
 
-In the place of `rampart.actors.osmosis.control.localization.localization`, the paper's, if a
-system's spec says so. A new process starts from the first absolute pose and fix. It keeps one
-thing: how far the positions still have to move as the wheels do, after these contradicted them. A
-successor that forgot this would believe what its predecessor was silent for.
+It replaces the paper's localization (`localization.localization`) if the spec names it. A new
+process starts from the first absolute pose and fix. Its checkpoint holds one value: the distance
+that contradicted positions still have to move like the wheels. Without it, a successor would use
+the positions that its predecessor had excluded.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ import math
 import msgspec
 
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
-from rampart.actors.osmosis.control.localization.position_source import FilterLimits
+from rampart.actors.osmosis.control.localization.pose_filter import FilterLimits, PoseFilter
 from rampart.actors.osmosis.messages import BaseStatus, GpsFix, Imu, Odometry, Pose
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
@@ -44,14 +43,14 @@ LOCALIZATION_STATE = StateFormat(LocalizationKept, version=1, objection=_objecti
 class FusedLocalization(Actor):
     """Publishes the fused pose with the stamp of its newest accepted reading.
 
-    It publishes none while it does not know one, so that a reader, and DM6, sees it grow old.
+    While the pose is unknown it publishes none, so that readers and DM6 see a stale pose.
     """
 
     class Parameters(Actor.Parameters, frozen=True):
-        """How far it is trusted.
+        """Parameters.
 
         Attributes:
-            bridge_m: how far the robot may go on dead reckoning alone, m.
+            bridge_m: longest distance on dead reckoning alone, m.
         """
 
         bridge_m: NonNegative = FilterLimits().bridge_m
@@ -62,60 +61,60 @@ class FusedLocalization(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self._filter = PoseFilter(FilterLimits(self.parameters.bridge_m))
-        self._told_s = -math.inf
+        self._published_s = -math.inf
         self._kept_m = 0.0
 
     def on_start(self) -> None:
-        """Go on from what the predecessor found out about the positions."""
+        """Restore the checkpoint."""
         if (kept := self.kept(LOCALIZATION_STATE)) is not None:
             self._kept_m = self._filter.owed_m = kept.owed_m
         self.keep(LOCALIZATION_STATE, LocalizationKept(self._kept_m))
 
     @on(topics.BASE_STATUS)
     def status(self, message: BaseStatus, header: Header) -> None:
-        """Take the base's own wheel speeds."""
+        """Take the wheel speeds."""
         self._filter.encoders(header.stamp, message, self.clock.now())
 
     @on(topics.IMU)
     def imu(self, message: Imu, header: Header) -> None:
-        """Take a reading of the gyro."""
+        """Take a reading of the IMU."""
         self._filter.imu(header.stamp, message, self.clock.now())
 
     @on(topics.ODOMETRY)
     def odometry(self, message: Odometry, header: Header) -> None:
-        """Take a reading of the wheels."""
+        """Take odometry."""
         self._filter.odometry(header.stamp, message, self.clock.now())
 
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, message: Pose, header: Header) -> None:
         """Take an absolute pose."""
         self._filter.absolute_pose(header.stamp, message, self.clock.now())
-        self._tell_first()
+        self._publish_first()
 
     @on(topics.GPS)
     def gps(self, message: GpsFix, header: Header) -> None:
         """Take a fix."""
         self._filter.gps(header.stamp, message, self.clock.now())
-        self._tell_first()
+        self._publish_first()
 
     @every(_PERIOD_S)
-    def tell(self) -> None:
-        """Publish the pose, if there is a newer one."""
+    def publish_pose(self) -> None:
+        """Publish the pose if there is a newer one."""
         owed_m = self._filter.owed_m
         if owed_m > self._kept_m or self._kept_m - owed_m >= (_KEEP_EACH_M if owed_m else 1e-9):
             self._kept_m = owed_m
             self.keep(LOCALIZATION_STATE, LocalizationKept(owed_m))
         estimate = self._filter.estimate()
-        if estimate is not None and estimate.stamp_s > self._told_s:
-            self._told_s = estimate.stamp_s
+        if estimate is not None and estimate.stamp_s > self._published_s:
+            self._published_s = estimate.stamp_s
             self.publish(topics.POSE, estimate.pose, stamp=estimate.stamp_s)
 
     @every(0.2)
     def repeat(self) -> None:
-        """Say what the pose rests on."""
+        """Publish the sources of the pose and its uncertainty."""
         self.publish(topics.LOCALIZATION_STATUS, self._filter.status(self.clock.now()))
 
-    def _tell_first(self) -> None:
-        """Publish the first pose at once, so that a respawn costs no extra period."""
-        if self._told_s == -math.inf:
-            self.tell()
+    def _publish_first(self) -> None:
+        """Publish the first pose at once, so that a restart costs no extra period."""
+        if self._published_s == -math.inf:
+            self.publish_pose()

@@ -1,7 +1,6 @@
-"""Localization: the robot's pose for all who need it, stamped with when it was measured.
+"""Localization as in the paper: the simulator's absolute pose (section V).
 
-The paper's localization is the simulator's absolute pose (section V). The stamp is that of the
-measurement, not of its passing on: a pose that arrives late must look old to DM6.
+The pose keeps the stamp of its measurement, so that a late pose is old for DM6.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from rampart.actors.runtime.actor import Actor, Context, Header, on
 
 
 def is_newer(pose: Pose, stamp_s: float, last_stamp_s: float, now_s: float) -> bool:
-    """Whether a measurement is usable and later than the last one passed on."""
+    """Whether a measurement is valid and newer than the last one."""
     return stamp_s > last_stamp_s and is_possible(stamp_s, now_s) and is_pose(pose)
 
 
 class Localization(Actor):
-    """Passes the absolute pose on; keeps nothing that a restart would lose."""
+    """Passes the absolute pose on; stateless."""
 
     outputs = (topics.POSE,)
 
@@ -31,7 +30,7 @@ class Localization(Actor):
 
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, pose: Pose, header: Header) -> None:
-        """Pass a measurement on with its own stamp."""
+        """Pass a newer, valid measurement on with its stamp."""
         if is_newer(pose, header.stamp, self._last_stamp_s, self.clock.now()):
             self._last_stamp_s = header.stamp
             self.publish(topics.POSE, pose, stamp=header.stamp)

@@ -1,10 +1,9 @@
 """An extended Kalman filter on the planar pose, with its 3x3 algebra written out.
 
-State: x m, y m, yaw rad of `base_link` in `map`. It is predicted by the way that the wheels and
-the gyro measured, and corrected by positions and headings. Nothing here judges a measurement:
-`position_nis` and `heading_nis` say how far one is from what was expected, in units of what was
-to be expected (normalised innovation squared; Bar-Shalom, Li, Kirubarajan, "Estimation with
-Applications to Tracking and Navigation", 2001, section 5.4), and the caller decides.
+State: x m, y m, yaw rad of `base_link` in `map`. It is predicted by the motion of wheels and gyro,
+and corrected by positions and headings. The caller gates measurements by `position_nis` and
+`heading_nis` (normalised innovation squared; Bar-Shalom, Li, Kirubarajan, "Estimation with
+Applications to Tracking and Navigation", 2001, section 5.4).
 
 Plain floats: at 50 predictions a second numpy's calls would cost ten times the arithmetic.
 """
@@ -54,13 +53,13 @@ class PlanarEkf:
 
     def predict(self, forward_m: float, turn_rad: float, variance_m2: float,
                 variance_rad2: float) -> tuple[float, float]:
-        """Move by a measured way; return it in `map`.
+        """Predict by a measured motion; return the displacement in `map`.
 
         Args:
-            forward_m: way along `base_link`'s x.
-            turn_rad: turn meanwhile.
-            variance_m2: of the way, added to either coordinate.
-            variance_rad2: of the turn.
+            forward_m: distance along `base_link`'s x.
+            turn_rad: change of heading.
+            variance_m2: variance of the distance, for each coordinate.
+            variance_rad2: variance of the turn.
         """
         middle = self.yaw_rad + turn_rad / 2
         dx, dy = forward_m * math.cos(middle), forward_m * math.sin(middle)
@@ -84,7 +83,7 @@ class PlanarEkf:
         return (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / (a * c - b * b)
 
     def update_position(self, x_m: float, y_m: float, variance_m2: float) -> None:
-        """Take a position in `map`."""
+        """Correct by a position in `map`."""
         a, b, c = self._xx + variance_m2, self._xy, self._yy + variance_m2
         determinant = a * c - b * b
         i_xx, i_xy, i_yy = c / determinant, -b / determinant, a / determinant
@@ -109,7 +108,7 @@ class PlanarEkf:
         return wrap_angle(yaw_rad - self.yaw_rad) ** 2 / (self._ww + variance_rad2)
 
     def update_heading(self, yaw_rad: float, variance_rad2: float) -> None:
-        """Take a heading in `map`."""
+        """Correct by a heading in `map`."""
         total = self._ww + variance_rad2
         off = wrap_angle(yaw_rad - self.yaw_rad)
         xw, yw, ww = self._xw, self._yw, self._ww
@@ -124,7 +123,7 @@ class PlanarEkf:
         self._ww = ww * variance_rad2 / total
 
     def doubt(self, sd_m: float, sd_rad: float = 0.0) -> None:
-        """Add to the uncertainty: what was taken in was wrong by so much."""
+        """Increase the uncertainty after wrong corrections."""
         self._xx += sd_m * sd_m
         self._yy += sd_m * sd_m
         self._ww += sd_rad * sd_rad

@@ -1,1 +1,1 @@
-"""The Mission Manager: a mission, its orders, and what of it survives a crash."""
+"""The Mission Manager: a mission, its orders and its checkpoint."""

@@ -1,4 +1,4 @@
-"""Mission Manager: takes a mission and gives its goals one by one."""
+"""Mission Manager: takes a mission and publishes its goals one by one."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import RecoveryNames
 
 UNCERTAIN_S = 1.0
-"""A Mission Manager that comes back waits so long for word of the step that others are at. They
-repeat it five times a second, and at once for a newcomer."""
+"""Time that a restarted Mission Manager waits for the step of planner or control. They repeat it
+five times a second, and at once for a new subscriber."""
 
 _SAME_POINT_M = 0.1
-"""A route that ends so near to a goal leads to it."""
+"""Greatest distance between a goal and the end of a route to it."""
 
 
 class MissionManager(Actor):
-    """Wires `mission_state` to its topics; see there for the machine.
+    """Wires the state machine `mission_state` to its topics.
 
-    Who holds the robot is heard from the FTM Manager's status, ten times a second, so a respawned
-    Mission Manager finds out as well.
+    The FTM Manager's status gives the recoveries that hold the robot, ten times a second, also to a
+    restarted Mission Manager.
     """
 
     class Parameters(Actor.Parameters, frozen=True):
-        """When the mission waits.
+        """Parameters.
 
         Attributes:
-            held_by: names of the recovery modules that hold the robot while they are activated;
-                the mission is paused then, for that reason. None by default, as in the paper.
+            held_by: recovery modules that hold the robot while they are activated; the mission is
+                paused meanwhile. None by default, as in the paper.
         """
 
         held_by: RecoveryNames = ()
@@ -53,25 +53,25 @@ class MissionManager(Actor):
 
     @on(topics.MISSION_REQUEST)
     def request(self, message: m.MissionRequest, _header: Header) -> None:
-        """Take a mission, unless it was taken before."""
+        """Take a mission, unless it was accepted before."""
         self._become(mission_state.accept(self.state, message, self.clock.now()))
 
     @on(topics.MISSION_ORDER)
     def order(self, message: m.MissionOrder, _header: Header) -> None:
-        """Obey an order or refuse it, and say so."""
+        """Execute or refuse an order, and answer."""
         state, answer = mission_state.obey(self.state, message, self.clock.now())
         self._become(state)
         self.publish(topics.MISSION_ORDER_ANSWER, answer)
 
     @on(ftm_topics.MANAGER_STATUS)
     def manager(self, message: ManagerStatus, _header: Header) -> None:
-        """Pause while a recovery holds the robot, and go on when it is released."""
+        """Pause while a recovery holds the robot."""
         if held_by := self.parameters.held_by:
             self._become(mission_state.hold(self.state, hold_reason(message, held_by)))
 
     @on(topics.CONTROL_STATUS)
     def progress(self, message: m.ControlStatus, _header: Header) -> None:
-        """Step on when the current goal is reached."""
+        """Advance when the current goal is reached."""
         self._compare(message.mission_id, message.step)
         message = msgspec.structs.replace(message, unmeasured=tuple(
             name for name in message.unmeasured if name in self._lights))
@@ -79,23 +79,23 @@ class MissionManager(Actor):
 
     @on(topics.ROUTE)
     def route(self, message: m.Route, _header: Header) -> None:
-        """Give up when there is no way."""
+        """Fail if there is no route."""
         self._compare(message.mission_id, message.step, message.waypoints[-1:])
         self._become(mission_state.routed(self.state, message))
 
     @on(topics.LIGHT_MEASURED)
     def light(self, message: m.LightMeasurement, _header: Header) -> None:
-        """Keep a light's measurement, if it is one of the airport's."""
+        """Keep the measurement of a light of the airport."""
         if message.light not in self._lights:
-            self.report_diagnostic("light", "no light of this airport", message.light)
+            self.report_diagnostic("light", "not a light of this airport", message.light)
             return
         self._become(mission_state.measured(self.state, message))
 
     def on_start(self) -> None:
-        """Say at once how things stand.
+        """Restore the checkpoint and publish status and goal.
 
-        A state from a checkpoint may be an older one. So status and goal are held back until
-        planner or control have said which step they are at, or have had the time to.
+        The checkpoint may be outdated. So status and goal are withheld until planner or control
+        have reported their step, or `UNCERTAIN_S` has passed.
         """
         if (state := self.kept(MISSION_STATE)) is not None:
             self.state = state
@@ -106,21 +106,21 @@ class MissionManager(Actor):
 
     @every(0.2)
     def repeat_goal(self) -> None:
-        """Repeat the goal for whoever joined late."""
+        """Repeat the goal."""
         if self.clock.now() >= self._uncertain_until_s:
             self.publish(topics.GOAL, mission_state.goal_order(self.state))
 
     @every(1.0)
     def remember(self) -> None:
-        """Keep the state, if that failed when it was new."""
+        """Save the state, again if that failed."""
         self.keep(MISSION_STATE, self.state)
 
     def _compare(self, mission_id: str, step: int,
                  end: tuple[tuple[float, float], ...] = ()) -> None:
-        """End the uncertainty after a respawn: planner or control know the step as well.
+        """End the uncertainty after a restart with the step of planner or control.
 
-        A later step than the checkpoint's is believed only with a way to that step's goal: if the
-        former process died because it gave a wrong goal, the others were told a wrong step.
+        A later step than the checkpoint's is accepted only with a route to that step's goal: the
+        former process may have crashed after it published a wrong goal.
         """
         if self.clock.now() < self._uncertain_until_s and mission_id == self.state.mission_id:
             goals = self.state.goals[step:step + 1]
@@ -135,7 +135,7 @@ class MissionManager(Actor):
 
     @every(0.5)
     def repeat_status(self) -> None:
-        """Repeat the status for whoever joined late."""
+        """Repeat the status."""
         if self.clock.now() >= self._uncertain_until_s:
             self.publish(topics.MISSION_STATUS, mission_state.status(self.state))
 
@@ -143,7 +143,7 @@ class MissionManager(Actor):
         if state is self.state:
             return
         before, self.state = self.state, state
-        self.remember()  # before anybody acts on it
+        self.remember()  # before a node acts on it
         self.repeat_status()
         order = mission_state.goal_order(state)
         if order != mission_state.goal_order(before):
@@ -151,7 +151,7 @@ class MissionManager(Actor):
 
 
 def hold_reason(status: ManagerStatus, holding: tuple[str, ...]) -> str:
-    """Return which of the recoveries that can hold the robot do, and for what; "" if none does."""
+    """Return which recoveries hold the robot and why, or ""."""
     held_by = [name for name in holding if name in status.activated]
     if not held_by:
         return ""

@@ -1,21 +1,21 @@
-"""Core of the Mission Manager: one mission as a state machine, goal by goal.
+"""Core of the Mission Manager: a mission as a state machine. Pure.
 
     idle → running ⇄ paused;  running → succeeded
            running, paused → returning home ⇄ paused;  returning home → cancelled
            running, paused, returning home → failed, cancelled
     idle, succeeded, failed, cancelled → running (the next mission)
 
-A mission is paused while somebody has asked for that, or while a recovery holds the robot, or
-both: so its phase tells whether the robot may be expected to move. Orders that make no sense in a
-phase are refused with a reason; the table is for mistakes in this program.
+A mission is paused by an order, by a recovery that holds the robot, or both, so the phase shows
+whether the robot may move. Orders that are not possible in a phase are refused with a reason; the
+table of transitions catches programming errors.
 
-The state is one frozen struct that msgspec can serialise, so that a checkpoint is its encoding;
-every function takes a state and returns the next one.
+The state is one frozen struct that msgspec can serialise, so a checkpoint is its encoding. Each
+function takes a state and returns the next one.
 
-The state is kept before the goal that follows from it is published. So the newest checkpoint is
-never behind what planner and control were told. If it is damaged, the one before it is, by a step;
-to follow that would send the robot back to a goal that it has reached. But only the Mission Manager
-gives steps, so a step that the others are at is one that it once gave (`catch_up`).
+The state is saved before the goal that follows from it is published, so the newest checkpoint is
+never behind planner and control. If it is damaged, the previous one is behind by a step and would
+send the robot back to a reached goal. Only the Mission Manager assigns steps, so the step of the
+others is one that it once published (`catch_up`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ TRANSITIONS: dict[m.MissionPhase, frozenset[m.MissionPhase]] = {
     P.RETURNING: frozenset({P.PAUSED, P.FAILED, P.CANCELLED}),
     **dict.fromkeys((P.SUCCEEDED, P.FAILED, P.CANCELLED), frozenset({P.RUNNING, P.FAILED})),
 }
-"""Phase → phases that may follow. A new mission may fail at once: it has no goals."""
+"""Phase → next phases. A new mission without goals fails at once."""
 
 ACTIVE = frozenset({P.RUNNING, P.PAUSED, P.RETURNING})
 """Phases in which a mission is under way."""
@@ -49,40 +49,40 @@ DRIVING = frozenset({P.RUNNING, P.RETURNING})
 """Phases in which the robot has a goal."""
 
 ACCEPTED_KEPT = 256
-"""A mission that is sent again is not accepted again as long as it is among the last so many."""
+"""Number of last missions that are not accepted again."""
 
 ANSWERS_KEPT = 32
-"""An order that is repeated gets its old answer as long as it is among the last so many."""
+"""Number of last orders that get the same answer if they are repeated."""
 
 _NO_GOAL = m.Goal(0.0, 0.0, m.Mode.TAXI)
 
 
 class IllegalTransitionError(ValueError):
-    """A phase was to follow another that it cannot follow; the message names both."""
+    """A transition that the table does not have; the message names both phases."""
 
 
 class MissionState(msgspec.Struct, frozen=True):
-    """Everything the Mission Manager must not forget.
+    """State of the Mission Manager, and its checkpoint.
 
     Attributes:
         mission_id: the mission under way, or the last one.
-        name: its name for people.
-        phase: where in its course it is.
+        name: its display name.
+        phase: its phase.
         goals: in `map`.
         step: index of the current goal; the number of goals once all are reached.
         step_started_s: simulated time at which the current step began.
         step_times_s: duration of each finished step in simulated seconds.
         lights: the first measurement of each light, in order of arrival.
-        reason: why it failed, was cancelled or paused, or goes another way than the shortest.
-        accepted: ids of the last missions that were accepted.
-        plan: how often another plan was asked for in this mission.
-        paused: on whose order it is paused and why; empty without such an order.
-        held: which recovery holds the robot and why; empty if none does.
-        home: where the mission began, once a first route has told.
-        homing: on whose order the robot drives home and why; empty if it does not.
-        skipped: indices of goals left out, and on whose order and why.
-        unmeasured: lights that were passed without a measurement.
-        answers: to the latest orders.
+        reason: why it failed, was cancelled or paused, or has a detour.
+        accepted: ids of the last accepted missions.
+        plan: number of plans ordered in this mission.
+        paused: sender and reason of the order to pause; empty without one.
+        held: recovery that holds the robot and why; empty without one.
+        home: start of the mission, known from the first route.
+        homing: sender and reason of the order to drive home; empty without one.
+        skipped: indices of skipped goals, each with sender and reason of the order.
+        unmeasured: lights passed without a measurement.
+        answers: answers to the last orders.
     """
 
     mission_id: str = ""
@@ -109,18 +109,18 @@ def enter(state: MissionState, phase: m.MissionPhase, reason: str = "") -> Missi
     """Return the state in a new phase.
 
     Raises:
-        IllegalTransitionError: the phase cannot follow the present one.
+        IllegalTransitionError: the table does not have the transition.
     """
     if phase not in TRANSITIONS[state.phase]:
         allowed = ", ".join(sorted(phase.value for phase in TRANSITIONS[state.phase]))
         raise IllegalTransitionError(
-            f"mission {state.mission_id!r}: phase: {state.phase.value} → {phase.value} is no "
-            f"transition, after {state.phase.value} may come: {allowed}")
+            f"mission {state.mission_id!r}: phase: {state.phase.value} → {phase.value}: expected "
+            f"one of {allowed}")
     return replace(state, phase=phase, reason=reason)
 
 
 def accept(state: MissionState, request: m.MissionRequest, now: float) -> MissionState:
-    """Take a mission; one that is under way is replaced. An id accepted before changes nothing."""
+    """Accept a mission, which replaces one under way; a known id changes nothing."""
     if request.mission_id in state.accepted:
         return state
     before = replace(state, phase=P.CANCELLED) if state.phase in ACTIVE else state
@@ -133,7 +133,7 @@ def accept(state: MissionState, request: m.MissionRequest, now: float) -> Missio
 
 
 def progress(state: MissionState, report: m.ControlStatus, now: float) -> MissionState:
-    """Step on if Osmosis Control has arrived at the current goal of this mission."""
+    """Advance if Osmosis Control has arrived at the current goal of this mission."""
     current = state.phase in DRIVING and report.which == _driven(state)
     if not current or report.phase is not m.ControlPhase.ARRIVED:
         return state
@@ -144,7 +144,7 @@ def progress(state: MissionState, report: m.ControlStatus, now: float) -> Missio
 
 
 def routed(state: MissionState, route: m.Route) -> MissionState:
-    """Take note of the way to the current goal; fail the mission if there is none."""
+    """Take the route to the current goal; fail the mission if there is none."""
     if state.phase not in DRIVING or route.which != _driven(state) or not route.active:
         return state
     if not route.waypoints:
@@ -153,8 +153,8 @@ def routed(state: MissionState, route: m.Route) -> MissionState:
     if state.phase is P.RETURNING:
         return state
     if state.home is None and state.step == len(state.skipped):
-        # The first waypoint of the first way is where the robot was, or the nearest place to it
-        # on the graph: somewhere that a way leads back to. Goals skipped before moved nothing.
+        # The first waypoint of the first route is the robot's position or the nearest place on
+        # the graph, so a route leads back there. Goals skipped before did not move the robot.
         state = replace(state, home=m.Goal(*route.waypoints[0], m.Mode.TAXI))
     if route.reason != state.reason:
         state = replace(state, reason=route.reason)
@@ -164,7 +164,7 @@ def routed(state: MissionState, route: m.Route) -> MissionState:
 def measured(state: MissionState, light: m.LightMeasurement) -> MissionState:
     """Keep the first measurement of each light.
 
-    Also just after success: the last light's message may come after that of the last arrival.
+    Also just after success: the last measurement may arrive after the last arrival.
     """
     known = {other.light for other in state.lights}
     if light.light in known or state.phase not in ACTIVE | {P.SUCCEEDED}:
@@ -173,7 +173,7 @@ def measured(state: MissionState, light: m.LightMeasurement) -> MissionState:
 
 
 def hold(state: MissionState, reason: str) -> MissionState:
-    """Take note of a recovery that holds the robot, or with an empty reason that none does."""
+    """Set why a recovery holds the robot; empty if none does."""
     if reason == state.held:
         return state
     return _settle(replace(state, held=reason))
@@ -182,7 +182,7 @@ def hold(state: MissionState, reason: str) -> MissionState:
 def obey(
     state: MissionState, order: m.MissionOrder, now: float
 ) -> tuple[MissionState, m.MissionOrderAnswer]:
-    """Obey an order, or refuse it with a reason; one that was answered before changes nothing."""
+    """Execute an order or refuse it with a reason; a repeated order gets the same answer."""
     for answer in state.answers:
         if answer.order == order.order:
             return state, answer
@@ -202,31 +202,32 @@ _EFFECTS: dict[m.MissionAction, Callable[[MissionState, str, float], MissionStat
     A.CANCEL: lambda state, why, _now: enter(state, P.CANCELLED, why),
     A.HOME: lambda state, why, _now: _settle(replace(state, homing=why, paused="")),
 }
-"""The next state by each order that is obeyed. Home also ends a pause."""
+"""Effect of each order. Home also ends a pause."""
 
 
 def _refusal(state: MissionState, action: m.MissionAction) -> str:
-    """Return why an order makes no sense now, or ""."""
+    """Return why an order is refused now, or ""."""
     paused = state.phase is P.PAUSED
     if action is A.RESUME and not paused:
-        return f"it is not paused but {state.phase.value}"
+        return f"the mission is not paused but {state.phase.value}"
     if state.phase not in ACTIVE:
         last = f", the last one is {state.phase.value}" if state.mission_id else ""
         return f"no mission is under way{last}"
-    unknown_home = "" if state.home else "where the mission began is not known"
+    unknown_home = "" if state.home else "the start of the mission is unknown"
     return {
-        A.PAUSE: state.paused and f"it is paused already, {state.paused}",
+        A.PAUSE: state.paused and f"the mission is already paused, {state.paused}",
         A.RESUME: "" if state.paused else
-        f"{state.held}; it goes on by itself when the robot is released",
-        A.REPLAN: "it is paused, and will be planned anew when it goes on" if paused else "",
-        A.SKIP: state.homing and "on the way home there is no goal to skip",
+        f"{state.held}; it continues when the robot is released",
+        A.REPLAN: "the mission is paused; it is replanned when it continues" if paused else "",
+        A.SKIP: state.homing and "there is no goal to skip on the way home",
         A.CANCEL: "",
-        A.HOME: f"it is on the way home already, {state.homing}" if state.homing else unknown_home,
+        A.HOME: f"the robot is already on its way home, {state.homing}" if state.homing
+        else unknown_home,
     }[action]
 
 
 def _settle(state: MissionState) -> MissionState:
-    """Bring the phase of a mission under way in line with what holds it."""
+    """Set the phase of a mission under way by its pauses."""
     if state.phase not in ACTIVE:
         return state
     reason = "; ".join(filter(None, (state.held, state.paused)))
@@ -237,7 +238,7 @@ def _settle(state: MissionState) -> MissionState:
 
 
 def _next_goal(state: MissionState, now: float) -> MissionState:
-    """Go on with the next goal, or end the mission after the last one."""
+    """Continue with the next goal, or end the mission after the last one."""
     state = replace(
         state, step=state.step + 1, step_started_s=now,
         step_times_s=(*state.step_times_s, now - state.step_started_s),
@@ -253,12 +254,12 @@ def _next_goal(state: MissionState, now: float) -> MissionState:
 
 
 def _driven(state: MissionState) -> tuple[str, int]:
-    """Return mission and step by which planner and control know what the robot drives to."""
+    """Return mission and step of the present goal, for planner and control."""
     return state.mission_id, len(state.goals) if state.homing else state.step
 
 
 def goal_order(state: MissionState) -> m.GoalOrder:
-    """Return the current goal for the Graph Planner; inactive unless the robot is to drive."""
+    """Return the current goal for the Graph Planner; inactive unless the robot drives."""
     if state.phase not in DRIVING:
         return m.GoalOrder(*_driven(state), _NO_GOAL, False, state.plan)
     goal = state.home if state.homing and state.home else state.goals[state.step]
@@ -266,7 +267,7 @@ def goal_order(state: MissionState) -> m.GoalOrder:
 
 
 def status(state: MissionState) -> m.MissionStatus:
-    """Return what the operator sees."""
+    """Return the status message."""
     measured_lights = {light.light for light in state.lights}
     return m.MissionStatus(
         state.mission_id, state.name, state.phase, state.step, state.goals, state.step_times_s,
@@ -279,10 +280,9 @@ def status(state: MissionState) -> m.MissionStatus:
 
 
 def catch_up(state: MissionState, step: int, now: float) -> MissionState:
-    """Return the state at the step that planner or control are at, if that is a later goal.
+    """Return the state at the step of planner or control, if that is later.
 
-    The first of the steps made up for gets the time until now, the others none: when they ended is
-    not known any more.
+    The first missing step gets the time until now and the others 0, since their ends are unknown.
     """
     missing = step - state.step
     if state.phase not in ACTIVE or missing <= 0 or step >= len(state.goals):
@@ -301,7 +301,7 @@ def _objection(state: MissionState) -> str:
         f"{phase.value} after the last goal": phase in ACTIVE and state.step == goals,
         f"{times} step times at step {state.step}": times != state.step,
         f"{phase.value} without a mission": phase is not P.IDLE and not state.mission_id,
-        "a light is in it twice": len(set(names)) < len(names),
+        "a light occurs twice": len(set(names)) < len(names),
         "a number is not finite": not all(map(math.isfinite, numbers)),
     }
     return "; ".join(text for text, holds in wrong.items() if holds)

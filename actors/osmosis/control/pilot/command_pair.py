@@ -1,20 +1,19 @@
-"""Two computers of one command: who drives, and what, when they disagree. Pure.
+"""Selects between the commands of Osmosis Control and its hot standby. Pure.
 
-Osmosis Control drives. Its hot standby takes over in the moment in which the active one's command
-is unusable (refused) or late, and gives back when the active one has been good for a while: going
-back and forth with a source that stutters would help nobody.
+Osmosis Control drives. The standby takes over as soon as the active command is refused or late, and
+returns control after the active one has been good for a while, so that control does not alternate
+with an intermittent source.
 
-**Comparison.** Of two that differ nobody can say which is wrong, but it is known which is the safer
-in each component: the slower and the one that turns less. While they disagree the robot drives
-that, and slowly, so that in the time that detection and respawn take it cannot leave its lane,
-whoever is right. With a turn rate that is wrong by a constant, the healthy one turns more and more
-against the growing heading error, until *its* rate is the smaller: the loop stays closed.
-(Duplex with comparison, as in any textbook on fault-tolerant control; a third computer could vote,
-and would cost a third process.)
+**Comparison.** Two instances cannot show which one is wrong, but in each component the smaller
+value is the safer one. While they disagree the robot drives these values, and slowly, so that it
+cannot leave its lane until detection and restart are complete. If one turn rate has a constant
+error, the healthy instance turns more and more against the growing heading error, until *its* rate
+is the smaller one: the loop stays closed. (This is duplex with comparison; a third instance could
+vote, at the cost of a third process.)
 
-A disagreement counts when it has lasted: two processes tick at different moments, and in a swing
-of the turn rate that is a difference. When nobody is left to compare with, doubt ends after a
-while: the comparison's respawns have then had their chance (`FORGET_S`).
+A disagreement has to last, because the processes compute at different times, which shows while the
+turn rate changes. Without a partner for comparison the doubt ends after `FORGET_S`, in which the
+restarts had their chance.
 """
 
 from __future__ import annotations
@@ -25,40 +24,36 @@ Command = tuple[float, float]
 """Linear velocity, m/s, and turn rate, rad/s, of `base_link`."""
 
 FORGET_S = 5.0
-"""So long after the last comparison a doubt is over."""
+"""Time after the last comparison at which a doubt ends."""
 
-# When the standby drives, and when the two disagree.
 TAKEOVER_S = 0.2
-"""Age of the active one's command at which a fresher standby drives: four periods."""
+"""Age of the active command at which a fresher standby drives: four periods."""
 
 RETURN_S = 0.5
-"""How long the active one must have been good to drive again."""
+"""Time that the active command must have been good to drive again."""
 
 SETTLING_S = 1.5
-"""How long a respawned follower takes to accelerate from its zero: meanwhile the other drives, and
-a difference raises no new doubt."""
+"""Time that a restarted follower takes to accelerate; meanwhile the other one drives, and
+differences raise no new doubt."""
 
 LINEAR_MPS = 0.25
-"""Difference of speed that is none."""
+"""Tolerated difference of speeds."""
 
 ANGULAR_RADPS = 0.35
-"""Difference of turn rate that is none."""
+"""Tolerated difference of turn rates."""
 
 DOUBT_S = 0.15
-"""How long they must have differed."""
+"""Time of disagreement that raises a doubt."""
 
 REASSURED_S = 0.3
-"""How long they must have agreed again."""
+"""Time of agreement that ends a doubt."""
 
 CAUTION_MPS = 0.3
-"""Top speed while in doubt."""
+"""Top speed during a doubt."""
 
 
 class CommandPair:
-    """Remembers from when the active one is good again, and since when the two differ.
-
-    Times are simulated seconds. Commands that the gate refused are None.
-    """
+    """Selects one of two commands. Times are simulated seconds; refused commands are None."""
 
     def __init__(self) -> None:
         self._active: Command | None = None
@@ -74,13 +69,13 @@ class CommandPair:
 
     def active(self, command: Command | None, stamp_s: float, incarnation: int, now: float) -> None:
         """Take Osmosis Control's command, or None for a refused one."""
-        if self._is_reborn(0, incarnation):
+        if self._is_restarted(0, incarnation):
             self._good_from_s = self._settled_s = now + SETTLING_S
         elif command is None:
             self._good_from_s = math.inf
         elif self._good_from_s == math.inf or (
                 now - self._active_s > TAKEOVER_S and self._active_s > -math.inf):
-            # It makes good what was wrong or late; a first command has nothing to make good.
+            # A source that was wrong or late has to prove itself; a first command has not.
             self._good_from_s = now + RETURN_S
         self._active, self._active_s = command, max(stamp_s, self._active_s)
         self._compare(now)
@@ -88,13 +83,13 @@ class CommandPair:
     def standby(self, command: Command | None, stamp_s: float, incarnation: int, now: float
                 ) -> None:
         """Take the standby's command, or None for a refused one."""
-        if self._is_reborn(1, incarnation):
+        if self._is_restarted(1, incarnation):
             self._settled_s = now + SETTLING_S
         self._standby, self._standby_s = command, max(stamp_s, self._standby_s)
         self._compare(now)
 
-    def _is_reborn(self, who: int, incarnation: int) -> bool:
-        before, self._incarnations[who] = self._incarnations[who], incarnation
+    def _is_restarted(self, source: int, incarnation: int) -> bool:
+        before, self._incarnations[source] = self._incarnations[source], incarnation
         return 0 < before < incarnation
 
     def _compare(self, now: float) -> None:
@@ -113,16 +108,16 @@ class CommandPair:
             self._apart_since_s = math.inf
 
     def in_doubt(self, now: float) -> bool:
-        """Whether the two have differed for long enough, and have not agreed since."""
+        """Whether the two disagree."""
         return now - self._apart_since_s >= DOUBT_S and now - self._compared_s <= FORGET_S
 
     def choice(self, active: tuple[Command | None, str], standby: Command | None, now: float
                ) -> tuple[Command | None, str]:
-        """Return the command to execute with what is special about it; None with why not.
+        """Return the command to execute with a remark; None with the reason.
 
         Args:
-            active: the active one's command, or None and why it may not be executed.
-            standby: the standby's, or None.
+            active: the active command, or None with the reason.
+            standby: the standby's command, or None.
             now: now.
         """
         command, why = active
@@ -130,7 +125,7 @@ class CommandPair:
             return self._carefully(command, now) if command is not None else (None, why)
         late = now - self._active_s > TAKEOVER_S and self._standby_s > self._active_s
         if command is None or late or now < self._good_from_s:
-            reason = why or ("no fresh command" if late else "the other is not good for long yet")
+            reason = why or ("no fresh command" if late else "osmosis control has just recovered")
             standby, doubt = self._carefully(standby, now)
             return standby, f"standby drives: {reason}" + (f"; {doubt}" if doubt else "")
         if not self.in_doubt(now):
@@ -139,7 +134,7 @@ class CommandPair:
         return self._carefully(gentle, now)
 
     def _carefully(self, command: Command, now: float) -> tuple[Command, str]:
-        """Return a command no faster than caution allows, and why."""
+        """Return a command, slowed down during a doubt, and a remark."""
         if not self.in_doubt(now):
             return command, ""
         linear_mps = max(-CAUTION_MPS, min(CAUTION_MPS, command[0]))

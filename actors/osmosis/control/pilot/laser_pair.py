@@ -1,22 +1,18 @@
-"""Two lasers, one view: what either sees counts, and one that is wrong or silent is left out. Pure.
+"""Combines two lasers into one view, and excludes a wrong or silent laser. Pure.
 
-Each device is judged by its own reference measurement (`LaserCheck`), by what its sweeps cover
-(`LaserReach`) and by its age. While both can be believed, an obstacle that one of them misses is
-there all the same: where their rays are alike the shorter range counts, else all echoes do. Only
-when neither can be believed is there no view.
+Each laser is checked by its reference measurement (`LaserCheck`), its coverage (`LaserReach`) and
+its age. While both are trusted, an echo of either counts: the shorter range if their rays
+coincide, else all echoes. If neither is trusted there is no view.
 
-Its reference measurement says whether it measures right, once a sweep.
+A safety laser also measures a target inside its housing at a known distance, once a sweep. Real
+light never gives the same value twice. So a stuck device repeats the reference bit by bit, even
+where there is no echo, and an error of its time base or receiver shows in the reference.
+(IEC 61496-3 requires such self-monitoring; here the reader does it.)
 
-A safety laser measures, besides the world, a target inside its own housing at a known distance,
-and real light never gives the same number twice. So a device that repeats itself repeats the
-reference to the last bit, also where there is no echo in which one could see it; and one whose
-time base or receiver has an error shows it in the reference. (Self-monitoring of this kind is what
-IEC 61496-3 asks of such devices; here it is done by who depends on it.)
-
-A sweep that covers less than the robot's spec says is not believed either: where it does not look,
-or not that far, it shows nothing, and nothing looks like free space. A ray that means nothing
-(`rampart.actors.osmosis.readings`) does not look either. The other laser's ray takes its place;
-where neither knows anything in an angle wider than the spec's gap, there is no view.
+A sweep with less coverage than the robot's spec is not trusted either: a missing ray would look
+like free space. The same holds for invalid rays (`rampart.actors.osmosis.readings`): the other
+laser's ray replaces them. If neither laser has a valid ray within an angle wider than the spec's
+gap, there is no view.
 """
 
 from __future__ import annotations
@@ -35,33 +31,32 @@ from rampart.actors.osmosis.readings import ray_distances
 LOWER, UPPER = 0, 1
 
 NO_REFERENCE_M = -1.0
-"""What a device reports that has no reference target."""
+"""Reported by a device without a reference target."""
 
 REFERENCE_M = 0.1
 """Distance of the reference target."""
 
 TOLERANCE_M = 0.06
-"""A single measurement is farther off than this only if the device is wrong: six standard
-deviations of a healthy one, once in 10^9 sweeps."""
+"""Largest error of a healthy device: six standard deviations, exceeded once in 10^9 sweeps."""
 
 REPEATS = 4
-"""So many equal measurements in a row are no coincidence."""
+"""Consecutive equal measurements of a stuck device."""
 
 DISTRUST_S = 1.0
-"""After a wrong measurement the device is not believed for so long."""
+"""Time of exclusion after a wrong measurement."""
 
 _TOGETHER_S = 0.12
-"""Sweeps less apart than this make one view: two periods of a laser, and some delay."""
+"""Greatest time between the sweeps of a view: two periods of a laser and a delay."""
 
 
 class LaserReach(msgspec.Struct, frozen=True):
-    """What a sweep covers at least.
+    """Least coverage of a sweep.
 
     Args:
-        range_m: It shows everything up to this distance.
-        field_rad: In this angle, half of it on either side of straight ahead.
-        gap_rad: With rays no farther apart.
-        near_m: Nearer than this a laser has no echo: it would lie within the robot.
+        range_m: least range.
+        field_rad: field of view, half of it on either side of straight ahead.
+        gap_rad: greatest angle between rays.
+        near_m: least distance of an echo; a nearer one would lie within the robot.
     """
 
     range_m: float
@@ -71,27 +66,29 @@ class LaserReach(msgspec.Struct, frozen=True):
 
     @property
     def edge_rad(self) -> float:
-        """Angle to either side at which there has to be a ray, or beyond."""
+        """Least angle of the outermost ray on either side."""
         return (self.field_rad - self.gap_rad) / 2
 
     def lack(self, sweep: LaserScan) -> str:
-        """Return what a sweep does not cover, or an empty text."""
+        """Return what a sweep does not cover, or ""."""
         count, odd = divmod(len(sweep.ranges_f32), 4)
         first_rad, step_rad = sweep.angle_min_rad, sweep.angle_increment_rad
         last_rad = first_rad + (count - 1) * step_rad
         edge_rad = self.edge_rad
         if odd or not 0 < step_rad <= self.gap_rad:
-            return f"the laser's rays are {step_rad:.3g} rad apart, not up to {self.gap_rad:.3g}"
+            return (f"the laser's rays are {step_rad:.3g} rad apart, expected at most "
+                    f"{self.gap_rad:.3g} rad")
         if not (-math.pi <= first_rad <= -edge_rad and edge_rad <= last_rad <= math.pi):
-            return (f"the laser sweeps from {first_rad:.2f} to {last_rad:.2f} rad, not "
-                    f"{self.field_rad:.2f} rad around straight ahead")
+            return (f"the laser sweeps from {first_rad:.2f} to {last_rad:.2f} rad, "
+                    f"expected {self.field_rad:.2f} rad around straight ahead")
         if not self.range_m <= sweep.range_max_m < math.inf:
-            return f"the laser sees {sweep.range_max_m:.2f} m far, not {self.range_m:.2f} m"
+            return (f"the laser's range is {sweep.range_max_m:.2f} m, expected at least "
+                    f"{self.range_m:.2f} m")
         return ""
 
 
 class LaserCheck:
-    """Judges sweep by sweep whether the laser can be believed."""
+    """Checks the reference measurement of each sweep."""
 
     def __init__(self) -> None:
         self._last_m = math.nan
@@ -100,12 +97,12 @@ class LaserCheck:
         self._why = ""
 
     def fault(self, reference_m: float, stamp_s: float) -> str:
-        """Return why a sweep must not be believed, or an empty text.
+        """Return why a sweep is not trusted, or "".
 
         Args:
-            reference_m: Its reference measurement; `NO_REFERENCE_M` for a device that makes none,
-                which is believed unless it once made some.
-            stamp_s: When it was made, simulated seconds.
+            reference_m: reference measurement; `NO_REFERENCE_M` is trusted only from a device that
+                never had one.
+            stamp_s: time of the sweep, simulated seconds.
         """
         if reference_m == NO_REFERENCE_M and math.isnan(self._last_m):
             return ""
@@ -121,12 +118,12 @@ class LaserCheck:
 
 
 class LaserView(msgspec.Struct, frozen=True):
-    """What can be seen.
+    """The combined view.
 
     Attributes:
-        points: Echoes in `base_link`, shape (n, 2), m.
-        stamp_s: When they were measured, simulated seconds.
-        fault: Why they must not be believed, or an empty text.
+        points: echoes in `base_link`, shape (n, 2), m.
+        stamp_s: time of measurement, simulated seconds.
+        fault: why there is no trusted view, or "".
     """
 
     points: Array
@@ -135,10 +132,10 @@ class LaserView(msgspec.Struct, frozen=True):
 
 
 class LaserPair:
-    """Takes sweeps of either laser, gives the view. A robot with one laser gives only `LOWER`.
+    """Combines sweeps. A robot with one laser has only `LOWER`.
 
     Args:
-        reach: What each sweep has to cover.
+        reach: least coverage of a sweep.
     """
 
     def __init__(self, reach: LaserReach) -> None:
@@ -154,13 +151,13 @@ class LaserPair:
 
         Args:
             laser: `LOWER` or `UPPER`.
-            sweep: In `base_link`.
-            stamp_s: When it was measured. A sweep from the future, or with a stamp that is no
-                number, shows nothing: the view grows old.
-            now_s: Now.
+            sweep: in `base_link`.
+            stamp_s: time of measurement; a sweep with an invalid stamp or one in the future is
+                ignored, so that the view becomes stale.
+            now_s: now.
         """
         if not is_possible(stamp_s, now_s) or stamp_s < self._seen_s - _TOGETHER_S:
-            return None  # late: what the other one has seen since is worth more
+            return None  # late: the other laser has a newer sweep
         other = 1 - laser
         self._sweeps[laser] = sweep
         self._stamps_s[laser] = stamp_s
@@ -168,24 +165,24 @@ class LaserPair:
         self._faults[laser] = untrue or self._reach.lack(sweep)
         partner = self._partner(other, stamp_s)
         if self._faults[laser]:
-            # The other one gives the view, as it did; it will be heard as soon as this one.
+            # The other laser provides the view.
             return None if partner else LaserView(NO_POINTS, stamp_s, self._faults[laser])
         if laser == UPPER and partner:
-            return None  # the lower one's sweeps make the view: twice as often is of no use
+            return None  # the view is updated with the sweeps of the lower laser
         points, hole = _seen(self._reach, _rays(sweep), partner and _rays(partner))
         if not hole:
             self._seen_s = max(stamp_s, self._seen_s)
         return LaserView(points, stamp_s, hole)
 
     def _partner(self, laser: int, now_s: float) -> LaserScan | None:
-        """Return the last sweep of the other laser if it is of now and can be believed."""
+        """Return the last sweep of a laser if it is fresh and trusted."""
         if self._faults[laser] or abs(now_s - self._stamps_s[laser]) > _TOGETHER_S:
             return None
         return self._sweeps[laser]
 
 
 _Rays = tuple[float, float, float, bytes]
-"""Of a sweep all that says where echoes are: first angle, step, greatest range, ranges."""
+"""Geometry of a sweep: first angle, step, greatest range, ranges."""
 
 
 def _rays(sweep: LaserScan) -> _Rays:
@@ -194,16 +191,15 @@ def _rays(sweep: LaserScan) -> _Rays:
 
 @lru_cache(maxsize=8)
 def _seen(reach: LaserReach, sweep: _Rays, partner: _Rays | None) -> tuple[Array, str]:
-    """Return the echoes of one sweep or two, and where nothing is known, or an empty text.
+    """Return the echoes of one or two sweeps, and a fault or "".
 
-    The array is read-only: sweeps that come again, as those without any echo do all the time,
-    get the same one.
+    Repeated sweeps, such as those without an echo, share the cached, read-only array.
     """
     looks = [(_distances(reach, sweep), *sweep[:2])]
     if partner is not None and partner != sweep:
         other = _distances(reach, partner)
         if sweep[:3] == partner[:3] and len(other) == len(looks[0][0]):
-            looks = [(np.fmin(looks[0][0], other), *sweep[:2])]  # of a number and NaN the number
+            looks = [(np.fmin(looks[0][0], other), *sweep[:2])]  # ignores NaN
         else:
             looks.append((other, *partner[:2]))
     if hole := _hole(reach, looks):
@@ -225,10 +221,10 @@ def _distances(reach: LaserReach, rays: _Rays) -> Array:
 
 
 def _hole(reach: LaserReach, looks: list[tuple[Array, float, float]]) -> str:
-    """Return in which angle, wider than the reach allows, nothing is known; else an empty text."""
+    """Return an angle without a valid ray that is wider than the gap, or ""."""
     unknown = [np.isnan(distances) for distances, *_ in looks]
     if not all(nothing.any() for nothing in unknown):
-        return ""  # one sweep is whole, as nearly always
+        return ""  # one sweep is complete
     known = np.sort(np.concatenate([
         first_rad + step_rad * np.flatnonzero(~nothing)
         for nothing, (_, first_rad, step_rad) in zip(unknown, looks, strict=True)]))
@@ -238,5 +234,5 @@ def _hole(reach: LaserReach, looks: list[tuple[Array, float, float]]) -> str:
     if not wide.any():
         return ""
     first = int(np.argmax(wide))
-    return (f"the laser's ranges mean nothing between {max(ends[first], -math.pi):.2f} and "
+    return (f"the laser has no valid range between {max(ends[first], -math.pi):.2f} and "
             f"{min(ends[first + 1], math.pi):.2f} rad")

@@ -1,22 +1,19 @@
-"""Core of the Safety Pilot: the last gate between anybody's command and the wheels.
+"""Core of the Safety Pilot: the gate between all commands and the base. Pure.
 
-Whatever reaches the base was decided here, from what is known now: the recovery modules' orders,
-the manager's sign of life, the operator's stick, the last good command, the last scan. The gate
-never trusts its inputs to be there: each has an age, and what is too old counts against motion.
+Each output depends on the recovery modules' orders, the manager's status, the joystick, the last
+valid command and the last scan. Each input has an age, and a stale input stops the robot.
 
-The strictest engaged order wins: stop > teleoperation > auto. A fresh joystick pre-empts auto.
+The strictest engaged order applies: stop > teleoperation > auto. A fresh joystick pre-empts auto.
 
-A stick counts if it was taken in hand after the last stop: after an order to stop, a brake, a base
-that had braked by itself, silence of the manager or of the lasers, and the start of this process.
-One that was held before stands the robot until it is let go: nothing that was asked for during a
-stop is done when the stop ends. The stick's message says since when it is held, so that neither a
-lost message nor a restart of anybody is taken for letting go.
+The joystick drives only if the operator pressed its dead man after the last stop: an order to stop,
+a brake, the base's dead man, silence of manager or lasers, or the start of this process. If it was
+held before, the robot stands until it is released, so that no input from the time of a stop acts
+when the stop ends. The message contains the time of the press, so neither a lost message nor a
+restarted process counts as a release.
 
-In auto there may be two computers of the command, Osmosis Control and its standby; which of them
-drives, and what they drive when they disagree, is
-`rampart.actors.osmosis.control.pilot.command_pair`. In the paper's unprotected baseline (`Checks`
-all off) only three things are left: the last command is kept and repeated, obstacles stop the
-robot, the joystick pre-empts.
+In auto, `command_pair` selects between Osmosis Control and its standby. In the paper's unprotected
+baseline (`Checks` all off) three functions remain: the last command is repeated, obstacles stop the
+robot, and the joystick pre-empts.
 """
 
 from __future__ import annotations
@@ -36,34 +33,33 @@ from rampart.actors.osmosis.messages import PilotMode, PilotOrder, StickTwist, T
 from rampart.manager.arbitration.silence import Silence
 
 STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
-"""Modes from the most permissive to the strictest; declared here, once."""
+"""Modes from the most permissive to the strictest."""
 
 _STANDING_MPS = 1e-3
-"""What a computer of the command may round to."""
+"""Rounding of a standstill."""
 
 _SOURCES = 64
-"""Of commands, of which the newest one's place in the sequence is remembered."""
+"""Number of command sources whose newest sequence number is stored."""
 
 _RENEWED_S = 0.35
-"""Age at which an order that bounds the way is none: it stops the robot."""
+"""Age at which an order with a `way` becomes an order to stop."""
 
 _WAY_TURN_RADPS = 0.5
-"""Largest turn rate while an order bounds the way."""
+"""Largest turn rate during an order with a `way`."""
 
-HELD_TOO_LONG = "the joystick was held during a stop: let go of it first"
-"""Why a stick has no effect that was taken in hand before the last stop ended."""
+HELD_TOO_LONG = "the joystick was held during a stop: release it first"
 
 _SLOWED = 0.999
-"""Below this share of the command the reason says that obstacles slow the robot."""
+"""Share of the command below which the reason names the obstacle."""
 
 
 class Checks(msgspec.Struct, frozen=True):
-    """Which checks are in force; the system spec's layers switch them.
+    """Enabled checks; the system spec's layers set them.
 
     Args:
-        inputs: refuse commands that are beyond the limits, stale, or older than one already
-            taken, and stop without a fresh scan.
-        manager: stop without the manager's sign of life.
+        inputs: refuse commands that exceed the limits, are stale or out of sequence, and stop
+            without a fresh scan.
+        manager: stop while the manager is silent.
     """
 
     inputs: bool = True
@@ -71,21 +67,20 @@ class Checks(msgspec.Struct, frozen=True):
 
 
 class GateLimits(msgspec.Struct, frozen=True):
-    """Bounds and ages.
+    """Bounds and timeouts.
 
     Args:
         max_linear_mps: largest speed, either direction.
         max_angular_radps: largest turn rate, either direction.
-        reverse_mps: largest speed backwards, where no laser looks; only the joystick drives there.
-        command_timeout_s: age at which a command is stale.
-        scan_timeout_s: age at which a scan is.
-        joystick_timeout_s: silence after which the stick counts as released.
-        manager_timeout_s: silence after which the manager counts as dead, over all its
-            incarnations; see `Silence`.
-        settling_s: a gate that has just started (perhaps again) knows no orders yet; it lets
-            nothing pass before each recovery module has had time to repeat its own.
+        reverse_mps: largest speed backwards, where there is no laser; for the joystick only.
+        command_timeout_s: age of a stale command.
+        scan_timeout_s: age of a stale scan.
+        joystick_timeout_s: silence after which the joystick counts as released.
+        manager_timeout_s: silence of the manager that stops the robot, over all its incarnations;
+            see `Silence`.
+        settling_s: time after the start in which nothing passes, until each recovery module has
+            repeated its order.
         room: distances of the obstacle stop.
-        pair: who drives when there is a standby.
     """
 
     max_linear_mps: float = 1.0
@@ -100,7 +95,7 @@ class GateLimits(msgspec.Struct, frozen=True):
 
 
 class GateOutput(msgspec.Struct, frozen=True, gc=False):
-    """What goes to the base. `stopped`: the gate, not the command, keeps the robot standing."""
+    """Output to the base. `stopped`: the gate stops the robot, and not the command."""
 
     linear_mps: float
     angular_radps: float
@@ -110,7 +105,7 @@ class GateOutput(msgspec.Struct, frozen=True, gc=False):
 
 
 class _Line(msgspec.Struct):
-    """State of one command source: auto, its standby, or joystick."""
+    """State of a command source: auto, standby or joystick."""
 
     twist: tuple[float, float] | None = None
     stamp_s: float = -math.inf
@@ -121,17 +116,17 @@ class _Line(msgspec.Struct):
 
 
 class SafetyGate:
-    """Collects inputs, answers `output(now)`. All times in simulated seconds.
+    """Takes the inputs and gives `output(now)`. Times are simulated seconds.
 
     Args:
-        limits: bounds and ages.
-        checks: which of them are in force.
+        limits: bounds and timeouts.
+        checks: enabled checks.
         started_s: now.
-        recoveries: names of the modules that may give orders; others are obeyed, and named.
+        recoveries: modules that may give orders; orders of others apply too and are reported.
 
     Attributes:
-        orders: what is ordered now, by whom.
-        refused: how many commands were refused.
+        orders: engaged orders by module.
+        refused: number of refused commands.
     """
 
     def __init__(self, limits: GateLimits, checks: Checks, started_s: float,
@@ -140,7 +135,7 @@ class SafetyGate:
         self._checks = checks
         self._started_s = started_s
         self.orders: Holders[PilotOrder] = Holders(recoveries, PilotOrder(
-            True, PilotMode.STOP, "too many unknown modules order something"))
+            True, PilotMode.STOP, "orders of too many unknown modules"))
         self._ordered_s: dict[str, float] = {}
         self._auto = _Line()
         self._standby = _Line()
@@ -155,12 +150,12 @@ class SafetyGate:
         self.refused = 0
 
     def order(self, recovery: str, order: PilotOrder, stamp_s: float = math.inf) -> None:
-        """Take note of a recovery module's order; it is in force until that module ends it.
+        """Take an order of a recovery module, which applies until the module ends it.
 
         Args:
             recovery: name of the module.
-            order: what it orders.
-            stamp_s: when, which counts for an order that bounds the way.
+            order: the order.
+            stamp_s: time of the order; an order with a `way` has to be renewed.
         """
         self._ordered_s.pop(recovery, None)
         if order.engaged:
@@ -171,7 +166,7 @@ class SafetyGate:
             self.orders.let_go(recovery)
 
     def _expire(self, now: float) -> None:
-        """Turn orders that bound the way and were not renewed into orders to stop."""
+        """Turn orders with a `way` that were not renewed into orders to stop."""
         for recovery, stamp_s in list(self._ordered_s.items()):
             if not now - stamp_s <= _RENEWED_S:
                 del self._ordered_s[recovery]
@@ -180,49 +175,49 @@ class SafetyGate:
                         True, PilotMode.STOP, "the way out is not renewed")
 
     def manager_alive(self, stamp_s: float, incarnation: int) -> None:
-        """Take note of the manager's status, true at `stamp_s`; see `Silence`."""
+        """Take the time of the manager's status; see `Silence`."""
         self._manager = self._manager.heard(stamp_s, incarnation)
 
     def braked(self, stamp_s: float) -> None:
-        """Take note that the base braked at `stamp_s`, by order or by its dead man."""
+        """Take the time at which the base braked, by order or by its dead man."""
         self._stopped_s = max(self._stopped_s, stamp_s)
 
     def scan(self, points: Array, stamp_s: float, fault: str = "") -> None:
-        """Take a scan: echoes in `base_link`, shape (n, 2), and when it was measured.
+        """Take a scan: echoes in `base_link`, shape (n, 2), and the time of measurement.
 
-        One that must not be believed (`fault` says why) is as good as none.
+        A scan with a `fault` counts as missing.
         """
         self._points, self._scan_s, self._scan_fault = points, stamp_s, fault
 
     def command(self, command: Twist, header: Header, now: float) -> str:
-        """Offer Osmosis Control's command; return why it was refused, or ""."""
+        """Take Osmosis Control's command; return why it was refused, or ""."""
         refused = self._take(self._auto, command, header, now)
         if self._standby.twist is not None:
             self._pair.active(*self._offer(self._auto, now), header.incarnation, now)
         return refused
 
     def standby(self, command: Twist, header: Header, now: float) -> str:
-        """Offer the command of Osmosis Control's standby; return why it was refused, or ""."""
+        """Take the standby's command; return why it was refused, or ""."""
         refused = self._take(self._standby, command, header, now)
         self._pair.standby(*self._offer(self._standby, now), header.incarnation, now)
         return refused
 
     def standby_drives(self, now: float) -> bool:
-        """Whether the standby's command is the one to execute now, or has a say in it."""
+        """Whether the standby's command affects the output now."""
         stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
         return not stick and bool(self._wanted(stick, now)[1])
 
     def _held_too_long(self, now: float) -> bool:
-        """Whether a stick is held since before the last stop has ended."""
+        """Whether the joystick is held since before the end of the last stop."""
         heard = now - self._stick.heard_s <= self._limits.joystick_timeout_s
         return heard and not self._stopped_s < self._stick_since_s <= now + AHEAD_S
 
     def _offer(self, line: _Line, now: float) -> tuple[tuple[float, float] | None, float]:
-        """Return what a line has to offer to the pair, and from when it is."""
+        """Return the usable command of a source and its time."""
         return self._usable(line, now)[0], line.stamp_s
 
     def joystick(self, command: StickTwist, header: Header, now: float) -> str:
-        """Offer Teleoperation's command; return why it was refused, or ""."""
+        """Take Teleoperation's command; return why it was refused, or ""."""
         refused = self._take(self._stick, command, header, now)
         if not refused:
             self._stick_since_s = command.held_since_s
@@ -233,7 +228,7 @@ class SafetyGate:
         if self._checks.inputs:
             newest = line.newest.get(header.source)
             if newest is not None and position <= newest:
-                # The newer one that was taken before stays valid.
+                # The newer command stays valid.
                 self.refused += 1
                 return (f"command {header.source}:{position[0]}/{position[1]} is out of sequence,"
                         f" newest is {newest[0]}/{newest[1]}")
@@ -242,7 +237,7 @@ class SafetyGate:
         backwards = line is not self._stick and command.linear_mps < -_STANDING_MPS
         if backwards and self._checks.inputs and not line.fault:
             line.fault = (f"command of {command.linear_mps:.2f} m/s is backwards, "
-                          "where no laser looks")
+                          "where there is no laser")
         if line.fault:
             self.refused += 1
             if self._checks.inputs:
@@ -257,14 +252,14 @@ class SafetyGate:
         linear, angular = command.linear_mps, command.angular_radps
         limits = self._limits
         if not (math.isfinite(linear) and math.isfinite(angular)):
-            # Also in the baseline: no base can execute it, the last command goes on instead.
+            # Also in the baseline: the base cannot execute it, and the last command stays.
             return f"command ({linear}, {angular}) is not finite"
         if self._checks.inputs:
             slack = 1.0 + 1e-6
             if abs(linear) > limits.max_linear_mps * slack:
-                return f"command of {linear:.2f} m/s is beyond {limits.max_linear_mps:.2f} m/s"
+                return f"command of {linear:.2f} m/s exceeds {limits.max_linear_mps:.2f} m/s"
             if abs(angular) > limits.max_angular_radps * slack:
-                return (f"command of {angular:.2f} rad/s is beyond"
+                return (f"command of {angular:.2f} rad/s exceeds"
                         f" {limits.max_angular_radps:.2f} rad/s")
             if not age_s <= limits.command_timeout_s:
                 return f"command is {age_s:.2f} s old, limit {limits.command_timeout_s:.2f} s"
@@ -274,13 +269,13 @@ class SafetyGate:
 
     @property
     def mode(self) -> PilotMode:
-        """The strictest engaged order's mode, auto without any."""
+        """Mode of the strictest engaged order; auto without orders."""
         if not self.orders:
             return PilotMode.AUTO
         return max((order.mode for order in self.orders.values()), key=STRICTNESS.index)
 
     def output(self, now: float) -> GateOutput:
-        """Return what the base is to do now."""
+        """Return the output to the base."""
         self._expire(now)
         mode = self.mode
         reason = self._stop(now)
@@ -308,40 +303,41 @@ class SafetyGate:
 
     @property
     def top_speed_mps(self) -> float:
-        """The lowest speed that an order in force allows at most; 0 or nonsense bounds nothing."""
+        """Lowest speed limit of the engaged orders; 0 without a valid one."""
         return min((order.top_speed_mps for order in self.orders.values()
                     if order.top_speed_mps > 0), default=0.0)
 
     def _bounded(self, wanted: tuple[float, float], passing: str
                  ) -> tuple[tuple[float, float], str]:
-        """Return a command no faster than orders and eyes allow; the turn rate is kept."""
+        """Limit a command by orders and the missing view to the rear; return it with a remark."""
         top_mps, reverse_mps = self.top_speed_mps, self._limits.reverse_mps
         ways = {order.way for order in self.orders.values()} - {Way.ANY}
         if ways:
             along = Way.FORWARDS if wanted[0] > 0 else Way.BACKWARDS
             linear = wanted[0] if ways == {along} else 0.0
             turn = min(max(wanted[1], -_WAY_TURN_RADPS), _WAY_TURN_RADPS)
-            passing = passing or ("" if (linear, turn) == wanted else "the way out only, slowly")
+            passing = passing or ("" if (linear, turn) == wanted else "only the way out, slowly")
             wanted = (linear, turn)
         if self._checks.inputs and wanted[0] < -reverse_mps:
-            wanted, passing = (-reverse_mps, wanted[1]), passing or "slowly: no laser looks back"
+            wanted, passing = (-reverse_mps, wanted[1]), passing or "slowly: no laser to the rear"
         if not top_mps or abs(wanted[0]) <= top_mps:
             return wanted, passing
-        return (math.copysign(top_mps, wanted[0]), wanted[1]), passing or "speed bounded by order"
+        limited_mps = math.copysign(top_mps, wanted[0])
+        return (limited_mps, wanted[1]), passing or "speed limited by an order"
 
     def _wanted(self, stick: bool, now: float) -> tuple[tuple[float, float] | None, str]:
-        """Return the command to execute and what is special about it, or None and why not."""
+        """Return the command to execute with a remark; None with the reason."""
         active = self._usable(self._stick if stick else self._auto, now)
         if stick or self._standby.twist is None:
             return active
         return self._pair.choice(active, self._usable(self._standby, now)[0], now)
 
     def forbidden(self, now: float) -> str:
-        """Return why nothing may drive now, not even the joystick, or ""."""
+        """Return why not even the joystick may drive now, or ""."""
         return self._stop(now) or (HELD_TOO_LONG if self._held_too_long(now) else "")
 
     def _stop(self, now: float) -> str:
-        """Return what stops the robot, whoever wants to drive, or ""."""
+        """Return what stops the robot regardless of the source of the command, or ""."""
         limits = self._limits
         if self.mode is PilotMode.STOP:
             return self._why(PilotMode.STOP) or "ordered to stop"
@@ -354,11 +350,11 @@ class SafetyGate:
             if self._scan_fault:
                 return self._scan_fault
             if not -AHEAD_S <= now - self._scan_s <= limits.scan_timeout_s:
-                return "no fresh laser scan"  # nor is one with a stamp from the future, or none
+                return "no fresh laser scan"
         return ""
 
     def _usable(self, line: _Line, now: float) -> tuple[tuple[float, float] | None, str]:
-        """Return a line's last command; None with the reason if it may not be executed."""
+        """Return the last command of a source; None with the reason if it is unusable."""
         if self._checks.inputs and line.fault:
             return None, line.fault
         late = now - line.stamp_s > self._limits.command_timeout_s
@@ -367,6 +363,6 @@ class SafetyGate:
         return line.twist, ""
 
     def _why(self, mode: PilotMode) -> str:
-        """The reasons of the orders for a mode."""
+        """Return the reasons of the orders for a mode."""
         named = sorted(self.orders.items())
         return "; ".join(f"{name}: {order.reason}" for name, order in named if order.mode is mode)

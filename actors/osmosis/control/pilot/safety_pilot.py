@@ -1,4 +1,4 @@
-"""Safety Pilot: the last gate before the base."""
+"""Safety Pilot: the gate before the base."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _PERIOD_S = 0.05
 class SafetyPilot(Actor):
     """Wires `SafetyGate` to its topics.
 
-    A command and an order act at once; the timer repeats what is in force, so that the base's
-    dead man is fed and everything that expires does.
+    Commands and orders act at once. The timer repeats the output for the base's dead man, and
+    applies timeouts.
     """
 
     outputs = (topics.BASE_COMMAND, topics.PILOT_STATUS, ftm_topics.HOLDS)
@@ -42,27 +42,27 @@ class SafetyPilot(Actor):
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, header: Header) -> None:
-        """Offer Osmosis Control's command to the gate and act on the answer at once."""
-        self._note(self._gate.command(message, header, self.clock.now()), header)
+        """Pass Osmosis Control's command to the gate and act."""
+        self._report_refusal(self._gate.command(message, header, self.clock.now()), header)
         self._act()
 
     @on(topics.STANDBY_COMMAND)
     def standby(self, message: m.Twist, header: Header) -> None:
-        """Offer the standby's command; act at once if it drives, else the active one's do."""
+        """Pass the standby's command to the gate; act only if it affects the output."""
         now = self.clock.now()
-        self._note(self._gate.standby(message, header, now), header)
+        self._report_refusal(self._gate.standby(message, header, now), header)
         if self._gate.standby_drives(now):
             self._act()
 
     @on(topics.TELEOP_COMMAND)
     def joystick(self, message: m.StickTwist, header: Header) -> None:
-        """Offer the operator's command to the gate and act on the answer at once."""
-        self._note(self._gate.joystick(message, header, self.clock.now()), header)
+        """Pass the operator's command to the gate and act."""
+        self._report_refusal(self._gate.joystick(message, header, self.clock.now()), header)
         self._act()
 
     @on(topics.BASE_STATUS)
     def base(self, message: m.BaseStatus, header: Header) -> None:
-        """See whether the base brakes by itself, or is made to past this node."""
+        """Take whether the base brakes, by its dead man or by an order past this node."""
         if message.brake_engaged or message.dead_man_tripped:
             self._gate.braked(min(header.stamp, self.clock.now()))
             if not self._last.stopped and self._gate.forbidden(self.clock.now()):
@@ -70,61 +70,62 @@ class SafetyPilot(Actor):
 
     @on(topics.SCAN)
     def scan(self, message: m.LaserScan, header: Header) -> None:
-        """Keep what can be seen; if nothing can be believed the robot stops."""
+        """Update the view; without a trusted view the robot stops."""
         self._see(LOWER, message, header)
 
     @on(topics.UPPER_SCAN)
     def upper_scan(self, message: m.LaserScan, header: Header) -> None:
-        """Keep what the second laser sees, on a robot that has one."""
+        """Update the view by the second laser, if the robot has one."""
         self._see(UPPER, message, header)
 
     @on(topics.PILOT_ORDER)
     def order(self, message: m.PilotOrder, header: Header) -> None:
-        """Obey a recovery module, and others as well; a change acts at once."""
+        """Take an order, of unknown modules too, and act on a change."""
         self._gate.order(header.source, message, min(header.stamp, self.clock.now()))
         if message.engaged and header.source not in self._recoveries:
-            self.report_diagnostic("pilot order", f"given by {header.source!r}, no recovery module "
-                                   "of this system; rampart reset ends it", header.source)
-        self._follow()
+            self.report_diagnostic("pilot order", f"given by {header.source!r}, which is not a "
+                                   "recovery module of this system; rampart reset ends it",
+                                   header.source)
+        self._act_on_orders()
 
     @on(ftm_topics.RESET)
     def reset(self, message: Reset, _header: Header) -> None:
-        """End the order of one that is no recovery module of the system."""
+        """End the order of a module that is not a recovery module of the system."""
         if self._gate.orders.reset(message.recovery):
-            self._follow()
+            self._act_on_orders()
 
-    def _follow(self) -> None:
-        """Act on orders that are others than before."""
+    def _act_on_orders(self) -> None:
+        """Act if the orders have changed."""
         gate, ordered, unknown = self._gate, self._ordered, self._unknown
         self._ordered, self._unknown = (gate.mode, gate.top_speed_mps), gate.orders.unknown
         if self._ordered != ordered:
             self._act()
-            self._tell()
+            self._publish_status()
         if self._unknown != unknown:
-            self._tell_holds()
+            self._publish_holds()
 
-    def _tell_holds(self) -> None:
-        """Tell who orders something and should not."""
+    def _publish_holds(self) -> None:
+        """Publish the modules that order something and should not."""
         self.publish(ftm_topics.HOLDS, Holds("pilot", self._gate.orders.unknown))
 
     @on(ftm_topics.MANAGER_STATUS)
     def manager(self, _message: ManagerStatus, header: Header) -> None:
-        """Hear that the manager lived when it said so: old news is as good as none."""
+        """Take the time of the manager's status."""
         self._gate.manager_alive(min(header.stamp, self.clock.now()), header.incarnation)
 
     @every(_PERIOD_S)
     def repeat(self) -> None:
-        """Repeat the command in force, unless fresh ones go out at this rate anyway."""
+        """Repeat the output, unless fresh commands cause it at this rate anyway."""
         self.read_postings()
         if self.clock.now() - self._sent_s > 1.2 * _PERIOD_S:
             self._act()
 
     @every(0.2)
     def repeat_status(self) -> None:
-        """Repeat the status for whoever joined late."""
-        self._tell()
+        """Repeat the status."""
+        self._publish_status()
         if self._gate.orders.unknown:
-            self._tell_holds()
+            self._publish_holds()
 
     def _see(self, laser: int, message: m.LaserScan, header: Header) -> None:
         view = self._lasers.take(laser, message, header.stamp, self.clock.now())
@@ -143,14 +144,14 @@ class SafetyPilot(Actor):
             topics.BASE_COMMAND, m.BaseCommand(self._last.linear_mps, self._last.angular_radps))
         shown = (before.mode, before.stopped, before.reason)
         if shown != (self._last.mode, self._last.stopped, self._last.reason):
-            self._tell()
+            self._publish_status()
 
-    def _tell(self) -> None:
+    def _publish_status(self) -> None:
         last = self._last
         self.publish(topics.PILOT_STATUS, m.PilotStatus(
             last.mode, last.stopped, clip(last.reason), self._gate.refused,
             self._gate.top_speed_mps, clip(self._gate.forbidden(self.clock.now()))))
 
-    def _note(self, refused: str, header: Header) -> None:
+    def _report_refusal(self, refused: str, header: Header) -> None:
         if refused:
             self.report_diagnostic("command refused", refused, header.source)

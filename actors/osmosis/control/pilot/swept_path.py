@@ -1,10 +1,10 @@
-"""Swept path: how fast may the robot go along a commanded arc without touching what it sees?
+"""Swept path: the highest speed along a commanded arc without touching an echo.
 
-The footprint is moved along the arc over the stopping distance of the speed. An echo is in the
-way if the hull comes nearer to it than the margin *and* nearer than it is now: so what already
-stands close beside or behind never forbids to move away. Slower needs less room, hence the speed
-is reduced to the highest that fits rather than cut to zero; the turn rate is kept as long as
-turning is safe, so that in front of an obstacle the robot can still turn away.
+The footprint is moved along the arc over the stopping distance of the speed. An echo blocks if the
+hull comes nearer to it than the margin *and* nearer than it is now, so a close echo beside or
+behind the robot never prevents it from moving away. A lower speed needs less room, so the speed is
+reduced to the highest that fits. The turn rate is kept while turning is safe, so that the robot can
+turn away in front of an obstacle.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ import numpy as np
 from rampart.actors.osmosis.control.polyline import Array, Hull
 
 _NEARER_M = 0.01
-"""Laser noise: a smaller approach is none."""
+"""Smaller approaches are laser noise."""
 
 _CRAWL_MPS = 0.08
-"""Slowed down below this the robot stands, else it would twitch with the laser's noise."""
+"""Below this speed the robot stops, since it would jerk with the laser's noise."""
 
 
 class StoppingRoom(msgspec.Struct, frozen=True):
-    """Room that has to be free for a speed.
+    """Free room that a speed requires.
 
     Args:
         hull: footprint.
-        top_speed_mps: speed for which the two distances below hold.
-        stop_distance_m: free distance ahead of the hull needed at top speed; if braking needs
-            more than this, braking decides.
-        lateral_distance_m: free distance beside the hull needed at top speed.
-        deceleration_mps2: braking that is certain.
-        reaction_s: from the scan to the wheels braking.
-        margin_m: what is left ahead when the robot stands.
-        touch_m: what is left beside the hull at any speed.
-        angular_deceleration_radps2: braking of a turn.
+        top_speed_mps: speed at which the two distances below hold.
+        stop_distance_m: free distance ahead of the hull at top speed; the braking distance applies
+            if it is larger.
+        lateral_distance_m: free distance beside the hull at top speed.
+        deceleration_mps2: guaranteed deceleration.
+        reaction_s: time from the scan until the wheels brake.
+        margin_m: distance ahead of the hull after a stop.
+        touch_m: distance beside the hull at any speed.
+        angular_deceleration_radps2: deceleration of a turn.
     """
 
     hull: Hull = Hull()
@@ -50,7 +50,7 @@ class StoppingRoom(msgspec.Struct, frozen=True):
     angular_deceleration_radps2: float = 4.0
 
     def ahead_m(self, speed_mps: float) -> float:
-        """Free distance ahead of the hull that a speed needs."""
+        """Return the free distance ahead of the hull that a speed requires."""
         top = self.top_speed_mps
         spare = self.stop_distance_m - self.margin_m - top**2 / (2 * self.deceleration_mps2)
         reaction_s = max(self.reaction_s, spare / top)
@@ -58,24 +58,24 @@ class StoppingRoom(msgspec.Struct, frozen=True):
         return self.margin_m + abs(speed_mps) * reaction_s + braking_m
 
     def beside_m(self, speed_mps: float) -> float:
-        """Free distance beside the hull that a speed needs; it grows with the speed."""
+        """Return the free distance beside the hull that a speed requires."""
         share = min(abs(speed_mps) / self.top_speed_mps, 1.0)
         return self.touch_m + max(self.lateral_distance_m - self.touch_m, 0.0) * share
 
     def turn_rad(self, rate_radps: float) -> float:
-        """Angle turned until a turn rate is braked."""
+        """Return the angle turned until a turn has stopped."""
         stopping_s = self.reaction_s + abs(rate_radps) / (2 * self.angular_deceleration_radps2)
         return abs(rate_radps) * stopping_s
 
 
 def is_free(linear_mps: float, angular_radps: float, points: Array, room: StoppingRoom) -> bool:
-    """Whether the robot may move like this for now.
+    """Whether the robot may execute a command.
 
     Args:
         linear_mps: forward speed, negative backwards.
         angular_radps: turn rate.
         points: laser echoes in `base_link`, shape (n, 2).
-        room: what has to be free.
+        room: required room.
     """
     if abs(linear_mps) < 1e-6:
         linear_mps = 0.0
@@ -96,7 +96,7 @@ def is_free(linear_mps: float, angular_radps: float, points: Array, room: Stoppi
 
 def _arc(linear_mps: float, angular_radps: float, path_m: float,
          room: StoppingRoom) -> tuple[Array, Array, Array]:
-    """Poses along the arc in `base_link`; it straightens once the turn could have been braked."""
+    """Return poses along the arc in `base_link`; it is straight where the turn has stopped."""
     turn_rad = math.copysign(room.turn_rad(angular_radps), angular_radps)
     if path_m == 0.0:
         yaw = np.linspace(0.0, turn_rad, 9)
@@ -115,9 +115,9 @@ def _arc(linear_mps: float, angular_radps: float, path_m: float,
 
 def limited(linear_mps: float, angular_radps: float, points: Array,
             room: StoppingRoom) -> tuple[float, float]:
-    """Return the command, slowed down as far as the echoes ask for; zero if nothing is free.
+    """Return the command with the highest safe speed; zero if no motion is safe.
 
-    Steps are a twentieth of the commanded speed. Turning is slowed after that, and given up last.
+    The speed is reduced in steps of a twentieth, then the turn rate.
     """
     if is_free(linear_mps, angular_radps, points, room):
         return linear_mps, angular_radps

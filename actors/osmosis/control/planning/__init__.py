@@ -1,1 +1,1 @@
-"""The Graph Planner: ways through the airport, round what is closed."""
+"""The Graph Planner: routes over the airport's graph, around closures."""

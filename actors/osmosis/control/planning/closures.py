@@ -1,8 +1,8 @@
-"""Closures: stretches of the airport's graph that are blocked for a while, and the graph without.
+"""Closures: parts of the airport's graph that are blocked for a while.
 
-An edge that passes a blocked place is not closed from end to end. Only the stretch within
-`gap_m` of the place is cut out, so that the robot, which stands in front of the place on that very
-edge, still stands on the graph, and a goal behind it can still be reached from the other side.
+Of an edge that passes a blocked place only the part within `gap_m` of the place is removed. So the
+robot in front of the place stays on the graph, and a goal behind it can be reached from the other
+side.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from rampart.actors.osmosis.airport.model import Point
 from rampart.actors.osmosis.control.planning.route_search import Edge
 
 MOST_PLACES = 32
-"""That are closed at a time; with one more, the one closed first is tried again."""
+"""Most closed places; a further one reopens the oldest."""
 
 _LEAST_STUB_M = 0.05
-"""A shorter rest of an edge is none."""
+"""Least length of the remainder of an edge."""
 
 
 class Closures(msgspec.Struct):
-    """The places that are blocked, each until it is tried again.
+    """Blocked places, each for a limited time.
 
     Args:
-        gap_m: how far round a place the graph is closed.
-        lasts_s: how long a place stays closed.
+        gap_m: radius of a closure.
+        lasts_s: duration of a closure.
     """
 
     gap_m: float = 1.0
@@ -37,7 +37,7 @@ class Closures(msgspec.Struct):
     _until_s: dict[Point, float] = msgspec.field(default_factory=lambda: Remembered(MOST_PLACES))
 
     def close(self, place: Point, now_s: float) -> None:
-        """Close the graph round a place in `map`; one near it that was closed before is renewed."""
+        """Close the graph around a place in `map`, or renew the closure of a place near it."""
         for known in self._until_s:
             if math.dist(known, place) <= self.gap_m:
                 self._until_s[known] = now_s + self.lasts_s
@@ -45,11 +45,11 @@ class Closures(msgspec.Struct):
         self._until_s[place] = now_s + self.lasts_s
 
     def reopen(self) -> None:
-        """Open everything: with it there is no way at all."""
+        """Remove all closures."""
         self._until_s.clear()
 
     def closed(self, now_s: float) -> tuple[Point, ...]:
-        """Return the places that are closed now."""
+        """Return the places closed now."""
         for place in [p for p, until_s in self._until_s.items() if until_s <= now_s]:
             del self._until_s[place]
         return tuple(self._until_s)
@@ -57,10 +57,9 @@ class Closures(msgspec.Struct):
 
 def without(nodes: Mapping[str, Point], edges: Iterable[Edge], places: Iterable[Point],
             gap_m: float) -> tuple[dict[str, Point], list[Edge]]:
-    """Return the graph without what lies within `gap_m` of the places.
+    """Return the graph without the parts within `gap_m` of the places.
 
-    The rests of an edge that is cut end in nodes of their own, named after the edge. No name of an
-    airport has the character `|`, and if one had, the node would only be counted on.
+    The remainders of a cut edge end in new nodes, named after the edge.
     """
     left, kept = dict(nodes), list(edges)
     for place in places:
@@ -82,7 +81,7 @@ def without(nodes: Mapping[str, Point], edges: Iterable[Edge], places: Iterable[
 
 
 def _within(place: Point, a: Point, b: Point, gap_m: float) -> tuple[float, float] | None:
-    """Return the shares of the way from a to b between which it is within `gap_m` of a place."""
+    """Return the range of shares from a to b within `gap_m` of a place, or None."""
     (dx, dy), (px, py) = (b[0] - a[0], b[1] - a[1]), (place[0] - a[0], place[1] - a[1])
     square = dx * dx + dy * dy
     if square == 0.0:

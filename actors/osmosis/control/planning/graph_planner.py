@@ -1,4 +1,4 @@
-"""Graph Planner: the way to the current goal over the airport's graph."""
+"""Graph Planner: plans the route to the current goal over the airport's graph."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rampart.manager.spec.tables import NonNegative
 
 
 class RouteKept(msgspec.Struct, frozen=True):
-    """State of the Graph Planner: the goal, and the route that was found for it."""
+    """State of the Graph Planner: the goal and its route."""
 
     order: GoalOrder
     route: Route
@@ -40,23 +40,21 @@ ROUTE_STATE = StateFormat(RouteKept, version=1, objection=_objection)
 class GraphPlanner(Actor):
     """Plans once per goal, from the latest pose, and repeats the route.
 
-    While the goal stays the same the route does, so nothing changes under the driving robot. A
-    respawned planner has its route from the checkpoint, and repeats it when it hears the goal that
-    it is for; without one it plans again, from where the robot is then.
+    The route changes only with the goal. A restarted planner restores its route from the checkpoint
+    and repeats it when it receives the same goal; without one it plans from the present pose.
 
-    If Osmosis Control reports that it does not get past something, the planner may plan round it:
-    the stretch of the graph near that place is closed for a while. Where there is no other way
-    the route stays, and the robot waits.
+    If Osmosis Control reports a blockage, the planner may plan around it: the graph near that place
+    is closed for a while. Without another route the present one stays, and the robot waits.
     """
 
     class Parameters(Actor.Parameters, frozen=True):
-        """When it plans round something.
+        """Reaction to blockages.
 
         Attributes:
-            replan_after_s: how long the robot must have been blocked, s; never if 0, as in the
-                paper.
-            avoid_for_s: how long the stretch stays closed, s.
-            avoid_gap_m: how far round the place the graph is closed, m.
+            replan_after_s: duration of a blockage before it plans around it, s; 0: never, as in
+                the paper.
+            avoid_for_s: duration of a closure, s.
+            avoid_gap_m: radius of a closure, m.
         """
 
         replan_after_s: NonNegative = 0.0
@@ -78,12 +76,12 @@ class GraphPlanner(Actor):
         self._kept: RouteKept | None = None
 
     def on_start(self) -> None:
-        """Remember the route; it is told when its goal is heard, for it may be an older one."""
+        """Restore the checkpoint; its route may be outdated and waits for its goal."""
         self._kept = self.kept(ROUTE_STATE)
 
     @on(topics.POSE)
     def pose(self, message: Pose, _header: Header) -> None:
-        """Keep the latest pose, if it is one; plan if a goal was waiting for it."""
+        """Keep the latest valid pose; plan if a goal waits for it."""
         if not is_pose(message):
             return
         self._pose = message
@@ -92,26 +90,26 @@ class GraphPlanner(Actor):
 
     @on(topics.GOAL)
     def goal(self, message: GoalOrder, _header: Header) -> None:
-        """Plan if the goal is another one."""
+        """Plan to a new goal."""
         if message == self._order:
             return
         before, self._order = self._order, message
         if self._blocked is not None and before is not None and message.plan > before.plan \
                 and message.which == before.which:
-            # Another plan is wanted, and what stands in front of the robot is known.
+            # Another plan was ordered while a blockage is known.
             self._closures.close((self._blocked.x_m, self._blocked.y_m), self.clock.now())
         self._route = self._blocked = None
         self._try_again_s = -math.inf
         if self._kept is not None and self._kept.order == message:
             self._route = self._kept.route
-            self._tell()
+            self._publish_route()
         else:
             self._plan()
         self._kept = None
 
     @on(topics.CONTROL_STATUS)
     def control(self, message: ControlStatus, _header: Header) -> None:
-        """Plan round what has blocked the robot for long enough."""
+        """Plan around a blockage that has lasted long enough."""
         route, now_s = self._route, self.clock.now()
         self._blocked = None
         if route is None or not route.active or message.which != route.which:
@@ -123,15 +121,15 @@ class GraphPlanner(Actor):
             after_s = self.parameters.replan_after_s
             if 0 < after_s <= now_s - blockage.since_s and now_s >= self._try_again_s:
                 self._try_again_s = now_s + after_s
-                self._plan_round(blockage, now_s)
+                self._plan_around(blockage, now_s)
 
     @every(0.2)
     def repeat(self) -> None:
-        """Repeat the route for whoever joined late."""
-        self._tell()
+        """Repeat the route."""
+        self._publish_route()
 
-    def _tell(self) -> None:
-        """Publish the route; what others follow is kept before."""
+    def _publish_route(self) -> None:
+        """Save the route, then publish it."""
         if self._order is not None and self._route is not None:
             self.keep(ROUTE_STATE, RouteKept(self._order, self._route))
             self.publish(topics.ROUTE, self._route)
@@ -152,9 +150,9 @@ class GraphPlanner(Actor):
             if plan.reason:
                 self.report_diagnostic("route search", plan.reason, order.mission_id)
             self._route = _route(order, plan.waypoints, plan.reason)
-        self._tell()
+        self._publish_route()
 
-    def _plan_round(self, blockage: Blockage, now_s: float) -> None:
+    def _plan_around(self, blockage: Blockage, now_s: float) -> None:
         order, pose, place = self._order, self._pose, (blockage.x_m, blockage.y_m)
         if order is None or pose is None:
             return
@@ -163,11 +161,11 @@ class GraphPlanner(Actor):
         where = show(place)
         if not plan.waypoints:
             self._closures.reopen()
-            self.report_diagnostic("route search", f"no way round {where}: {plan.reason}",
+            self.report_diagnostic("route search", f"no route around {where}: {plan.reason}",
                                    order.mission_id)
             return
-        self._route = _route(order, plan.waypoints, f"way round {where}, which is blocked")
-        self._tell()
+        self._route = _route(order, plan.waypoints, f"route around {where}, which is blocked")
+        self._publish_route()
 
     def _search(self, order: GoalOrder, pose: Pose) -> PlannedRoute:
         nodes, edges = without(self._airport.nodes, self._airport.edges,

@@ -1,9 +1,8 @@
 """Route search: A* over the airport's graph, from any pose to any point near it.
 
-Start and goal need not be nodes: each is snapped to the nearest edge, or to a node that is about
-as near, and joins the search as a temporary node. The heuristic is the straight distance, which
-never overestimates on a graph whose edges are straight, so the route is a shortest one.
-(Hart, Nilsson, Raphael 1968; paper, section III.)
+Start and goal need not be nodes: each is snapped to the nearest edge, or to a node that is about as
+near, and added as a temporary node. The heuristic is the straight distance, which never
+overestimates, so the route is a shortest one (Hart, Nilsson, Raphael 1968; paper, section III).
 """
 
 from __future__ import annotations
@@ -19,32 +18,31 @@ from rampart.actors.osmosis.airport.model import Attachment, Point, foot, show
 
 Edge = tuple[str, str]
 
-# How far start and goal may be from the graph, in metres.
 NODE_SNAP_M = 0.3
-"""A node at most this much farther than the nearest edge wins over the edge."""
+"""A node is preferred if it is at most this much farther than the nearest edge."""
 
 START_REACH_M = 12.0
-"""Farthest distance of the robot from the graph."""
+"""Greatest distance of the robot from the graph."""
 
 GOAL_REACH_M = 3.0
-"""Farthest distance of a goal from the graph; keep it within the pavement."""
+"""Greatest distance of a goal from the graph."""
 
 APPROACH_M = 2.0
-"""A start farther than this from the graph gets a leg of its own back to it."""
+"""Distance from the graph above which the start is a waypoint."""
 
 CUT_M = 1.0
-"""A goal at most this far from the graph is headed for directly; to a farther one the robot turns
-off where it is nearest, so as to stay on the pavement."""
+"""Distance from the graph up to which the robot goes straight to the goal; to a farther goal it
+turns off at the nearest place, to stay on the pavement."""
 
 STRAIGHT_M = 0.5
-"""A row whose inner points are within this of the straight line is straight."""
+"""Greatest distance of the inner points of a straight row to its line."""
 
 ROW_BEGINS_M = 1.0
-"""A row begins at the first node of the way if that is at most this far away."""
+"""Greatest distance of the first node at which a row begins there."""
 
 
 class PlannedRoute(msgspec.Struct, frozen=True):
-    """Result of a search: waypoints in `map` from start to goal, or none and the reason."""
+    """Result of a search: waypoints in `map` from start to goal, or a reason."""
 
     waypoints: tuple[Point, ...]
     reason: str
@@ -57,28 +55,28 @@ def plan_route(nodes: Mapping[str, Point], edges: Iterable[Edge], start: Point, 
     Args:
         nodes: name to position in `map`, metres.
         edges: pairs of node names, undirected.
-        start: where the robot is.
-        goal: where it shall go; the route ends there exactly.
-        straight: light verification: inner waypoints of a straight row are left out, and the row
-            begins at its node, if that is near, and not where the robot is: from there the line
-            would be at a slant and lead past beside the first light.
+        start: position of the robot.
+        goal: end of the route.
+        straight: light verification: inner waypoints of a straight row are removed, and the row
+            begins at its node if that is near, since a slanted line from the robot would miss the
+            first light.
     """
     if not all(map(math.isfinite, (*start, *goal))):
-        return PlannedRoute((), f"start {show(start)} or goal {show(goal)} is not a finite point")
+        return PlannedRoute((), f"start {show(start)} or goal {show(goal)} is not finite")
     usable = sorted({(min(edge), max(edge)) for edge in edges if edge[0] != edge[1]})
     joined: list[Attachment] = []
     reaches = ((start, "start", START_REACH_M), (goal, "goal", GOAL_REACH_M))
     for point, what, reach_m in reaches:
         snap = _snap(nodes, usable, point)
         if snap is None:
-            return PlannedRoute((), "the graph has no edge that is open")
+            return PlannedRoute((), "the graph has no open edge")
         if snap.distance_m > reach_m:
             return PlannedRoute((), f"{what} {show(point)} is {snap.distance_m:.1f} m from the "
-                                    f"graph, at most {reach_m:.1f} m is allowed")
+                                    f"graph, expected at most {reach_m:.1f} m")
         joined.append(snap)
     path = _search(nodes, usable, joined[0], joined[1])
     if path is None:
-        return PlannedRoute((), f"no way in the graph from {show(start)} to {show(goal)}")
+        return PlannedRoute((), f"no route in the graph from {show(start)} to {show(goal)}")
     if joined[1].distance_m <= CUT_M:
         path[-1] = goal
     else:
@@ -164,7 +162,7 @@ def _without_repeats(path: list[Point]) -> list[Point]:
 
 
 def _straightened(path: list[Point]) -> list[Point]:
-    """Return the ends alone if the row between them is straight, else the path as it is."""
+    """Return only the ends of a straight row, else the path."""
     first, last = path[0], path[-1]
     if all(math.dist(point, foot(point, first, last)) <= STRAIGHT_M for point in path[1:-1]):
         return [first, last] if len(path) > 1 else path

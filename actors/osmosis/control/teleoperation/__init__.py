@@ -1,1 +1,1 @@
-"""Driving by hand: joysticks, gamepads, and whose stick counts."""
+"""Teleoperation by joystick or gamepad."""

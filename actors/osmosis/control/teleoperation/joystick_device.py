@@ -1,15 +1,14 @@
-"""A joystick that is plugged into this machine, as the kernel's joystick interface tells of it.
+"""A joystick of this machine, read through the kernel's joystick interface.
 
-`/dev/input/jsN` is a stream of 8-byte records, `struct js_event` of <linux/joystick.h> as described
+`/dev/input/jsN` is a stream of 8-byte records, `struct js_event` of <linux/joystick.h>, described
 in the kernel's Documentation/input/joydev/joystick-api.rst: milliseconds, value, type, number. When
-the device is opened, and when its queue has overflowed, the kernel first tells the state of every
+the device is opened, and after an overflow of its queue, the kernel first sends the state of each
 button and axis in records marked as initial.
 
-A button that is already down when the device is opened is not a press: the dead man counts only
-from a press that was seen. So neither a stuck button nor a gamepad that is plugged in again in the
-wrong moment moves the robot.
+A button that is already down when the device is opened does not count as pressed: the dead man
+requires a press. So neither a stuck button nor a gamepad that is plugged in again moves the robot.
 
-Anything that speaks the same records will do: a FIFO or a pseudo-terminal is a virtual joystick.
+A FIFO or pseudo-terminal with the same records is a virtual joystick.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ import msgspec
 from rampart.actors.osmosis.messages import Joystick
 
 AUTO = "auto"
-"""Stands for the first joystick there is."""
+"""Name of the first joystick found."""
 
 EVENT = struct.Struct("=IhBB")
 """`struct js_event`: time in ms, value, type, number of the button or axis."""
 
 BUTTON, AXIS, INITIAL = 0x01, 0x02, 0x80
-"""Types of records; the last is the mark of one that tells a state and not a change."""
+"""Types of records; the last is the flag of an initial state."""
 
 FULL_SCALE = 32767
 _DEVICES = Path("/dev/input")
@@ -44,7 +43,7 @@ _NUMBER = re.compile(r"js(\d+)$")
 
 
 class ForeignDeviceError(Exception):
-    """What comes from the device are no records of a joystick; one line."""
+    """The device does not send joystick records; one line."""
 
 
 Number = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -52,16 +51,16 @@ Sign = Literal[-1, 1]
 
 
 class StickMapping(msgspec.Struct, frozen=True):
-    """Which axes and which button of a device mean what; the defaults suit common gamepads.
+    """Axes and button of a device; the defaults suit common gamepads.
 
     Attributes:
         forward_axis: number of the axis for forward and back.
         left_axis: number of the axis for turning left and right.
-        forward_sign: -1 if the axis grows as the stick is pulled back, as the kernel has it.
-        left_sign: -1 if the axis grows to the right, as the kernel has it.
-        dead_man_button: number of the button to be held while driving (4: the left shoulder).
-        dead_zone: share of the way from the middle that counts as the middle; what is left is
-            stretched, so that the speed begins at zero.
+        forward_sign: -1 if the axis grows backwards, as in the kernel.
+        left_sign: -1 if the axis grows to the right, as in the kernel.
+        dead_man_button: number of the button to hold while driving (4: the left shoulder).
+        dead_zone: share of the range around the centre that counts as 0; the rest is scaled, so
+            that the speed begins at zero.
     """
 
     forward_axis: Number = 1
@@ -72,16 +71,16 @@ class StickMapping(msgspec.Struct, frozen=True):
     dead_zone: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.1
 
     def __post_init__(self) -> None:
-        """Check what a type cannot say."""
+        """Check that the axes differ."""
         if self.forward_axis == self.left_axis:
-            raise ValueError("left_axis: is the forward axis already")
+            raise ValueError("left_axis: expected another axis than forward_axis")
 
 
 class StickDecoder:
-    """Records in, position of the stick out. Pure.
+    """Decodes records to the position of the joystick. Pure.
 
     Args:
-        mapping: what means what.
+        mapping: axes and button.
     """
 
     def __init__(self, mapping: StickMapping) -> None:
@@ -91,10 +90,10 @@ class StickDecoder:
         self._pressed = False
 
     def feed(self, data: bytes) -> None:
-        """Take what was read; a record that is not complete waits for its rest.
+        """Take bytes; an incomplete record waits for its rest.
 
         Raises:
-            ForeignDeviceError: a record is neither about a button nor about an axis.
+            ForeignDeviceError: a record is neither of a button nor of an axis.
         """
         data = self._rest + data
         whole = len(data) - len(data) % EVENT.size
@@ -108,11 +107,11 @@ class StickDecoder:
                     self._axes[number] = value
             else:
                 raise ForeignDeviceError(
-                    f"event type 0x{kind:02x} is none of a joystick's (0x01 button, 0x02 axis)")
+                    f"event type 0x{kind:02x}: expected 0x01 (button) or 0x02 (axis)")
 
     @property
     def stick(self) -> Joystick:
-        """Where the stick is now."""
+        """Position of the joystick."""
         mapping = self._mapping
         return Joystick(self._position(mapping.forward_axis, mapping.forward_sign),
                         self._position(mapping.left_axis, mapping.left_sign), self._pressed)
@@ -126,7 +125,7 @@ class StickDecoder:
 
 
 def device_path(name: str, directory: Path = _DEVICES) -> str:
-    """Return the path of a device; for `AUTO` the first one there is, "" if there is none."""
+    """Return the path of a device; for `AUTO` the first one found, or ""."""
     if name != AUTO:
         return name
     found = [(int(match[1]), entry) for entry in directory.glob("js*")
@@ -135,13 +134,13 @@ def device_path(name: str, directory: Path = _DEVICES) -> str:
 
 
 class JoystickDevice:
-    """Reads a device on the event loop, without ever waiting for it.
+    """Reads a device on the event loop without blocking.
 
     Args:
         name: path of the device, or `AUTO`.
-        mapping: what means what.
-        moved: called when something was read; `stick` is the new position.
-        gone: called with the reason when an open device has vanished or proved to be none.
+        mapping: axes and button.
+        moved: called after each read; `stick` is the new position.
+        gone: called with the reason when an open device has failed.
     """
 
     def __init__(self, name: str, mapping: StickMapping, moved: Callable[[], None],
@@ -156,32 +155,32 @@ class JoystickDevice:
 
     @property
     def stick(self) -> Joystick:
-        """Where the stick is; in the middle and let go while there is no device."""
+        """Position of the joystick; centred and released without a device."""
         return self._decoder.stick
 
     def open(self) -> str:
-        """Open the device if it is there; return why it is not, or ""."""
+        """Open the device; return why that failed, or ""."""
         self.path = device_path(self._name)
         if not self.path:
-            return f"there is no joystick in {_DEVICES}"
+            return f"no joystick in {_DEVICES}"
         try:
             mode = Path(self.path).stat().st_mode
             if not (stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)):
-                return "is neither a device nor a FIFO"
+                return "neither a device nor a FIFO"
             file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
         except (OSError, ValueError) as error:
             return getattr(error, "strerror", None) or str(error)
         try:
             asyncio.get_running_loop().add_reader(file, self._readable)
-        except OSError as error:  # a device that cannot be waited for, such as /dev/zero
+        except OSError as error:  # a device without poll, such as /dev/zero
             os.close(file)
-            return f"is no joystick: {error.strerror}"
+            return f"not a joystick: {error.strerror}"
         self._decoder = StickDecoder(self._mapping)
         self._file = file
         return ""
 
     def close(self) -> None:
-        """Let the device go, and the stick with it. Closing twice is harmless."""
+        """Close the device and release the joystick; idempotent."""
         file, self._file = self._file, None
         self._decoder = StickDecoder(self._mapping)
         if file is not None:

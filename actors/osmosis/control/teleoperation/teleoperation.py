@@ -1,8 +1,8 @@
-"""Teleoperation: the operator's stick as a velocity command.
+"""Teleoperation: converts the joystick to a velocity command.
 
-Silent while the dead-man button is released, so the Safety Pilot's joystick mode ends with it. The
-stick may be a device on this machine or any node that publishes `topics.JOYSTICK`;
-`stick_arbitration` decides which of several is followed.
+It is silent while the dead-man button is released, which ends the Safety Pilot's joystick mode. The
+joystick is a device of this machine, or a node that publishes `topics.JOYSTICK`;
+`stick_arbitration` selects one of several.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import NonNegative
 
 _LOOK_S = 0.05
-"""Period in which a held stick is repeated and a silent one noticed (simulated seconds)."""
+"""Period for repeating a held joystick and noticing a silent one (simulated seconds)."""
 
 _REPLUG_S = 0.5
-"""Period in which a device that is not there is looked for."""
+"""Period for opening a missing device."""
 
 
 def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float
                 ) -> StickTwist | None:
-    """Return the velocity for a stick position, None while the dead man is released.
+    """Return the velocity for a joystick position; None while the dead man is released.
 
     Args:
-        stick: positions in [-1, 1]; beyond, they are cut; not finite counts as released.
-        max_linear_mps: speed at full stick.
-        max_angular_radps: turn rate at full stick.
+        stick: positions in [-1, 1], else clipped; non-finite values count as released.
+        max_linear_mps: speed at full deflection.
+        max_angular_radps: turn rate at full deflection.
     """
     if not (stick.dead_man and math.isfinite(stick.forward) and math.isfinite(stick.left)):
         return None
@@ -47,19 +47,19 @@ def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float
 
 
 class Teleoperation(Actor):
-    """Turns each stick position into a command at once.
+    """Converts each joystick position to a command at once.
 
-    A device tells changes only, so while its dead man is held its position is repeated; messages
-    are repeated by whoever sends them. A device that vanishes has let go, and is looked for again.
+    A device reports only changes, so its position is repeated while the dead man is held; nodes
+    repeat their messages. A device that fails counts as released, and is opened again.
     """
 
     class Parameters(Actor.Parameters, StickMapping, frozen=True):
-        """How it is driven; axes and button as of `StickMapping`.
+        """Speeds and device, besides those of `StickMapping`.
 
         Attributes:
-            linear_mps: speed at full stick; the robot's if left out.
-            angular_radps: turn rate at full stick; the robot's if left out.
-            device: path of a joystick, or "auto" for the first one; "" for none.
+            linear_mps: speed at full deflection; by default the robot's.
+            angular_radps: turn rate at full deflection; by default the robot's.
+            device: path of a joystick, "auto" for the first one, "" for none.
         """
 
         linear_mps: NonNegative | None = None
@@ -82,17 +82,17 @@ class Teleoperation(Actor):
         self._missing = ""
 
     def on_start(self) -> None:
-        """Open the joystick, if there is to be one."""
+        """Open the joystick, if one is configured."""
         if self._named and not self.context.run.plan.virtual:
             self._plug()
 
     def on_stop(self) -> None:
-        """Let the joystick go."""
+        """Close the joystick."""
         self._device.close()
 
     @on(topics.JOYSTICK)
     def joystick(self, message: Joystick, header: Header) -> None:
-        """Offer a position; if it is followed, its velocity goes out at once."""
+        """Take a position; publish its velocity if it is selected."""
         self._offer(header.source, message, header.stamp)
 
     def _offer(self, source: str, stick: Joystick, stamp_s: float) -> None:
@@ -105,19 +105,19 @@ class Teleoperation(Actor):
         self._attend()
 
     def _attend(self) -> None:
-        """Look again soon while somebody has the stick, or holds a device in vain."""
+        """Schedule `_again` while a joystick is held."""
         if (self._device.stick.dead_man or self._arbiter.holder) and self._look is None:
             self._look = self.call_later(_LOOK_S, self._again)
 
     def _obey(self, ruling: Ruling) -> None:
-        """On release publish one last zero, so the stop does not wait."""
+        """On release publish a final zero, so that the stop does not wait for a timeout."""
         if ruling.released and not ruling.follows:
             self.publish(topics.TELEOP_COMMAND, StickTwist(0.0, 0.0))
         if ruling.told:
             self.report_diagnostic("joystick", ruling.told, ruling.whom)
 
     def _again(self) -> None:
-        """Repeat a device that is held, and notice who has fallen silent."""
+        """Repeat a held device, and release a silent joystick."""
         self._look = None
         if self._device.stick.dead_man:
             self._moved()
@@ -130,18 +130,19 @@ class Teleoperation(Actor):
     def _plug(self) -> None:
         missing = self._device.open()
         if missing and missing != self._missing:
-            self.report_diagnostic("joystick", f"waiting for it: {missing}", self._device.path)
+            self.report_diagnostic(
+                "joystick", f"waiting for the device: {missing}", self._device.path)
         self._missing = missing
         if missing:
             self.call_later(_REPLUG_S, self._plug)
         else:
-            self._moved()  # a button that is down already counts as let go
+            self._moved()  # a button that is already down counts as released
 
     def _moved(self) -> None:
         self._offer(self._device.path, self._device.stick, self.clock.now())
 
     def _gone(self, why: str) -> None:
-        self._moved()  # closed, it has let go
-        self.report_diagnostic("joystick", f"vanished: {why}", self._device.path)
+        self._moved()  # a closed device is released
+        self.report_diagnostic("joystick", f"lost: {why}", self._device.path)
         self._missing = why
         self.call_later(_REPLUG_S, self._plug)

@@ -1,1 +1,1 @@
-"""Detection modules that know where the robot is and where it must not be."""
+"""Detection modules of position: prohibited area and localization."""

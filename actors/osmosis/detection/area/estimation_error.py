@@ -1,10 +1,9 @@
-"""DM8: error in localization estimation (paper, figure 5: an event that it leaves bare).
+"""DM8: error in localization estimation (paper, figure 5, where this event has no mechanism).
 
-Freshness and a heartbeat show a localization that is silent or dead. This module shows one that
-lies: it holds the pose against GPS, wheels and IMU, which it hears for itself. The pose is wrong
-if GPS and the wheels agree with each other and not with it; a receiver that is wrong alone does
-not make it active. It names the life of the node that published the pose, so that this one is
-respawned, and no later one.
+Freshness and heartbeat detect a silent or dead localization. This module detects a wrong one: it
+compares the pose with GPS, wheels and IMU. The pose is wrong if GPS and wheels agree with each
+other and not with it; a wrong GPS alone does not activate it. It names the incarnation that
+published the pose, so that no later one is restarted.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ _TURNED_FIXES = 3
 
 
 class EstimationMonitor(Finding):
-    """Active while the pose is outvoted, in its position or, while it drives, in its heading.
+    """Active while the pose is outvoted in its position, or in its heading while the robot drives.
 
-    The heading is held against the IMU's and against the course over ground.
+    The heading is compared with the IMU's and with the course over ground.
 
     Args:
-        known_after_s: until when the first comparison may take, -inf for not at all; then there is
-            nothing to compare, which is for DM6 and for the fence to notice.
+        known_after_s: time from which it may be idle without a comparison, -inf for at once; DM6
+            and DM1 detect missing inputs.
     """
 
     def __init__(self, known_after_s: float) -> None:
@@ -41,7 +40,7 @@ class EstimationMonitor(Finding):
         self._turned = 0
 
     def pose(self, pose: m.Pose, stamp_s: float, now_s: float, suspect: str) -> None:
-        """Take the pose under test; `suspect` is the incarnation of the node that says it."""
+        """Take the checked pose; `suspect` is the incarnation that published it."""
         if is_pose(pose) and self.vote.see_position(stamp_s, (pose.x_m, pose.y_m), now_s):
             self._yaw_rad = pose.yaw_rad
             if not self.active:
@@ -66,15 +65,15 @@ class EstimationMonitor(Finding):
         vote = self.vote
         if vote.outlier == _POSE:
             self.reason = self.reason or (
-                f"the pose is {vote.apart_m:.1f} m from GPS, which moves as the wheels do")
+                f"the pose is {vote.apart_m:.1f} m from GPS, which moves like the wheels")
         elif self._turned >= _TURNED_FIXES:
-            self.reason = self.reason or "the pose is turned against the IMU and the course"
+            self.reason = self.reason or "the heading differs from the IMU and the course"
         elif not self._turned:
             self.reason = ""
 
 
 class EstimationError(DetectionModule):
-    """DM8: see the module."""
+    """Active while the published pose is wrong."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -82,28 +81,28 @@ class EstimationError(DetectionModule):
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
-        """Hear the heading."""
+        """Take the heading."""
         self.monitor.vote.track.imu(message, header.stamp, self.clock.now())
 
     @on(topics.ODOMETRY)
     def odometry(self, message: m.Odometry, header: Header) -> None:
-        """Hear the way that the wheels made."""
+        """Take odometry."""
         self.monitor.vote.track.odometry(message, header.stamp, self.clock.now())
 
     @on(topics.BASE_STATUS)
     def status(self, message: m.BaseStatus, header: Header) -> None:
-        """Take the base's own wheel speeds."""
+        """Take the wheel speeds."""
         self.monitor.vote.see_encoders(message, header.stamp, self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
-        """Hear a fix, and compare."""
+        """Take a fix and compare."""
         self.monitor.gps(message, header.stamp, self.clock.now())
         self.follow()
 
     @on(topics.POSE)
     def pose(self, message: m.Pose, header: Header) -> None:
-        """Hear the pose under test."""
+        """Take the checked pose."""
         self.monitor.pose(message, header.stamp, self.clock.now(),
                           f"{header.source}#{header.incarnation}")
         self.follow()

@@ -1,19 +1,18 @@
-"""Two out of three: a position, GPS, and the robot's own dead reckoning.
+"""Two-out-of-three vote of a position, GPS and dead reckoning.
 
-DM1 (voted) and DM8 have the same problem as localization, and solve it for themselves, by another
-code than localization's: whoever checks must not share the error of what it checks.
+DM1 (voted) and DM8 have the same problem as localization. They solve it with other code, since a
+check must not share the errors of what it checks.
 
-Wheels and IMU give a *track*: where the robot would be if it had started at (0, 0). Each position
-source has an offset from it. What the sources say at different times is compared by the offsets,
-so motion between the readings does not matter, and the offset of an honest source stays while
-that of a wrong one moves. Its recent movement, with forgetting, is its *deviation*,
-over some seconds and over a minute: a slow drift leaves no trace in five seconds.
+Wheels and IMU give a *track*: the position if the robot had started at (0, 0). Each position source
+has an offset from the track. Offsets of different times can be compared, since they do not depend
+on the motion in between. The offset of a healthy source is constant. Its recent movement, with
+forgetting, is the source's *deviation*, over some seconds and, for slow drifts, over a minute.
 
-    both positions agree            they are right, unless both have moved otherwise than
-                                    odometry, encoders and gyro, which agree: two against two
-    they differ                     the one with by far the greater deviation is wrong
-    one is missing                  the other counts while its deviation is small
-    neither, or nothing is clear    nobody is believed
+    both positions agree            they are correct, unless odometry, encoders and gyro agree on
+                                    another motion: two against two
+    they differ                     the one with a much larger deviation is wrong
+    one is missing                  the other one counts while its deviation is small
+    both are missing, or unclear    no position is trusted
 
 Times are simulated seconds, positions are in `map`.
 """
@@ -25,7 +24,7 @@ import math
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.ftm.plausible import is_possible, is_sane
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.motion_parity import MotionParity
+from rampart.actors.osmosis.motion_check import MotionParity
 from rampart.actors.osmosis.readings import is_fix, is_imu, is_odometry
 
 GPS = "GPS"
@@ -33,21 +32,21 @@ WHEELS = "dead reckoning"
 
 Place = tuple[float, float]
 
-# When witnesses agree; docs/case-study/localization.md says where the numbers come from.
+# Limits of agreement; docs/case-study/localization.md explains the numbers.
 APART_M = 0.3
-"""Two positions farther apart than this differ."""
+"""Greatest distance of two positions that agree."""
 
 DEVIATION_M = 0.35
-"""A position that has moved otherwise than the wheels by more differs from them."""
+"""Greatest deviation of a position that agrees with the wheels."""
 
 CLEARLY = 2.0
-"""How many times greater the deviation of the wrong one must be."""
+"""Least ratio of the deviations that identifies the wrong one."""
 
 FORGET_S = 5.0
 """Time constant of the deviation."""
 
 STRAY_M, STRAY_S = 0.4, 60.0
-"""The same over a minute: a drift of 1.5 cm/s has then moved a position by half a metre."""
+"""Deviation over a minute, in which a drift of 1.5 cm/s moves a position by half a metre."""
 
 POSITION_FRESH_S = 0.25
 """Greatest age of the other position."""
@@ -59,19 +58,19 @@ WHEELS_FRESH_S = 0.2
 """Greatest age of odometry, and of the IMU's heading."""
 
 DIFFERING = 2
-"""Fixes in a row that must differ before it counts."""
+"""Consecutive fixes that must differ."""
 
 AGREEING = 4
-"""Fixes in a row that must agree before who was wrong is believed again."""
+"""Consecutive fixes that must agree before a wrong source is trusted again."""
 
 
 class Track:
     """Dead reckoning by wheels and IMU; the IMU's heading is aligned with the course of GPS.
 
     Attributes:
-        place: where the robot would be if it had started at (0, 0).
-        stamp_s: of the newest odometry.
-        speed_mps: of the newest odometry.
+        place: position if the robot had started at (0, 0).
+        stamp_s: time of the newest odometry.
+        speed_mps: speed of the newest odometry.
         parity: whether odometry, encoders and gyro agree.
     """
 
@@ -85,7 +84,7 @@ class Track:
         self._wheels_rad = 0.0
         self.parity = MotionParity()
         self._by_gyro = True
-        # From the wheels' heading to that in `map`, for want of a gyro; None before the first.
+        # Offset from the wheels' heading to `map`, used without a gyro; None before the first.
         self._fallback_rad: float | None = None
 
     def imu(self, imu: m.Imu, stamp_s: float, now_s: float) -> None:
@@ -96,7 +95,7 @@ class Track:
 
     @property
     def by_gyro(self) -> bool:
-        """Whether the heading is the gyro's: it is present, and turns as the wheels do."""
+        """Whether the heading is the gyro's: it is present and turns like the wheels."""
         return self._by_gyro and self.stamp_s - self._imu[0] <= self._fresh_s
 
     @property
@@ -107,7 +106,7 @@ class Track:
         return (self._fallback_rad or 0.0) + self._wheels_rad
 
     def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> float:
-        """Take odometry; return the way made since the last, m."""
+        """Take odometry; return the distance since the last one, m."""
         yaw_rad, linear_mps = odometry.pose.yaw_rad, odometry.twist.linear_mps
         if not stamp_s > self.stamp_s or not is_possible(stamp_s, now_s) \
                 or not is_odometry(odometry):
@@ -124,7 +123,7 @@ class Track:
             self.speed_mps = linear_mps
             return 0.0
         heading = self.heading_rad
-        if self.by_gyro:  # slowly: what a failing gyro adds is not taken over before it is noticed
+        if self.by_gyro:  # slowly, so that a failing gyro is detected first
             off = heading - yaw_rad
             self._fallback_rad = off if self._fallback_rad is None else self._fallback_rad + (
                 dt_s / _FALLBACK_S * math.remainder(off - self._fallback_rad, math.tau))
@@ -135,13 +134,13 @@ class Track:
         return abs(made_m)
 
     def align(self, course_rad: float) -> None:
-        """Take the course over ground of a robot that drives straight forward."""
+        """Align with the course over ground while the robot drives straight ahead."""
         off = math.remainder(course_rad - self.heading_rad, math.tau)
         if abs(off) < _WILD_COURSE_RAD:
             self._turn(_ALIGN_GAIN * off)
 
     def align_slowly(self, yaw_rad: float) -> None:
-        """Take the heading of a position source, no faster than a sound gyro drifts."""
+        """Align with the heading of a position source, no faster than a healthy gyro drifts."""
         off = math.remainder(yaw_rad - self.heading_rad, math.tau)
         self._turn(_SLOW_GAIN * max(-_SLOW_RAD, min(_SLOW_RAD, off)))
 
@@ -153,11 +152,11 @@ class Track:
 
     @property
     def straight(self) -> bool:
-        """Whether the robot drives straight on, so that its course is its heading."""
+        """Whether the robot drives straight ahead, so that its course is its heading."""
         return self.speed_mps > _COURSE_FROM_MPS and abs(self._imu[2]) < _STRAIGHT_RADPS
 
     def at(self, stamp_s: float) -> Place:
-        """Return the place at a time near the newest odometry."""
+        """Return the position at a time near the newest odometry."""
         on_m = self.speed_mps * max(-self._fresh_s, min(self._fresh_s, stamp_s - self.stamp_s))
         heading = self.heading_rad
         return (self.place[0] + on_m * math.cos(heading), self.place[1] + on_m * math.sin(heading))
@@ -170,11 +169,11 @@ _COURSE_FROM_MPS, _STRAIGHT_RADPS = 0.4, 0.1
 
 
 class Witness:
-    """One source of positions, held against the track.
+    """A source of positions and its deviation from the track.
 
     Attributes:
-        stamp_s: of the newest reading.
-        offset: of the newest reading from the track.
+        stamp_s: time of the newest reading.
+        offset: from the track to the newest reading.
     """
 
     def __init__(self, name: str, fresh_s: float) -> None:
@@ -186,11 +185,11 @@ class Witness:
         self._of_old: Place = (0.0, 0.0)
 
     def fresh(self, now_s: float) -> bool:
-        """Whether its newest reading is new enough."""
+        """Whether its newest reading is fresh."""
         return now_s - self.stamp_s <= self._fresh_s
 
     def see(self, stamp_s: float, place: Place, track: Track, forget_s: float) -> None:
-        """Take a reading; `forget_s` is infinite while it is not to be taken for usual."""
+        """Take a reading; `forget_s` is infinite to freeze the averages."""
         at = track.at(stamp_s)
         offset = self.offset = (place[0] - at[0], place[1] - at[1])
         dt_s, self.stamp_s = stamp_s - self.stamp_s, stamp_s
@@ -202,17 +201,17 @@ class Witness:
             self._of_old = _towards(self._of_old, offset, dt_s / STRAY_S)
 
     def restart(self) -> None:
-        """Take the present offset for usual."""
+        """Restart the averages at the present offset."""
         self._usual = self._of_old = self.offset
 
     @property
     def deviation_m(self) -> float:
-        """By how much it has lately moved otherwise than the track."""
+        """Recent deviation from the track."""
         return 0.0 if self._usual is None else math.dist(self.offset, self._usual)
 
     @property
     def strays(self) -> bool:
-        """Whether it has moved otherwise than the track by more than the track's errors explain."""
+        """Whether it deviates from the track by more than the track's errors explain."""
         return self._usual is not None and (
             self.deviation_m > DEVIATION_M or math.dist(self.offset, self._of_old) > STRAY_M)
 
@@ -225,13 +224,13 @@ class PositionVote:
     """The vote over time.
 
     Args:
-        name: of the position that is not GPS.
+        name: name of the position that is not GPS.
 
     Attributes:
-        outlier: name of the position that is outvoted; "" if none is.
-        compared: whether both positions were ever held against each other.
-        contradicted: whether both positions have moved otherwise than wheels and gyro, although
-            odometry, encoders and gyro agree. Two against two: no witness is believed.
+        outlier: name of the outvoted position, or "".
+        compared: whether both positions were ever compared.
+        contradicted: whether odometry, encoders and gyro agree on another motion than both
+            positions. Two against two: no position is trusted.
     """
 
     def __init__(self, name: str) -> None:
@@ -243,17 +242,17 @@ class PositionVote:
         self.apart_m = 0.0
         self._differing = self._agreeing = 0
 
-    # -- what is heard --------------------------------------------------------------------------
+    # -- inputs ---------------------------------------------------------------------------------
 
     def see_position(self, stamp_s: float, place: Place, now_s: float,
                      yaw_rad: float | None = None) -> bool:
-        """Take a reading of the position that is not GPS; return whether it could be used.
+        """Take a reading of the position that is not GPS; return whether it is usable.
 
         Args:
-            stamp_s: when it was true.
-            place: in `map`.
+            stamp_s: its time.
+            place: position in `map`.
             now_s: now.
-            yaw_rad: its heading, if that may keep the gyro's aligned while GPS is out.
+            yaw_rad: its heading, if that may align the gyro's while GPS is excluded.
         """
         if not self._usable(self.position, stamp_s, place, now_s):
             return False
@@ -264,11 +263,11 @@ class PositionVote:
         return True
 
     def see_encoders(self, status: m.BaseStatus, stamp_s: float, now_s: float) -> None:
-        """Take the base's own wheel speeds."""
+        """Take the wheel speeds."""
         self.track.parity.encoders(status, stamp_s, now_s)
 
     def see_gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> bool:
-        """Take a fix and compare; return whether it could be used."""
+        """Take a fix and compare; return whether it is usable."""
         if not is_fix(fix) or not self._usable(self.gps, stamp_s, (fix.x_m, fix.y_m), now_s):
             return False
         track = self.track
@@ -286,9 +285,10 @@ class PositionVote:
                 and -AHEAD_S <= now_s - stamp_s <= GPS_FRESH_S)
 
     def _forget_s(self, witness: Witness) -> float:
-        """While it is not clear who is wrong, and later of who is, nothing is taken for usual.
+        """Return the time constant of a source's averages; infinite while they are frozen.
 
-        Nor of one that deviates while no other position confirms it: it would be forgotten.
+        They are frozen while it is open which source is wrong, then for that source, and for a
+        source that deviates without another position to confirm it.
         """
         if self.outlier == witness.name or (self._differing > 0 and not self.outlier):
             return math.inf
@@ -321,7 +321,7 @@ class PositionVote:
                 other.restart()
 
     def _hold_against_motion(self, now_s: float) -> None:
-        """Compare two positions that agree with a dead reckoning that is confirmed."""
+        """Compare two agreeing positions with confirmed dead reckoning."""
         parity, pair = self.track.parity, (self.position, self.gps)
         stray = all(witness.strays for witness in pair)
         if self.track.by_gyro and parity.confirmed(now_s):
@@ -336,11 +336,11 @@ class PositionVote:
         return self.wheels_fresh(now_s) and self.track.parity.sure(now_s)
 
     def wheels_fresh(self, now_s: float) -> bool:
-        """Whether odometry is heard."""
+        """Whether odometry is received."""
         return now_s - self.track.stamp_s <= WHEELS_FRESH_S
 
     def agreeing(self, now_s: float) -> tuple[str, ...]:
-        """Return the names of two witnesses that agree now; none if there are no two."""
+        """Return the names of two witnesses that agree now, or none."""
         position, gps = self.position, self.gps
         if self.contradicted:
             return ()

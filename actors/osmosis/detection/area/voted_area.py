@@ -1,10 +1,10 @@
-"""DM1 for the full system: the prohibited area, by a position on which two out of three agree.
+"""DM1 of the full system: the prohibited area, by a position on which two of three agree.
 
-The paper's DM1 (`prohibited_area`) hears the GPS receiver alone: a receiver that is wrong by two
-metres stops a robot that is well, and one that is stuck blinds it. This one votes between GPS, the
-absolute pose and its own dead reckoning, and is still independent of the localization node, which
-it does not hear. While fewer than two agree it goes on by dead reckoning, with a bound of the error
-that grows with the way. Beyond a bounded time or way it knows nothing, and is active.
+The paper's DM1 (`prohibited_area`) uses GPS alone: an error of two metres stops a healthy robot,
+and a stuck receiver blinds it. This module votes between GPS, absolute pose and its own dead
+reckoning. It is still independent of the localization node. While fewer than two agree, it uses
+dead reckoning with an error bound that grows with the distance. Beyond a bounded time or distance
+the position is unknown, and the module is active.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from rampart.manager.spec.tables import NonNegative, Positive
 
 _ABSOLUTE = "absolute pose"
 _ERROR_PER_M = 0.06
-"""Error of dead reckoning, m per m driven: above the worst measured over 5 m."""
+"""Error of dead reckoning, m per m: more than the largest measured over 5 m."""
 
 
 class VotedPosition:
-    """The voted position over time; `look` gives it as a fix for the fence.
+    """The voted position over time; `look` returns it as a fix.
 
     Args:
-        accuracy_m: bound of the error of a voted position, m.
-        blind_s: how long it may go on by dead reckoning, s.
-        blind_m: how far, m.
+        accuracy_m: error bound of a voted position, m.
+        blind_s: longest time on dead reckoning, s.
+        blind_m: longest distance on dead reckoning, m.
     """
 
     def __init__(self, accuracy_m: float, blind_s: float, blind_m: float) -> None:
@@ -45,7 +45,7 @@ class VotedPosition:
         self.by_gps = False
 
     def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> None:
-        """Take the way that the wheels made."""
+        """Take odometry."""
         self._since_m += self.vote.track.odometry(odometry, stamp_s, now_s)
 
     def gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> None:
@@ -54,7 +54,7 @@ class VotedPosition:
             self._fix = fix
 
     def look(self, now_s: float) -> tuple[m.GpsFix, float] | None:
-        """Return where the robot is, as far as is known, and when that was; None if it is not."""
+        """Return the position as a fix and its time; None if it is unknown."""
         vote = self.vote
         two = vote.agreeing(now_s)
         self.by_gps = GPS in two
@@ -75,22 +75,20 @@ class VotedPosition:
 
 
 class VotedArea(DetectionModule):
-    """Active while the robot would not stop before the prohibited area, or its place is unknown."""
+    """Active while the robot would not stop before the prohibited area, or is not located."""
 
     class Parameters(DetectionModule.Parameters, frozen=True):
-        """When it warns.
+        """Thresholds.
 
         Attributes:
-            margin_m: as for `ProhibitedArea`.
-            unknown_s: how long the place may be unknown, s.
-            hold_s: how long it must have been safe again before the module is idle, s.
-            blind_s: how long it goes on by dead reckoning while fewer than two witnesses agree, s.
-            blind_m: how far it does so, m.
+            margin_m: see `ProhibitedArea.Parameters`.
+            unknown_s: longest time without a known position, s.
+            blind_s: longest time on dead reckoning while fewer than two witnesses agree, s.
+            blind_m: longest distance on dead reckoning, m.
         """
 
         margin_m: Positive | None = None
         unknown_s: NonNegative = 5 * GPS_PERIOD_S
-        hold_s: NonNegative = 0.5
         blind_s: NonNegative = 10.0
         blind_m: NonNegative = 5.0
 
@@ -103,35 +101,34 @@ class VotedArea(DetectionModule):
         self._where = VotedPosition(
             context.run.system.robot.gps_accuracy_m, parameters.blind_s, parameters.blind_m)
         self.monitor = self.judged_by(fence_of(
-            self, parameters.margin_m, parameters.hold_s, "position that two sources agree on",
-            parameters.unknown_s))
+            self, parameters.margin_m, "position that two sources agree on", parameters.unknown_s))
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
-        """Hear the heading."""
+        """Take the heading."""
         self._where.vote.track.imu(message, header.stamp, self.clock.now())
 
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, message: m.Pose, header: Header) -> None:
-        """Hear the absolute pose."""
+        """Take the absolute pose."""
         if is_pose(message):
             self._where.vote.see_position(header.stamp, (message.x_m, message.y_m),
                                           self.clock.now(), message.yaw_rad)
 
     @on(topics.BASE_STATUS)
     def status(self, message: m.BaseStatus, header: Header) -> None:
-        """Take the base's own wheel speeds."""
+        """Take the wheel speeds."""
         self._where.vote.see_encoders(message, header.stamp, self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
-        """Hear a fix, and look where the robot is and where it is going."""
+        """Take a fix, and check position and velocity."""
         self._where.gps(message, header.stamp, self.clock.now())
         self._look()
 
     @on(topics.ODOMETRY)
     def odometry(self, message: m.Odometry, header: Header) -> None:
-        """Hear the way that the wheels made; look, if GPS gives no occasion."""
+        """Take odometry, and check without GPS."""
         now_s = self.clock.now()
         self._where.odometry(message, header.stamp, now_s)
         waited_s = now_s - self._looked_s

@@ -11,7 +11,7 @@ from PIL import Image
 
 from rampart.actors.osmosis.airport.errors import AirportError
 from rampart.actors.osmosis.airport.formats import load_airport, load_mission, load_with_truth
-from rampart.actors.osmosis.airport.mask import MaskScale
+from rampart.actors.osmosis.airport.mask import COLUMNS_PER_M, LEFT_M, ROWS_PER_M, TOP_M
 
 TOML = """
 name = "Field"
@@ -46,7 +46,6 @@ radius_m = 0.4
 R02 = 0.25
 """
 
-SCALE = MaskScale(columns_per_m=10, rows_per_m=10, left_m=0, top_m=12)
 GRAPH = {
     "nodes": [{"id": "N1", "x": 2, "y": 6}, {"id": "N2", "x": 10, "y": 6.0}],
     "edges": [["N1", "N2"]],
@@ -59,14 +58,28 @@ def write_toml(folder: Path, text: str) -> Path:
     return path
 
 
+def column(x_m: float) -> int:
+    return round(COLUMNS_PER_M * (x_m - LEFT_M))
+
+
+def row(y_m: float) -> int:
+    return round(ROWS_PER_M * (TOP_M - y_m))
+
+
+def red():
+    """An image of the area from -80 to 80 m, all of it prohibited."""
+    pixels = np.zeros((row(-80), column(80), 3), dtype=np.uint8)
+    pixels[..., 0] = 255
+    return pixels
+
+
 def write_foreign(folder: Path, graph=None, mission="x=9.5,y=6,taxi=1\n\nx=3,y=6.25,taxi=0\n",
                   image="field_area.png"):  # fmt: skip
-    """A red image of 12 x 12 m with a green strip from y = 4 to 8 m, x = 1 to 11 m."""
-    pixels = np.zeros((120, 120, 3), dtype=np.uint8)
-    pixels[..., 0] = 255
-    pixels[40:80, 10:110] = (0, 255, 0)
-    pixels[20, 60] = pixels[60, 60] = (251, 255, 0)  # a speck in each colour's ground
-    pixels[20, 60, 0] = 0
+    """A red image with a green strip from y = 4 to 8 m, x = 1 to 11 m."""
+    pixels = red()
+    pixels[row(8):row(4), column(1):column(11)] = (0, 255, 0)
+    pixels[row(10), column(6)] = (0, 255, 0)  # a speck on each ground
+    pixels[row(6), column(6)] = (251, 255, 0)
     Image.fromarray(pixels).save(folder / image, quality=75)
     (folder / "field.graph").write_text(json.dumps(graph or GRAPH))
     (folder / "MISSION_A.miss").write_text(mission)
@@ -102,9 +115,9 @@ def test_the_truth_about_lights_is_read_apart_from_the_airport(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ('["S", "T"]]', '["S", "X"]]', "edges[0]: 'X': unknown node; name one from nodes"),
+        ('["S", "T"]]', '["S", "X"]]', "edges[0]: 'X': unknown node; expected one of nodes"),
         ("T = [30.0, 0.0]", "T = [nan, 0.0]", "nodes.T[0]: nan: must be a finite number"),
-        ("T = [30.0, 0.0]", "T = [30.0, 20.0]", "in the prohibited area; put it on the pavement"),
+        ("T = [30.0, 0.0]", "T = [30.0, 20.0]", "in the prohibited area; expected on the pavement"),
         ("T = [30.0, 0.0]", "S = [30.0, 0.0]", "file: not valid TOML: "),
         ("T = [30.0, 0.0]", 'T = [30.0, "0.0"]', "nodes.T[1]: '0.0': Expected `float`, got `str`"),
         ('edges = [["S", "T"]]', 'edges = "ST"', "edges: 'ST': Expected `array`, got `str`"),
@@ -115,19 +128,19 @@ def test_the_truth_about_lights_is_read_apart_from_the_airport(tmp_path):
         ("half_width_m = 3.0", "half_widht_m = 3.0", "surface[0].half_widht_m: 3.0: unknown field"),
         ("centre_line = [[-3, 0], [33, 0]]", "polygon = [[0,0],[9,9],[9,0],[0,9]]",
          "surface[0].polygon: Self-intersection"),
-        ("centre_line = [[-3, 0], [33, 0]]", "polygon = [[0,0],[9,9]]", "three points or more"),
-        ("centre_line = [[-3, 0], [33, 0]]", "", "give either polygon or centre_line"),
+        ("centre_line = [[-3, 0], [33, 0]]", "polygon = [[0,0],[9,9]]", "three or more points"),
+        ("centre_line = [[-3, 0], [33, 0]]", "", "expected either polygon or centre_line"),
         ("last = [10.0, 0.0]", "last = [10.0, 5.0]", "row.R03: (10, 5): off the pavement"),
-        ("count = 3", "", "row[0]: R: give either first, last and count, or positions"),
+        ("count = 3", "", "row[0]: R: expected either first, last and count, or positions"),
         ("R02 = 0.25", "R09 = 0.25", "world.light_factors.R09: 'R09': unknown light"),
-        ("R02 = 0.25", "R02 = -1.0", "world.light_factors.R02: -1.0: a share"),
+        ("R02 = 0.25", "R02 = -1.0", "world.light_factors.R02: -1.0: expected a factor"),
         ('shape = "cylinder"', 'shape = "cone"', "shape: 'cone': must be one of cylinder, box"),
         ("radius_m = 0.4", "radius_m = 0.4\nheight = 2", "obstacle[0].height: 2: unknown field"),
         ('name = "Field"', 'title = "F"\nname = "Field"',
          "title: 'F': unknown field; known: name,"),
         ('name = "Field"', "", "missing required field `name`"),
         ("[[surface]]", '[[surface]]\nname = "Runway"\nkind = "apron"\n'
-         "polygon = [[0,0],[1,0],[0,1]]\n[[surface]]", "surface: 'Runway': name given twice"),
+         "polygon = [[0,0],[1,0],[0,1]]\n[[surface]]", "surface: 'Runway': duplicate name"),
     ],
 )  # fmt: skip
 def test_a_broken_airport_is_refused_in_one_line_with_file_field_and_value(
@@ -142,37 +155,37 @@ def test_a_broken_airport_is_refused_in_one_line_with_file_field_and_value(
 
 @pytest.mark.parametrize("image", ["field_area.png", "field_area.jpg"])
 def test_the_authors_formats_load_as_an_airport_of_ones_own(tmp_path, image):
-    airport = load_airport(write_foreign(tmp_path, image=image), SCALE)
+    airport = load_airport(write_foreign(tmp_path, image=image))
     assert airport.nodes == {"N1": (2.0, 6.0), "N2": (10.0, 6.0)}
     goals = airport.missions["A"].goals
     assert [(g.x_m, g.y_m, g.mode) for g in goals] == [
         (9.5, 6.0, "taxi"), (3.0, 6.25, "light verification")]  # fmt: skip
     assert (airport.start.x_m, airport.start.y_m, airport.start.yaw_rad) == (2.0, 6.0, 0.0)
-    # The strip is 40 m2; specks of one pixel are gone; the edge is right to about a pixel.
+    # The strip is 40 m2, its edge of 28 m is right to about a pixel; specks of one pixel are gone.
     assert airport.allowed.geom_type in ("Polygon", "MultiPolygon")
-    assert airport.allowed.area == pytest.approx(40, abs=3)
-    assert airport.prohibited_distance_m(6, 6) == pytest.approx(2.0, abs=0.15)
+    assert airport.allowed.area == pytest.approx(40, abs=28 / ROWS_PER_M)
+    assert airport.prohibited_distance_m(6, 6) == pytest.approx(2.0, abs=1.5 / ROWS_PER_M)
     assert airport.prohibited_distance_m(6, 10) < 0
     assert airport.prohibited_distance_m(-5, 6) < 0
-    assert airport.warnings == ("field.graph: lights: none: nothing will be measured",)
+    assert airport.warnings == ("field.graph: lights: none: there is nothing to inspect",)
 
 
 def test_jpeg_ringing_beside_an_edge_does_not_widen_the_pavement(tmp_path):
-    pixels = np.zeros((120, 120, 3), dtype=np.uint8)
-    pixels[..., 0] = 255
-    for row in range(120):  # a slanted edge crosses blocks everywhere
-        pixels[row, 20 + row // 3 : 80 + row // 3] = (0, 255, 0)
+    pixels = red()
+    for line in range(len(pixels)):  # a slanted edge crosses blocks everywhere
+        pixels[line, 300 + line // 3 : 360 + line // 3] = (0, 255, 0)
     Image.fromarray(pixels).save(tmp_path / "field_area.jpg", quality=60)
     (tmp_path / "field.graph").write_text(
-        json.dumps({"nodes": [{"id": "N", "x": 7, "y": 6}], "edges": []}))  # fmt: skip
-    airport = load_airport(tmp_path, SCALE)
-    assert airport.allowed.area == pytest.approx(72, rel=0.03)
+        json.dumps({"nodes": [{"id": "N", "x": -10, "y": 58}], "edges": []}))  # fmt: skip
+    airport = load_airport(tmp_path)
+    strip_m2 = 60 * len(pixels) / (COLUMNS_PER_M * ROWS_PER_M)
+    assert airport.allowed.area == pytest.approx(strip_m2, rel=0.03)
 
 
 def test_a_node_in_the_red_of_a_foreign_airport_is_a_warning_not_a_refusal(tmp_path):
     graph = {"nodes": [*GRAPH["nodes"], {"id": "N3", "x": 10, "y": 10}],
              "edges": [["N1", "N2"], ["N2", "N3"]]}  # fmt: skip
-    airport = load_airport(write_foreign(tmp_path, graph), SCALE)
+    airport = load_airport(write_foreign(tmp_path, graph))
     assert any("nodes.N3: (10, 10): in the prohibited area" in w for w in airport.warnings)
 
 
@@ -182,63 +195,63 @@ def test_a_node_in_the_red_of_a_foreign_airport_is_a_warning_not_a_refusal(tmp_p
         ({"nodes": [], "edges": []}, "nodes: empty"),
         ({"nodes": [{"id": "N1", "x": 1}], "edges": []}, "nodes[0].y: None: must be a finite"),
         ({"nodes": [{"id": "N1", "x": 1, "y": True}], "edges": []}, "nodes[0].y: True"),
-        ({"nodes": [{"x": 1, "y": 1}], "edges": []}, "nodes[0]: {'x': 1, 'y': 1}: must be"),
-        ({"nodes": [GRAPH["nodes"][0]] * 2, "edges": []}, "nodes[1].id: 'N1': given twice"),
+        ({"nodes": [{"x": 1, "y": 1}], "edges": []}, "nodes[0]: {'x': 1, 'y': 1}: expected"),
+        ({"nodes": [GRAPH["nodes"][0]] * 2, "edges": []}, "nodes[1].id: 'N1': duplicate id"),
         ({"nodes": GRAPH["nodes"], "edges": [["N1", "N9"]]}, "edges[0]: 'N9': unknown node"),
-        ({"nodes": GRAPH["nodes"], "edges": ["N1"]}, "edges[0]: 'N1': must be"),
-        ({"nodes": GRAPH["nodes"]}, "needs the lists nodes and edges"),
-        ({"nodes": GRAPH["nodes"], "edges": []}, "missions.A.goals[0]: (9.5, 6): no way there"),
+        ({"nodes": GRAPH["nodes"], "edges": ["N1"]}, "edges[0]: 'N1': expected"),
+        ({"nodes": GRAPH["nodes"]}, "expected the lists nodes and edges"),
+        ({"nodes": GRAPH["nodes"], "edges": []}, "missions.A.goals[0]: (9.5, 6): not connected"),
     ],
 )
 def test_a_broken_graph_file_is_refused_in_one_line(tmp_path, graph, expected):
     write_foreign(tmp_path, graph)
-    assert expected in refusal(load_airport, tmp_path / "field.graph", SCALE)
+    assert expected in refusal(load_airport, tmp_path / "field.graph")
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("x=1,y=2", "line 1: 'x=1,y=2': must be like x=20,y=-57,taxi=1"),
-        ("\nx=1,y=2,taxi=2", "line 2: taxi=2: 1 is taxi, 0 light verification"),
+        ("x=1,y=2", "line 1: 'x=1,y=2': expected x=20,y=-57,taxi=1"),
+        ("\nx=1,y=2,taxi=2", "line 2: taxi=2: expected 1 (taxi) or 0"),
         ("x=1,y=abc,taxi=1", "line 1: y: 'abc': must be a finite number of metres"),
         ("x=nan,y=1,taxi=1", "line 1: x: 'nan': must be a finite"),
-        ("x=1,x=1,taxi=1", "must be like"),
-        ("x=1,y=1,taxi=1,y=2", "must be like"),
+        ("x=1,x=1,taxi=1", "expected x=20,y=-57,taxi=1"),
+        ("x=1,y=1,taxi=1,y=2", "expected x=20,y=-57,taxi=1"),
         ("\n \n", "goals: empty"),
         ("x=50,y=6,taxi=1", "40.0 m from the graph"),
     ],
 )
 def test_a_broken_mission_file_is_refused_in_one_line(tmp_path, text, expected):
-    airport = load_airport(write_foreign(tmp_path), SCALE)
+    airport = load_airport(write_foreign(tmp_path))
     path = tmp_path / "MISSION_B.miss"
     path.write_text(text)
     assert expected in refusal(load_mission, path, airport)
 
 
 def test_missions_load_by_name_and_from_both_kinds_of_file(tmp_path):
-    airport = load_airport(write_foreign(tmp_path), SCALE)
+    airport = load_airport(write_foreign(tmp_path))
     assert load_mission("A", airport) is airport.missions["A"]
     assert load_mission(tmp_path / "MISSION_A.miss", airport) == airport.missions["A"]
     own = tmp_path / "own.toml"
     own.write_text('name = "O"\ngoals = [{ x_m = 4, y_m = 6, mode = "taxi" }]')
     assert load_mission(own, airport).name == "O"
-    assert "no such mission, there are: A" in refusal(load_mission, "B", airport)
+    assert "unknown mission; known: A" in refusal(load_mission, "B", airport)
 
 
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
-        (lambda f: (f / "field_area.png").unlink(), "area image: none: need exactly one"),
+        (lambda f: (f / "field_area.png").unlink(), "area image: none: expected exactly one"),
         (lambda f: (f / "field_area.png").write_bytes(b"no"), "area image: unreadable"),
         (lambda f: (f / "field.graph").write_text("{"), "not JSON"),
-        (lambda f: (f / "field.graph").unlink(), "need exactly one .toml or .graph"),
+        (lambda f: (f / "field.graph").unlink(), "expected exactly one .toml or .graph"),
         (lambda f: Image.new("RGB", (120, 120), (255, 0, 0)).save(f / "field_area.png"),
-         "all of it red"),
+         "entirely red"),
     ],
 )  # fmt: skip
 def test_a_folder_that_is_no_airport_says_what_is_missing(tmp_path, spoil, expected):
     spoil(write_foreign(tmp_path))
-    assert expected in refusal(load_airport, tmp_path, SCALE)
+    assert expected in refusal(load_airport, tmp_path)
 
 
 def test_an_unknown_airport_name_gets_a_suggestion():

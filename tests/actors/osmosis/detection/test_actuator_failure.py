@@ -50,7 +50,7 @@ def test_a_sound_base_is_left_alone(kept):
 def test_a_wheel_that_does_not_keep_up_is_named_within_a_second(treads, wheel):
     bench = Bench()
     assert bench.run(0.9, treads)
-    assert bench.monitor.reason == f"the {wheel} wheel does not keep up with its neighbour"
+    assert bench.monitor.reason == f"the {wheel} wheel lags behind its neighbour"
 
 
 def test_a_jolt_is_no_failure():

@@ -37,7 +37,7 @@ class Bench:
             return
         for source, command in zip(("active", "standby"), PAIRS[event], strict=True):
             if command is not None:
-                self.comparison.heard(source, command, now_s, self.lives[source], now_s)
+                self.comparison.take(source, command, now_s, self.lives[source], now_s)
 
     def play(self, events: str) -> str:
         return play(self.comparison, self.handle, events)
@@ -89,10 +89,10 @@ def test_a_respawned_comparison_claims_nothing_before_it_knows(events, expected)
 def test_a_command_from_the_future_is_not_compared_when_its_sender_is_silent(stamp_s):
     bench = Bench()
     bench.play("==")
-    bench.comparison.heard("active", GOOD, stamp_s, 1, 0.2)
+    bench.comparison.take("active", GOOD, stamp_s, 1, 0.2)
     for tick in range(20):
         now_s = 0.5 + 0.05 * tick
-        bench.comparison.heard("standby", TURNS, now_s, 1, now_s)
+        bench.comparison.take("standby", TURNS, now_s, 1, now_s)
     assert not bench.comparison.active
 
 

@@ -138,7 +138,7 @@ class Story:
     def tell(self, monitor, now_s):
         for what, source in self.SOURCES.items():
             if what not in self.silent:
-                monitor.heard(getattr(self, what), source, self.lives[what],
+                monitor.take(getattr(self, what), source, self.lives[what],
                               now_s - (self.age_s if what == "route" else 0.0), now_s)
         monitor.pose(*self.pose, now_s)
 
@@ -175,7 +175,7 @@ CONTRADICTIONS = {
     "a route while paused": ({**PAUSED, **IDLE_GOAL}, "graph_planner#1", "plans, the goal"),
     "an old progress": ({"control": {"step": 2}}, "osmosis_control#1", "is at goal 3"),
     "nothing moves on": ({"control": {"phase": ControlPhase.ARRIVED}}, "mission_manager#1",
-                         "goes on with goal 1, which is reached"),
+                         "keeps goal 1, which is reached"),
     "a step beyond the last": ({"mission": {"step": 2}, "goal": {"step": 2}}, "mission_manager#1",
                                "goal 3"),
 }
@@ -249,12 +249,12 @@ def test_progress_that_stays_the_same_while_the_robot_drives_is_wrong(tells, fir
 @pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
 def test_a_stamp_of_no_possible_time_does_not_hide_that_its_sender_is_silent(stamp_s):
     monitor, _ = watch(Story(), 1.0)
-    monitor.heard(Story().route, "graph_planner", 1, stamp_s, 1.0)
+    monitor.take(Story().route, "graph_planner", 1, stamp_s, 1.0)
     story = Story()
     story.silent = {"route"}
     monitor, _ = watch(story, 4.0, monitor, 1.0)
     assert monitor.nodes == ("graph_planner#1",)
-    monitor.heard(story.route, "graph_planner", 1, 5.0, 5.0)
+    monitor.take(story.route, "graph_planner", 1, 5.0, 5.0)
     assert not monitor.active
 
 

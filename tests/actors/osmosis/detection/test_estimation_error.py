@@ -181,4 +181,4 @@ async def test_the_actor_names_the_life_that_lied(system):
     assert ear.states == ["idle", "active"]
     report = ear.heard[-1][1]
     assert report.nodes == ("localization#1",)
-    assert report.reason == "the pose is 2.0 m from GPS, which moves as the wheels do"
+    assert report.reason == "the pose is 2.0 m from GPS, which moves like the wheels"

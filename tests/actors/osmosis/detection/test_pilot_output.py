@@ -39,7 +39,7 @@ class Bench:
         self.monitor = PilotOutputMonitor("safety_pilot", 0.0, 5.0, PilotLimits(held_s=HELD_S))
         self.now = 0.0
         self.life = 1
-        self.monitor.said(stopped=False, reason="", now_s=0.0)
+        self.monitor.status(stopped=False, reason="", now_s=0.0)
         self.drive(10)
 
     def drive(self, ticks, asked=(0.8, 0.1), sent=None, *, first="asked", age_s=0.0,
@@ -49,17 +49,17 @@ class Bench:
             self.now += PERIOD_S
             got = asked if sent is None else sent
             if first == "asked":
-                self.monitor.asked(*asked, self.now, by)
+                self.monitor.commanded(*asked, self.now, by)
             if got is not False:
                 self.monitor.sent(*got, self.now - age_s, self.life, self.now)
             if first == "sent":
-                self.monitor.asked(*asked, self.now + 0.001, by)
+                self.monitor.commanded(*asked, self.now + 0.001, by)
             while self.monitor.due_s <= self.now:
                 self.monitor.expire(self.monitor.due_s)
         return self.monitor.active
 
     def says(self, reason, *, stopped=False):
-        self.monitor.said(stopped=stopped, reason=reason, now_s=self.now)
+        self.monitor.status(stopped=stopped, reason=reason, now_s=self.now)
 
 
 def test_also_when_the_output_is_heard_before_the_command_that_it_follows():
@@ -74,7 +74,7 @@ def test_what_nobody_asked_for_accuses_the_pilots_life_within_a_fifth_of_a_secon
     bench = Bench()
     assert bench.drive(4, sent=sent)
     assert bench.monitor.nodes == ("safety_pilot#1",)
-    assert "nobody has asked for" in bench.monitor.reason
+    assert "which no command explains" in bench.monitor.reason
 
 
 def test_one_strange_message_is_a_race():
@@ -95,7 +95,7 @@ def test_while_it_says_that_it_stops_it_must_not_drive():
     bench.says("RM2: because", stopped=True)
     assert not bench.drive(20, sent=(0.0, 0.0))
     assert bench.drive(5)
-    assert "says that it stops" in bench.monitor.reason
+    assert "reports a stop" in bench.monitor.reason
 
 
 def test_its_word_may_follow_its_deed():
@@ -144,7 +144,7 @@ def test_a_pilot_that_goes_on_for_longer_is_accused():
     while not bench.drive(1, sent=(0.8, 0.1), first="nobody"):
         assert bench.now - last_s < HELD_S + 0.2
     assert bench.now - last_s > HELD_S
-    assert "nobody has asked for" in bench.monitor.reason
+    assert "which no command explains" in bench.monitor.reason
 
 
 def test_while_nobody_asks_it_may_not_send_anything_else():

@@ -14,12 +14,13 @@ from rampart.actors.detection.freshness import FreshnessMonitor
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
-from rampart.actors.osmosis.detection.area.geofence import (
+from rampart.actors.osmosis.detection.area.prohibited_area import (
     FenceLimits,
     FenceMonitor,
+    ProhibitedArea,
+    half_diagonal_m,
     intrusion,
 )
-from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea, half_diagonal_m
 from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.messages import GpsFix
 from rampart.actors.runtime.actor import Actor

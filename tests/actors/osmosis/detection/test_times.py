@@ -25,9 +25,9 @@ def compare(active: tuple[float, float], standby: tuple[float, float]) -> list[f
     standby_life, back_s = 1, 0.0
     for tick in range(200):
         now_s = tick * PERIOD_S
-        monitor.heard("osmosis_control", active, now_s, 1, now_s)
+        monitor.take("osmosis_control", active, now_s, 1, now_s)
         if now_s >= back_s:
-            monitor.heard("standby_control", standby, now_s, standby_life, now_s)
+            monitor.take("standby_control", standby, now_s, standby_life, now_s)
         if monitor.nodes and monitor.nodes not in accused_s:
             accused_s[monitor.nodes] = now_s
             if len(accused_s) == 1:  # it is respawned
@@ -51,7 +51,7 @@ def test_dm12_finds_an_output_that_is_stuck_in_its_time(stuck):
     found_s = None
     for tick in range(60):
         now_s = tick * PERIOD_S
-        monitor.asked(*(stuck if now_s < 1.0 else (0.0, 0.0)), now_s)
+        monitor.commanded(*(stuck if now_s < 1.0 else (0.0, 0.0)), now_s)
         monitor.sent(*stuck, now_s, 1, now_s)
         if monitor.active and found_s is None:
             found_s = now_s

@@ -12,11 +12,12 @@ from rampart.actors.osmosis.messages import (
     MissionStatus,
     Mode,
 )
-from rampart.actors.osmosis.page import orders as hmi_orders
-from rampart.actors.osmosis.page.orders import Orders
-from rampart.actors.osmosis.page.submission import (
-    GIVE_UP_S,
+from rampart.actors.osmosis.page.missions import (
+    MISSION_GIVE_UP_S,
+    NO_REASON,
+    ORDER_GIVE_UP_S,
     RESPAWN_WINDOW_S,
+    Orders,
     Submission,
     first_request,
 )
@@ -91,9 +92,9 @@ def test_a_mission_is_refused_while_another_one_is_under_way(phase):
 def test_a_mission_from_the_page_is_withdrawn_when_nobody_takes_it_but_the_first_is_not():
     submission = Submission("r7", 2, 50.0, None)
     submission.ask("A", GOALS, 50.0)
-    assert submission.expire(50.0 + GIVE_UP_S - 0.1) == ""
-    assert submission.expire(50.0 + GIVE_UP_S) == (
-        "mission A was not taken: the Mission Manager does not answer")
+    assert submission.expire(50.0 + MISSION_GIVE_UP_S - 0.1) == ""
+    assert submission.expire(50.0 + MISSION_GIVE_UP_S) == (
+        "mission A was not accepted: the Mission Manager does not answer")
     assert submission.pending is None
     first = Submission("r7", 1, 0.0, FIRST)
     assert first.expire(1e6) == ""
@@ -123,17 +124,17 @@ def test_an_order_is_repeated_as_the_same_message_until_it_is_answered():
 def test_a_refusal_comes_with_its_reason_and_the_next_order_has_another_id():
     orders = under_way(*MissionAction)
     first = orders.give(MissionAction.HOME, "", 10.0)
-    assert first.reason == hmi_orders.NO_REASON
+    assert first.reason == NO_REASON
     assert orders.answer(MissionOrderAnswer(first.order, False, "no way")) == "home refused: no way"
     assert orders.give(MissionAction.HOME, "", 11.0).order != first.order
 
 
 def test_an_order_that_makes_no_sense_in_the_present_phase_is_not_passed_on():
     orders = Orders("r7/hmi.1", "operator")
-    with pytest.raises(RefusedError, match="the Mission Manager was not heard yet"):
+    with pytest.raises(RefusedError, match="no status of the Mission Manager was received yet"):
         orders.give(MissionAction.PAUSE, "", 1.0)
     orders = under_way(MissionAction.PAUSE, MissionAction.SKIP)
-    with pytest.raises(RefusedError, match="resume makes no sense while the mission is running; "
+    with pytest.raises(RefusedError, match="resume is not possible while the mission is running; "
                                            "possible: pause, skip"):
         orders.give(MissionAction.RESUME, "", 1.0)
     orders.give(MissionAction.PAUSE, "", 1.0)
@@ -144,7 +145,7 @@ def test_an_order_that_makes_no_sense_in_the_present_phase_is_not_passed_on():
 def test_an_order_that_nobody_answers_is_withdrawn():
     orders = under_way(MissionAction.CANCEL)
     orders.give(MissionAction.CANCEL, "", 10.0)
-    assert orders.expire(9.9 + hmi_orders.GIVE_UP_S) == ""
-    assert orders.expire(10.0 + hmi_orders.GIVE_UP_S) == (
+    assert orders.expire(9.9 + ORDER_GIVE_UP_S) == ""
+    assert orders.expire(10.0 + ORDER_GIVE_UP_S) == (
         "cancel was not obeyed: the Mission Manager does not answer")
     assert orders.pending is None

@@ -170,7 +170,7 @@ def test_where_home_is_not_known_it_waits_for_that_until_its_deadline(late_s):
         await asyncio.sleep(0.5)
         if late_s > 2.0:
             assert boss.reports[-1][1].reason == (
-                "not done within 2 s: refused: where the mission began is not known")
+                "not done within 2 s: refused: the start of the mission is unknown")
             boss.order("RM9", decision=2)
             await asyncio.sleep(0.2)
         assert boss.phases[-1] == "degraded"

@@ -43,18 +43,18 @@ def test_the_lights_of_a_row_are_those_that_it_passes_over():
 def test_a_measurement_is_sent_again_until_it_is_shown(ledger):
     ledger.add(measured("L1"), 0.0)
     assert ledger.to_send_again(9.0) == []  # nobody has been heard
-    ledger.hear(shown())
+    ledger.confirm(shown())
     assert ledger.to_send_again(0.4) == []  # it is on its way
     assert ledger.to_send_again(0.5) == [measured("L1")]
     assert ledger.to_send_again(0.6) == []
     assert ledger.to_send_again(1.0) == [measured("L1")]
-    ledger.hear(shown("L1"))
+    ledger.confirm(shown("L1"))
     assert ledger.to_send_again(9.0) == []
 
 
 def test_another_missions_status_shows_nothing(ledger):
     ledger.add(measured("L1"), 0.0)
-    ledger.hear(shown("L2", mission_id="y"))
+    ledger.confirm(shown("L2", mission_id="y"))
     assert ledger.judged == {"L1"}
     assert ledger.to_send_again(9.0) == []
     assert ledger.detour(ledger.on_row(ROW), 10.0, ended=False) is None
@@ -62,7 +62,7 @@ def test_another_missions_status_shows_nothing(ledger):
 
 def test_a_light_passed_without_a_measurement_is_gone_back_for_and_then_given_up(ledger):
     row = ledger.on_row(ROW)
-    ledger.hear(shown())
+    ledger.confirm(shown())
     ledger.add(measured("L1"), 0.0)
     assert ledger.detour(row, 8.0, ended=False) is None  # the sensor is still over L2
     detour = ledger.detour(row, 9.0, ended=False)
@@ -80,18 +80,18 @@ def test_a_light_passed_without_a_measurement_is_gone_back_for_and_then_given_up
 
 def test_a_successor_in_the_middle_of_a_detour_goes_back_again(ledger):
     row = ledger.on_row(ROW)
-    ledger.hear(shown())
+    ledger.confirm(shown())
     assert ledger.detour(row, 6.0, ended=False).light == "L1"
     successor = LightLedger(LIGHTS)
     successor.restore(ledger.kept)
     assert successor.detour(row, 6.0, ended=False) is None  # the Mission Manager may have it
-    successor.hear(shown())
+    successor.confirm(shown())
     assert successor.detour(row, 6.0, ended=False).light == "L1"
 
 
 def test_lights_that_it_drives_round_are_left_out_without_taking_the_sensor_for_blind(ledger):
     row = ledger.on_row(ROW)
-    ledger.hear(shown())
+    ledger.confirm(shown())
     for step in range(40):
         ledger.leave_out(row, 6.0 + 0.1 * step)
     assert ledger.kept.given_up == ("L2",)
@@ -112,7 +112,7 @@ def test_a_blind_sensor_costs_one_detour_and_every_other_fault_ends(ledger):
             if dice.random() < 0.002:
                 kept, book = book.kept, LightLedger(LIGHTS)
                 book.restore(kept)
-            book.hear(shown(*manager))
+            book.confirm(shown(*manager))
             for at_m, name in row:
                 if 0.9 <= s_m + 0.45 - at_m < 1.1:
                     if works[name] and not missed[name] and book.add(measured(name), 0.0):

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.control.following.path_follower import PathFollower
-from rampart.actors.osmosis.control.following.potential_field import field, repulsion
+from rampart.actors.osmosis.control.following.path_follower import PathFollower, field, repulsion
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import Polyline, wrap_angle
 from tests.actors.osmosis.control.world import HULL, Circle, World, drive

@@ -97,7 +97,7 @@ def test_the_active_one_drives_again_when_it_has_been_good_for_half_a_second():
     bench = Bench().tick((0.8, 0.0), (0.7, 0.0), ticks=20)
     bench.tick((3.0, 0.0), (0.7, 0.0))
     bench.tick((0.8, 0.0), (0.7, 0.0), ticks=9)
-    assert bench.reason == "standby drives: the other is not good for long yet"
+    assert bench.reason == "standby drives: osmosis control has just recovered"
     bench.tick((0.8, 0.0), (0.7, 0.0), ticks=3)
     assert (bench.out, bench.reason) == ((0.8, 0.0), "")
 
@@ -172,7 +172,7 @@ def test_the_lowest_ordered_bound_holds_until_its_order_ends_and_keeps_the_turn_
     bench.gate.order("RM8", m.PilotOrder(True, PilotMode.AUTO, "worse", 0.3))
     assert bench.out == (0.3, 0.4)
     bench.gate.order("RM8", m.PilotOrder(False, PilotMode.AUTO, ""))
-    assert (bench.out, bench.reason) == ((0.5, 0.4), "speed bounded by order")
+    assert (bench.out, bench.reason) == ((0.5, 0.4), "speed limited by an order")
     bench.gate.order("RM7", m.PilotOrder(False, PilotMode.AUTO, ""))
     assert (bench.out, bench.gate.top_speed_mps) == ((0.9, 0.4), 0.0)
     for nonsense in (0.0, -1.0, math.nan):

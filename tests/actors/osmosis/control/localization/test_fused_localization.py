@@ -100,7 +100,7 @@ def test_it_says_which_source_it_has_excluded_and_why():
         await ear.drive(3.0)
         ear.fail("gps-bias")
         await ear.drive(3.0)
-        assert ear.status.excluded == (("GPS", "moves otherwise than the others, 0.6 m"),)
+        assert ear.status.excluded == (("GPS", "moves differently from the others, 0.6 m"),)
         assert ear.error_m(0.0) < 0.05
 
     play(scenario)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
-from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
-from rampart.actors.osmosis.control.localization.position_source import FilterLimits
+from rampart.actors.osmosis.control.localization.pose_filter import FilterLimits, PoseFilter
 from tests.actors.osmosis.control.localization_drive import (
     END_S,
     SOURCES,

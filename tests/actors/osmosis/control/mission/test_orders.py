@@ -57,7 +57,8 @@ def test_pause_and_resume():
         operator.ask(MissionAction.RESUME)
         assert await house.until(lambda: operator.status.phase is MissionPhase.SUCCEEDED, 90)
         assert [a.accepted for a in operator.answers] == [True, False, True]
-        assert operator.answers[1].reason == "it is paused already, operator: aircraft passing"
+        assert operator.answers[1].reason == (
+            "the mission is already paused, operator: aircraft passing")
 
     play(scenario)
 
@@ -111,7 +112,7 @@ def test_a_transient_controlled_stop_pauses_the_mission_and_its_end_resumes_it()
         assert operator.status.reason == "held by RM2: DM6: localization not updated"
         operator.ask(MissionAction.RESUME)
         await asyncio.sleep(0.2)
-        assert "goes on by itself" in operator.answers[-1].reason
+        assert "continues when the robot is released" in operator.answers[-1].reason
         operator.release()
         assert await house.until(lambda: operator.status.phase is MissionPhase.SUCCEEDED, 90)
         assert operator.phases == ["idle", "running", "paused", "running", "succeeded"]

@@ -239,9 +239,9 @@ def test_backwards_where_no_laser_looks_drives_the_stick_alone_and_slowly():
     assert bench.out() == (-0.2, 0.4)
     bench.send(-1.0, 0.4, stick=True)
     assert bench.out() == (-LIMITS.reverse_mps, 0.4)
-    assert "no laser looks back" in bench.gate.output(bench.now).reason
+    assert "no laser to the rear" in bench.gate.output(bench.now).reason
     bench.wait(0.31)
-    assert "backwards, where no laser looks" in bench.send(-0.2)
+    assert "backwards, where there is no laser" in bench.send(-0.2)
     assert bench.out() == (0.0, 0.0)
     assert bench.send(0.2) == ""
     assert bench.out() == (0.2, 0.0)

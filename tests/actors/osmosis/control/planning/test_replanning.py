@@ -196,7 +196,7 @@ def test_the_planner_plans_round_what_has_blocked_the_robot_for_long_enough():
     assert passes(direct, CRATE)
     assert not passes(detour, CRATE)
     assert detour.waypoints[-1] == direct.waypoints[-1]
-    assert detour.reason == "way round (-29.3, -5.0), which is blocked"
+    assert detour.reason == "route around (-29.3, -5.0), which is blocked"
 
 
 def test_as_in_the_paper_it_does_not():

@@ -97,9 +97,9 @@ FAULTS = {
     "across the grass": (((0.0, 0.0), (30.0, 27.0)), None, None, "leg 1 from (0.0, 0.0) to "
                          "(30.0, 27.0) crosses the prohibited area"),
     "along the edge": (((0.0, 0.0), (27.0, 2.6), (30.0, 27.0)), None, None,
-                       "passes 0.40 m from the prohibited area, 0.60 m is the least"),
+                       "passes 0.40 m from the prohibited area, expected at least 0.60 m"),
     "over pavement where no edge is": (((0.0, 1.9), (26.0, 1.9)), None, None,
-                                       "leg 1 from (0.0, 1.9) to (26.0, 1.9) lies on no edge"),
+                                       "leg 1 from (0.0, 1.9) to (26.0, 1.9) follows no edge"),
     "back to the graph": (((2.0, 2.2), (3.0, 0.0), (30.0, 0.0)), (2.0, 2.2), None, ""),
     "off the graph to the goal": (((0.0, 0.0), (20.0, 0.0), (20.0, 2.2)), None, None, ""),
     "off the graph on the way": (((0.0, 0.0), (9.0, 0.0), (9.0, 2.2), (20.0, 2.2), (20.0, 0.0),

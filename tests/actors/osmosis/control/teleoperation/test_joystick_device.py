@@ -105,7 +105,7 @@ def test_no_stream_of_records_leaves_the_range(records, zone, piece):
     ({"left_sign": [1]}, "left_sign = [1]: expected -1 or 1"),
     ({"dead_man_button": -1}, "dead_man_button = -1: expected a whole number, 0 or more, at most"),
     ({"dead_man_button": True}, "dead_man_button = True"),
-    ({"left_axis": 1}, "left_axis = 1: is the forward axis already")])
+    ({"left_axis": 1}, "left_axis = 1: expected another axis than forward_axis")])
 def test_a_mapping_without_sense_is_refused_by_name_and_value(parameters, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         read_parameters(Teleoperation.Parameters, parameters, "spec.toml", "parameters")

@@ -159,7 +159,7 @@ async def test_a_joystick_that_is_pulled_out_stops_and_drives_again_after_a_fres
         await it.until(lambda: m.Twist(1.0, 0.0) in it.page.commands)
         it.unplug()
         await it.until(lambda: it.page.commands[-1] == STOP)
-        await it.until(lambda: it.told("vanished"))
+        await it.until(lambda: it.told("lost"))
         await it.plug()
         it.page.commands.clear()
         it.tell(record(BUTTON | INITIAL, 4, 1), record(AXIS | INITIAL, 1, -32767))
@@ -189,7 +189,7 @@ async def test_a_page_that_falls_silent_while_holding_stops_the_robot(tmp_path):
 
 async def test_a_device_that_is_not_there_is_waited_for_and_the_page_drives_meanwhile(tmp_path):
     async with desk(tmp_path, device="later") as it:
-        await it.until(lambda: it.told("waiting for it"))
+        await it.until(lambda: it.told("waiting for the device"))
         it.page.publish(topics.JOYSTICK, m.Joystick(0.5, 0.0, True))
         await it.until(lambda: m.Twist(0.5, 0.0) in it.page.commands)
         (tmp_path / "later").symlink_to(tmp_path / "stick")

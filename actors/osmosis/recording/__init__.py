@@ -1,1 +1,0 @@
-"""What viewers of recordings get to see of Osmosis."""
