@@ -1,4 +1,4 @@
-"""The application of Osmosis: an airport, and a mission there."""
+"""The application of Osmosis: an airport and a mission there."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
     from rampart.actors.osmosis.airport.model import Airport, Mission, WorldTruth
 
 _AIRPORT = "airport"
-"""Folder of a recording with the airport's files."""
+"""Folder of the airport's files in a recording."""
 
 TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
 
 
 class Osmosis(Application):
-    """What the nodes of Osmosis know of the airport and of their mission.
+    """The airport and the mission, for the nodes of Osmosis.
 
     Attributes:
-        airport: where the robot drives, as the controller believes it to be.
-        mission: what it does there.
-        world: what differs in the world from the controller's map.
+        airport: the airport on the controller's map.
+        mission: the mission.
+        world: differences of the world from the controller's map.
     """
 
     class Options(Application.Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-        """Choices for a run of Osmosis."""
+        """Options of a run of Osmosis."""
 
         airport: Annotated[str, msgspec.Meta(
             description="shipped airport, a .toml, or a .graph with its image beside it",
@@ -40,7 +40,7 @@ class Osmosis(Application):
             description="mission of the airport, or a file with lines x=…,y=…,taxi=…",
             extra={"metavar": "NAME|FILE", "file": True, "campaign": "A"})]
         obstacles: Annotated[int, msgspec.Meta(
-            ge=0, description="how many of the airport's obstacles stand on the way",
+            ge=0, description="number of the airport's obstacles on the way",
             extra={"metavar": "N", "campaign": "0,2"})] = 0
         joystick: Annotated[str, msgspec.Meta(
             description="drive with a joystick or gamepad of this machine, e.g. /dev/input/js0 "
@@ -58,7 +58,7 @@ class Osmosis(Application):
         ("--mission A --obstacles 2", "two obstacles on the way"),
         ("--joystick", "drive by hand: hold the left shoulder button"),
         ("--virtual --fault kill:osmosis_control@30 --fault gps-bias@goal2+5", "two faults"),
-        ("--airport my/airport.graph --mission my/MISSION_A.miss", "an airport of your own"),
+        ("--airport my/airport.graph --mission my/MISSION_A.miss", "your airport"),
     )
     options: Options
 
@@ -69,13 +69,13 @@ class Osmosis(Application):
         self.airport, self.world = formats.load_with_truth(options.airport)
         self.mission: Mission = formats.load_mission(options.mission, self.airport)
         if options.obstacles > len(self.airport.obstacles):
-            raise ValueError(f"obstacles = {options.obstacles}: {self.airport.name} has places for "
-                             f"{len(self.airport.obstacles)}")
+            raise ValueError(f"obstacles = {options.obstacles}: expected at most "
+                             f"{len(self.airport.obstacles)} on {self.airport.name}")
 
     @classmethod
     def on_map(cls, airport: Airport, mission: Mission | None = None,
                world: WorldTruth | None = None) -> Osmosis:
-        """Return an application of what is loaded already; without a mission, of none."""
+        """Return the application for a loaded airport, with a mission or without."""
         from rampart.actors.osmosis.airport.model import Mission, WorldTruth  # noqa: PLC0415 heavy
 
         found = cls.__new__(cls)
@@ -85,7 +85,7 @@ class Osmosis(Application):
         return found
 
     def documents(self) -> list[tuple[str, Path]]:
-        """Return the airport's files, and the mission's if it has one."""
+        """Return the files of the airport and of the mission, if it has one."""
         from rampart.actors.osmosis.airport.formats import files_of  # noqa: PLC0415 as above
 
         found = [(f"{_AIRPORT}/{path.name}", path) for path in files_of(Path(self.airport.source))]
@@ -99,7 +99,7 @@ class Osmosis(Application):
         """Return the application on the airport of a recording, without a mission.
 
         Raises:
-            OSError, ValueError: it has none, or it is unsound.
+            OSError, ValueError: the recording has no valid airport.
         """
         from rampart.actors.osmosis.airport.formats import load_airport  # noqa: PLC0415 as above
 
@@ -111,27 +111,27 @@ class Osmosis(Application):
 
     @classmethod
     def said(cls, name: str, value: Any) -> str:
-        """Return an option's value in words; obstacles are counted."""
+        """Return an option's value as text."""
         if name == "obstacles":
             return f"{value or 'no'} obstacle{'' if value == 1 else 's'}"
         return super().said(name, value)
 
     @classmethod
     def simpler(cls, options: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return the options without obstacles, if there are any."""
+        """Return the options without obstacles, if they have some."""
         return [{**options, "obstacles": 0}] if options.get("obstacles") else []
 
     def check(self, spec: SystemSpec, *, virtual: bool) -> str:
-        """Refuse a joystick that nobody can drive with; one that is not plugged in is waited for.
+        """Refuse an unusable joystick; return a note about one that is not connected yet.
 
         Raises:
-            ValueError: no node reads it, it is neither a device nor a FIFO, or nobody drives.
+            ValueError: the run is virtual, no node reads it, or it is neither a device nor a FIFO.
         """
         name = self.options.joystick
         if not name:
             return ""
         if virtual:
-            raise ValueError(f"--joystick {name}: not with --virtual, nobody can drive that fast")
+            raise ValueError(f"--joystick {name}: not possible with --virtual")
         if all(node.actor != TELEOPERATION for node in spec.nodes):
             raise ValueError(f"--joystick {name}: no node of {spec.name} reads it")
         device = Path(name)
@@ -139,9 +139,9 @@ class Osmosis(Application):
             raise ValueError(f"--joystick {name}: neither a device nor a FIFO; joysticks are "
                              "/dev/input/js0, /dev/input/js1 …")
         if name != "auto" and not device.exists():
-            return f"--joystick {name}: not there yet, waiting for it"
+            return f"--joystick {name}: not connected yet, waiting for it"
         return ""
 
     def world_parameters(self) -> Mapping[str, Any]:
-        """Return how many obstacles stand in the world."""
+        """Return the number of obstacles for the world."""
         return {"obstacles": self.options.obstacles}

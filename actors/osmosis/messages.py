@@ -1,11 +1,11 @@
 """The messages of Osmosis: SI units, REP-103 axes, REP-105 frames.
 
-The bus puts the header round these structs (`rampart.actors.bus.envelope`). Angles: (-pi, pi], x
+The bus adds the header to these structs (`rampart.actors.bus.envelope`). Angles: (-pi, pi], x
 forward, y left, yaw counter-clockwise. A field named `*_f32` is a little-endian float32 array.
 
-Every field but a measurement or a command is bounded by its type (`rampart.actors.bus.bounds`): a
-payload beyond the bounds never reaches an actor. A plain `float` may be anything, NaN and infinity
-included; its reader judges it.
+Each field but a measurement or a command is bounded by its type (`rampart.actors.bus.bounds`): a
+payload beyond the bounds never reaches an actor. A plain `float` may have any value, NaN and
+infinity included; its reader checks it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rampart.actors.bus.bounds import (
 )
 from rampart.actors.bus.messages import Message
 
-# ---- robot: what a Summit XL driver publishes and takes --------------------------------------
+# ---- robot: the Summit XL layer --------------------------------------------------------------
 
 
 class Pose(Message, frozen=True):
@@ -47,10 +47,10 @@ class Twist(Message, frozen=True):
 
 
 class StickTwist(Twist, frozen=True):
-    """Velocity that the operator's stick asks for, and when the stick was taken in hand.
+    """Velocity of the operator's joystick, and since when its dead man is held.
 
-    `held_since_s` is in simulated seconds. A stick that was held before a stop ended drives only
-    after its operator has let go of it.
+    `held_since_s` is in simulated seconds. A joystick that was held before a stop ended drives only
+    after it was released.
     """
 
     held_since_s: float = 0.0
@@ -83,10 +83,10 @@ class GpsFix(Message, frozen=True):
 
 
 class LaserScan(Message, frozen=True):
-    """One sweep of the 2D laser in `base_link`; a range of `range_max_m` means no echo.
+    """A sweep of the 2D laser in `base_link`; a range of `range_max_m` means no echo.
 
     `reference_m` is the range to the target in the laser's housing, measured once a sweep, for
-    `rampart.actors.osmosis.control.pilot.laser_pair`; exactly -1 for a device without one.
+    `rampart.actors.osmosis.control.pilot.laser_pair`; exactly -1 for a device without a target.
     """
 
     angle_min_rad: float
@@ -97,17 +97,17 @@ class LaserScan(Message, frozen=True):
 
 
 class LightSample(Message, frozen=True):
-    """Illuminance at the light sensor, which looks down at the ground ahead of the robot."""
+    """Illuminance at the light sensor, which faces the ground ahead of the robot."""
 
     illuminance_lux: float
 
 
 class BaseCommand(Twist, frozen=True):
-    """Velocity for the base. The base stops by itself when these cease (dead man)."""
+    """Velocity for the base. Without fresh commands the base stops (dead man)."""
 
 
 class BrakeCommand(Message, frozen=True):
-    """Low-level brake: blocks the wheels, whatever is commanded, until its last holder lets go."""
+    """Low-level brake: blocks the wheels until its last holder releases it."""
 
     engaged: bool
     reason: Text
@@ -120,6 +120,8 @@ class BaseStatus(Message, frozen=True):
     dead_man_tripped: bool
     command_age_s: float
     wheel_speeds_radps: tuple[float, float, float, float]
+
+
 # ---- mission and control ---------------------------------------------------------------------
 
 
@@ -131,7 +133,7 @@ class Mode(StrEnum):
 
 
 class Goal(Message, frozen=True):
-    """One point of a mission, in `map`, and the mode in which to reach it."""
+    """A point of a mission, in `map`, and its mode."""
 
     x_m: float
     y_m: float
@@ -139,7 +141,7 @@ class Goal(Message, frozen=True):
 
 
 class MissionRequest(Message, frozen=True):
-    """A mission for the Mission Manager. The same `mission_id` twice is one mission."""
+    """A mission for the Mission Manager. A repeated `mission_id` is the same mission."""
 
     mission_id: Name
     name: Name
@@ -159,7 +161,7 @@ class MissionPhase(StrEnum):
 
 
 class LightVerdict(StrEnum):
-    """Judgement on a light: below half its nominal intensity it is dim (ICAO Annex 14, 10.4)."""
+    """Verdict on a light: below half its nominal intensity it is dim (ICAO Annex 14, 10.4)."""
 
     OK = "ok"
     DIM = "dim"
@@ -167,7 +169,7 @@ class LightVerdict(StrEnum):
 
 
 class LightMeasurement(Message, frozen=True):
-    """One light measured in passing."""
+    """Measurement of a light in passing."""
 
     light: Name
     intensity_cd: float
@@ -176,7 +178,7 @@ class LightMeasurement(Message, frozen=True):
 
 
 class MissionAction(StrEnum):
-    """What can be asked of a mission under way."""
+    """Orders to a mission under way."""
 
     PAUSE = "pause"
     RESUME = "resume"
@@ -187,7 +189,7 @@ class MissionAction(StrEnum):
 
 
 class MissionOrder(Message, frozen=True):
-    """An order to the Mission Manager, `by` whom and why; the same `order` twice is one order."""
+    """An order to the Mission Manager with sender and reason; a repeated `order` counts once."""
 
     order: Name
     action: MissionAction
@@ -196,7 +198,7 @@ class MissionOrder(Message, frozen=True):
 
 
 class MissionOrderAnswer(Message, frozen=True):
-    """Whether an order was obeyed, and why not; `plan` is the number of the plan it led to."""
+    """Whether an order was accepted, and why not; `plan` is the number of the resulting plan."""
 
     order: Name
     accepted: bool
@@ -205,10 +207,10 @@ class MissionOrderAnswer(Message, frozen=True):
 
 
 class MissionStatus(Message, frozen=True):
-    """Where the mission is. `step` is the index of the current goal; lights measured so far.
+    """Progress of the mission: `step`, the index of the current goal, and the measured lights.
 
-    `skipped` holds the indices of goals left out on request, `unmeasured` the lights that the robot
-    passed and could not measure, `orders` those that would be obeyed now.
+    `skipped`: indices of goals skipped by order; `unmeasured`: lights passed without a measurement;
+    `orders`: those that would be accepted now.
     """
 
     mission_id: Name
@@ -225,21 +227,21 @@ class MissionStatus(Message, frozen=True):
 
 
 class OfStep(Message, frozen=True):
-    """What belongs to one step of a mission."""
+    """Base of messages that belong to a step of a mission."""
 
     mission_id: Name
     step: Count
 
     @property
     def which(self) -> tuple[str, int]:
-        """The mission, and the step of it."""
+        """Mission and step."""
         return self.mission_id, self.step
 
 
 class GoalOrder(OfStep, frozen=True):
-    """The Mission Manager's current goal for the Graph Planner; `active` False means none.
+    """The Mission Manager's current goal for the Graph Planner; `active` False: no goal.
 
-    On the way home `step` is the number of goals. `plan` grows with each request for another plan.
+    On the way home `step` is the number of goals. `plan` grows with each order to replan.
     """
 
     goal: Goal
@@ -248,9 +250,9 @@ class GoalOrder(OfStep, frozen=True):
 
 
 class Route(OfStep, frozen=True):
-    """Way to a goal: waypoints in `map`, first is the start; empty with a `reason` if none.
+    """Route to a goal: waypoints in `map` from the start; empty with a `reason` if there is none.
 
-    `plan` is that of the goal it was made for. The reason of a way round something says so.
+    `plan` is that of its goal. A detour has a `reason` too.
     """
 
     mode: Mode
@@ -261,7 +263,7 @@ class Route(OfStep, frozen=True):
 
 
 class ControlPhase(StrEnum):
-    """What Osmosis Control is doing with its route."""
+    """State of Osmosis Control."""
 
     IDLE = "idle"
     FOLLOWING = "following"
@@ -271,7 +273,7 @@ class ControlPhase(StrEnum):
 
 
 class Blockage(Message, frozen=True):
-    """Something on the route that the robot does not get past: where in `map`, and since when."""
+    """A blockage of the route: its place in `map`, and since when."""
 
     x_m: float
     y_m: float
@@ -281,12 +283,12 @@ class Blockage(Message, frozen=True):
 class ControlStatus(OfStep, frozen=True):
     """Progress along the route of (mission, step).
 
-    `blocked` holds at most one blockage, the one in front of the robot now. `reason` says why a
-    route was refused. `unmeasured` names, on arrival, lights that were passed unmeasured.
+    `blocked`: at most one blockage, in front of the robot now; `reason`: why a route was refused;
+    `unmeasured`: on arrival, lights passed without a measurement.
 
-    For a standby to do the same: `back_to`, the point in `map` to which the robot goes back, if it
-    does; whether it is `passing` something beside the row; how far to the left of the route it
-    means to be; what its yaw loop has learnt.
+    Intent for the standby: `back_to`, the point in `map` to which the robot goes back, if any;
+    `passing`: it passes an obstacle beside a row; `aside_m`: intended offset to the left of the
+    route; `turn_added_radps`: correction of the yaw loop.
     """
 
     phase: ControlPhase
@@ -302,10 +304,10 @@ class ControlStatus(OfStep, frozen=True):
 
 
 class LocalizationStatus(Message, frozen=True):
-    """What the pose rests on: sources in use, and those that are not, each with the reason.
+    """Sources of the pose: those in use, and those excluded with the reason.
 
-    Standard deviations are infinite before there is a pose. `bridged_m` is the way made since two
-    independent sources last agreed on the position.
+    Standard deviations are infinite before the first pose. `bridged_m` is the distance driven since
+    two independent sources last agreed on the position.
     """
 
     in_use: Names
@@ -316,7 +318,7 @@ class LocalizationStatus(Message, frozen=True):
 
 
 class Joystick(Message, frozen=True):
-    """Stick positions in [-1, 1] and the dead-man button."""
+    """Joystick positions in [-1, 1] and the dead-man button."""
 
     forward: float
     left: float
@@ -324,10 +326,7 @@ class Joystick(Message, frozen=True):
 
 
 class WayOutRequest(Message, frozen=True):
-    """An operator's word that a robot inside a prohibited area may be driven out, once.
-
-    The same `order` twice is one request.
-    """
+    """Request to drive a robot out of a prohibited area, once; a repeated `order` counts once."""
 
     order: Name
     by: Name
@@ -335,9 +334,9 @@ class WayOutRequest(Message, frozen=True):
 
 
 class WayOutAnswer(Message, frozen=True):
-    """Whether the way out is granted, and why not; or, after it was, why it has ended.
+    """Whether the way out is granted, and why not; later why it has ended.
 
-    `is_out`: it has ended because the robot is far enough from the area to be released.
+    `is_out`: it ended because the robot is far enough from the area to be released.
     """
 
     order: Name
@@ -347,7 +346,7 @@ class WayOutAnswer(Message, frozen=True):
 
 
 class PilotMode(StrEnum):
-    """Whose commands the Safety Pilot passes on."""
+    """Source of the commands that the Safety Pilot passes."""
 
     AUTO = "auto"
     STOP = "stop"
@@ -355,7 +354,7 @@ class PilotMode(StrEnum):
 
 
 class Way(StrEnum):
-    """In which directions the robot may drive; whatever it is, it may turn."""
+    """Allowed directions; turning is always allowed."""
 
     ANY = "any"
     FORWARDS = "forwards"
@@ -364,10 +363,10 @@ class Way(StrEnum):
 
 
 class PilotOrder(Message, frozen=True):
-    """A recovery module's order to the Safety Pilot, in force while `engaged`.
+    """A recovery module's order to the Safety Pilot, which applies while `engaged`.
 
-    `top_speed_mps` bounds the speed of what passes; 0 leaves the bound of the robot. An order whose
-    `way` is not any is one to stop if it is not renewed.
+    `top_speed_mps` limits the speed; 0: only the robot's limit applies. An order with another `way`
+    than any becomes an order to stop if it is not renewed.
     """
 
     engaged: bool
@@ -378,9 +377,9 @@ class PilotOrder(Message, frozen=True):
 
 
 class PilotStatus(Message, frozen=True):
-    """What the Safety Pilot does and why: `reason` is empty while commands pass unchanged.
+    """State of the Safety Pilot: `reason` is empty while commands pass unchanged.
 
-    `top_speed_mps` is the lowest bound ordered, or 0; `forbids`: why not even the joystick drives.
+    `top_speed_mps`: lowest ordered limit, or 0; `forbids`: why not even the joystick may drive.
     """
 
     mode: PilotMode
@@ -389,11 +388,13 @@ class PilotStatus(Message, frozen=True):
     refused_commands: Count
     top_speed_mps: float = 0.0
     forbids: Text = ""
+
+
 # ---- world: for the judge and the tests, never for the controller ----------------------------
 
 
 class GroundTruth(Message, frozen=True):
-    """What really happens. Counters are cumulative, so a lost sample loses nothing."""
+    """Ground truth. Counters are cumulative, so that a lost sample loses no event."""
 
     pose: Pose
     twist: Twist
@@ -405,7 +406,7 @@ class GroundTruth(Message, frozen=True):
 
 
 class ObstacleCommand(Message, frozen=True):
-    """Makes a named obstacle of the airport appear at (x, y) in `map`, or go away."""
+    """Adds a named obstacle at (x, y) in `map`, or removes it."""
 
     name: Name
     present: bool
@@ -415,7 +416,7 @@ class ObstacleCommand(Message, frozen=True):
 
 
 class ActuatorFaultKind(StrEnum):
-    """What can fail about the base's actuators."""
+    """Failures of the base's actuators."""
 
     STUCK_WHEEL = "stuck wheel"
     WEAK_WHEEL = "weak wheel"
@@ -423,12 +424,12 @@ class ActuatorFaultKind(StrEnum):
 
 
 class ActuatorFault(Message, frozen=True):
-    """Puts a fault of the base's actuators in force; 0 simulated seconds end it.
+    """Starts a fault of the base's actuators; a duration of 0 ends it.
 
     `wheel`: front left, front right, rear left or rear right; a brake failure ignores it.
-    `strength` from 0 to 1, where 1 loses nothing: what is left of a weak wheel's torque and speed,
-    or with a brake failure of the braking torque, with wheels that do not lock; a stuck wheel
-    ignores it. `InjectionReport.affected` counts the 10 ms ticks in which something changed.
+    `strength` from 0 to 1 (no loss): remaining share of a weak wheel's torque and speed, or with a
+    brake failure of the braking torque, without locking; a stuck wheel ignores it.
+    `InjectionReport.affected` counts the 10 ms ticks in which the fault had an effect.
     """
 
     injection: Name
@@ -439,6 +440,6 @@ class ActuatorFault(Message, frozen=True):
 
 
 class ObstacleList(Message, frozen=True):
-    """The obstacles that are there now, for the map on the operator's page."""
+    """The present obstacles, for the map on the operator's page."""
 
     obstacles: Many[ObstacleCommand]

@@ -1,27 +1,26 @@
-"""Faults of the Summit XL's actuators: what is left of motors and brake while they last. Pure.
+"""Faults of the Summit XL's actuators: the remaining capability of motors and brake. Pure.
 
-**Stuck wheel**: gearbox or bearing has seized. The wheel is blocked like a braked one, and its
-motor does not strain against that (its drive trips); the tyre slides.
+**Stuck wheel**: a seized gearbox or bearing. The wheel is blocked like a braked one, and its motor
+gives no torque (its drive trips); the tyre slides.
 
-**Weak wheel**: of the motor's voltage and current a share k is left (a broken phase, a derated
-power stage, a bad contact). Stall torque and no-load speed of a motor are proportional to them, so
-its envelope shrinks: torque within k times the servo's limit, speed up to k times what the motor is
-rated for. Inside the envelope the closed loop still reaches its target, so a weak motor is masked
-while little is asked of it and shows in acceleration, in turns (the tyres' lateral slip costs
-torque) and at speed. Beyond its no-load speed it is driven through the ground and brakes, within
-its torque. At k = 0 the wheel rolls free. Scaling the target or the servo's gain instead would be
-a wheel that disobeys on an empty road, which a speed loop does not let happen.
+**Weak wheel**: a share k of the motor's voltage and current remains (a broken phase, a derated
+power stage, a bad contact). Stall torque and no-load speed are proportional to them, so the
+envelope shrinks: torque up to k times the servo's limit, speed up to k times the rated speed.
+Inside the envelope the closed loop reaches its target, so a weak motor shows only in acceleration,
+in turns (the tyres' lateral slip costs torque) and at speed. Beyond its no-load speed it is driven
+by the ground and brakes within its torque. At k = 0 the wheel rolls freely. A scaled target or
+servo gain would be a wheel that is slow even without load, which a speed loop prevents.
 
-**Brake failure**: the base has no brake but its motors. The brake order takes them from the
-velocity command and has them absorb energy along a ramp, then block. With a share s left the ramp
-has s times the deceleration, the torque s times what the healthy ramp needs and only ever against
-the wheel's motion (an absorber does not drive), and the wheels never block. At s = 0 the base
-coasts, slowed by the friction of bearings and gears alone. A stop by velocity command (the
-controlled stop) does not use the brake and still works. The friction helps a weak brake, not a
-ramp that is held: above s = 0.9 the way to a stop is the healthy one, within a centimetre or two.
+**Brake failure**: the motors are the base's only brake. A brake order makes them absorb energy
+along a ramp, regardless of the velocity command, and then block. With a share s the ramp has s
+times the deceleration and s times the torque of the healthy ramp, only against the wheel's motion
+(an absorber does not drive), and the wheels never block. At s = 0 the base coasts, slowed by the
+friction of bearings and gears. A stop by velocity command (the controlled stop) does not use the
+brake and still works. Friction helps a weak brake: above s = 0.9 the stopping distance is that of a
+healthy one, within one or two centimetres.
 
-A fault counts the ticks in which it changed something. Of several faults on one actuator the worst
-acts and counts: a stuck wheel hides its weak motor.
+A fault counts the ticks in which it had an effect. Of several faults on one actuator the worst acts
+and counts: a stuck wheel hides its weak motor.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ from rampart.sim.osmosis.robot import WHEEL_NAMES, WHEEL_RADIUS_M, DriveLimits, 
 from rampart.sim.osmosis.scene import WorldError
 
 STANDING_RADPS = 0.05
-"""A wheel slower than this, 6 mm/s at its tread, stands: there is nothing to brake or to block."""
+"""A slower wheel, 6 mm/s at its tread, stands: a brake has no effect."""
 
 
 MAX_IN_FORCE = 64
-"""Faults at a time."""
+"""Most faults at a time."""
 
 _REMEMBERED = 256
-"""Faults that are over, of which the count is told again when somebody asks."""
+"""Number of ended faults whose count is reported again on request."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +52,8 @@ class Motor:
     Args:
         torque_nm: the loop's torque limit.
         servo_gain: torque per speed error, N m s/rad.
-        rated_radps: speed it is built for: the base's top speed.
-        brake_torque_nm: what it takes to brake the base along the healthy ramp.
+        rated_radps: rated speed, at the base's top speed.
+        brake_torque_nm: torque that brakes the base along the healthy ramp.
     """
 
     torque_nm: float
@@ -64,7 +63,7 @@ class Motor:
 
 
 def motor_of(model: Any, limits: DriveLimits) -> Motor:
-    """Return the wheel motors of a compiled MuJoCo model of the Summit XL, which are all alike."""
+    """Return the wheel motor of a compiled MuJoCo model of the Summit XL; all four are equal."""
     # The free joint has the first six degrees of freedom, the wheels come next.
     inertia = float(model.dof_armature[6] + model.body("wheel_front_left").inertia[1])
     moved_kg = float(model.body("base").subtreemass[0]) + 4 * inertia / WHEEL_RADIUS_M**2
@@ -76,10 +75,10 @@ def motor_of(model: Any, limits: DriveLimits) -> Motor:
 
 @dataclass(frozen=True, slots=True)
 class Actuation:
-    """What the wheels get in one tick; per wheel in the order of `WHEEL_NAMES`.
+    """Input of the wheels in one tick, in the order of `WHEEL_NAMES`.
 
     Attributes:
-        targets_radps: speeds to servo to.
+        targets_radps: target speeds of the servos.
         torques_nm: least and greatest torque of the servos.
         blocked: which wheels are seized.
     """
@@ -91,7 +90,7 @@ class Actuation:
 
 @dataclass(frozen=True, slots=True)
 class FaultNews:
-    """A fault has been taken, has changed something for the first time, or is over."""
+    """A fault has started, has its first effect, or has ended."""
 
     injection: str
     affected_ticks: int
@@ -107,7 +106,7 @@ class _InForce:
 
 @dataclass(frozen=True, slots=True)
 class _Loss:
-    """What the faults in force leave of one actuator, and those of them that decide it."""
+    """Remaining share of an actuator, and the faults that cause it."""
 
     share: float
     causes: tuple[_InForce, ...]
@@ -117,7 +116,7 @@ class ActuatorFaults:
     """The actuator faults in force. Time is an argument.
 
     Args:
-        motor: what each of the four wheels has when healthy.
+        motor: healthy motor of each wheel.
     """
 
     def __init__(self, motor: Motor) -> None:
@@ -132,18 +131,17 @@ class ActuatorFaults:
         return bool(self._in_force)
 
     def order(self, order: ActuatorFault, now_s: float) -> None:
-        """Put a fault in force, change one, or end it by a duration of 0.
+        """Start or change a fault, or end it by a duration of 0.
 
-        A fault that is ordered again under its id while in force is replaced and goes on counting.
-        Ending one that is over already repeats the news of its end.
+        A repeated id replaces the fault and keeps its count. Ending an ended fault repeats the news
+        of its end.
 
         Raises:
-            WorldError: a value is impossible, a fault to be ended was never in force, or there are
-                too many.
+            WorldError: a value is invalid, the fault to end never started, or there are too many.
         """
         injection = order.injection
         if not order.duration_s >= 0:
-            raise WorldError(f"duration_s = {order.duration_s}: must be seconds, 0 to end the "
+            raise WorldError(f"duration_s = {order.duration_s}: expected seconds, 0 to end the "
                              "fault, inf for the rest of the run")
         if order.duration_s == 0:
             if injection in self._in_force:
@@ -151,15 +149,15 @@ class ActuatorFaults:
             elif injection in self._over:
                 self._news.append(FaultNews(injection, self._over[injection], finished=True))
             else:
-                raise WorldError(f"injection = {injection!r}: no such fault in force to end")
+                raise WorldError(f"injection = {injection!r}: unknown fault, nothing to end")
             return
         if not 0 <= order.strength <= 1:  # NaN is refused here as well
-            raise WorldError(f"strength = {order.strength}: must be a share from 0 to 1")
+            raise WorldError(f"strength = {order.strength}: expected a share from 0 to 1")
         if order.kind != ActuatorFaultKind.BRAKE_FAILURE and order.wheel not in WHEEL_NAMES:
-            raise WorldError(f"wheel = {order.wheel!r}: must be one of {', '.join(WHEEL_NAMES)}")
+            raise WorldError(f"wheel = {order.wheel!r}: expected one of {', '.join(WHEEL_NAMES)}")
         before = self._in_force.get(injection)
         if before is None and len(self._in_force) >= MAX_IN_FORCE:
-            raise WorldError(f"{MAX_IN_FORCE} faults are in force; wait for one to end")
+            raise WorldError(f"faults: {MAX_IN_FORCE} in force: expected no more at a time")
         affected_ticks = before.affected_ticks if before else 0
         self._in_force[injection] = _InForce(order, now_s + order.duration_s, affected_ticks)
         self._weigh()
@@ -171,24 +169,24 @@ class ActuatorFaults:
             self._end(injection)
 
     def take_news(self) -> list[FaultNews]:
-        """Return what has happened since the last call, oldest first."""
+        """Return the news since the last call, oldest first."""
         news, self._news = self._news, []
         return news
 
     @property
     def brake_share(self) -> float:
-        """Share of its deceleration that the brake has left."""
+        """Remaining share of the brake's deceleration."""
         return self._brake.share
 
     def actuate(self, targets_radps: WheelSpeeds, speeds_radps: WheelSpeeds, braking: bool
                 ) -> Actuation:
-        """Return what motors and brake make of the drive's wish in one tick, and count.
+        """Apply the faults to the drive's output of one tick, and count their effects.
 
         Args:
-            targets_radps: wheel speeds that the drive asks for, along the weak ramp if the brake
-                is ordered and fails.
+            targets_radps: wheel speeds by the drive; along the weak ramp if a failed brake is
+                ordered.
             speeds_radps: wheel speeds now.
-            braking: whether the brake is ordered, by whomever.
+            braking: whether the brake is ordered.
         """
         brake_fails = braking and self._brake.share < 1
         if brake_fails and max(map(abs, speeds_radps)) > STANDING_RADPS:
@@ -202,7 +200,7 @@ class ActuatorFaults:
                     self._count(self._stuck[wheel])
             elif self._weak[wheel].share < 1:
                 weak, sound = self._weak[wheel], torques[wheel]
-                # Braking, a motor is off the speed loop: only its torque counts.
+                # While it brakes, a motor has no speed loop: only its torque counts.
                 top_radps = math.inf if brake_fails else weak.share * self._motor.rated_radps
                 limit_nm = weak.share * self._motor.torque_nm
                 targets[wheel] = max(-top_radps, min(top_radps, asked))
@@ -215,14 +213,14 @@ class ActuatorFaults:
         return Actuation(tuple(targets), tuple(torques), self._blocked)
 
     def _torque_range(self, speed_radps: float, brake_fails: bool) -> tuple[float, float]:
-        """What a motor that is not weak itself may give to a wheel of this speed."""
+        """Return the torque range of a motor that is not weak, at a wheel speed."""
         if not brake_fails:
             return -self._motor.torque_nm, self._motor.torque_nm
         absorbed_nm = self._brake.share * self._motor.brake_torque_nm
         return (-absorbed_nm, 0.0) if speed_radps > 0 else (0.0, absorbed_nm)
 
     def _weigh(self) -> None:
-        """Work out what is left of each actuator: once per change, not once per tick."""
+        """Update the remaining share of each actuator, once per change."""
         self._brake = self._loss(ActuatorFaultKind.BRAKE_FAILURE)
         self._stuck = [self._loss(ActuatorFaultKind.STUCK_WHEEL, name) for name in WHEEL_NAMES]
         self._weak = [self._loss(ActuatorFaultKind.WEAK_WHEEL, name) for name in WHEEL_NAMES]

@@ -1,13 +1,12 @@
-"""The robot from behind and above: for replays, and for the page, to which a program sends it.
+"""Renders the robot from behind and above, for replays and for the operator's page.
 
-The program is run as `python -m rampart.sim.osmosis.camera`, by whoever shows the picture. It reads
-one line that says what to build, then one line for each picture that is wanted. It answers each
-with the picture, a JPEG behind its length in four bytes (big-endian). So it renders only what is
-asked for, no faster than it is read, and ends when its input does.
+The page runs it as the program `python -m rampart.sim.osmosis.camera`. It reads one line with the
+airport, then one line per picture, and answers each with a JPEG behind its length in four bytes
+(big-endian). So it renders only on request, and ends with its input.
 
-It has a scene of its own and follows what the controller believes: published pose and obstacles.
-The physics never waits for it. It runs at the lowest priority, and where nothing can be rendered
-(no EGL) it says why on standard error, in one line, and ends with exit code 1.
+It has its own scene and shows the published pose and obstacles. The physics never waits for it. It
+runs at the lowest priority. If it cannot render (no EGL), it prints one line on standard error and
+exits with code 1.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ from rampart.sim.runs.physics import RobotModel
 
 PIXELS_PER_M = 10
 MAX_PIXELS = 8192
-"""Longer side of the ground's picture; of an airport too large for it there are fewer a metre."""
+"""Longer side of the ground's picture; a large airport has fewer pixels per metre."""
 
 MARGIN_M = 30.0
-"""Grass that is drawn round the airport."""
+"""Width of the grass drawn around the airport."""
 
 _GRASS, _PAVEMENT, _RUNWAY = (96, 122, 78), (150, 155, 160), (112, 117, 123)
 _LIGHT, _LINE = (255, 244, 200), (210, 190, 90)
@@ -51,22 +50,20 @@ _JPEG_QUALITY = 72
 
 
 class Order(msgspec.Struct, forbid_unknown_fields=True):
-    """The first line: which airport, and how large the pictures are."""
+    """The first line: the airport."""
 
     airport: str
-    width: int = 416
-    height: int = 260
 
 
 Obstacle = tuple[str, float | None, float | None, float | None]
 """Name, x, y and radius."""
 
+PICTURE_PIXELS = 416, 260
+"""Width and height of a picture."""
+
 
 class View(msgspec.Struct, forbid_unknown_fields=True):
-    """A line that asks for a picture: the pose, and obstacles, in `map`.
-
-    Numbers that are not finite come as null: JSON has no other way to say them.
-    """
+    """Request of a picture: pose and obstacles in `map`; null for numbers that are not finite."""
 
     x_m: float | None
     y_m: float | None
@@ -75,10 +72,10 @@ class View(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class AirportModel(RobotModel):
-    """The robot at its airport, seen from behind and above.
+    """The robot at its airport, from behind and above.
 
     Args:
-        application: with the airport.
+        application: gives the airport.
     """
 
     def __init__(self, application: Osmosis) -> None:
@@ -87,10 +84,10 @@ class AirportModel(RobotModel):
         super().__init__(self._scene.model, self._scene.data)
         self.camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         self.camera.distance, self.camera.elevation = 4.6, -22.0
-        self.options.geomgroup[:] = (1, 1, 1, 1, 0, 0)  # obstacles that are not there are in 4
+        self.options.geomgroup[:] = (1, 1, 1, 1, 0, 0)  # absent obstacles are in group 4
 
     def take(self, topic: Topic[Any], body: Any) -> None:
-        """Place the robot where it believes to be, and the obstacles that are there."""
+        """Place the robot by its published pose, and the present obstacles."""
         if topic == topics.POSE:
             self.place(body.x_m, body.y_m, body.yaw_rad)
         elif topic == topics.OBSTACLES:
@@ -107,7 +104,7 @@ class AirportModel(RobotModel):
             self.camera.azimuth = math.degrees(yaw_rad)
 
     def put(self, obstacles: tuple[Obstacle, ...]) -> None:
-        """Have these obstacles stand there, and no others."""
+        """Show these obstacles and no others."""
         scene = self._scene
         wanted = {name: (_number(x), _number(y), _number(r)) for name, x, y, r in obstacles}
         for name in [n for n in scene.present if n not in wanted]:
@@ -115,7 +112,7 @@ class AirportModel(RobotModel):
         for name, (x, y, r) in wanted.items():
             there = scene.present.get(name)
             if there is None or (there.x_m, there.y_m, there.radius_m) != (x, y, r):
-                with contextlib.suppress(WorldError):  # one too many, or one that makes no sense
+                with contextlib.suppress(WorldError):  # too many, or invalid
                     scene.put(name, x, y, r, shapely.Polygon())
 
 
@@ -123,15 +120,16 @@ class Camera:
     """Renders an airport.
 
     Raises:
-        Exception: whatever MuJoCo raises where nothing can be rendered.
+        Exception: MuJoCo cannot render.
     """
 
-    def __init__(self, airport: Airport, width: int, height: int) -> None:
+    def __init__(self, airport: Airport) -> None:
         self._robot = AirportModel(Osmosis.on_map(airport))
+        width, height = PICTURE_PIXELS
         self._renderer = mujoco.Renderer(self._robot.model, height, width)
 
     def picture(self, view: View) -> bytes:
-        """Return a JPEG of what there is to see; NaN poses are taken for the last one."""
+        """Return a JPEG of a view; a pose that is not finite is ignored."""
         robot = self._robot
         robot.place(_number(view.x_m), _number(view.y_m), _number(view.yaw_rad))
         robot.put(view.obstacles)
@@ -147,7 +145,7 @@ def _number(value: float | None) -> float:
 
 
 def dress(spec: Any, airport: Airport) -> None:
-    """Give a model what makes it worth looking at: ground, sky, light, colours."""
+    """Add ground, sky, light and colours to a model."""
     x0, y0, x1, y1 = _extent(airport)
     ground = spec.add_texture(name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
     image = ground_image(airport)
@@ -192,7 +190,7 @@ def ground_image(airport: Airport) -> Image.Image:
     def fill(shape: Any, colour: tuple[int, int, int]) -> None:
         for part in shapely.get_parts(shape):
             if part.geom_type == "Polygon" and not part.is_empty:
-                mask = Image.new("1", image.size)  # what lies in a hole stays as it is
+                mask = Image.new("1", image.size)  # holes keep their ground
                 mask_pen = ImageDraw.Draw(mask)
                 mask_pen.polygon([at(x, y) for x, y in part.exterior.coords], 1)
                 for hole in part.interiors:
@@ -216,14 +214,14 @@ def _extent(airport: Airport) -> tuple[float, float, float, float]:
 
 
 def main() -> int:
-    """Read lines, write pictures, until there are no more lines."""
-    # Whoever started it may be killed at any moment; a hung driver would not see the pipe close.
+    """Write a picture for each line of standard input."""
+    # Its parent may be killed at any time; a hung graphics driver would not notice the pipe.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     os.nice(19)
     source, out = sys.stdin.buffer, sys.stdout.buffer
     try:
         order = msgspec.json.decode(source.readline(), type=Order)
-        camera = Camera(load_airport(order.airport), order.width, order.height)
+        camera = Camera(load_airport(order.airport))
         decoder = msgspec.json.Decoder(View)
         for line in source:
             picture = camera.picture(decoder.decode(line))
@@ -231,9 +229,9 @@ def main() -> int:
             out.flush()
     except (BrokenPipeError, KeyboardInterrupt):
         return 0
-    except Exception as error:  # the last stop before the exit code
-        words = " ".join(str(error).split()) or "no reason given"
-        print(f"{type(error).__name__}: {words}", file=sys.stderr)
+    except Exception as error:  # reported by the exit code
+        reason = " ".join(str(error).split()) or "no reason given"
+        print(f"{type(error).__name__}: {reason}", file=sys.stderr)
         return 1
     return 0
 

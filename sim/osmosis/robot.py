@@ -1,6 +1,6 @@
 """The Summit XL's base: dimensions, skid-steer kinematics and its drive electronics.
 
-Skid steering: turning, all four tyres slip sideways. With equal wheel loads the lateral moment
+Skid steering: in a turn all four tyres slip sideways. With equal wheel loads the lateral moment
 a * omega * a of the tyres (a: half wheelbase, b: half track) is balanced when the wheels of a side
 run at omega * (b + a^2 / b), for linear as well as for Coulomb friction. So the base has an
 effective track `SLIP_FACTOR` = 1 + (a / b)^2 times the real one, independent of speed (the same
@@ -21,27 +21,27 @@ WHEEL_X_M = 0.229
 WHEEL_Y_M = 0.235
 CIRCUMRADIUS_M = math.hypot(LENGTH_M, WIDTH_M) / 2
 SLIP_FACTOR = 1.0 + (WHEEL_X_M / WHEEL_Y_M) ** 2
-"""Effective over real track."""
+"""Ratio of effective to real track."""
 
 WHEEL_NAMES = ("front left", "front right", "rear left", "rear right")
-"""Order of the wheels wherever there are four of something."""
+"""Order of the wheels in all tuples of four."""
 
 WheelSpeeds = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class DriveLimits:
-    """What the base's electronics allow (datasheet: 3 m/s).
+    """Limits of the base's electronics (datasheet: 3 m/s).
 
     Args:
-        linear_mps: speed a command is clipped to; well above the controller's own bound, so that
-            a wrong command value does harm unless somebody stops it.
-        angular_radps: the same for turning.
-        acceleration_mps2: speeding up.
-        deceleration_mps2: slowing down under command: the controlled stop.
-        brake_mps2: slowing down when braked, below what the tyres hold; then the wheels lock.
-        angular_acceleration_radps2: change of turning rate under command.
-        brake_radps2: slowing of turning when braked.
+        linear_mps: speed to which a command is clipped; well above the controller's limit, so that
+            a wrong command is dangerous.
+        angular_radps: the same for the turn rate.
+        acceleration_mps2: acceleration by command.
+        deceleration_mps2: deceleration by command: the controlled stop.
+        brake_mps2: deceleration by the brake, within the grip of the tyres; then the wheels lock.
+        angular_acceleration_radps2: change of the turn rate by command.
+        brake_radps2: deceleration of the turn rate by the brake.
     """
 
     linear_mps: float = 3.0
@@ -62,7 +62,7 @@ def wheel_speeds(linear_mps: float, angular_radps: float) -> WheelSpeeds:
 
 
 def twist_from_wheels(speeds: WheelSpeeds) -> tuple[float, float]:
-    """Return (linear m/s, angular rad/s) that the wheels stand for: what odometry believes."""
+    """Return the twist (m/s, rad/s) of wheel speeds by the kinematic model."""
     left = (speeds[0] + speeds[2]) / 2 * WHEEL_RADIUS_M
     right = (speeds[1] + speeds[3]) / 2 * WHEEL_RADIUS_M
     return (left + right) / 2, (right - left) / (2 * WHEEL_Y_M * SLIP_FACTOR)
@@ -73,13 +73,13 @@ class Drive:
 
     Args:
         limits: speeds and ramps.
-        dead_man_timeout_s: brake when the last valid command is older; None switches the dead
-            man off, so that the last command is kept for ever (the paper's unprotected baseline).
+        dead_man_timeout_s: age of the last valid command at which it brakes; None: no dead man, so
+            that the last command stays (the paper's unprotected baseline).
 
     Attributes:
-        brake_ordered: the brake is wanted.
+        brake_ordered: whether the brake is ordered.
         braking: whether the brake was on in the last update, ordered or by the dead man.
-        brake_share: share of its deceleration that the brake has left; below 1 it does not lock.
+        brake_share: remaining share of the brake's deceleration; below 1 it does not lock.
     """
 
     def __init__(self, limits: DriveLimits, dead_man_timeout_s: float | None) -> None:
@@ -94,10 +94,10 @@ class Drive:
         self.braking = False
 
     def command(self, linear_mps: float, angular_radps: float, now_s: float) -> bool:
-        """Take a velocity command; one that is not finite is refused and does not count as fresh.
+        """Take a velocity command; one that is not finite is refused.
 
         Returns:
-            Whether it was taken.
+            Whether it was accepted.
         """
         if not (math.isfinite(linear_mps) and math.isfinite(angular_radps)):
             return False
@@ -112,26 +112,26 @@ class Drive:
         return now_s - self._wanted_at_s
 
     def dead_man_tripped(self, now_s: float) -> bool:
-        """Whether the dead man brakes because commands have ceased."""
+        """Whether the dead man brakes, because commands are missing."""
         timeout_s = self.dead_man_timeout_s
         return timeout_s is not None and self.command_age_s(now_s) > timeout_s + 1e-9
 
     def give_way(self, linear_mps: float, angular_radps: float) -> None:
-        """Bring the ramps down to the measured speed where friction is faster than the brake.
+        """Limit the ramps to the measured speed, if friction is stronger than the brake.
 
-        So the drive goes on from where the base is once the brake is released, without a jerk.
+        So the drive continues from the base's speed when the brake is released.
         """
         self._linear = _between_zero_and(self._linear, linear_mps)
         self._angular = _between_zero_and(self._angular, angular_radps)
 
     @property
     def locked(self) -> bool:
-        """Whether the wheels are blocked: braked, and the ramp has come to zero."""
+        """Whether the wheels are blocked: braked, with the ramp at zero."""
         stopped = self._linear == 0.0 and self._angular == 0.0
         return self.braking and stopped and self.brake_share == 1.0
 
     def update(self, now_s: float, dt_s: float) -> WheelSpeeds:
-        """Advance the ramps by `dt_s` and return the wheel speeds to servo to, rad/s."""
+        """Advance the ramps by `dt_s`; return the target wheel speeds, rad/s."""
         limits = self.limits
         self.braking = self.brake_ordered or self.dead_man_tripped(now_s)
         if self.braking:

@@ -1,8 +1,8 @@
 """Builds the MuJoCo model of an airport: floor, robot, buildings and a pool of obstacles.
 
 MuJoCo's model is fixed once compiled, so obstacles that appear later come from a pool of mocap
-bodies: one for every preset and `SPARE_OBSTACLES` for others. One that is absent is parked
-below the ground, collides with nothing and is in a group that no ray sees.
+bodies: one per preset and `SPARE_OBSTACLES` others. An absent obstacle is parked below the ground,
+without collisions and in a group that rays ignore.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ PRESENT_GROUP, ABSENT_GROUP, SOLID_GROUP = 3, 4, 3
 COLLIDES_WITH_CHASSIS = 2
 NOTHING_M = 1000.0
 FARTHEST_M = 1e6
-"""Clearance where there is nothing at all: finite, so that it can be written as JSON."""
+"""Largest coordinate of an obstacle."""
 
 _PARKED_Z_M = -10.0
 
 
 class WorldError(ValueError):
-    """Something impossible was asked of the world: one line, with the value and the remedy."""
+    """An invalid request to the world: one line with value and remedy."""
 
 
 @dataclass(slots=True)
 class Solid:
-    """An obstacle that stands in the world, with its ground plan for clearances."""
+    """A present obstacle with its ground plan for clearances."""
 
     name: str
     shape: ObstacleShape
@@ -57,9 +57,8 @@ class Scene:
     """The compiled model and data, and the obstacles in them.
 
     Args:
-        airport: buildings, obstacle presets and the start pose are taken from it.
-        dress: adds to the model what is only to be seen (`rampart.sim.osmosis.camera`), before it
-            is compiled.
+        airport: gives buildings, obstacle presets and the start pose.
+        dress: adds visual elements (`rampart.sim.osmosis.camera`) before the model is compiled.
     """
 
     def __init__(self, airport: Airport, dress: Callable[[Any], None] = lambda _spec: None) -> None:
@@ -96,23 +95,23 @@ class Scene:
         self._refresh()
 
     def place_robot(self, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Have the robot stand somewhere else; `mj_forward` follows."""
+        """Move the robot; the caller runs `mj_forward`."""
         self.data.qpos[0:2] = x_m, y_m
         self.data.qpos[3:7] = _turned(yaw_rad)
 
     def put(self, name: str, x_m: float, y_m: float, radius_m: float, footprint: Any) -> None:
-        """Make an obstacle appear, or move it; a preset's name keeps the preset's shape.
+        """Add or move an obstacle; a preset keeps its shape.
 
         Args:
-            name: of the obstacle.
-            x_m: where.
-            y_m: where.
-            radius_m: how large.
-            footprint: the robot's, as a shapely polygon; nothing can appear on it.
+            name: name of the obstacle.
+            x_m: position in `map`.
+            y_m: position in `map`.
+            radius_m: radius or half side.
+            footprint: the robot's footprint as a shapely polygon, which must be free.
 
         Raises:
-            WorldError: not finite, too far away, a radius out of bounds, on the robot, or no room
-                in the pool.
+            WorldError: not finite, too far away, invalid radius, on the robot, or the pool is
+                empty.
         """
         solid = Solid(name, self._shapes.get(name, "cylinder"), x_m, y_m, radius_m)
         if not all(map(math.isfinite, (x_m, y_m, radius_m))):
@@ -123,12 +122,12 @@ class Scene:
         if not 0.05 <= radius_m <= 5.0:
             raise WorldError(f"obstacle {name}: radius_m: {radius_m:g}: must be in 0.05 to 5 m")
         if solid.outline.intersects(footprint):
-            raise WorldError(f"obstacle {name}: ({x_m:g}, {y_m:g}): on the robot; choose a place "
-                             "clear of it")
+            raise WorldError(f"obstacle {name}: ({x_m:g}, {y_m:g}): on the robot; expected beside "
+                             "it")
         if name not in self._slots:
             if not self._spare:
-                raise WorldError(f"obstacle {name}: {SPARE_OBSTACLES} besides the presets are "
-                                 "there; take one away first")
+                raise WorldError(f"obstacle {name}: too many: expected at most "
+                                 f"{SPARE_OBSTACLES} besides the presets")
             self._slots[name] = self._spare.pop()
         r, h = radius_m, OBSTACLE_HALF_HEIGHT_M
         box = solid.shape == "box"
@@ -141,7 +140,7 @@ class Scene:
         self._refresh()
 
     def remove(self, name: str) -> bool:
-        """Take an obstacle away; returns whether it was there."""
+        """Remove an obstacle; return whether it was present."""
         if self.present.pop(name, None) is None:
             return False
         self._park(self._slots[name])
@@ -166,17 +165,17 @@ class Scene:
         return geom, body
 
     def _refresh(self) -> None:
-        """Bring derived positions up to date, so that a ray cast at once sees the change."""
+        """Update derived positions, so that rays see the change at once."""
         mujoco.mj_kinematics(self.model, self.data)
         outlines = [*self._buildings, *(solid.outline for solid in self.present.values())]
         self.outlines = shapely.unary_union(outlines) if outlines else None
 
     def clearance_m(self, footprint: Any) -> float:
-        """Distance from a footprint to the nearest obstacle or building; NOTHING_M without."""
+        """Return the distance to the nearest obstacle or building, `NOTHING_M` without one."""
         return NOTHING_M if self.outlines is None else float(self.outlines.distance(footprint))
 
     def touched(self) -> set[str]:
-        """Names of the geoms that the chassis touches now."""
+        """Return the names of the geoms that the chassis touches."""
         chassis = self.model.geom("chassis").id
         return {self.model.geom(int(b if a == chassis else a)).name
                 for a, b in self.data.contact.geom if chassis in (a, b)}

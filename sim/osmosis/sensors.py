@@ -1,7 +1,7 @@
-"""The robot's sensors: what they measure of the true state, each with its own seeded noise.
+"""The robot's sensors: measurements of the true state, each with its own seeded noise.
 
-Noise figures are those of the class of device: RTK-GPS 2 cm, a 2D safety laser 1 cm, a MEMS IMU,
-encoders with 4096 counts a turn, a lux meter of 1 %.
+Noise is typical of the devices: RTK-GPS 2 cm, a 2D safety laser 1 cm, a MEMS IMU, encoders with
+4096 counts per turn, a lux meter of 1 %.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class Noise:
-    """Standard normal numbers, drawn in blocks: one call of the generator costs as much as 100."""
+    """Standard normal numbers, drawn in blocks for speed."""
 
     BLOCK = 256
 
@@ -42,13 +42,13 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class LaserSpec:
-    """The 2D laser, above `base_link`, so its ranges are from the robot's centre.
+    """The 2D laser above `base_link`; ranges are from the robot's centre.
 
     Args:
         rays: number of rays, two or more, evenly over the field of view, from right to left.
         field_of_view_rad: centred on straight ahead.
-        range_max_m: also the reading when there is no echo.
-        height_m: above the ground; clears the chassis, below the top of every obstacle.
+        range_max_m: range, and the reading without an echo.
+        height_m: height above the ground, between the chassis and the top of the obstacles.
         noise_m: standard deviation.
         reference_m: distance of the target in the housing, measured once a sweep.
     """
@@ -95,7 +95,7 @@ class Laser:
         return self.spec.reference_m + self.spec.noise_m * self._reference_noise.take()[0]
 
     def cast(self, model: Any, data: Any, pose: tuple[float, float, float]) -> Floats:
-        """Return the true ranges, m, from the first to the last ray; the next call's too."""
+        """Return the true ranges, m, per ray; the next call overwrites the array."""
         x_m, y_m, yaw_rad = pose
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         self._turn[0, :2] = cos, sin
@@ -108,7 +108,7 @@ class Laser:
         return self._ranges
 
     def sweep(self, true_m: Floats) -> Floats:
-        """Return what the device makes of true ranges, m; `range_max_m` where there is no echo."""
+        """Return the measured ranges, m; `range_max_m` without an echo."""
         if not len(self._noise):
             self._noise = self._rng.normal(0.0, self.spec.noise_m, (64, self.spec.rays))
         ranges: Floats = true_m + self._noise[-1]
@@ -136,7 +136,7 @@ class Gps:
 
 
 class Imu:
-    """Strap-down IMU: rate and specific force are means since the last reading (delta outputs).
+    """Strap-down IMU: rate and specific force are means since the last reading.
 
     The heading starts at the truth, as after an alignment, and drifts with the gyro's bias.
     """
@@ -200,12 +200,12 @@ class WheelOdometry:
 
 
 class LightSensor:
-    """Lux meter over the ground ahead of the robot; formula and place in `airport.photometry`."""
+    """Lux meter over the ground ahead of the robot; see `airport.photometry`."""
 
     NOISE_SHARE = 0.01
     NOISE_LUX = 0.5
     AMBIENT_LUX = 2.0
-    """Night-time apron lighting, near enough constant."""
+    """Apron lighting at night, modelled as constant."""
 
     def __init__(self, airport: Airport, truth: WorldTruth, rng: np.random.Generator) -> None:
         real = truth.intensity_cd(airport)

@@ -1,8 +1,8 @@
-"""The simulator actor: stands behind the Summit XL layer's keys, as a real robot's driver would.
+"""The simulator actor: it has the Summit XL layer's topics, like the driver of a real robot.
 
-It alone knows ground truth, which it publishes on `world/` for the judge and the tests.
-One timer of 20 ms steps the physics to the clock's time and publishes whatever has become due
-on the way, each message with the stamp of its reading.
+Only it has the ground truth, which it publishes on `world/` for the judge and the tests. A timer of
+20 ms steps the physics to the clock's time and publishes all readings that are due, each with its
+own stamp.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from heapq import heapreplace
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
-import msgspec
 import numpy as np
 
 from rampart.actors.bus import messages as bm
@@ -39,7 +38,7 @@ WAKE_UP_S = 0.02
 MAX_CATCH_UP_S = 1.0
 
 _KEEP_S = 0.1
-"""Simulated seconds between two states of the world that a resumed run goes on from."""
+"""Simulated seconds between two checkpoints of the world, for a resumed run."""
 
 _JOBS = (topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.UPPER_SCAN,
          topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES)
@@ -49,24 +48,20 @@ class Simulator(Actor):
     """Runs the `World` on the actor's clock."""
 
     class Parameters(Actor.Parameters, frozen=True):
-        """Robot and world; the run says the first four.
+        """Robot and world; the run sets the first four.
 
         Attributes:
-            seed: of everything random.
-            obstacles: number of presets that take part.
-            dead_man: whether the base brakes when commands cease.
-            dead_man_timeout_s: after how long.
-            laser_range_m: of each laser.
-            laser_rays: of each laser.
-            upper_laser: whether the robot has a second one.
+            seed: seed of all noise.
+            obstacles: number of obstacle presets.
+            dead_man: whether the base brakes without commands.
+            dead_man_timeout_s: time without a command until it brakes, s.
+            upper_laser: whether the robot has a second laser.
         """
 
         seed: int = 0
         obstacles: int = 0
         dead_man: bool = True
         dead_man_timeout_s: Positive = 0.4
-        laser_range_m: Positive = 8.0
-        laser_rays: Annotated[int, msgspec.Meta(ge=2)] = 181
         upper_laser: bool = False
 
     parameters: Parameters
@@ -76,8 +71,7 @@ class Simulator(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self._airport = Osmosis.of(context).airport
-        self._laser = LaserSpec(
-            rays=self.parameters.laser_rays, range_max_m=self.parameters.laser_range_m)
+        self._laser = LaserSpec()
         self._asked_s = self._skipped_s = 0.0
         self._keep_at_s = -math.inf
         self._real_time_factor = 1.0
@@ -87,13 +81,13 @@ class Simulator(Actor):
         self._holds_timer: Timer | None = None
 
     def on_start(self) -> None:
-        """Build the world at the present time."""
+        """Build the world."""
         now_s, parameters = self.clock.now(), self.parameters
         kept = self.kept(WORLD_STATE) if self.context.run.plan.part else None
         self._world = world = World(
             self._airport, Osmosis.of(self.context).world, parameters.seed, parameters.obstacles,
             dead_man_timeout_s=parameters.dead_man_timeout_s if parameters.dead_man else None,
-            laser=self._laser, start_s=now_s, max_catch_up_s=MAX_CATCH_UP_S, kept=kept)
+            start_s=now_s, max_catch_up_s=MAX_CATCH_UP_S, kept=kept)
         self._asked_s = now_s
         readings: dict[Topic[Any], Callable[[], Any]] = {
             topics.IMU: world.imu, topics.ODOMETRY: world.odometry,
@@ -113,29 +107,30 @@ class Simulator(Actor):
 
     @on(topics.BASE_COMMAND)
     def command(self, message: m.BaseCommand, header: Header) -> None:
-        """Pass a velocity command to the base; it is as fresh as its stamp says."""
+        """Pass a velocity command to the base, with its stamp."""
         self._advance()
         stamp_s = min(header.stamp, self.clock.now())
         if not self._world.command(message.linear_mps, message.angular_radps, stamp_s):
-            self.report_diagnostic("velocity command", "not finite, refused", header.source)
+            self.report_diagnostic("velocity command", "refused: not finite", header.source)
 
     @on(topics.BRAKE)
     def brake(self, message: m.BrakeCommand, header: Header) -> None:
-        """Have the source hold the brake or let go of it; nobody lets go for another."""
+        """Hold or release the brake for the source; a source releases only its own hold."""
         self._advance()
         unknown = self._brakes.unknown
         if message.engaged:
             self._brakes.hold(header.source, True)
             if self._brakes.is_unknown(header.source):
-                self.report_diagnostic("brake", f"held by {header.source!r}, no recovery module of "
-                                       "this system; rampart reset lets go", header.source)
+                self.report_diagnostic("brake", f"held by {header.source!r}, which is not a "
+                                       "recovery module of this system; rampart reset releases it",
+                                       header.source)
         else:
             self._brakes.let_go(header.source)
         self._braked(unknown)
 
     @on(ftm_topics.RESET)
     def reset(self, message: fm.Reset, _header: Header) -> None:
-        """Let go of the brake in the place of a holder that is no recovery module."""
+        """Release the brake for a holder that is not a recovery module."""
         self._advance()
         unknown = self._brakes.unknown
         if self._brakes.reset(message.recovery):
@@ -147,7 +142,7 @@ class Simulator(Actor):
             self._tell_holds()
 
     def _tell_holds(self) -> None:
-        """Tell who holds the brake and should not, again and again as long as somebody does."""
+        """Publish the unknown holders of the brake, and repeat it while there are some."""
         unknown = self._brakes.unknown
         self.publish(ftm_topics.HOLDS, fm.Holds("brake", unknown))
         if self._holds_timer is not None:
@@ -157,7 +152,7 @@ class Simulator(Actor):
 
     @on(topics.OBSTACLE)
     def obstacle(self, message: m.ObstacleCommand, header: Header) -> None:
-        """Put an obstacle into the world or take it away."""
+        """Add or remove an obstacle."""
         self._advance()
         try:
             if message.present:
@@ -171,10 +166,10 @@ class Simulator(Actor):
 
     @on(topics.ACTUATOR_FAULT)
     def actuator_fault(self, message: m.ActuatorFault, header: Header) -> None:
-        """Put a fault of the actuators in force or end it, and report how it fares.
+        """Start or end a fault of the actuators.
 
-        Reports go out when it is taken, when it first changes something, and when it is over; a
-        refused one is reported as finished with the reason.
+        It reports the start, the first effect and the end; a refused fault is reported as finished
+        with the reason.
         """
         self._advance()
         try:
@@ -188,7 +183,7 @@ class Simulator(Actor):
 
     @every(WAKE_UP_S)
     def tick(self) -> None:
-        """Step the physics to now and publish what has become due."""
+        """Step the physics to now and publish the readings that are due."""
         self._advance()
         if self.clock.now() >= self._keep_at_s and not self.context.run.plan.virtual:
             self._keep_at_s = self.clock.now() + _KEEP_S
@@ -216,7 +211,7 @@ class Simulator(Actor):
             news.injection, self.name, news.affected_ticks, news.finished, clip(reason)))
 
     def _measure_speed(self, now_s: float) -> None:
-        """Over each second, the share of the clock's time that was simulated and not skipped."""
+        """Measure the simulated share of the clock's time over each second."""
         asked_s = now_s - self._asked_s
         if asked_s >= 1.0:
             skipped_s = self._world.skipped_s - self._skipped_s
@@ -238,16 +233,15 @@ class Simulator(Actor):
 
 
 class Schedule:
-    """Due times of named periodic jobs, on one grid, whatever the rhythm of the wake-ups.
+    """Due times of periodic jobs on one grid, independent of the wake-ups.
 
-    The simulator wakes up every 20 ms and the IMU is read every 10 ms, so a wake-up works off
-    several due times; each reading gets the stamp of its own due time.
+    A wake-up may cover several due times of a job; each reading has the stamp of its due time.
 
     Args:
-        rates_hz: rate of each job; all of them are first due at `start_s`.
-        start_s: time of the first due times.
-        keep_s: due times that are older than this when asked for are dropped, so that a
-            simulator that was held up publishes fresh readings and not a flood of late ones.
+        rates_hz: rate of each job.
+        start_s: first due time of all jobs.
+        keep_s: older due times are dropped, so that a delayed simulator does not publish a flood
+            of late readings.
     """
 
     def __init__(self, rates_hz: Mapping[str, float], start_s: float, keep_s: float) -> None:
@@ -258,7 +252,7 @@ class Schedule:
                        for place, (name, rate_hz) in enumerate(rates_hz.items())]
 
     def due(self, now_s: float) -> Iterator[tuple[float, str]]:
-        """Yield (due time, job) in order of time, up to and including `now_s`."""
+        """Yield (due time, job) in order of time up to `now_s`."""
         queue, start_s = self._queue, self._start_s
         oldest_s = now_s - self._keep_s
         while queue[0][0] < oldest_s:

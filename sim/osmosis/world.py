@@ -1,7 +1,7 @@
-"""The world: airport, Summit XL, obstacles, and the ground truth about them. Synchronous.
+"""The world: airport, Summit XL, obstacles, and their ground truth. Synchronous.
 
-Time is the caller's: `step_to(t)` advances the physics to t. Nothing here reads a clock, so the
-same world runs in real time and, many times faster, on a virtual clock.
+The caller provides the time: `step_to(t)` advances the physics to t. So the same world runs in real
+time and, many times faster, in virtual time.
 """
 
 from __future__ import annotations
@@ -28,38 +28,38 @@ TICK_S = 0.01
 """The drive electronics' period, and the grain of `step_to`."""
 
 TRUTH_PERIOD_S, CLOSE_TRUTH_PERIOD_S = 0.05, 0.02
-"""Ground truth is examined this often; the second when something is near."""
+"""Period of the ground truth; the second applies near an obstacle or the prohibited area."""
 
 NEVER_S = 1e6
-"""Age that is reported for a command before the first one."""
+"""Age of the command before the first one."""
 
 NEAR_M = 0.3
-"""Nearer than this, things are looked at more often."""
+"""Distance for the shorter period."""
 
 SAME_CONTACT_S = 0.5
-"""A contact with the same thing after a shorter break is the same collision."""
+"""A contact with the same object after a shorter break is the same collision."""
 
 LOCKED_DAMPING = 300.0
-"""Wheel damping, N m s/rad, of a blocked wheel, braked or stuck: all that moves is the tyre."""
+"""Damping, N m s/rad, of a blocked wheel, braked or stuck."""
 
 EXACT_BELOW_M = 1.0
-"""Clearances are exact below this; above it they may be lower bounds."""
+"""Clearances above this may be lower bounds."""
 
 Pose = tuple[float, float, float]
 """x m, y m, yaw rad in `map`."""
 
 
 class WorldKept(msgspec.Struct, frozen=True):
-    """What a resumed run finds of its world: the robot stands where it was, as after a power cut.
+    """State of the world for a resumed run: the robot stands at its pose, as after a power cut.
 
     Attributes:
         pose: x m, y m, yaw rad in `map`.
-        obstacles: present ones: name, x m, y m, radius m.
+        obstacles: present obstacles: name, x m, y m, radius m.
         waiting: names of presets that have not appeared yet.
-        leaving: presets that go again, each with the time since the world began, s.
-        began_s: simulated time at which it began.
-        collisions: counted so far.
-        prohibited_s: time spent in the prohibited area so far.
+        leaving: time since `began_s` at which presets disappear, s.
+        began_s: simulated start time of the world.
+        collisions: number of collisions.
+        prohibited_s: time spent in the prohibited area.
     """
 
     pose: tuple[float, float, float]
@@ -85,18 +85,18 @@ class World:
 
     Args:
         airport: geometry, start pose, obstacle presets.
-        truth: what the lights really give.
-        seed: of all noise; the same seed and calls give the same world, bit for bit.
-        obstacles: how many of the airport's presets take part, the first ones first.
+        truth: real intensities of the lights.
+        seed: seed of all noise; the same seed and calls give the same world bit by bit.
+        obstacles: number of the airport's presets, from the first.
         dead_man_timeout_s: see `rampart.sim.osmosis.robot.Drive`.
         laser: field of view, range, number of rays.
-        start_s: time at which the world begins.
-        max_catch_up_s: the most that one `step_to` simulates. If the caller was held up longer,
-            the world has stood still meanwhile instead of holding it up further.
-        kept: how a world was left that this one continues.
+        start_s: start time of the world.
+        max_catch_up_s: longest time that one `step_to` simulates; more is skipped, so that a
+            delayed caller is not delayed further.
+        kept: state of a world to continue.
 
     Raises:
-        WorldError: more obstacles asked for than the airport has presets.
+        WorldError: the airport has fewer presets than `obstacles`.
     """
 
     def __init__(self, airport: Airport, truth: WorldTruth | None = None, seed: int = 0,
@@ -104,8 +104,8 @@ class World:
                  laser: sensors.LaserSpec | None = None, start_s: float = 0.0,
                  max_catch_up_s: float = 1.0, kept: WorldKept | None = None) -> None:
         if not 0 <= obstacles <= len(airport.obstacles):
-            raise WorldError(f"obstacles: {obstacles}: {airport.name} has presets for 0 to "
-                             f"{len(airport.obstacles)}")
+            raise WorldError(f"obstacles: {obstacles}: expected 0 to {len(airport.obstacles)} on "
+                             f"{airport.name}")
         self.airport = airport
         self.time_s = start_s
         self.skipped_s = 0.0
@@ -118,8 +118,8 @@ class World:
         self._model, self._data = self._scene.model, self._scene.data
         self._steps_per_tick = round(TICK_S / self._model.opt.timestep)
         self._ticks = 0
-        # Views into MuJoCo's memory, kept because each look-up by name costs as much as a reading.
-        # The free joint of the base comes first: 7 positions, 6 velocities; then the wheels.
+        # Views into MuJoCo's memory, since look-ups by name are slow. The free joint of the base
+        # is first: 7 positions, 6 velocities; then the wheels.
         self._base_q, self._base_v = self._data.qpos[:7], self._data.qvel[:6]
         self._wheel_q, self._wheel_v = self._data.qpos[7:11], self._data.qvel[6:10]
         self._servos = self._data.ctrl
@@ -157,17 +157,14 @@ class World:
 
     @property
     def data(self) -> mujoco.MjData:
-        """What MuJoCo knows of the state."""
+        """State in MuJoCo."""
         return self._data
 
     # -- actuators ------------------------------------------------------------------------------
 
     def command(self, linear_mps: float, angular_radps: float, stamp_s: float | None = None
                 ) -> bool:
-        """Give the base a velocity command; returns False if it was refused as not finite.
-
-        For the dead man the command is as old as its stamp says; without one it is from now.
-        """
+        """Pass a velocity command of a time, by default now; return whether it is valid."""
         stamp_s = self.time_s if stamp_s is None else stamp_s
         return self._drive.command(linear_mps, angular_radps, stamp_s)
 
@@ -176,25 +173,25 @@ class World:
         self._drive.brake_ordered = engaged
 
     def order_fault(self, order: m.ActuatorFault) -> None:
-        """Put a fault of the actuators in force from now on, or end it (duration 0).
+        """Start a fault of the actuators, or end it (duration 0).
 
         Raises:
-            WorldError: unknown wheel, strength not in 0 to 1, impossible duration, nothing to end.
+            WorldError: invalid wheel, strength or duration, or nothing to end.
         """
         self._faults.order(order, self.time_s)
         self._faulty = True
 
     def fault_news(self) -> list[FaultNews]:
-        """Return what has happened to actuator faults since the last call, oldest first."""
+        """Return the news of actuator faults since the last call, oldest first."""
         return self._faults.take_news()
 
     # -- time -----------------------------------------------------------------------------------
 
     def step_to(self, t_s: float) -> None:
-        """Advance to time `t_s` in ticks of 10 ms; a remainder waits for the next call.
+        """Advance to time `t_s` in ticks of 10 ms.
 
         Raises:
-            WorldError: time that is not finite.
+            WorldError: the time is not finite.
         """
         if not math.isfinite(t_s):
             raise WorldError(f"step_to: {t_s}: time must be finite")
@@ -207,7 +204,7 @@ class World:
             self._tick()
 
     def _set_time(self) -> None:
-        # From a tick count, so that rounding does not add up over a long mission.
+        # From the tick count, so that rounding errors do not add up.
         self.time_s = self._start_s + self.skipped_s + self._ticks * TICK_S
 
     def _tick(self) -> None:
@@ -215,7 +212,7 @@ class World:
             self._actuate_with_faults()
         else:
             targets = self._drive.update(self.time_s, TICK_S)
-            if targets != self._targets:  # MuJoCo keeps them, and to write them is dear
+            if targets != self._targets:  # writing them is slow
                 self._servos[:] = self._targets = targets
             if self._drive.locked != self._locked:
                 self._locked = self._drive.locked
@@ -230,7 +227,7 @@ class World:
             self._examine()
 
     def _actuate_with_faults(self) -> None:
-        """Apply the actuator faults; in the tick after the last one this heals the model."""
+        """Apply the actuator faults; the tick after the last one restores the model."""
         self._faults.expire(self.time_s)
         self._faulty = bool(self._faults)
         drive = self._drive
@@ -251,46 +248,46 @@ class World:
 
     @property
     def pose(self) -> Pose:
-        """True pose of `base_link` in `map`: x m, y m, yaw rad. Also the absolute localization."""
+        """True pose of `base_link` in `map`: x m, y m, yaw rad; also the absolute pose."""
         x, y, _, qw, qx, qy, qz = self._base_q.tolist()
         return x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
 
     def scan(self, laser: int = 0) -> sensors.Floats:
-        """One sweep of a laser, m: 0 is the lower one, 1 the upper one."""
-        # The clearance is from the footprint's edge, the laser in its middle: nothing in range
-        # needs no rays. It may be one look old, in which the robot moves less than the radius.
+        """Return a sweep of the lower (0) or upper (1) laser, m."""
+        # Without an obstacle in range no rays are needed. The clearance is from the footprint and
+        # may be one period old, in which the robot moves less than the footprint's radius.
         if self._obstacle_clearance_m > self.laser.range_max_m:
             return np.full(self.laser.rays, self.laser.range_max_m)
-        # Both sweep at the same time, the lower one first: the rays are cast once.
+        # Both sweep at the same time, the lower one first, with the same rays.
         if laser == 0 or self._echoes[0] != self._ticks:
             self._echoes = self._ticks, self._lasers[0].cast(self._model, self._data, self.pose)
         return self._lasers[laser].sweep(self._echoes[1])
 
     def laser_reference(self, laser: int = 0) -> float:
-        """A laser's measurement of the target in its housing, m; one a sweep."""
+        """Return a laser's measurement of the target in its housing, m; one per sweep."""
         return self._lasers[laser].reference()
 
     def gps(self) -> m.GpsFix:
-        """One GPS fix."""
+        """Return a GPS fix."""
         x_m, y_m, _ = self.pose
         vx, vy, *_ = self._base_v.tolist()
         return self._gps.read(x_m, y_m, vx, vy)
 
     def imu(self) -> m.Imu:
-        """One IMU reading."""
+        """Return an IMU reading."""
         vx, vy, *_ = self._base_v.tolist()
         return self._imu.read(self.time_s, self.pose[2], vx, vy)
 
     def odometry(self) -> m.Odometry:
-        """Wheel odometry up to now."""
+        """Return the odometry."""
         return self._odometry.read(_four(self._wheel_q), self.time_s)
 
     def light(self) -> float:
-        """One reading of the light sensor, lux."""
+        """Return a reading of the light sensor, lux."""
         return self._light.read(self.pose)
 
     def base_status(self) -> m.BaseStatus:
-        """Brake, dead man and wheel speeds."""
+        """Return the state of the base."""
         return m.BaseStatus(
             self._drive.braking, self._drive.dead_man_tripped(self.time_s),
             max(0.0, min(NEVER_S, self._drive.command_age_s(self.time_s))), _four(self._wheel_v))
@@ -299,11 +296,11 @@ class World:
 
     @property
     def obstacles(self) -> tuple[Solid, ...]:
-        """Obstacles present."""
+        """Present obstacles."""
         return tuple(self._scene.present.values())
 
     def add_obstacle(self, name: str, x_m: float, y_m: float, radius_m: float) -> None:
-        """Make an obstacle appear or move it; a preset's name keeps the preset's shape.
+        """Add or move an obstacle; a preset keeps its shape.
 
         Raises:
             WorldError: not finite, out of bounds, on the robot, or too many.
@@ -312,19 +309,19 @@ class World:
         self._changed(name)
 
     def remove_obstacle(self, name: str) -> bool:
-        """Take an obstacle away, or keep a preset from appearing; returns whether it was there."""
+        """Remove an obstacle or a waiting preset; return whether it was present."""
         self._changed(name)
         return self._scene.remove(name)
 
     def _changed(self, name: str) -> None:
-        """An obstacle has come or gone: its time window and the distance then known are void."""
+        """Reset the time window of an obstacle, and the known clearance."""
         self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
         self._leaving.pop(name, None)
         self._near_obstacle.forget()
         self._examine_at_s = self.time_s
 
     def _bring_obstacles(self) -> None:
-        """Let presets appear and go by their time windows."""
+        """Add and remove presets by their time windows."""
         elapsed_s = self.time_s - self._began_s
         for name in [name for name, until in self._leaving.items() if elapsed_s >= until]:
             self.remove_obstacle(name)
@@ -337,7 +334,7 @@ class World:
             try:
                 self.add_obstacle(preset.name, preset.x_m, preset.y_m, preset.radius_m)
             except WorldError:
-                continue  # The robot stands there now: it appears once the place is clear.
+                continue  # the robot is there: it appears when the place is free
             if preset.gone_after_s is not None:
                 self._leaving[preset.name] = elapsed_s + preset.gone_after_s
 
@@ -345,13 +342,13 @@ class World:
         self._began_s = kept.began_s
         self._collisions, self._prohibited_s = kept.collisions, kept.prohibited_s
         for obstacle in kept.obstacles:
-            with contextlib.suppress(WorldError):  # on the robot, which was moving
+            with contextlib.suppress(WorldError):  # on the robot, which has moved
                 self.add_obstacle(*obstacle)
         self._waiting = [preset for preset in self._waiting if preset.name in kept.waiting]
         self._leaving.update(kept.leaving)
 
     def keep(self) -> WorldKept:
-        """Return what a resumed run needs to go on in this world."""
+        """Return the state for a resumed run."""
         return WorldKept(
             self.pose, tuple((o.name, o.x_m, o.y_m, o.radius_m) for o in self.obstacles),
             tuple(preset.name for preset in self._waiting), dict(self._leaving), self._began_s,
@@ -360,12 +357,12 @@ class World:
     # -- ground truth ---------------------------------------------------------------------------
 
     def truth(self, real_time_factor: float = 1.0) -> m.GroundTruth:
-        """Ground truth; clearances are at most 50 ms old.
+        """Return the ground truth; clearances are at most 50 ms old.
 
         `obstacle_clearance_m` is from the footprint to the nearest obstacle or building
-        (`rampart.sim.osmosis.scene.NOTHING_M` if there is none), `prohibited_clearance_m` from the
-        footprint's nearest corner to the prohibited area, negative in it. Both are exact below 1 m
-        and lower bounds above (see `rampart.sim.osmosis.world`).
+        (`rampart.sim.osmosis.scene.NOTHING_M` without one), `prohibited_clearance_m` from the
+        footprint's nearest corner to the prohibited area, negative inside. Both are exact below
+        `EXACT_BELOW_M` and lower bounds above.
         """
         x_m, y_m, yaw_rad = self.pose
         vx, vy, *_ = self._base_v.tolist()
@@ -393,19 +390,23 @@ class World:
         self._examine_at_s = self.time_s + (CLOSE_TRUTH_PERIOD_S if near else TRUTH_PERIOD_S)
 
     def _prohibited_exactly(self, pose: Pose) -> float:
-        """Distance of the footprint's nearest corner to the prohibited area, m."""
+        """Return the distance of the footprint's nearest corner to the prohibited area, m."""
         corners = shapely.get_coordinates(footprint(pose))[:4]
         return float(self.airport.prohibited_distances_m(corners).min())
 
 
 def _four(wheels: sensors.Floats) -> robot.WheelSpeeds:
-    """Return a view of what MuJoCo has of the wheels as plain numbers."""
+    """Convert a view of the wheels to plain numbers."""
     fl, fr, rl, rr = wheels.tolist()
     return fl, fr, rl, rr
 
 
 class Clearance:
-    """A distance from the footprint to something that stands still until `forget` is called.
+    """Distance from the footprint to objects that stand still until `forget` is called.
+
+    An exact distance is nearly as slow as the physics of the same 50 ms. No part of the robot comes
+    nearer by more than it has moved, so the last exact distance minus the motion is a lower bound,
+    which is used while it exceeds `EXACT_BELOW_M`.
 
     Args:
         exact: distance for a pose, m.
@@ -417,11 +418,11 @@ class Clearance:
         self._distance_m = -math.inf
 
     def forget(self) -> None:
-        """Make the next look an exact one."""
+        """Make the next distance exact."""
         self._distance_m = -math.inf
 
     def measure(self, pose: Pose) -> float:
-        """Return the distance for a pose: exact below `EXACT_BELOW_M`, else a lower bound, m."""
+        """Return the distance for a pose, exact below `EXACT_BELOW_M`, else a lower bound, m."""
         x_m, y_m, yaw_rad = self._pose
         turned_rad = abs(math.remainder(pose[2] - yaw_rad, math.tau))
         moved_m = math.dist(pose[:2], (x_m, y_m)) + turned_rad * CIRCUMRADIUS_M
@@ -433,5 +434,5 @@ class Clearance:
 
 
 def footprint(pose: Pose) -> Any:
-    """Return the robot's outline on the ground as a shapely polygon in `map`."""
+    """Return the robot's footprint as a shapely polygon in `map`."""
     return rectangle(*pose, LENGTH_M, WIDTH_M)

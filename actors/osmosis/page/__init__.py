@@ -1,1 +1,1 @@
-"""What the operator's page shows and takes for Osmosis: map, laser, missions, stick."""
+"""The operator's page of Osmosis: map, lasers, missions, joystick."""

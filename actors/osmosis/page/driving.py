@@ -1,4 +1,4 @@
-"""Driving Osmosis from its page: whether a stick has an effect, and why not."""
+"""Driving Osmosis from its page: whether the joystick has an effect, and why not."""
 
 from __future__ import annotations
 
@@ -18,43 +18,43 @@ if TYPE_CHECKING:
     from rampart.actors.runtime.actor import Actor
 
 _STALE_S = 1.5
-"""Simulated seconds after which the Safety Pilot counts as silent; half a real one at least."""
+"""Simulated seconds after which the Safety Pilot is silent, but at least half a real one."""
 
 _DRIVEN_BY = ("teleoperation", "safety_pilot")
-"""Nodes between a page's stick and the base."""
+"""Nodes between the page's joystick and the base."""
 
 
 class Driving(Operating):
-    """The operator's hands, and what the robot makes of its stick.
+    """The operator's controls, and the effect of the joystick.
 
     Args:
         actor: the page's node.
-        state: what its pages are shown; the section "operating" is this one's.
-        panels: of the page.
+        state: state of the pages; this class writes the section "operating".
+        panels: panels of the page.
     """
 
     def __init__(self, actor: Actor, state: HmiState, panels: Sequence[Panel]) -> None:
         self._pilot: m.PilotStatus | None = None
-        self._pilot_heard_s = -math.inf
+        self._pilot_s = -math.inf
         self._brake = False
         self._dead: tuple[str, ...] = ()
         self._driven_by = tuple(p.title for p in panels if p.topic == topics.JOYSTICK.key)
         super().__init__(actor, state, panels)
 
     def pilot(self, message: m.PilotStatus) -> None:
-        """Hear the Safety Pilot."""
-        before, self._pilot, self._pilot_heard_s = self._pilot, message, self._now()
+        """Take the status of the Safety Pilot."""
+        before, self._pilot, self._pilot_s = self._pilot, message, self._now()
         if before != message:
             self.show()
 
     def base(self, message: m.BaseStatus) -> None:
-        """Hear the base: whether its brake is engaged."""
+        """Take the state of the brake."""
         if message.brake_engaged != self._brake:
             self._brake = message.brake_engaged
             self.show()
 
     def nodes(self, table: fm.NodeTable) -> None:
-        """Hear the supervisor: whether those between stick and wheels run."""
+        """Take the table of nodes: whether those between joystick and base run."""
         super().nodes(table)
         running = {row.name for row in table.nodes if row.state is fm.NodeState.RUNNING}
         dead = tuple(name for name in _DRIVEN_BY if name not in running)
@@ -63,7 +63,7 @@ class Driving(Operating):
             self.show()
 
     def diagnostic(self, report: bm.Diagnostic) -> None:
-        """Hear why Teleoperation does not follow this stick, e.g. since somebody else drives."""
+        """Take why Teleoperation ignores this joystick, e.g. because another one drives."""
         if (report.node == _DRIVEN_BY[0] and report.offender == self._actor.name
                 and report.context == "joystick"):
             for panel in self._driven_by:
@@ -71,33 +71,33 @@ class Driving(Operating):
             self.show()
 
     def effect(self, panel: str, now_s: float) -> tuple[bool, str]:
-        """Return whether a panel's stick has any effect now, and in words why not, or what."""
+        """Return whether a panel's joystick has an effect now, and a text that explains it."""
         if panel not in self._driven_by:
             return super().effect(panel, now_s)
         pilot = self._pilot
         patience_s = max(_STALE_S, 0.5 * self._actor.clock.rate)
         return effect(
-            pilot_heard=now_s - self._pilot_heard_s <= patience_s, mode=pilot.mode if pilot else "",
+            pilot_heard=now_s - self._pilot_s <= patience_s, mode=pilot.mode if pilot else "",
             forbids=pilot.forbids if pilot else "", brake=self._brake, dead_nodes=self._dead)
 
 
 def effect(*, pilot_heard: bool, mode: str, forbids: str, brake: bool, dead_nodes: tuple[str, ...]
            ) -> tuple[bool, str]:
-    """Return whether the stick has any effect now, and in words why not, or what it does.
+    """Return whether the joystick has an effect now, and a text that explains it.
 
     Args:
-        pilot_heard: whether the Safety Pilot was heard lately.
-        mode: of the Safety Pilot.
-        forbids: why it lets nobody drive, "" if it does.
+        pilot_heard: whether the Safety Pilot's status is fresh.
+        mode: mode of the Safety Pilot.
+        forbids: why it forbids driving, or "".
         brake: whether the base's brake is engaged.
-        dead_nodes: which of the nodes between stick and wheels do not run.
+        dead_nodes: nodes between joystick and base that do not run.
     """
     for is_so, why in ((dead_nodes, f"{', '.join(dead_nodes)} does not run"),
-                       (not pilot_heard, "the Safety Pilot is not heard"),
+                       (not pilot_heard, "the Safety Pilot is silent"),
                        (brake, "the brake is engaged (emergency stop)"),
                        (forbids, forbids)):
         if is_so:
             return False, f"no effect: {why}"
     if mode == "teleoperation":
-        return True, "the robot obeys the stick alone; it stands while you let go"
-    return True, "the stick overrides the mission while you hold it; let go and the mission goes on"
+        return True, "the robot obeys only the joystick; it stands while you release it"
+    return True, "the joystick overrides the mission while you hold it"

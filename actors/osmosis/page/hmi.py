@@ -1,7 +1,6 @@
-"""The operator's page of Osmosis: hands missions and orders to the controller, shows the airport.
+"""The operator's page of Osmosis: sends missions and orders, and shows the airport.
 
-What it must not do after a respawn is decided in `submission`, which orders make sense in `orders`,
-what a stick does in `driving`.
+`missions` decides what it sends, also after a restart; `driving` explains the joystick's effect.
 """
 
 from __future__ import annotations
@@ -39,16 +38,15 @@ from rampart.files.plain_text import one_line
 
 
 class OsmosisHmi(Hmi):
-    """The operator's node of Osmosis. It shows what there is, and waits for none of it."""
+    """The operator's node of Osmosis. It waits for no input."""
 
     optional_inputs = topics.ROBOT
 
     class Parameters(Hmi.Parameters, frozen=True):
-        """What its page shows.
+        """Parameters.
 
         Attributes:
-            camera: module that renders the picture of the robot (`rampart.sim.osmosis.camera`);
-                "" for none.
+            camera: module that renders the robot (`rampart.sim.osmosis.camera`); "" for none.
         """
 
         camera: str = ""
@@ -120,18 +118,18 @@ class OsmosisHmi(Hmi):
 
     def _repeat(self) -> None:
         now = self.clock.now()
-        if told := self._submission.expire(now):
-            self._state.log(now, "note", told)
+        if outcome := self._submission.expire(now):
+            self._state.log(now, "note", outcome)
         if self._submission.pending is not None and system_is_up(
                 self._table, now - self.context.run.plan.begins_s):
             self.publish(topics.MISSION_REQUEST, self._submission.pending)
-        self._tell(self._orders.expire(now))
+        self._show_outcome(self._orders.expire(now))
         if self._orders.pending is not None:
             self.publish(topics.MISSION_ORDER, self._orders.pending)
         super()._repeat()
 
-    def _tell(self, outcome: str) -> None:
-        """Say what became of an order, if there is anything to say."""
+    def _show_outcome(self, outcome: str) -> None:
+        """Show the outcome of an order, if there is one."""
         if outcome:
             self._state.announce(outcome, self.clock.now(), "order to the mission: ")
 
@@ -142,18 +140,18 @@ class OsmosisHmi(Hmi):
             case OrderRequest():
                 order = self._orders.give(request.action, request.reason, self.clock.now())
                 self.publish(topics.MISSION_ORDER, order)
-                return f"{request.action.value} asked for"
+                return f"{request.action.value} requested"
         return super()._fulfil(request, page)
 
     def _start(self, name: str) -> str:
         if name not in self._missions:
-            raise RefusedError(f"no mission {name[:40]!r}; there are: "
+            raise RefusedError(f"unknown mission {name[:40]!r}; known: "
                                f"{', '.join(self._missions) or 'none'}")
         self.publish(topics.MISSION_REQUEST, self._submission.ask(
             name, _goals(self._missions[name]), self.clock.now()))
-        return f"mission {name} asked for"
+        return f"mission {name} requested"
 
-    # -- hearing --------------------------------------------------------------------------------
+    # -- inputs ---------------------------------------------------------------------------------
 
     @on(topics.MISSION_STATUS)
     def _mission_status(self, message: m.MissionStatus, _header: Header) -> None:
@@ -163,7 +161,7 @@ class OsmosisHmi(Hmi):
 
     @on(topics.MISSION_ORDER_ANSWER)
     def _order_answer(self, message: m.MissionOrderAnswer, _header: Header) -> None:
-        self._tell(self._orders.answer(message))
+        self._show_outcome(self._orders.answer(message))
 
     @on(topics.POSE)
     def _pose(self, message: m.Pose, header: Header) -> None:

@@ -1,7 +1,7 @@
-"""The airport as the page draws it: at once, and no more of it than a page can hold. Pure.
+"""The airport as drawn on the page, bounded in size. Pure.
 
-It is sent to each page that opens, once. A map with more in it than a person can see is drawn with
-less detail, then without what there is most of, and how much is missing is counted and shown.
+Each page receives it once, when it opens. A map that is too large loses detail and then items; the
+page shows the number of items that are left out.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from rampart.actors.osmosis.airport.model import Airport, Light
 from rampart.files.plain_text import one_line
 
 MAX_PATHS_BYTES = 150_000
-"""Of the prohibited area, the pavement and the buildings together."""
+"""Size of the prohibited area, the pavement and the buildings together."""
 
 MAX_GRAPH = 2500
-"""Nodes, and edges."""
+"""Most nodes, and most edges."""
 
 MAX_LIGHTS = 1500
-"""So many lights are shown of an airport: an SVG with more is slow on a telephone."""
+"""Most lights: an SVG with more is slow on a phone."""
 
 _FINEST_M, _COARSER = 0.02, 4.0
-"""Tolerance of the outlines, and by how much it grows until they fit."""
+"""Initial tolerance of the outlines, and the factor by which it grows until they fit."""
 
 
 class PageMap(msgspec.Struct, frozen=True):
-    """A map as it is sent.
+    """An encoded map.
 
     Attributes:
         encoded: an `AirportDrawing` as JSON.
-        left_out: what is missing, and how many of it.
+        left_out: kind of item and number left out.
     """
 
     encoded: msgspec.Raw
@@ -41,7 +41,7 @@ class PageMap(msgspec.Struct, frozen=True):
 
 
 def page_map(airport: Airport) -> PageMap:
-    """Return the map of an airport, as fine as there is room for."""
+    """Return the map of an airport with the finest tolerance that fits."""
     tolerance_m = _FINEST_M
     while _paths_bytes(drawn := draw(airport, tolerance_m)) > MAX_PATHS_BYTES:
         tolerance_m *= _COARSER
@@ -63,17 +63,17 @@ def page_map(airport: Airport) -> PageMap:
 
 
 def _is_seen(named: tuple[str, str]) -> bool:
-    """Tell whether something is left of a shape at the drawing's tolerance."""
+    """Whether a shape is visible at the drawing's tolerance."""
     return bool(named[1])
 
 
 def lights_shown(airport: Airport) -> frozenset[str]:
-    """Return the names of the lights that are on the map of an airport."""
+    """Return the names of the lights on the map of an airport."""
     return frozenset(light.name for light in islice(filter(_is_plain, airport.lights), MAX_LIGHTS))
 
 
 def _is_plain(light: Light) -> bool:
-    """Tell whether the page can show a light's name as it is: by that the light is known."""
+    """Whether the page can show a light's name unchanged, since the name is its key."""
     return all(name == one_line(name, MAX_NAME) for name in (light.name, light.row))
 
 
@@ -84,4 +84,4 @@ def _paths_bytes(drawn: AirportDrawing) -> int:
 
 
 _SHAPE_BYTES = 6
-"""Of JSON around a name and a path."""
+"""JSON around a name and a path."""

@@ -1,1 +1,1 @@
-"""The recovery modules of Osmosis: stops, reduced speed, teleoperation, new plans."""
+"""The recovery modules of Osmosis: stops, reduced speed, teleoperation, replanning."""

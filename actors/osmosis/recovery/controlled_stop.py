@@ -1,4 +1,4 @@
-"""RM2: controlled stop (paper, table II): speed 0, with the control loop alive."""
+"""RM2: controlled stop (paper, table II): speed 0 while the control loop runs."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ class PilotRecovery(HeldRecovery):
     """Orders the Safety Pilot into a mode: base of RM2, RM5 and RM8.
 
     Class attributes:
-        mode: what is ordered.
-        confirming: modes of the Safety Pilot by which the order is fulfilled.
-        top_speed_mps: bound that is ordered with it, 0 for none.
+        mode: the ordered mode.
+        confirming: modes of the Safety Pilot that fulfil the order.
+        top_speed_mps: ordered speed limit; 0 for none.
     """
 
     outputs = (*HeldRecovery.outputs, topics.PILOT_ORDER)
@@ -29,10 +29,10 @@ class PilotRecovery(HeldRecovery):
 
     @on(topics.PILOT_STATUS)
     def pilot_status(self, message: PilotStatus, header: Header) -> None:
-        """See which mode the Safety Pilot is in."""
+        """Take the mode of the Safety Pilot."""
         self.confirm(in_force=message.mode in self.confirming, stamp_s=header.stamp,
                      reason=f"safety pilot in mode {message.mode}")
 
 
 class ControlledStop(PilotRecovery):
-    """The Safety Pilot commands speed 0, whatever it is told by others."""
+    """The Safety Pilot commands speed 0, regardless of its inputs."""

@@ -1,8 +1,7 @@
-"""RM8: go on, but slowly.
+"""RM8: reduced speed.
 
-A robot whose motors or brakes have lost some of their strength is master of less speed, not of
-none: a weak motor keeps up below its reduced no-load speed, and from a lower speed a stop takes
-less room. The mission goes on in a degraded mode, and takes longer.
+A robot with weak motors or brakes is safe at a lower speed: a weak motor follows below its reduced
+no-load speed, and a stop needs less room. The mission continues in a degraded mode.
 """
 
 from __future__ import annotations
@@ -14,13 +13,13 @@ from rampart.manager.spec.tables import Positive
 
 
 class ReducedSpeed(PilotRecovery):
-    """The Safety Pilot lets nobody drive faster than a bound."""
+    """The Safety Pilot limits the speed of all commands."""
 
     class Parameters(PilotRecovery.Parameters, frozen=True):
-        """How slowly.
+        """Parameters.
 
         Attributes:
-            top_speed_mps: the bound.
+            top_speed_mps: the speed limit.
         """
 
         top_speed_mps: Positive = 0.5
@@ -33,8 +32,8 @@ class ReducedSpeed(PilotRecovery):
         self.top_speed_mps = self.parameters.top_speed_mps
 
     def pilot_status(self, message: PilotStatus, header: Header) -> None:
-        """See which bound the Safety Pilot keeps."""
+        """Take the speed limit of the Safety Pilot."""
         in_force = 0.0 < message.top_speed_mps <= self.top_speed_mps
         self.confirm(in_force=in_force, stamp_s=header.stamp,
                      reason=f"at most {message.top_speed_mps:g} m/s" if in_force
-                     else "the safety pilot does not bound the speed")
+                     else "the safety pilot does not limit the speed")

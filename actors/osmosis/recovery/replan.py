@@ -1,8 +1,8 @@
-"""RM6: replan. The robot keeps driving, or waits, until it has another way to its goal.
+"""RM6: replan. The robot keeps driving, or waits, until it has another route to its goal.
 
-Not among the paper's recoveries: it leaves open how the FTM Manager tells the control nodes that a
-plan is no good. Here it asks the Mission Manager, who knows whether there is a mission to plan for,
-and who orders the Graph Planner; the answer is the route itself.
+It is not among the paper's recoveries: the paper leaves open how the FTM Manager reports a bad plan
+to the control nodes. Here it sends an order to the Mission Manager, which orders the Graph Planner;
+the answer is the route itself.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from rampart.actors.runtime.actor import Context, Header, on
 
 
 class Replan(RecoveryModule):
-    """Asks for another plan, and is done when the route that comes of it is there.
+    """Orders another plan, and is done when its route is published.
 
-    It fails if the Mission Manager refuses, if there is no way, or at its deadline.
+    It fails if the Mission Manager refuses, if there is no route, or at its deadline.
     """
 
     outputs = (*RecoveryModule.outputs, topics.MISSION_ORDER)
@@ -28,7 +28,7 @@ class Replan(RecoveryModule):
         self._plan: int | None = None
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Ask, once for each order."""
+        """Send one order per command."""
         if self._order is not None and not renewed:
             return
         self._order = MissionOrder(f"{self.name}-{self.context.incarnation}-{command.decision}",
@@ -38,21 +38,21 @@ class Replan(RecoveryModule):
         self.publish(topics.MISSION_ORDER, self._order)
 
     def let_go(self) -> None:
-        """Forget the order: the robot has its route."""
+        """Drop the order."""
         self._order = self._plan = None
 
     def repeat(self) -> None:
-        """Repeat what the Mission Manager has not answered; it takes it for one order."""
+        """Repeat an unanswered order, which counts once by its id."""
         if self._order is not None and self._plan is None and self.phase is RecoveryPhase.ACTING:
             self.publish(topics.MISSION_ORDER, self._order)
 
     def unfinished(self) -> str:
-        """Say what is missing."""
+        """Return what is missing."""
         return "no answer from the Mission Manager" if self._plan is None else "no new route"
 
     @on(topics.MISSION_ORDER_ANSWER)
     def answer(self, message: MissionOrderAnswer, _header: Header) -> None:
-        """Hear whether the order is obeyed."""
+        """Take the answer."""
         if self._order is None or message.order != self._order.order or self._plan is not None:
             return
         if message.accepted:
@@ -62,11 +62,11 @@ class Replan(RecoveryModule):
 
     @on(topics.ROUTE)
     def route(self, message: Route, _header: Header) -> None:
-        """See the new route come."""
+        """Take the new route."""
         if self._plan is None or not message.active or message.plan < self._plan \
                 or self.phase is not RecoveryPhase.ACTING:
             return
         if message.waypoints:
-            self.succeed(message.reason or "planned anew")
+            self.succeed(message.reason or "replanned")
         else:
-            self.fail(f"no way: {message.reason}")
+            self.fail(f"no route: {message.reason}")

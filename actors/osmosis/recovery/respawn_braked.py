@@ -1,11 +1,11 @@
-"""RM7: respawn the Safety Pilot, with the brake held meanwhile.
+"""RM7: restart the Safety Pilot while the brake is engaged.
 
-Whoever commands the wheels is wrong, and until its successor has settled nobody else does. So this
-recovery goes past it as the emergency stop does, but lets go by itself: when the new Safety Pilot
-lives, it is that which stops the robot until it knows all orders.
+The node that commands the wheels is wrong, and no other node does until its successor has settled.
+So this recovery uses the brake, like the emergency stop, but releases it by itself: the new Safety
+Pilot stops the robot until it has all orders.
 
-It does not claim the brakes, since an emergency stop must have nobody to wait for. Each may hold
-the brake and let go of it: the base brakes as long as anybody holds it (`topics.BRAKE`).
+It does not claim the brakes, since an emergency stop must not wait. The base brakes while any
+source holds the brake (`topics.BRAKE`).
 """
 
 from __future__ import annotations
@@ -18,43 +18,43 @@ from rampart.actors.runtime.actor import Context
 
 
 class RespawnBraked(Respawn):
-    """`Respawn` that holds the low-level brake from its order until its nodes are back.
+    """`Respawn` that holds the low-level brake until its nodes run again.
 
-    If the nodes do not come back the brake stays engaged until the manager releases this recovery.
+    If they do not, the brake stays engaged until the manager releases this recovery.
     """
 
     outputs = (*Respawn.outputs, topics.BRAKE)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        # An earlier life may have died with the brake held.
+        # The previous incarnation may have left the brake engaged.
         self._holds = context.incarnation > 1
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Brake, then ask for the nodes."""
+        """Brake, then request the restart."""
         if renewed or self.phase is RecoveryPhase.ACTING:
             self._brake(engaged=True, why=command.reason)
         super().act(command, renewed=renewed)
 
     def succeed(self, reason: str = "") -> None:
-        """Release the brake: the nodes are back."""
+        """Release the brake: the nodes run again."""
         self._brake(engaged=False, why="")
         super().succeed(reason)
 
     def let_go(self) -> None:
-        """Release the brake, whether the nodes are back or not."""
+        """Release the brake, whether the nodes run or not."""
         self._brake(engaged=False, why="")
         super().let_go()
 
     def stay_idle(self) -> None:
-        """Release a brake that an earlier life of this module may have left behind."""
+        """Release a brake that the previous incarnation may have left engaged."""
         self._brake(engaged=False, why="")
 
     def repeat(self) -> None:
-        """Repeat what is not answered, and the brake while it is held."""
+        """Repeat an unanswered request, and the order to the brake while it is held."""
         super().repeat()
         if self._holds and self.activated:
-            self._brake(engaged=True, why="the safety pilot is being respawned")
+            self._brake(engaged=True, why="the safety pilot is being restarted")
 
     def _brake(self, *, engaged: bool, why: str) -> None:
         if engaged or self._holds:

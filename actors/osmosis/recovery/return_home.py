@@ -1,8 +1,7 @@
-"""A robot that is to go home: the mission is given up, and the robot drives to where it began.
+"""Return home: the mission is cancelled, and the robot drives to its start.
 
-Not among the paper's recoveries. It is what a robot may do that nobody can reach any more
-(`rampart.actors.detection.link_lost`): it neither goes on unwatched nor stays where it is. Like RM6
-it asks the Mission Manager, who knows whether there is a mission and where it began.
+It is not among the paper's recoveries. With `rampart.actors.detection.link_lost` it brings home a
+robot that no operator can reach. Like RM6 it sends an order to the Mission Manager.
 """
 
 from __future__ import annotations
@@ -23,12 +22,11 @@ from rampart.actors.runtime.actor import Context, Header, on
 
 
 class ReturnHome(RecoveryModule):
-    """Orders `home`, and sees to it that the robot drives nowhere else while the cause lasts.
+    """Orders `home`, also for a mission that begins or continues while the cause lasts.
 
-    Where no mission is under way there is nothing to bring home. A mission that begins, or goes on,
-    in the meantime is ordered home as well. When the cause is gone the robot still drives home: an
-    operator who wants something else can say so then. It fails if by its deadline the Mission
-    Manager has not answered, or refuses still, as it does until it knows where the mission began.
+    Without a mission there is nothing to do. When the cause is gone, the robot still drives home
+    until an operator gives another order. It fails at its deadline if the Mission Manager has not
+    answered or still refuses, as it does until the start of the mission is known.
     """
 
     outputs = (*RecoveryModule.outputs, topics.MISSION_ORDER)
@@ -41,7 +39,7 @@ class ReturnHome(RecoveryModule):
         self._order: MissionOrder | None = None
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Ask, and again what was refused."""
+        """Send the order, again after a refusal."""
         self._why = command.reason
         if self.phase is RecoveryPhase.FAILED and renewed:
             self.resume(self._why)
@@ -49,22 +47,22 @@ class ReturnHome(RecoveryModule):
             self._ask()
 
     def let_go(self) -> None:
-        """Ask for nothing any more."""
+        """Drop the order."""
         self._order = None
 
     def repeat(self) -> None:
-        """Repeat what the Mission Manager has not answered; it takes it for one order."""
+        """Repeat an unanswered order, which counts once by its id."""
         if self._order is not None and self.phase is RecoveryPhase.ACTING:
             self.publish(topics.MISSION_ORDER, self._order)
 
     def unfinished(self) -> str:
-        """Say what is missing."""
+        """Return what is missing."""
         return (f"refused: {self._refused}" if self._refused
                 else "no answer from the Mission Manager")
 
     @on(topics.MISSION_ORDER_ANSWER)
     def answer(self, message: MissionOrderAnswer, _header: Header) -> None:
-        """Hear whether the order is obeyed."""
+        """Take the answer."""
         if self._order is None or message.order != self._order.order:
             return
         self._order, self._refused = None, message.reason
@@ -73,7 +71,7 @@ class ReturnHome(RecoveryModule):
 
     @on(topics.MISSION_STATUS)
     def status(self, message: MissionStatus, header: Header) -> None:
-        """See what became of it, and a mission that can be ordered home now."""
+        """Follow the mission, and order home one that can be now."""
         if self.phase not in {RecoveryPhase.ACTING, RecoveryPhase.DEGRADED} \
                 or header.stamp < self._asked_s:
             return

@@ -7,7 +7,7 @@ from rampart.actors.osmosis.recovery.controlled_stop import PilotRecovery
 
 
 class SwitchTeleoperation(PilotRecovery):
-    """The Safety Pilot executes the joystick only. A stop, being stricter, fulfils this too."""
+    """The Safety Pilot executes the joystick only. A stop is stricter and fulfils this too."""
 
     mode = PilotMode.TELEOPERATION
     confirming = (PilotMode.TELEOPERATION, PilotMode.STOP)

@@ -1,10 +1,10 @@
-"""The way out of a prohibited area: what the operator may do while the emergency stop holds. Pure.
+"""The way out of a prohibited area during an emergency stop. Pure.
 
-A robot that stands inside a prohibited area, or too near to one, keeps DM1 active, and so RM1
-latched. Nobody could drive it out. On the word of an operator RM1 lets go of the brake for one
-grip of the stick: slowly, and in directions that lead out only. RM1 judges the direction by the
-pose, ten times a second, and the Safety Pilot obeys. An independent look at GPS ends it if the
-robot gets deeper. Whatever is not known ends it, too; then the brake is engaged again.
+A robot inside a prohibited area, or too near to one, keeps DM1 active and RM1 latched, so it could
+not be driven out. On request of an operator RM1 releases the brake while the dead man is held once:
+slowly, and only in directions that lead out. RM1 determines the direction from the pose, ten times
+a second, and the Safety Pilot enforces it. An independent check of GPS ends the way out if the
+robot gets deeper. Any missing input ends it too; then the brake is engaged again.
 """
 
 from __future__ import annotations
@@ -17,34 +17,34 @@ import msgspec
 from rampart.actors.osmosis.messages import Way
 
 PERIOD_S = 0.1
-"""Between two looks."""
+"""Period of the decision."""
 
 FRESH_S = 0.3
-"""Age at which a pose, a fix and the stick count as lost."""
+"""Greatest age of pose, fix and joystick."""
 
 PILOT_S = 0.6
-"""Age at which the Safety Pilot's word is none: three of its periods."""
+"""Greatest age of the Safety Pilot's status: three of its periods."""
 
 TAKE_S = 10.0
-"""Within which the operator has to take the stick."""
+"""Time in which the operator has to press the dead man."""
 
 TOP_SPEED_MPS = 0.2
 STANDING_RADPS = 0.1
-"""Of a wheel."""
+"""Largest wheel speed at a standstill."""
 
 APART_M = 0.5
-"""Difference of pose and GPS at which neither is believed."""
+"""Greatest distance of pose and GPS."""
 
 DEEPER_M = 0.15
-"""So much nearer to the middle of the area than before, by GPS, ends it."""
+"""Increase of depth by GPS that ends the way out."""
 
 _STEP_M = 0.25
 _STEEP = 0.3
-"""Metres nearer to the edge for a metre of way, at least."""
+"""Least metres towards the edge per metre driven."""
 
 
 class Look(msgspec.Struct):
-    """The newest readings, each with its stamp; simulated seconds, metres and radians in `map`."""
+    """Newest readings with their stamps; simulated seconds, metres and radians in `map`."""
 
     pose: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     pose_s: float = -math.inf
@@ -57,19 +57,19 @@ class Look(msgspec.Struct):
 
 
 class WayOut:
-    """One permission, from the operator's word until it ends.
+    """One permission, from the request until its end.
 
     Args:
-        distance_m: signed distance of a point in `map` from the area, negative inside.
-        too_near_m: at this distance of its centre the robot cannot be released.
-        far_m: at this one it can, with a margin.
+        distance_m: signed distance from a point in `map` to the area; negative inside.
+        too_near_m: distance of the robot's centre up to which it cannot be released.
+        far_m: distance at which it can be released, with a margin.
         now_s: now.
 
     Attributes:
-        began_s: when it was granted.
-        way: where the robot may drive.
+        began_s: time of the permission.
+        way: allowed directions.
         is_out: whether the robot is far enough from the area.
-        open: whether the Safety Pilot obeys, so that the brake may be let go.
+        open: whether the Safety Pilot obeys, so that the brake may be released.
     """
 
     def __init__(self, distance_m: Callable[[float, float], float], too_near_m: float,
@@ -84,12 +84,12 @@ class WayOut:
         self.open = False
 
     def refusal(self, look: Look, now_s: float) -> str:
-        """Return why there is no way out to be granted, or ""."""
+        """Return why a way out is refused, or ""."""
         unknown = self._unknown(look, now_s)
         if unknown:
             return unknown
         if now_s - look.wheels_s > FRESH_S or look.wheels_radps > STANDING_RADPS:
-            return "the robot does not stand"
+            return "the robot moves"
         self._farthest_m = self._distance_m(*look.fix)
         if self._farthest_m > self._too_near_m:
             return (f"the robot is {self._farthest_m:.2f} m from the prohibited area: "
@@ -97,7 +97,7 @@ class WayOut:
         return ""
 
     def look(self, look: Look, now_s: float) -> str:
-        """Decide where the robot may drive now; return why the way out ends, or ""."""
+        """Determine the allowed directions; return why the way out ends, or ""."""
         self.way = Way.NEITHER
         lost = self._lost(look, now_s) or self._unknown(look, now_s)
         if lost:
@@ -113,19 +113,19 @@ class WayOut:
         return ""
 
     def _lost(self, look: Look, now_s: float) -> str:
-        """Return whose word of the way out has ended, or ""."""
+        """Return whether operator or Safety Pilot ended it, or ""."""
         before, self._held = self._held, now_s - look.stick_s <= FRESH_S
         if before and not self._held:
-            return "the operator let go"
+            return "the operator released the dead man"
         if not self._held and now_s - self.began_s > TAKE_S:
-            return f"no stick was taken in hand within {TAKE_S:g} s"
+            return f"the dead man was not pressed within {TAKE_S:g} s"
         if self.open and now_s - look.pilot_s > PILOT_S:
             return "the safety pilot is silent"
         return ""
 
     def _unknown(self, look: Look, now_s: float) -> str:
         if not now_s - look.pose_s <= FRESH_S:
-            return "the pose is not known"
+            return "the pose is unknown"
         if not now_s - look.fix_s <= FRESH_S:
             return "GPS is silent"
         if not math.dist(look.pose[:2], look.fix) <= APART_M:

@@ -95,7 +95,7 @@ async def test_a_mission_is_started_from_the_page_unless_one_runs(world):
         at = await served(hmi)
         async with websockets.connect(f"ws://{at}/ws") as page:
             await page.send('{"type": "mission", "name": "Z"}')
-            assert (await hear(page, "error"))["text"] == "no mission 'Z'; there are: A, B, AB"
+            assert (await hear(page, "error"))["text"] == "unknown mission 'Z'; known: A, B, AB"
             await page.send('{"type": "mission", "name": "B"}')
             await hear(page, "done")
             await eventually(lambda: bool(world.others.requests))
@@ -140,7 +140,7 @@ async def test_an_order_is_given_from_the_page_if_it_makes_sense_and_its_answer_
             assert (await hear(page, "error"))["text"] == (
                 "resume is not possible while the mission is running; possible: pause")
             await page.send('{"type": "order", "action": "pause", "reason": "runway in use"}')
-            assert (await hear(page, "done"))["text"] == "pause asked for"
+            assert (await hear(page, "done"))["text"] == "pause requested"
             await eventually(lambda: bool(world.others.orders))
             order = world.others.orders[0]
             assert (order.action, order.reason, order.by) == ("pause", "runway in use", "operator")

@@ -150,10 +150,10 @@ async def test_the_page_says_whether_the_stick_has_an_effect_now(world):
     async with world.hmi(hmi_port=free_port()) as hmi:
         async with open_page(await served(hmi)) as page:
             shown = await operating(page, lambda _: True)
-            assert shown["text"] == "no effect: the Safety Pilot is not heard"
+            assert shown["text"] == "no effect: the Safety Pilot is silent"
             for said, works, text in (
                     (pilot(m.PilotMode.AUTO), True, "overrides the mission"),
-                    (pilot(m.PilotMode.TELEOPERATION), True, "obeys the stick alone"),
+                    (pilot(m.PilotMode.TELEOPERATION), True, "obeys only the joystick"),
                     (pilot(m.PilotMode.STOP, "RM2: stale"), False, "no effect: RM2: stale")):
                 async with repeated(
                         lambda said=said: world.others.publish(topics.PILOT_STATUS, said)):

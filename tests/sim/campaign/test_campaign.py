@@ -448,7 +448,7 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
     (("--runs", "3", "--kinds", "gremlin"), "unknown kind 'gremlin'; known: paper, sensor"),
     (("--fault", "gremlins"), "unknown fault 'gremlins'"),
     (("--runs", "3", "--obstacles", "many"), "--obstacles many: must be a number"),
-    (("--runs", "3", "--obstacles", "99"), "obstacles = 99: Vallombre has places for 5"),
+    (("--runs", "3", "--obstacles", "99"), "obstacles = 99: expected at most 5 on Vallombre"),
     (("--runs", "3", "--strategy", "hope"), "unknown strategy 'hope'"),
     (("--runs", "3", "--network", "wet"), "unknown network 'wet'"),
     (("--runs", "3", "--patience", "0"), "--patience 0"),

@@ -246,15 +246,15 @@ def test_a_fault_that_leaves_everything_changes_no_bit(kind):
 # ---- bad input ----------------------------------------------------------------------
 
 BAD = [
-    (fault(STUCK, "middle left"), "wheel = 'middle left': must be one of front left"),
-    (fault(WEAK, ""), "wheel = '': must be one of"),
-    (fault(WEAK, strength=-0.1), "strength = -0.1: must be a share from 0 to 1"),
-    (fault(BRAKE, strength=1.01), "strength = 1.01: must be a share"),
-    (fault(BRAKE, strength=math.nan), "strength = nan: must be a share"),
-    (fault(STUCK, duration_s=math.nan), "duration_s = nan: must be seconds"),
-    (fault(STUCK, duration_s=-math.inf), "duration_s = -inf: must be seconds"),
-    (fault(STUCK, duration_s=-1.0), "duration_s = -1.0: must be seconds"),
-    (fault(STUCK, duration_s=0.0), "injection = 'f': no such fault in force to end"),
+    (fault(STUCK, "middle left"), "wheel = 'middle left': expected one of front left"),
+    (fault(WEAK, ""), "wheel = '': expected one of"),
+    (fault(WEAK, strength=-0.1), "strength = -0.1: expected a share from 0 to 1"),
+    (fault(BRAKE, strength=1.01), "strength = 1.01: expected a share"),
+    (fault(BRAKE, strength=math.nan), "strength = nan: expected a share"),
+    (fault(STUCK, duration_s=math.nan), "duration_s = nan: expected seconds"),
+    (fault(STUCK, duration_s=-math.inf), "duration_s = -inf: expected seconds"),
+    (fault(STUCK, duration_s=-1.0), "duration_s = -1.0: expected seconds"),
+    (fault(STUCK, duration_s=0.0), "injection = 'f': unknown fault, nothing to end"),
 ]
 
 

@@ -154,7 +154,7 @@ def names(sim: World) -> set[str]:
 def test_the_first_presets_take_part_and_more_than_there_are_is_refused():
     assert names(world(road(obstacles=PRESETS), obstacles=1)) == {"drum"}
     assert names(world(road(obstacles=PRESETS))) == set()
-    with pytest.raises(WorldError, match="obstacles: 4: Road has presets for 0 to 3"):
+    with pytest.raises(WorldError, match="obstacles: 4: expected 0 to 3 on Road"):
         world(road(obstacles=PRESETS), obstacles=4)
 
 
@@ -205,7 +205,7 @@ def test_the_pool_of_obstacles_is_finite_and_places_in_it_are_given_back():
     sim = world()
     for i in range(SPARE_OBSTACLES):
         sim.add_obstacle(f"o{i}", 5.0 + 2 * i, 0.0, 0.3)
-    with pytest.raises(WorldError, match="take one away first"):
+    with pytest.raises(WorldError, match="expected at most"):
         sim.add_obstacle("one more", 3.0, 0.0, 0.3)
     sim.remove_obstacle("o0")
     sim.add_obstacle("one more", 3.0, 0.0, 0.3)

@@ -82,7 +82,7 @@ def test_a_replan_is_done_when_the_new_route_is_there():
 
 @pytest.mark.parametrize(("mission", "way", "dumb", "reason"), [
     (False, ((0.0, 0.0),), False, "refused: no mission is under way"),
-    (True, (), False, "no way: no way"),
+    (True, (), False, "no route: no way"),
     (True, ((0.0, 0.0),), True, "not done within 2 s: no new route")])
 def test_a_replan_without_a_new_route_fails_with_the_reason(mission, way, dumb, reason):
     async def scenario(boss, planner, manager):

@@ -352,7 +352,7 @@ def test_a_stick_held_since_before_a_stop_ended_stands_the_robot_until_it_is_let
         bench.send(0.5)
         bench.send(0.5, stick=True)
         assert bench.out() == (0.0, 0.0)
-    assert "let go" in bench.reason()
+    assert "release it first" in bench.reason()
     assert bench.gate.forbidden(bench.now) == bench.reason()
     bench.wait(0.31)
     bench.send(0.4)

@@ -212,7 +212,7 @@ async def test_in_virtual_time_no_device_is_opened(tmp_path):
 @pytest.mark.parametrize(("arguments", "words"), [
     (["--joystick", "{file}"], "neither a device nor a FIFO"),
     (["--joystick", "{directory}"], "neither a device nor a FIFO"),
-    (["--joystick", "--virtual"], "not with --virtual")])
+    (["--joystick", "--virtual"], "not possible with --virtual")])
 def test_a_launch_with_what_is_no_joystick_is_refused(arguments, words, tmp_path, capsys):
     (tmp_path / "file").touch()
     told = [a.format(file=tmp_path / "file", directory=tmp_path) for a in arguments]
