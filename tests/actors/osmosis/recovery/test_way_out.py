@@ -155,8 +155,8 @@ def looked(now_s=0.0, **readings):
 
 
 @pytest.mark.parametrize(("readings", "words"), [
-    ({}, ""), ({"pose_s": -1.0}, "pose"), ({"fix_s": -1.0}, "GPS"), ({"wheels_s": -1.0}, "stand"),
-    ({"wheels_radps": 1.0}, "stand"), ({"fix": (-2.0, 0.0)}, "differ"),
+    ({}, ""), ({"pose_s": -1.0}, "pose"), ({"fix_s": -1.0}, "GPS"), ({"wheels_s": -1.0}, "moves"),
+    ({"wheels_radps": 1.0}, "moves"), ({"fix": (-2.0, 0.0)}, "differ"),
     ({"fix": (math.nan, 0.0)}, "differ"), ({"pose": (math.nan, 0.0, 0.0)}, "differ"),
     ({"fix": (0.7, 0.0), "pose": (0.7, 0.0, 0.0)}, "reset")])
 def test_when_a_way_out_is_granted(readings, words):
@@ -183,4 +183,4 @@ def test_a_robot_that_gets_deeper_or_gets_out_or_waits_is_not_driven_on():
     assert out.is_out
     late = WayOut(area_to_the_west, 0.6, 0.75, 0.0)
     assert late.look(looked(9.0, stick_s=0.0), 9.0) == ""
-    assert "no stick" in late.look(looked(11.0, stick_s=0.0), 11.0)
+    assert "not pressed" in late.look(looked(11.0, stick_s=0.0), 11.0)
