@@ -11,7 +11,7 @@ ROLES = {
     "supervisor": "rampart.actors.supervision.supervisor:Supervisor",
     "first supervisor": "rampart.actors.hosts.host_supervisor:FirstSupervisor",
     "host supervisor": "rampart.actors.hosts.host_supervisor:HostSupervisor",
-    "host observer": "rampart.actors.hosts.host_observer:HostObserver",
+    "host observer": "rampart.actors.hosts.host_supervisor:HostObserver",
     "router": "rampart.actors.supervision.router:Router",
     "observer": "rampart.sim.runs.observer:Observer",
     "views": "rampart.actors.recording.views:Views",

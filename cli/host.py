@@ -17,7 +17,7 @@ import msgspec
 
 from rampart.actors.bus.run_folder import register_of
 from rampart.actors.ftm.messages import ProcessEvent
-from rampart.actors.hosts.host_observer import HostObserver
+from rampart.actors.hosts.host_supervisor import HostObserver
 from rampart.actors.hosts.launchers import OtherLauncher
 from rampart.actors.hosts.meeting import MeetingError
 from rampart.actors.runtime.actor import Context

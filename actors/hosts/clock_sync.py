@@ -1,11 +1,10 @@
-"""What time it is on another host: an interval that certainly holds the offset of two clocks.
+"""The offset of another host's clock, as an interval that certainly contains it.
 
-A question that is sent at `asked_s` and whose answer comes at `heard_s` was answered in between: so
-the other clock, which said `told_s` then, is ahead by at least told - heard and at most told -
-asked, whatever the network did. The intervals of several questions have to overlap, each widened by
-what the clocks may have drifted since; the overlap is narrow as soon as one question and one
-answer, not necessarily of the same exchange, were quick (Marzullo and Owicki, 1983). Where they do
-not overlap, one of the two clocks is wrong.
+A question sent at `sent_s` and answered by `received_s` was answered in between. So the remote
+clock, which read `remote_s` then, is ahead by at least remote - received and by at most
+remote - sent, whatever the network did. The intervals of several exchanges overlap if each is
+widened by the drift since. The overlap is narrow as soon as one question and one answer, of any two
+exchanges, were quick (Marzullo and Owicki, 1983). Without an overlap one of the clocks has jumped.
 """
 
 from __future__ import annotations
@@ -13,62 +12,59 @@ from __future__ import annotations
 from collections import deque
 
 DRIFT = 2e-4
-"""Seconds a second by which two clocks may drift apart: twice what a cheap crystal may be off."""
+"""Seconds per second by which two clocks may drift apart: twice the error of a cheap crystal."""
 
-_KEPT = 60
+_WINDOW = 60
+"""Exchanges that count."""
 
 _SLEW_S = 0.002
-"""By which the clock in use is moved at most, for each exchange, while it may be right."""
+"""Largest correction per exchange, as long as the offset in use may be right."""
 
 
 class ClockSync:
     """How far another host's monotonic clock is ahead of this one's.
 
     Args:
-        tolerated_s: An error that readers of messages tolerate. A larger one that is proven is put
-            right at once: all that is stamped by that clock would be refused meanwhile.
+        tolerated_s: Error that readers of messages tolerate. A larger proven error is corrected at
+            once, since readers would refuse every message of this host meanwhile.
 
     Attributes:
         offset_s: In use, seconds; moves slowly towards the middle of the interval.
-        bound_s: By how much it may be wrong at most, if both clocks run evenly.
+        bound_s: Its largest possible error at the last exchange, if both clocks run evenly.
     """
 
     def __init__(self, tolerated_s: float = 0.1) -> None:
         self._tolerated_s = tolerated_s
         self.offset_s = 0.0
         self.bound_s = float("inf")
-        self._kept: deque[tuple[float, float, float]] = deque(maxlen=_KEPT)
+        self._exchanged_s = 0.0
+        self._intervals: deque[tuple[float, float, float]] = deque(maxlen=_WINDOW)
 
-    def exchanged(self, asked_s: float, told_s: float, heard_s: float) -> None:
+    def add_exchange(self, sent_s: float, remote_s: float, received_s: float) -> None:
         """Take one exchange.
 
         Args:
-            asked_s: This clock, when the question was sent.
-            told_s: The other clock, when it was answered.
-            heard_s: This clock, when the answer came.
+            sent_s: This clock, when the question was sent.
+            remote_s: The other clock, when it was answered.
+            received_s: This clock, when the answer arrived.
         """
-        drift_s = DRIFT * (heard_s - asked_s)  # it was told at some time in between
-        self._kept.append((heard_s, told_s - heard_s - drift_s, told_s - asked_s + drift_s))
-        low_s, high_s = self._overlap(heard_s)
-        if low_s > high_s:
-            newest = self._kept[-1]  # a clock has jumped
-            self._kept.clear()
-            self._kept.append(newest)
-            low_s, high_s = newest[1:]
-        middle_s = (low_s + high_s) / 2
-        step_s = middle_s - self.offset_s
+        drift_s = DRIFT * (received_s - sent_s)
+        newest = (received_s, remote_s - received_s - drift_s, remote_s - sent_s + drift_s)
+        self._intervals.append(newest)
+        low_s = max(low_s - DRIFT * (received_s - at_s) for at_s, low_s, _ in self._intervals)
+        high_s = min(high_s + DRIFT * (received_s - at_s) for at_s, _, high_s in self._intervals)
+        if low_s > high_s:  # a clock has jumped
+            self._intervals.clear()
+            self._intervals.append(newest)
+            _, low_s, high_s = newest
+        step_s = (low_s + high_s) / 2 - self.offset_s
         is_wrong = not low_s - self._tolerated_s <= self.offset_s <= high_s + self._tolerated_s
-        if len(self._kept) > 1 and not is_wrong:
+        if len(self._intervals) > 1 and not is_wrong:
             step_s = min(max(step_s, -_SLEW_S), _SLEW_S)
         self.offset_s += step_s
         self.bound_s = max(high_s - self.offset_s, self.offset_s - low_s)
+        self._exchanged_s = received_s
 
     def bound_at(self, now_s: float) -> float:
-        """Return by how much the offset may be wrong, a while after the last exchange."""
-        if not self._kept:
-            return self.bound_s
-        return self.bound_s + DRIFT * (now_s - self._kept[-1][0])
-
-    def _overlap(self, now_s: float) -> tuple[float, float]:
-        return (max(low_s - DRIFT * (now_s - at_s) for at_s, low_s, _ in self._kept),
-                min(high_s + DRIFT * (now_s - at_s) for at_s, _, high_s in self._kept))
+        """Return the largest possible error of the offset, some time after the last exchange."""
+        return self.bound_s + DRIFT * (now_s - self._exchanged_s)

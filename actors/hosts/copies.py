@@ -1,13 +1,13 @@
-"""Which states of nodes another host is sent, and which of those it sends are taken. Pure.
+"""Copies of node states on two hosts: what to publish, and what to accept. Pure.
 
-A node that has its home on another host than the first may have to run on the first. So each of the
-two holds the newest state that it has kept. Each repeats what it holds (`Checkpoints`), and at once
-what has changed since it repeated all. Lost, late, double and disordered messages do no harm: the
-next one has the state again, and only what is newer is ever taken.
+A node of another host may have to run on the first host. So both hold the newest state that either
+has kept. Each repeats all of its states, and publishes at once what has changed since the last
+repetition. A lost, late, repeated or reordered message does no harm: the next one carries the state
+again, and only a newer state is accepted.
 
-*Newer* is decided by incarnation, then generation (`Record.age`). A host where the node runs takes
-no state but of a higher incarnation than its own: what runs there is superseded then. A host that
-gives a node back marks which state is the last (`KeptState.final`), so that the other waits for it.
+*Newer* is decided by incarnation, then generation (`Record.age`). A host that runs the node accepts
+only a state of a higher incarnation than its own, since its process is superseded then. A host that
+gives a node back marks the last state (`KeptState.final`), and its home waits for that.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _NONE = Record(0, 0, 0, 0, b"")
 
 @dataclass(slots=True)
 class _State:
-    """What is known of the state of one node.
+    """Two copies of one node's state.
 
     Attributes:
-        other: Host that holds it as well.
-        mine: The newest here.
-        theirs: What the other published last; None if nothing yet, or before it was lost.
+        other: Host that holds the second copy.
+        mine: The newest on this host.
+        theirs: What the other host published last; None if nothing since it was lost.
     """
 
     other: str
@@ -38,28 +38,25 @@ class _State:
     theirs: KeptState | None = None
 
 
-class Taken(NamedTuple):
-    """What comes of a message.
-
-    Attributes:
-        records: To be kept here, each with its node.
-        problems: What is wrong with it, each with the node that it is about.
-    """
+class Received(NamedTuple):
+    """Result of a message: records to keep, and problems, each with the node's name."""
 
     records: tuple[tuple[str, Record], ...] = ()
     problems: tuple[tuple[str, str], ...] = ()
 
 
 class Copies:
-    """What one host knows of the states that it shares with others.
+    """The states that one host shares with others.
 
     Args:
         run: Name of the run.
-        own: Name of the host.
-        home_of: Of each node that may run on two hosts, the name of the one that is its home; that
-            is not the first, which is the other.
-        runs: Returns the highest incarnation of a node that this host runs; 0 if it does not.
-        issued: Returns the highest incarnation of a node that is known to have been issued.
+        own: Name of this host.
+        home_of: Home of each node that may run on two hosts; the second is the first host.
+        runs: Returns the highest incarnation of a node that this host runs; 0 for none.
+        issued: Returns the highest incarnation of a node that is known to be issued.
+
+    Attributes:
+        nodes: Nodes that this host shares.
     """
 
     def __init__(self, run: str, own: str, home_of: Mapping[str, str],
@@ -69,64 +66,56 @@ class Copies:
         self._issued = issued
         self._states = {node: _State(FIRST if own == home else home)
                         for node, home in home_of.items() if own in {home, FIRST}}
-        self._unsettled = set(self._states)
+        self.nodes = tuple(self._states)
+        self._unsettled = set(self.nodes)
         self._changed: set[str] = set()
 
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        """Names of the nodes that it is about."""
-        return tuple(self._states)
-
-    def kept(self, node: str, record: Record | None) -> None:
+    def note_kept(self, node: str, record: Record | None) -> None:
         """Note the newest state of a node on this host's disk."""
         self._states[node].mine = record or _NONE
         self._changed.add(node)
 
     def unsettle(self, nodes: Iterable[str]) -> None:
-        """Note that a process of nodes is being ended here: it may keep something yet."""
+        """Note that processes of nodes are being ended here, and may still keep a state."""
         self._unsettled.update(self._states.keys() & set(nodes))
 
-    def settled(self, node: str) -> None:
-        """Note that it has ended, and that what it has kept was noted."""
+    def settle(self, node: str) -> None:
+        """Note that no process of a node is left here, and that its last state was noted."""
         self._unsettled.discard(node)
 
-    def lost(self, host: str) -> None:
-        """Note that a host is lost: what it published may be past."""
+    def lose(self, host: str) -> None:
+        """Forget what a lost host published."""
         for state in self._states.values():
             if state.other == host:
                 state.theirs = None
 
-    def told(self, host: str, message: Checkpoints) -> Taken:
-        """Take what another host holds; it is believed about nodes of which it holds the state.
-
-        Args:
-            host: Name of it.
-            message: From its supervisor.
-        """
+    def receive(self, host: str, message: Checkpoints) -> Received:
+        """Take the states that another host holds, of nodes that it may hold."""
         if message.run != self._run:
-            return Taken(problems=((host, f"checkpoints of run {message.run!r}"),))
+            return Received(problems=((host, f"checkpoints of run {message.run!r}, "
+                                       f"expected {self._run!r}"),))
         records, problems = list[tuple[str, Record]](), list[tuple[str, str]]()
         for kept in message.kept:
             state = self._states.get(kept.node)
             if state is None and host == FIRST:
                 continue  # for another host
             if state is None or state.other != host:
-                problems.append((kept.node, f"a state from host {host or 'the first'}, which it "
-                                 "may not keep"))
+                problems.append((kept.node, f"host {host or 'the first'} published a state of this "
+                                 "node, which it does not share"))
                 continue
             state.theirs = kept
             if (_age(kept) > state.mine.age
                     and self._runs(kept.node) < kept.incarnation <= self._issued(kept.node)):
                 records.append((kept.node, Record(kept.incarnation, kept.generation, kept.version,
                                                   kept.failures, kept.state)))
-        return Taken(tuple(records), tuple(problems))
+        return Received(tuple(records), tuple(problems))
 
     def changes(self) -> Checkpoints:
-        """Return what has changed since all was repeated."""
+        """Return the states that have changed since all were repeated; a reader may skip some."""
         return self._message(self._changed)
 
     def all(self) -> Checkpoints:
-        """Return all that is held here; what a message has no room for comes with the next."""
+        """Return all states; those that do not fit come first in the next message."""
         self._changed.clear()
         return self._message(tuple(self._states))
 
@@ -134,31 +123,26 @@ class Copies:
         kept, bytes_left = list[KeptState](), LARGEST_STATE_BYTES
         for node in nodes:
             record = self._states[node].mine
-            if len(record.state) > bytes_left:
-                continue
-            bytes_left -= len(record.state)
-            kept.append(KeptState(
-                node, *record, self._issued(node),
-                not self._runs(node) and node not in self._unsettled))
-        for one in kept:  # to the end: the next message begins with what was left out
-            self._states[one.node] = self._states.pop(one.node)
+            if len(record.state) <= bytes_left:
+                bytes_left -= len(record.state)
+                kept.append(KeptState(node, *record, self._issued(node),
+                                      not self._runs(node) and node not in self._unsettled))
+        for state in kept:
+            self._states[state.node] = self._states.pop(state.node)  # to the end
         return Checkpoints(self._run, tuple(kept))
 
-    def is_caught_up(self, nodes: Iterable[str], issued: Mapping[str, int]) -> bool:
-        """Whether the last states that another host has kept of its nodes are here.
+    def is_caught_up(self, issued: Mapping[str, int]) -> bool:
+        """Whether the last states of nodes that another host has given back are on this disk.
 
         Args:
-            nodes: That it has given back.
-            issued: Highest incarnation of each that it has said it issued; 0 if none.
+            issued: The nodes, each with the highest incarnation that the other host has issued.
         """
-        for node in nodes:
-            state = self._states.get(node)
-            if state is None:
-                continue
-            theirs = state.theirs
-            if (theirs is None or not theirs.final or theirs.issued < issued.get(node, 0)
-                    or _age(theirs) > state.mine.age):
-                return False
+        for node, incarnation in issued.items():
+            if state := self._states.get(node):
+                theirs = state.theirs
+                if (theirs is None or not theirs.final or theirs.issued < incarnation
+                        or _age(theirs) > state.mine.age):
+                    return False
         return True
 
 

@@ -1,13 +1,12 @@
-"""The supervisors of a system of several hosts: each runs what `Placement` gives it.
+"""Supervisors of a system of several hosts: each runs the units that `Placement` gives it.
 
-They tell each other what they run, and of which incarnation (`supervisor/{name}/nodes`). What one
-hears is noted in the folder of the run on its own host, where every reader looks whether an
-incarnation was issued; nobody but a supervisor writes there what another host has issued. The
-first host's publishes the table of all.
+They publish what they run, with incarnations (`supervisor/{name}/nodes`). A supervisor writes the
+incarnations that other hosts have issued to the run folder of its own host, where every reader
+looks them up. No other process writes them there. The first host's supervisor publishes the table
+of all hosts.
 
-With checkpoints they also hold the newest state of each node that either of two hosts may run
-(`Copies`), which they publish, and a node that is given back starts when what it has
-kept there has come.
+With checkpoints they also publish the newest state of each node that two hosts may run (`Copies`).
+A node that is given back starts when the state kept there has arrived.
 """
 
 from __future__ import annotations
@@ -21,6 +20,8 @@ from pathlib import Path
 from signal import Signals
 from typing import Any, ClassVar
 
+from msgspec.structs import replace
+
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.messages import Heartbeat
@@ -31,7 +32,7 @@ from rampart.actors.ftm import topics
 from rampart.actors.hosts.copies import Copies
 from rampart.actors.hosts.placement import FIRST, Changes, Home, Placement
 from rampart.actors.hosts.state_files import StateFiles
-from rampart.actors.runtime.actor import Context, Header, every, on
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.run_plan import SUPERVISOR, on_host
 from rampart.actors.supervision.kill_node import (
@@ -46,29 +47,24 @@ from rampart.actors.supervision.supervised_process import SupervisedProcess
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.manager.spec.schema import Kind
 
-_SAID_S = 0.1
-"""Simulated seconds after which it is signalled itself: the answer has gone by then."""
+_ANSWER_S = 0.1
+"""Simulated seconds between the answer to an order and the signal, which may end this process."""
 
 _ENDING_S = 0.005
-"""Real seconds between two looks whether a process that was given back has ended."""
+"""Real seconds between two checks whether a process that was given back has ended."""
 
 _WAIT_S = 2.0
-"""Real seconds after which the last state of a node that is given back is not waited for."""
+"""Longest wait for the last state of a node that is given back, real seconds."""
 
 _ORDERS_KEPT = 64
-"""An order to signal that is repeated gets its old answer, as long as it is among the last ones."""
+"""Most orders to signal whose answers are remembered, for orders that arrive again."""
 
 
 class HostSupervisor(Supervisor):
     """Keeps the processes of one host of several running."""
 
     class Parameters(Supervisor.Parameters, frozen=True):
-        """Whom it hears besides.
-
-        Attributes:
-            host: name of its host.
-            others: names of the other hosts.
-        """
+        """Besides: names of its own host and of the others."""
 
         host: str = ""
         others: tuple[str, ...] = ()
@@ -81,27 +77,25 @@ class HostSupervisor(Supervisor):
                  files: Callable[..., StateFiles] = StateFiles) -> None:
         super().__init__(context, processes)
         plan, spec, own = context.run.plan, context.run.system, self.parameters.host
-        hosts, units = self.layout.hosts, self.layout.units
-        loop = asyncio.get_running_loop()
+        hosts, loop = self.layout.hosts, asyncio.get_running_loop()
         self._now_s = loop.time
         self._folder, self._base_port = plan.folder, plan.base_port
         self._supervisors = {hosts.supervisors[host]: host for host in self.parameters.others}
         self._guards = {name: host for host in hosts.supervisors for name in hosts.guards_of(host)}
         self._signalled: deque[fm.ProcessEvent] = deque(maxlen=_ORDERS_KEPT)
-        self._placement = Placement(
-            own,
-            {name: Home(hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes),
-                        any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
-             for name, unit in units.items()},
-            self._guards, hosts.link, self._known, now_s=loop.time(), rate=plan.rate)
+        homes = {
+            name: Home(hosts.home_of[unit.nodes[0].name], tuple(node.name for node in unit.nodes),
+                       any(node.command or node.kind is Kind.WORLD for node in unit.nodes))
+            for name, unit in self.layout.units.items()}
+        self._placement = Placement(own, homes, self._guards, hosts.link, self._known,
+                                    now_s=loop.time(), rate=plan.rate)
         self._ending: set[str] = set()
         self._waits: dict[tuple[str, int], float] = {}
         keeps_states = bool(plan.checkpoints) and spec.layers.checkpoints
         self._copies = Copies(
-            plan.run_id, own, {
-                node.name: home for name, unit in units.items() for node in unit.nodes
-                if keeps_states and (home := hosts.home_of[unit.nodes[0].name]) != FIRST
-                and not self._placement.is_fixed(name)},
+            plan.run_id, own,
+            {node: home.host for home in homes.values() for node in home.nodes
+             if keeps_states and home.host != FIRST and not home.is_fixed},
             self.highest_of, lambda node: context.register(node) or 0)
 
         def from_thread(call: Callable[..., None], node: str, *what: Any) -> None:
@@ -116,7 +110,7 @@ class HostSupervisor(Supervisor):
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Supervisor.Parameters) -> Members:
-        """Hear the other supervisors, too; of states, those with which it shares some."""
+        """Receive the tables of all other supervisors, and states from those that share some."""
         if topic in (topics.HOST_NODES, topics.CHECKPOINTS):
             assert isinstance(parameters, HostSupervisor.Parameters)  # noqa: S101 for the type checker
             shares_all = topic is topics.HOST_NODES or parameters.host == FIRST
@@ -127,81 +121,81 @@ class HostSupervisor(Supervisor):
     @classmethod
     def output_names(cls, topic: Topic[Any], name: str, parameters: Supervisor.Parameters
                      ) -> Members:
-        """Publish what runs here, and what it holds, under its own name."""
+        """Publish tables and states under its own name."""
         if topic in (topics.HOST_NODES, topics.CHECKPOINTS):
             return (name,)
         return super().output_names(topic, name, parameters)
 
     def units_at_start(self, running: Collection[str]) -> Iterable[str]:
-        """Return what has its home here, and what runs here already in another host's place.
+        """Return the units of this home, and those that run here already in another one's place.
 
-        What ran on another host last is not begun here before the first has given it back.
+        A unit that ran on another host last starts here only when the first host gives it back.
         """
         return self._placement.begin(running, lambda node: is_elsewhere(self._folder, node))
 
     def on_start(self) -> None:
-        """Start what is kept here, and look at the other hosts from now on."""
+        """Start the units of this host, and watch its states."""
         super().on_start()
         if self._copies.nodes:
             self._files.start()
-            self.tell_states()
+            self.publish_states()
             for node in self._copies.nodes:
                 self._files.settle(node)
 
     def on_stop(self) -> None:
-        """End all processes as any supervisor, and look at no states any more."""
+        """End all processes, and watch states no more."""
         super().on_stop()
         self._files.close()
 
-    # -- what it hears --------------------------------------------------------------------------
+    # -- other hosts ----------------------------------------------------------------------------
 
     @on(bus_topics.HEARTBEAT)
-    def guard_heard(self, _message: Heartbeat, header: Header) -> None:
-        """Note that another host is there."""
+    def note_guard(self, _message: Heartbeat, header: Header) -> None:
+        """Note that another host is alive."""
         own = self.parameters.host
         host = self._guards.get(header.source, own)
-        if host != own and self._placement.heard(host, self._now_s()):
-            self.publish_table()  # each soon knows what the other runs
-            self.tell_states()
+        if host != own and self._placement.note_alive(host, self._now_s()):
+            self.publish_table()  # the sooner the other one knows it, the better
+            self.publish_states()
 
     @on(topics.HOST_NODES)
-    def told(self, table: fm.NodeTable, header: Header) -> None:
-        """Note what another supervisor runs, and let go of what has a higher incarnation there."""
+    def take_table(self, table: fm.NodeTable, header: Header) -> None:
+        """Note what another supervisor runs, and end what has a higher incarnation there."""
         host = self._supervisors.get(header.source)
         if host is None:
             return
         now_s = self._now_s()
-        was_missed = self._placement.heard(host, now_s)
-        news, drop = self._placement.told(host, table.nodes, now_s)
-        news = [row for row in news if row.name != header.source]  # of itself it is believed
-        for unit in drop:  # first: what runs here must not be found with a higher one known
+        was_silent = self._placement.note_alive(host, now_s)
+        news, drop = self._placement.take_table(host, table.nodes, now_s)
+        for unit in drop:  # first: no reader may know the higher incarnation while it runs here
             self._drop(unit)
+        news = [row for row in news if row.name != header.source]  # its header proves its own
         for row in news:
             self._issue(row.name, row.incarnation)
-        if news or drop or was_missed:
+        if news or drop or was_silent:
             self.publish_table()
 
     @on(topics.CHECKPOINTS)
-    def told_states(self, message: fm.Checkpoints, header: Header) -> None:
-        """Keep what another host holds and this one lacks."""
+    def take_states(self, message: fm.Checkpoints, header: Header) -> None:
+        """Keep the newer states of another host."""
         host = self._supervisors.get(header.source)
         if host is None or not self._copies.nodes:
             return
-        taken = self._copies.told(host, message)
-        for node, problem in taken.problems:
+        received = self._copies.receive(host, message)
+        for node, problem in received.problems:
             self._state_problem(node, problem)
-        for node, record in taken.records:
+        for node, record in received.records:
             self._files.take(node, record)
 
     @on(topics.SIGNAL)
     def signal(self, order: fm.SignalOrder, _header: Header) -> None:
-        """Signal a process of this host; what is none, another supervisor may know."""
+        """Signal a process of this host, once per order; other hosts answer for theirs."""
         answers = [answer for answer in self._signalled if answer.by == order.order]
-        answer = answers[0] if answers else self._carried_out(order)
+        answer = answers[0] if answers else self._carry_out(order)
         if answer is not None:
             self.publish(topics.PROCESS_EVENT, answer)
 
-    def _carried_out(self, order: fm.SignalOrder) -> fm.ProcessEvent | None:
+    def _carry_out(self, order: fm.SignalOrder) -> fm.ProcessEvent | None:
         try:
             victim = find_node(order.node, order.signal, self._base_port)
         except UnknownNodeError:
@@ -211,51 +205,49 @@ class HostSupervisor(Supervisor):
         else:
             pid, incarnation = victim.pid, victim.incarnation
             event, detail = "signalled", order.signal
-            self.call_later(_SAID_S, partial(_kill, pid, SIGNALS[order.signal]))
+            self.call_later(_ANSWER_S, partial(_kill, pid, SIGNALS[order.signal]))
         answer = fm.ProcessEvent(order.node, event, pid, incarnation, order.order, detail)
         self._signalled.append(answer)
         return answer
 
     def _known(self, node: str) -> int:
-        """Return the highest incarnation of a node that was issued anywhere, as known here."""
+        """Return the highest incarnation of a node, of any host, that is known here."""
         return max(self.context.register(node) or 0, self.highest_of(node))
 
     def _issue(self, node: str, incarnation: int) -> None:
-        """Have all readers of this host know the incarnation of a node that does not run here."""
+        """Make an incarnation of another host known to all readers of this one."""
         if incarnation > (self.context.register(node) or 0):
             try:
                 issue(self._folder, [node], incarnation)
             except OSError as error:
-                self.report_diagnostic("incarnation", f"not noted: {error}", node)
+                self.report_diagnostic("incarnation", f"{incarnation} is not noted: {error}", node)
 
     def excuse(self, now_s: float, missed_s: float) -> None:
-        """Do not count as silence of other hosts either what could not be received."""
+        """Do not count it as silence of other hosts either."""
         super().excuse(now_s, missed_s)
         self._placement.excuse(now_s, missed_s)
 
     def check(self) -> None:
-        """Look for processes and for hosts that are silent."""
+        """Check for silent processes and hosts."""
         super().check()
         changes = self._placement.look(self._now_s(), self._has_states)
         if changes == Changes():
             return
         for host in changes.lost:
-            self._copies.lost(host)
-            self._tell_of(host, "unreachable")
+            self._copies.lose(host)
+            self._publish_event(host, "unreachable")
         for host in changes.back:
-            self._tell_of(host, "back")
+            self._publish_event(host, "back")
         for unit in changes.drop:
             self._drop(unit)
         for unit, above in changes.take:
             self.take_on(unit, above)
         self.publish_table()
 
-    # -- what follows ---------------------------------------------------------------------------
-
     def _drop(self, unit: str) -> None:
         process = self.hand_over(unit)
         if process is not None:
-            for node in process.names:  # one that was asked for may have begun
+            for node in process.names:  # the one that was requested may have started
                 self._issue(node, process.highest + process.waits)
             self._copies.unsettle(process.names)
             self._ending.update(process.names)
@@ -264,55 +256,53 @@ class HostSupervisor(Supervisor):
     # -- states of nodes ------------------------------------------------------------------------
 
     def _state_kept(self, node: str, record: Record | None, is_last: bool) -> None:
-        self._copies.kept(node, record)
+        self._copies.note_kept(node, record)
         if is_last and node not in self._ending:
-            self._copies.settled(node)
+            self._copies.settle(node)
         self.publish(topics.CHECKPOINTS, self._copies.changes())
 
     def _state_problem(self, node: str, problem: str) -> None:
         self.report_diagnostic("checkpoint", problem, node)
 
     def _settle(self, process: SupervisedProcess) -> None:
-        """Have the states of a process that was handed over looked at when it has ended."""
+        """Have the last states of a process that was handed over read, when it has ended."""
         if process.asks or not process.handle.gone():
             self.call_later(_ENDING_S * self.clock.rate, partial(self._settle, process))
             return
         process.let_go()
         self._ending.difference_update(process.names)
-        for node in self._copies.nodes:
-            if node in process.names:
+        for node in process.names:
+            if node in self._copies.nodes:
                 self._files.settle(node)
 
     def _has_states(self, unit: str) -> bool:
-        """Whether a unit that was given back can go on from what it has kept there."""
-        told, now_s = self._placement.told_of(unit), self._now_s()
-        since_s = self._waits.setdefault((unit, max(told.values())), now_s)
-        if self._copies.is_caught_up(told, told):
+        """Whether a unit that was given back can start: its states are here, or late."""
+        issued, now_s = self._placement.incarnations(unit), self._now_s()
+        since_s = self._waits.setdefault((unit, max(issued.values())), now_s)
+        if self._copies.is_caught_up(issued):
             return True
         if now_s - since_s < _WAIT_S:
             return False
-        self._state_problem(unit, "the last state was not sent in time by the host that gave "
-                                "it back; starting with what is here")
+        self._state_problem(unit, "the host that gave it back has not sent the last state within "
+                            f"{_WAIT_S:g} s; starting from the state on this host")
         return True
 
     @every(0.5)
-    def tell_states(self) -> None:
-        """Repeat what is held here."""
+    def publish_states(self) -> None:
+        """Repeat the states that are held here."""
         if self._copies.nodes:
             self.publish(topics.CHECKPOINTS, self._copies.all())
 
-    # -- what it says ---------------------------------------------------------------------------
+    # -- tables and events ----------------------------------------------------------------------
 
-    def _tell_of(self, host: str, event: str) -> None:
+    def _publish_event(self, host: str, event: str) -> None:
         other, own = host or "the first", self.parameters.host or "the first"
         self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
             on_host(SUPERVISOR, host), event, 0, 0, self.name,
             f"host {other}, as seen from {own}"))
 
     def _own_rows(self) -> tuple[fm.NodeInfo, ...]:
-        return tuple(fm.NodeInfo(
-            row.name, row.kind, row.pid, row.state, row.incarnation, row.restarts, row.late_s,
-            self.parameters.host) for row in super().rows())
+        return tuple(replace(row, host=self.parameters.host) for row in super().rows())
 
     def publish_table(self) -> None:
         """Publish what runs here, and what was given back."""
@@ -322,23 +312,44 @@ class HostSupervisor(Supervisor):
 
 
 def _kill(pid: int, number: Signals) -> None:
-    kill(pid, number)  # it may be gone by now
+    kill(pid, number)
 
 
 class FirstSupervisor(HostSupervisor):
-    """The first host's, which tells what runs on all of them."""
+    """The first host's supervisor, which also publishes the table of all hosts."""
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (*HostSupervisor.outputs, topics.NODES)
 
     def rows(self) -> tuple[fm.NodeInfo, ...]:
         """Return the nodes of all hosts."""
-        others = tuple(
+        others = (
             row if not self._placement.is_lost(row.host) else fm.NodeInfo(
                 row.name, row.kind, 0, fm.NodeState.UNREACHABLE, row.incarnation, row.restarts,
                 host=row.host) for row in self._placement.rows())
         return (*self._own_rows(), *others)
 
     def publish_table(self) -> None:
-        """Publish likewise, and what runs on all hosts."""
+        """Publish both tables."""
         super().publish_table()
         self.publish(topics.NODES, fm.NodeTable(self.rows()))
+
+
+class HostObserver(Actor):
+    """Passes on the process events of one host's supervisor, in the launcher of that host."""
+
+    class Parameters(Actor.Parameters, frozen=True):
+        """Name of the supervisor."""
+
+        supervisor: str = ""
+
+    parameters: Parameters
+
+    def __init__(self, context: Context, event: Callable[[fm.ProcessEvent, float], None]) -> None:
+        super().__init__(context)
+        self._event = event
+
+    @on(topics.PROCESS_EVENT)
+    def process_event(self, event: fm.ProcessEvent, header: Header) -> None:
+        """Pass on an event with its time."""
+        if header.source == self.parameters.supervisor:
+            self._event(event, header.stamp)

@@ -1,4 +1,4 @@
-"""The launchers of a run on several hosts: the first waits for the others, which ask it."""
+"""Launchers of a run on several hosts: the first host's waits for the others, which ask it."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rampart.actors.hosts.clock_sync import ClockSync
 from rampart.actors.hosts.meeting import (
     DOOR,
     PERIOD_S,
+    Answer,
     Attendance,
     Meeting,
     MeetingError,
     RunOverError,
-    Told,
     contents_of,
     joined,
 )
@@ -33,11 +33,11 @@ _RETRY_S = 0.2
 
 
 class FirstLauncher(Launcher):
-    """The first host's: as any launcher, but it starts when all hosts are ready.
+    """The first host's launcher, which starts when all hosts are ready.
 
     Attributes:
-        say: is told for whom it waits.
-        is_unwanted: whether the user has had enough of that.
+        say: Takes a line with the hosts that it waits for.
+        is_unwanted: Whether the user has interrupted the run.
     """
 
     def __init__(self, run: RunContext, title: str, link: socket.socket | None = None) -> None:
@@ -55,16 +55,11 @@ class FirstLauncher(Launcher):
             self._meeting = Meeting(
                 self.plan, tuple(host for host in hosts.supervisors if host), contents,
                 lambda: run_folder.issued(self.plan.folder))
-            await self._meeting.open(
-                *hosts.meeting_place(), self.plan.credentials(DOOR))
+            await self._meeting.open(*hosts.meeting_place(), self.plan.credentials(DOOR))
         except (MeetingError, OSError) as error:
             raise LaunchError(str(error)) from None
-        ready = asyncio.create_task(self._meeting.all_ready(self.say))
-        while not ready.done():
-            await asyncio.wait({ready}, timeout=_RETRY_S)
-            if self.is_unwanted():
-                ready.cancel()
-                raise LaunchError("interrupted while it waited for the other hosts")
+        if not await self._meeting.all_ready(self.say, self.is_unwanted):
+            raise LaunchError("interrupted while it waited for the other hosts")
         await super().start()
         self._meeting.begin(self.plan.origin_s)
 
@@ -76,14 +71,14 @@ class FirstLauncher(Launcher):
 
 
 class OtherLauncher(Launcher):
-    """Another host's, from the first question to the end of the run.
+    """Another host's launcher, from the first question to the end of the run.
 
     Use: `connect`, `join`, `start`, `stay`, `end`.
 
     Args:
-        own: what of the plan is this host's own.
-        say: is told what happens, in a line.
-        link: connection to this host's root.
+        own: Plan with this host's own fields.
+        say: Takes a line for the user.
+        link: Connection to this host's root.
     """
 
     def __init__(self, own: RunPlan, say: Callable[[str], None], link: socket.socket) -> None:
@@ -101,22 +96,22 @@ class OtherLauncher(Launcher):
         self._run_id = ""
         self._begins_s = 0.0
         self._incarnations: dict[str, int] = {}
-        self._said = self._unreachable = ""
-        self._is_trusted = True
+        self._reported = ""
+        self._is_connected = self._is_clock_known = True
 
     async def join(self) -> None:
         """Wait for the first host, and take the plan of the run from it.
 
         Raises:
-            MeetingError: this host may not take part.
+            MeetingError: This host may not take part.
         """
-        while (told := await self._asked()) is None:
+        while (answer := await self._ask_first()) is None:
             pass
-        plan = joined(told.plan, self._own)
+        plan = joined(answer.plan, self._own)
         self._attendance.ready(contents_of(plan, load_application(plan, self._spec)))
-        self._run_id, self._incarnations = plan.run_id, told.incarnations
+        self._run_id, self._incarnations = plan.run_id, answer.incarnations
         self.plan = msgspec.structs.replace(
-            plan, incarnations=(told.starts - 1) * run_folder.EPOCH)
+            plan, incarnations=(answer.starts - 1) * run_folder.EPOCH)
 
     async def load(self) -> None:
         """Have the root load the run, as any launcher."""
@@ -125,46 +120,47 @@ class OtherLauncher(Launcher):
             run_folder.issue(self.plan.folder, [name], incarnation)
 
     async def start(self) -> None:
-        """Load the run, and start this host's processes when the first host says so.
+        """Load the run, and start this host's processes when the first host starts its own.
 
         Raises:
-            LaunchError: They cannot be started.
-            MeetingError: this host may not take part, or the run is over already, or another.
+            LaunchError: The processes cannot be started.
+            MeetingError: This host may not take part, or the run is over, or another one runs.
         """
         await self.load()
-        while (told := await self._asked()) is None or told.origin_s is None:
-            if told is not None:
-                self._tell_user(f"waiting for {', '.join(told.waits_for) or 'the first host'}")
+        while (answer := await self._ask_first()) is None or answer.origin_s is None:
+            if answer is not None:
+                self._report(f"waiting for {', '.join(answer.waits_for) or 'the first host'}")
             await asyncio.sleep(PERIOD_S)
-        self._begins_s = told.origin_s - self._clocks.offset_s
+        self._begins_s = answer.origin_s - self._clocks.offset_s
         await super().start()
 
     def origin_s(self) -> float:
-        """Return when simulated time began, or will, as the first host has it."""
+        """Return the reading of this host's clock at the first host's simulated time 0."""
         self.follow(self._begins_s)
         return self._begins_s
 
     def follow(self, origin_s: float) -> None:
-        """Have all processes of this host go by this origin."""
+        """Set the origin of time for all processes of this host."""
         keep_origin(origin_file(self.plan.folder), origin_s)
         self.plan = msgspec.structs.replace(self.plan, origin_s=origin_s)
 
     async def stay(self) -> str:
-        """Follow the first host's clock until the run is over; return why it is.
+        """Follow the first host's clock until the run is over.
 
-        "" if this host has ended its part before.
+        Returns:
+            Why the run is over; "" if only this host has ended its part.
 
         Raises:
-            MeetingError: the first host runs something else by now.
+            MeetingError: The first host has begun another run.
         """
         while not self.failure:
             try:
-                told = await self._asked()
+                answer = await self._ask_first()
             except RunOverError as over:
                 return str(over)
-            if told is not None and told.origin_s is not None:
-                self.follow(told.origin_s - self._clocks.offset_s)
-                self._judge_clock()
+            if answer is not None and answer.origin_s is not None:
+                self.follow(answer.origin_s - self._clocks.offset_s)
+                self._check_clock()
             await asyncio.sleep(PERIOD_S)
         return ""
 
@@ -173,39 +169,40 @@ class OtherLauncher(Launcher):
         await self._attendance.close()
         await super().end()
 
-    async def _asked(self) -> Told | None:
-        """Ask once, and note what the answer shows of the clocks; None if there is no answer now.
+    async def _ask_first(self) -> Answer | None:
+        """Ask once, and measure the clocks; None without an answer.
 
         Raises:
-            MeetingError: this host may not take part, or the first one has begun another run.
+            MeetingError: This host may not take part, or the first one has begun another run.
         """
         try:
-            told, asked_s, heard_s = await self._attendance.ask()
+            answer, sent_s, received_s = await self._attendance.ask()
         except OSError as error:
+            self._is_connected = False
             why = error.strerror or str(error) or "no answer"
-            self._unreachable = (f"the first host cannot be reached at {self._where[0]} port "
-                                 f"{self._where[1]} ({why}); trying on")
-            self._tell_user(self._unreachable)
+            self._report(f"the first host cannot be reached at {self._where[0]} port "
+                         f"{self._where[1]} ({why}); trying again")
             await asyncio.sleep(_RETRY_S)
             return None
-        if self._said and self._said == self._unreachable:
-            self._tell_user("the first host answers")
-        if told.plan.run_id != (self._run_id or told.plan.run_id):
-            raise MeetingError(f"the first host has begun another run ({told.plan.run_id}); "
+        if not self._is_connected:
+            self._is_connected = True
+            self._report("the first host answers")
+        if answer.plan.run_id != (self._run_id or answer.plan.run_id):
+            raise MeetingError(f"the first host has begun another run ({answer.plan.run_id}); "
                                "start this host again")
-        self._clocks.exchanged(asked_s, told.now_s, heard_s)
-        return told
+        self._clocks.add_exchange(sent_s, answer.now_s, received_s)
+        return answer
 
-    def _judge_clock(self) -> None:
+    def _check_clock(self) -> None:
         bound_s = self._clocks.bound_at(time.monotonic())
-        is_trusted = bound_s <= self._clock_s
-        if is_trusted != self._is_trusted:
-            self._is_trusted = is_trusted
-            self._tell_user(f"this host's clock is known within {bound_s * 1e3:.0f} ms of the "
-                            f"first host's; [link] clock_s = {self._clock_s:g} "
-                            + ("holds again" if is_trusted else "does not hold"))
+        is_known = bound_s <= self._clock_s
+        if is_known != self._is_clock_known:
+            self._is_clock_known = is_known
+            self._report(f"the offset to the first host's clock is known within "
+                         f"{bound_s * 1e3:.0f} ms, {'as' if is_known else 'not as'} expected: "
+                         f"[link] clock_s = {self._clock_s:g}")
 
-    def _tell_user(self, line: str) -> None:
-        if line != self._said:
-            self._said = line
+    def _report(self, line: str) -> None:
+        if line != self._reported:
+            self._reported = line
             self._say(line)

@@ -1,8 +1,8 @@
-"""The files of states that two hosts hold: sees what nodes keep here, and keeps what is sent.
+"""Checkpoint files of nodes that two hosts share: reads new states, keeps those of other hosts.
 
-A thread does both, so that the supervisor waits for no disk. It looks fifty times a second which
-files there are and how long they are, and reads a node's again when that has changed. Nodes do not
-know of it, and their saves wait for nothing.
+A thread does both, so the supervisor waits for no disk. It checks names and lengths of the files
+fifty times a second, and reads those of a node again when they have changed. Nodes and their saves
+are not affected.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from rampart.actors.runtime.checkpoint import Record, in_words
 from rampart.actors.runtime.checkpoint_file import files_of, put, read
 
 LOOK_S = 0.02
-"""Real seconds between two looks at the files."""
+"""Real seconds between two checks of the files."""
 
 _END_S = 0.5
 
 
 class StateFiles:
-    """The files of some nodes. Use: `start`, then the rest, then `close`.
+    """Files of some nodes. Use: `start`, then the rest, then `close`.
 
     Args:
-        folder: of the files.
-        run: name of the run.
-        nodes: their names.
-        kept: called in the thread with a node and the newest state of it, None if there is none:
-            when that has changed, and after `settle`, then with True.
-        problem: called in the thread with a node and one line on what went wrong.
+        folder: Of the files.
+        run: Name of the run.
+        nodes: Names of the nodes.
+        kept: Called in the thread with a node, its newest state (None if there is none) and whether
+            it is the last: when that state has changed, and after `settle`, as the last.
+        problem: Called in the thread with a node and one line.
     """
 
     def __init__(self, folder: Path, run: str, nodes: Iterable[str],
@@ -48,16 +48,16 @@ class StateFiles:
         self._is_over = False
         self._seen: dict[str, object] = {}
         self._suspected: dict[str, object] = {}
-        self._told: dict[str, Record | None] = {}
-        self._why_not: dict[str, str] = {}
+        self._newest: dict[str, Record | None] = {}
+        self._reported: dict[str, str] = {}
         self._thread = threading.Thread(target=self._work, name="states of nodes", daemon=True)
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start the thread."""
         self._thread.start()
 
     def take(self, node: str, record: Record) -> None:
-        """Keep a state that was sent, unless there is a newer one."""
+        """Keep a state that another host has sent, unless there is a newer one."""
         with self._lock:
             waiting = self._sent.get(node)
             if waiting is None or record.age > waiting.age:
@@ -65,7 +65,7 @@ class StateFiles:
         self._wanted.set()
 
     def settle(self, node: str) -> None:
-        """Look at a node's files in any case: no process of it is there any more."""
+        """Read a node's files in any case: no process of it is left."""
         with self._lock:
             self._settling.add(node)
         self._wanted.set()
@@ -107,19 +107,19 @@ class StateFiles:
                 self._kept(node, None, True)
             return
         if problems and trace != self._suspected.get(node) and not settles:
-            self._suspected[node] = trace  # it may be half written: looked at once more
+            self._suspected[node] = trace  # it may be half written: read it once more
             return
         self._seen[node] = trace
         self._report(node, "; ".join(problems))
         newest = records[0] if records else None
-        if newest != self._told.get(node) or settles:
-            self._told[node] = newest
+        if newest != self._newest.get(node) or settles:
+            self._newest[node] = newest
             self._kept(node, newest, settles)
 
     def _report(self, node: str, why: str) -> None:
-        if why != self._why_not.get(node, "") and why:
+        if why and why != self._reported.get(node):
             self._problem(node, f"cannot be read for another host: {why}")
-        self._why_not[node] = why
+        self._reported[node] = why
 
     def _keep(self, node: str, record: Record) -> None:
         try:

@@ -1,4 +1,4 @@
-"""Two hosts hold the newest states of the nodes that either may run, whatever the line does."""
+"""Two hosts hold the newest states of shared nodes, whatever the link does."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rampart.actors.bus.bounds import MANY, MAX_PAYLOAD_BYTES
 from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.ftm.messages import LARGEST_STATE_BYTES, Checkpoints, KeptState
-from rampart.actors.hosts.copies import Copies, Taken
+from rampart.actors.hosts.copies import Copies, Received
 from rampart.actors.runtime.checkpoint import Record
 
 HOMES = {"camera": "ground", "hmi": "ground", "drill": "moon"}
@@ -33,24 +33,24 @@ class Host:
         self.copies = Copies("r", name, HOMES, lambda node: self.runs.get(node, 0),
                              lambda node: self.issued[node])
         for node in self.copies.nodes:
-            self.copies.settled(node)
+            self.copies.settle(node)
 
     def keep(self, node: str, record: Record) -> None:
         before = self.disk.get(node)
         assert before is None or record.age > before.age, "an older one in a newer one's place"
         self.disk[node] = record
-        self.copies.kept(node, record)
+        self.copies.note_kept(node, record)
 
     def message(self) -> Checkpoints:
         return self.copies.all()
 
-    def hear(self, other: str, message: Checkpoints) -> Taken:
-        taken = self.copies.told(other, message)
-        self.problems += taken.problems
-        for node, record in taken.records:
+    def receive(self, other: str, message: Checkpoints) -> Received:
+        received = self.copies.receive(other, message)
+        self.problems += received.problems
+        for node, record in received.records:
             if node not in self.disk or record.age > self.disk[node].age:  # as a store has it
                 self.keep(node, record)
-        return taken
+        return received
 
 
 @pytest.fixture
@@ -69,8 +69,8 @@ def held(node: str, record: Record, *, final: bool = False) -> KeptState:
 
 def exchange(robot: Host, ground: Host) -> None:
     """Both publish what they hold, and receive it."""
-    ground.hear("", robot.message())
-    robot.hear("ground", ground.message())
+    ground.receive("", robot.message())
+    robot.receive("ground", ground.message())
 
 
 def test_changes_are_all_there_were_since_everything_was_repeated_for_a_reader_may_skip_some(
@@ -86,43 +86,44 @@ def test_changes_are_all_there_were_since_everything_was_repeated_for_a_reader_m
 
 def test_a_state_that_comes_twice_late_or_never_does_not_replace_the_newest(robot, ground):
     ground.keep("camera", state(1, 1))
-    robot.hear("ground", ground.copies.changes())  # with the next message
+    robot.receive("ground", ground.copies.changes())  # with the next message
     assert robot.disk == {"camera": state(1, 1)}
     late = ground.message()
     for generation in range(2, 100):
         ground.keep("camera", state(1, generation))
         ground.message()  # and lost
     newest = ground.message()
-    assert robot.copies.told("ground", newest).records  # and the disk is full
-    assert robot.hear("ground", newest).records
-    assert robot.hear("ground", newest) == robot.hear("ground", late) == Taken()
+    assert robot.copies.receive("ground", newest).records  # and the disk is full
+    assert robot.receive("ground", newest).records
+    assert robot.receive("ground", newest) == robot.receive("ground", late) == Received()
     assert robot.disk == {"camera": state(1, 99)}
 
 
-def test_who_may_not_speak_for_a_node_s_state_is_refused_and_told(robot, ground):
-    robot.hear("moon", Checkpoints("r", (held("camera", state(1, 7), final=True),)))
-    robot.hear("ground", Checkpoints("r", (held("pilot", state(1, 7)),)))
+def test_states_from_a_host_that_does_not_share_the_node_are_refused_and_reported(robot, ground):
+    robot.receive("moon", Checkpoints("r", (held("camera", state(1, 7), final=True),)))
+    robot.receive("ground", Checkpoints("r", (held("pilot", state(1, 7)),)))
     ground.keep("camera", state(1, 7))
-    robot.hear("ground", msgspec.structs.replace(ground.message(), run="last week's"))
+    robot.receive("ground", msgspec.structs.replace(ground.message(), run="last week's"))
     assert robot.disk == {}
     assert [who for who, _ in robot.problems] == ["camera", "pilot", "ground"]
-    assert not robot.copies.is_caught_up(["camera"], {})  # nor is it taken for the last one
-    assert robot.copies.is_caught_up(["valve"], {"valve": 7})  # which nobody shares
-    assert ground.hear("", Checkpoints("r", (held("drill", state(1, 7)),))) == Taken()  # no problem
+    assert not robot.copies.is_caught_up({"camera": 0})  # nor is it taken for the last one
+    assert robot.copies.is_caught_up({"valve": 7})  # it is not shared
+    of_moon = Checkpoints("r", (held("drill", state(1, 7)),))
+    assert ground.receive("", of_moon) == Received(), "it is for another host, so no problem"
 
 
-def test_an_incarnation_that_nobody_knows_to_be_issued_is_not_taken_yet(robot, ground):
-    """Else one message with the highest number there is would shut out all real ones for ever."""
+def test_a_state_of_an_incarnation_that_is_not_known_to_be_issued_is_not_taken_yet(robot, ground):
+    """Else one message with the highest number there is would shut out all real ones."""
     ground.keep("camera", state(2**53, 1))
-    robot.hear("ground", ground.message())
+    robot.receive("ground", ground.message())
     assert robot.disk == {}
     ground = Host("ground", camera=2)
     ground.keep("camera", state(2, 1))
     robot.issued["camera"] = 1
-    robot.hear("ground", ground.message())
+    robot.receive("ground", ground.message())
     assert robot.disk == {}
     robot.issued["camera"] = 2  # the table of what runs there has come
-    robot.hear("ground", ground.message())
+    robot.receive("ground", ground.message())
     assert robot.disk == {"camera": state(2, 1)}
 
 
@@ -135,7 +136,7 @@ def test_the_largest_states_of_all_nodes_come_one_by_one_and_fit_into_a_message(
     for turn in range(2):
         message = ground.message()
         assert len(encode(Header("supervisor_ground", 1, 1, 0.0), message)) < MAX_PAYLOAD_BYTES
-        robot.hear("ground", message)
+        robot.receive("ground", message)
         assert len(robot.disk) == turn + 1
     kept = KeptState("a_name_of_twenty_chr", *state(2**53, 2**53, b""), 2**53, True)
     size = len(encode(Header("s", 1, 1, 0.0), Checkpoints("r", (kept,) * (MANY // 2))))
@@ -150,8 +151,8 @@ def taken_over(robot: Host, ground: Host) -> None:
     exchange(robot, ground)
     ground.keep("camera", state(1, 10))
     exchange(robot, ground)
-    robot.copies.lost("ground")
-    ground.copies.lost("")
+    robot.copies.lose("ground")
+    ground.copies.lose("")
     robot.runs["camera"] = EPOCH + 1
     robot.keep("camera", state(EPOCH + 1, 11))
 
@@ -166,7 +167,7 @@ def test_what_a_superseded_process_keeps_meanwhile_never_wins(robot, ground):
 def test_where_a_node_runs_nothing_is_taken_but_of_a_higher_incarnation(robot, ground):
     taken_over(robot, ground)
     del robot.disk["camera"]  # it was set aside, say
-    robot.copies.kept("camera", None)
+    robot.copies.note_kept("camera", None)
     ground.keep("camera", state(1, 500))
     exchange(robot, ground)
     assert "camera" not in robot.disk
@@ -174,32 +175,32 @@ def test_where_a_node_runs_nothing_is_taken_but_of_a_higher_incarnation(robot, g
 
 def test_a_node_that_is_given_back_waits_for_the_last_state_that_was_kept(robot, ground):
     taken_over(robot, ground)
-    told = {"camera": EPOCH + 1}
+    issued = {"camera": EPOCH + 1}
     ground.runs["camera"] = 0
     exchange(robot, ground)
-    assert not ground.copies.is_caught_up(["camera"], told)  # it still runs there
+    assert not ground.copies.is_caught_up(issued)  # it still runs there
     robot.copies.unsettle(["camera"])
     robot.runs["camera"] = 0
     exchange(robot, ground)
-    assert not ground.copies.is_caught_up(["camera"], told)  # its process is being ended
+    assert not ground.copies.is_caught_up(issued)  # its process is being ended
     robot.keep("camera", state(EPOCH + 1, 12))
-    robot.copies.settled("camera")
+    robot.copies.settle("camera")
     last = robot.message()
-    ground.copies.told("", last)
-    assert not ground.copies.is_caught_up(["camera"], told)  # the last state is not on the disk
-    ground.hear("", last)
+    ground.copies.receive("", last)
+    assert not ground.copies.is_caught_up(issued)  # the last state is not on the disk
+    ground.receive("", last)
     assert ground.disk["camera"] == state(EPOCH + 1, 12)
-    assert ground.copies.is_caught_up(["camera"], told)
+    assert ground.copies.is_caught_up(issued)
 
 
-def test_what_was_said_before_the_loss_is_no_word_for_it(robot, ground):
+def test_what_was_published_before_the_loss_is_not_the_last_state(robot, ground):
     robot.issued["camera"] = 1
     exchange(robot, ground)
     before = robot.message()
     taken_over(robot, ground)
-    assert not ground.copies.is_caught_up(["camera"], {"camera": EPOCH + 1})  # nothing since
-    ground.hear("", before)  # it was under way all the time
-    assert not ground.copies.is_caught_up(["camera"], {"camera": EPOCH + 1})
+    assert not ground.copies.is_caught_up({"camera": EPOCH + 1})  # nothing since
+    ground.receive("", before)  # it was under way all the time
+    assert not ground.copies.is_caught_up({"camera": EPOCH + 1})
 
 
 def test_a_host_with_an_empty_disk_gets_what_the_other_holds(robot):
@@ -207,13 +208,13 @@ def test_a_host_with_an_empty_disk_gets_what_the_other_holds(robot):
     fresh = Host("ground")
     exchange(robot, fresh)
     assert fresh.disk == {"camera": state(3, 40)}
-    assert fresh.copies.is_caught_up(["camera"], {})
+    assert fresh.copies.is_caught_up({"camera": 0})
 
 
 EVENTS = st.lists(st.one_of(
     st.tuples(st.just("keep"), st.sampled_from(["camera", "hmi"])),
-    st.tuples(st.sampled_from(["robot says", "ground says"]), st.integers(0, 3)),
-    st.tuples(st.sampled_from(["hear", "again"]), st.integers(0, 7)),
+    st.tuples(st.sampled_from(["robot publishes", "ground publishes"]), st.integers(0, 3)),
+    st.tuples(st.sampled_from(["receive", "again"]), st.integers(0, 7)),
     st.tuples(st.sampled_from(["take over", "give back"]), st.just("camera"))), max_size=60)
 
 
@@ -230,14 +231,15 @@ def test_however_messages_are_lost_late_double_and_disordered_in_the_end_both_ho
             incarnation = where.runs.get(which) or 1
             if where.disk.get(which, state(0, 0)).age < (incarnation, generation):
                 where.keep(which, state(incarnation, generation, b"%d" % generation))
-        elif what.endswith("says"):
-            says, hears = (robot, ground) if what == "robot says" else (ground, robot)
-            under_way.append((hears, says.name, says.copies.changes() if which else says.message()))
-        elif what in {"hear", "again"} and under_way:
-            hears, name, message = under_way[which % len(under_way)]
-            hears.hear(name, message)
-            if what == "hear":
-                under_way.remove((hears, name, message))
+        elif what.endswith("publishes"):
+            sender, receiver = (robot, ground) if what == "robot publishes" else (ground, robot)
+            under_way.append(
+                (receiver, sender.name, sender.copies.changes() if which else sender.message()))
+        elif what in {"receive", "again"} and under_way:
+            receiver, name, message = under_way[which % len(under_way)]
+            receiver.receive(name, message)
+            if what == "receive":
+                under_way.remove((receiver, name, message))
         elif what == "take over" and not robot.runs.get("camera"):
             epoch += EPOCH
             robot.runs["camera"] = epoch + 1

@@ -1,4 +1,4 @@
-"""Two supervisors in virtual time, on machines and disks that are played: who goes on from what."""
+"""Two supervisors in virtual time, on simulated machines and disks: what runs where, from what."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rampart.actors.bus.envelope import decode, pack
 from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import Checkpoints, KeptState
+from rampart.actors.ftm.messages import Checkpoints, KeptState, NodeInfo
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.clock import Clock
@@ -137,7 +137,8 @@ class World:
         self.file = folder / "two.toml"
         self.file.write_text(two_hosts({"robot": "10.0.0.1", "ground": "10.0.0.2"},
                                        ("camera", "part_finder", "D_VISION_CRASH"), "cell", 0.1))
-        self.told: list[tuple[str, str]] = []
+        self.diagnostics: list[tuple[str, str]] = []
+        self.rows: dict[str, NodeInfo] = {}
         self.states = 0
         self.hub.taps.append(self.see)
         self.robot, self.ground = Host(self, ""), Host(self, "ground")
@@ -154,11 +155,13 @@ class World:
         if topics.CHECKPOINTS.member(key.removeprefix("rampart/")):
             self.states += 1
         if DIAGNOSTIC.member(key.removeprefix("rampart/")):
-            told = decode(DIAGNOSTIC, payload)[1]
-            self.told.append((told.context, told.reason))
+            found = decode(DIAGNOSTIC, payload)[1]
+            self.diagnostics.append((found.context, found.reason))
+        if topics.NODES.member(key.removeprefix("rampart/")) is not None:
+            self.rows = {row.name: row for row in decode(topics.NODES, payload)[1].nodes}
 
-    def say(self, host: str, source: str, topic, body, member: str) -> None:
-        """Say something as a node of a host; `source` is its name and its incarnation."""
+    def publish(self, host: str, source: str, topic, body, member: str) -> None:
+        """Publish as a node of a host; `source` is its name and its incarnation."""
         name, _, incarnation = source.partition("#")
         self._sequence += 1
         self._buses[host].publish(topic, topic.at(member), pack(
@@ -171,7 +174,7 @@ class World:
             for host in (self.robot, self.ground):
                 for one in host.processes.values():
                     for name in one.names if one.bound and not one.killed else ():
-                        self.say(host.name, f"{name}#{one.incarnation}", HEARTBEAT,
+                        self.publish(host.name, f"{name}#{one.incarnation}", HEARTBEAT,
                                  Heartbeat(one.pid, 0, 0.1, 0, 0), name)
             await asyncio.sleep(0.1)
 
@@ -206,7 +209,7 @@ async def world(checkpoints: str = "kept") -> AsyncIterator[World]:
 async def test_the_first_host_goes_on_from_it_and_its_home_from_what_was_kept_there(made):
     await made.taken_over()
     assert made.robot.loaded["camera", EPOCH + 1] == record(1, 2)
-    made.ground.files.keep("camera", record(1, 3))  # it knows nothing of that yet
+    made.ground.files.keep("camera", record(1, 3))  # its supervisor does not know of the take-over
     made.robot.files.keep("camera", record(EPOCH + 1, 3))
     await asyncio.sleep(2.0)
     made.robot.files.keep("camera", record(EPOCH + 1, 4))
@@ -214,14 +217,14 @@ async def test_the_first_host_goes_on_from_it_and_its_home_from_what_was_kept_th
     await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
     assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 4)
     assert made.robot.runs("camera") == 0
-    assert not [one for one in made.told if one[0] == "checkpoint"]
+    assert not [one for one in made.diagnostics if one[0] == "checkpoint"]
     made.ground.files.keep("camera", record(EPOCH + 2, 5))
     await asyncio.sleep(DELAY_S + 0.001)
     assert made.robot.disk["camera"] == record(EPOCH + 2, 5)
 
 
 @within(world)
-async def test_a_process_that_ends_while_it_is_given_back_is_not_begun_anew(made, monkeypatch):
+async def test_a_process_that_ends_while_it_is_given_back_is_not_restarted(made, monkeypatch):
     """The news of its end waits in the mailbox."""
     await made.taken_over()
     ended, hand_over = [], made.robot.supervisor.hand_over
@@ -285,7 +288,7 @@ async def test_one_that_could_not_be_held_is_ended_as_soon_as_it_can_be(made, mo
 
 
 @within(world)
-async def test_what_was_let_go_comes_home_though_the_supervisor_there_is_another_one_by_now(made):
+async def test_what_was_given_back_comes_home_although_the_supervisor_there_was_replaced(made):
     await made.taken_over()
     made.robot.files.keep("camera", record(EPOCH + 1, 3))
     await asyncio.sleep(1.0)
@@ -302,8 +305,8 @@ async def test_what_was_let_go_comes_home_though_the_supervisor_there_is_another
 
 
 @within(world)
-async def test_who_stood_still_for_a_moment_takes_nothing_over(made):
-    """What the others said meanwhile is still to be read when the timers are due."""
+async def test_a_supervisor_that_stood_still_takes_nothing_over(made):
+    """Messages of that time are still unread when the timers are due."""
     for _ in range(10):
         made.is_cut = True
         await asyncio.sleep(DELAY_S + 0.01)  # what was under way has been read
@@ -327,7 +330,7 @@ async def test_what_is_kept_in_the_moment_of_its_end_goes_home_as_well(made):
 
 
 @within(world)
-async def test_a_last_state_that_never_comes_is_waited_for_two_seconds_and_told(made):
+async def test_a_last_state_that_never_comes_is_waited_for_two_seconds_and_reported(made):
     await made.taken_over()
     made.robot.files.is_stuck = True
     made.is_cut = False
@@ -335,11 +338,11 @@ async def test_a_last_state_that_never_comes_is_waited_for_two_seconds_and_told(
     given_back_s = made.clock.now()
     await eventually(lambda: made.ground.runs("camera") == EPOCH + 2)
     assert 2.0 < made.clock.now() - given_back_s < 2.5
-    assert any("the last state was not sent in time" in why for _, why in made.told)
+    assert any("has not sent the last state" in why for _, why in made.diagnostics)
 
 
 @within(world)
-async def test_a_host_that_is_started_anew_with_an_empty_disk_goes_on_from_the_first_s_copy(made):
+async def test_a_host_that_starts_again_with_an_empty_disk_goes_on_from_the_first_s_copy(made):
     await made.taken_over()
     made.robot.files.keep("camera", record(EPOCH + 1, 3))
     made.ground.task.cancel()
@@ -357,8 +360,16 @@ async def test_a_host_that_is_started_anew_with_an_empty_disk_goes_on_from_the_f
     assert made.ground.loaded["camera", EPOCH + 2] == record(EPOCH + 1, 3)
 
 
+@within(world)
+async def test_the_table_of_all_hosts_has_all_that_is_known_of_a_node(made):
+    for name in ("gripper", "camera"):
+        await eventually(lambda name=name: made.rows[name].heard_s > made.clock.now() - 1.0)
+    assert {name: made.rows[name].host for name in ("gripper", "camera")} == {
+        "gripper": "", "camera": "ground"}
+
+
 @within(partial(world, checkpoints=""))
-async def test_without_checkpoints_nothing_is_said_of_states(made):
+async def test_without_checkpoints_no_states_are_published(made):
     await asyncio.sleep(5.0)
     made.is_cut = True
     await eventually(lambda: made.robot.runs("camera") == EPOCH + 1)
@@ -368,10 +379,10 @@ async def test_without_checkpoints_nothing_is_said_of_states(made):
 
 
 @within(world)
-async def test_with_checkpoints_little_is_said_and_what_is_forged_changes_nothing(made):
+async def test_states_are_published_twice_a_second_and_forged_ones_change_nothing(made):
     def forge(source: str) -> None:
         state = KeptState("camera", *record(1, 99), issued=9, final=True)
-        made.say("ground", source, topics.CHECKPOINTS, Checkpoints("r", (state,)),
+        made.publish("ground", source, topics.CHECKPOINTS, Checkpoints("r", (state,)),
                  "supervisor_ground")
 
     before = made.states
@@ -384,7 +395,7 @@ async def test_with_checkpoints_little_is_said_and_what_is_forged_changes_nothin
         forge(source)
     await asyncio.sleep(1.0)
     assert made.robot.disk == {}
-    assert any(why.startswith("not a Checkpoints") for _, why in made.told), made.told
+    assert any(why.startswith("not a Checkpoints") for _, why in made.diagnostics), made.diagnostics
 
 
 def test_a_module_takes_no_number_of_another_machine_for_a_process_of_its_own(tmp_path, sockets):

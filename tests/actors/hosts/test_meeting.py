@@ -26,8 +26,8 @@ from rampart.actors.hosts.meeting import (
     MeetingError,
     RunOverError,
     contents_of,
-    context,
     joined,
+    tls_context,
 )
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.launcher import Launcher
@@ -46,10 +46,10 @@ FIRST = {"rampart": "aa", "specification": "bb"}
 
 
 @asynccontextmanager
-async def meeting(*hosts: str, shown: Credentials | None = None):
+async def meeting(*hosts: str, credentials: Credentials | None = None):
     where = ("127.0.0.1", free_port())
     made = Meeting(PLAN, hosts or ("ground",), CONTENTS, lambda: {"hmi": 3})
-    await made.open(*where, shown)
+    await made.open(*where, credentials)
     try:
         yield made, where
     finally:
@@ -59,7 +59,7 @@ async def meeting(*hosts: str, shown: Credentials | None = None):
 async def test_the_first_waits_until_the_others_are_ready_and_all_begin():
     async with meeting() as (made, where):
         said: list[str] = []
-        waiting = asyncio.create_task(made.all_ready(said.append))
+        waiting = asyncio.create_task(made.all_ready(said.append, lambda: False))
         ground = Attendance("ground", where, FIRST)
         told, asked_s, heard_s = await ground.ask()
         assert not re.search(b"t0ken|k3y", msgspec.json.encode(told.plan))  # no secret travels
@@ -79,16 +79,16 @@ async def test_the_first_waits_until_the_others_are_ready_and_all_begin():
 
 
 @pytest.mark.parametrize(("host", "contents", "words"), [
-    ("moon", FIRST, "no host 'moon' waits to take part; known: ground"),
+    ("moon", FIRST, "no host 'moon'; this run waits for ground"),
     ("ground", FIRST | {"specification": "xx"}, "specification: not the same .*copy it from there"),
     ("ground", FIRST | {"rampart": "older"}, "rampart: not the same as on the first host")])
-async def test_who_may_not_take_part_is_told_why(host, contents, words):
+async def test_a_host_that_may_not_take_part_gets_the_reason(host, contents, words):
     async with meeting() as (_, where):
         with pytest.raises(MeetingError, match=words):
             await Attendance(host, where, contents).ask()
 
 
-async def test_who_is_there_already_is_not_taken_for_another_and_has_the_files_of_the_plan():
+async def test_a_host_that_takes_part_is_not_replaced_and_has_the_files_of_the_plan():
     async with meeting("ground", "moon") as (_, where):
         ground = Attendance("ground", where, FIRST)
         await ground.ask()
@@ -103,7 +103,7 @@ async def test_who_is_there_already_is_not_taken_for_another_and_has_the_files_o
         await ground.close()
 
 
-async def test_a_host_that_is_started_anew_is_counted_and_the_old_one_is_sent_away():
+async def test_a_second_start_of_a_host_is_counted_and_the_first_one_is_refused():
     async with meeting() as (made, where):
         old = Attendance("ground", where, FIRST)
         old.ready(CONTENTS)
@@ -112,7 +112,7 @@ async def test_a_host_that_is_started_anew_is_counted_and_the_old_one_is_sent_aw
         new = Attendance("ground", where, FIRST)
         told, _, _ = await new.ask()
         assert (told.starts, told.origin_s) == (2, 1.0)
-        with pytest.raises(MeetingError, match="host ground was started anew"):
+        with pytest.raises(MeetingError, match="host ground was started again"):
             await old.ask()
         await new.close()
 
@@ -120,7 +120,7 @@ async def test_a_host_that_is_started_anew_is_counted_and_the_old_one_is_sent_aw
 async def test_one_that_goes_before_the_start_is_waited_for_again():
     async with meeting("ground", "moon") as (made, where):
         said: list[str] = []
-        waiting = asyncio.create_task(made.all_ready(said.append))
+        waiting = asyncio.create_task(made.all_ready(said.append, lambda: False))
         ground = Attendance("ground", where, FIRST)
         ground.ready(CONTENTS)
         await ground.ask()
@@ -130,10 +130,11 @@ async def test_one_that_goes_before_the_start_is_waited_for_again():
         assert [line.partition(":")[0] for line in said] == [
             "waiting for ground, moon", "waiting for moon", "waiting for ground, moon"]
         waiting.cancel()
+        assert not await made.all_ready(said.append, lambda: True), "the user has interrupted it"
 
 
 @pytest.mark.parametrize("later_s", [0.05, 1.0])  # over a bad line it is sent again
-async def test_the_end_is_told(later_s):
+async def test_the_others_are_notified_of_the_end(later_s):
     async with meeting() as (made, where):
         ground = Attendance("ground", where, FIRST)
         await ground.ask()
@@ -144,7 +145,7 @@ async def test_the_end_is_told(later_s):
         await closing
 
 
-async def test_no_answer_and_one_that_makes_no_sense_are_errors_that_may_pass():
+async def test_no_answer_and_a_nonsense_answer_are_errors_that_may_pass():
     with pytest.raises(OSError, match="Connect call failed"):
         await Attendance("ground", ("127.0.0.1", free_port()), FIRST).ask()
 
@@ -165,7 +166,7 @@ async def is_undisturbed(where) -> bool:
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\n\r\n", b"x" * 2_000_000])
-async def test_a_stranger_is_let_go_and_disturbs_nobody(sent):
+async def test_a_stranger_is_disconnected_and_disturbs_no_host(sent):
     async with meeting() as (_, where):
         reader, writer = await asyncio.open_connection(*where)
         with contextlib.suppress(ConnectionError):  # there was more than is read
@@ -178,8 +179,8 @@ async def test_a_stranger_is_let_go_and_disturbs_nobody(sent):
         assert await is_undisturbed(where)
 
 
-@pytest.mark.parametrize("sent", [b"", "garbage", b'{"type":"ask"}', b"x" * 2_000_000,
-                                  b'{"type":"ask","host":"ground","serial":"1","contents":5}'])
+@pytest.mark.parametrize("sent", [b"", "garbage", b'{"host":"ground"}', b"x" * 2_000_000,
+                                  b'{"host":"ground","serial":"1","contents":5}'])
 async def test_questions_that_make_no_sense_end_their_connection_only(sent):
     async with meeting() as (_, where):
         async with connect("ws://first/", host=where[0], port=where[1]) as stranger:
@@ -222,9 +223,9 @@ def keys(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["observer_ground", "DM5", "observer", "observer_moon", ""])
-async def test_with_keys_nobody_but_the_other_launcher_is_told_anything(keys, name):
+async def test_with_keys_only_the_other_launcher_gets_an_answer(keys, name):
     """The key of observer_moon is revoked."""
-    async with meeting(shown=credentials_in(str(keys), DOOR)) as (_, where):
+    async with meeting(credentials=credentials_in(str(keys), DOOR)) as (_, where):
         ground = Attendance("ground", where, FIRST, credentials_in(str(keys), name)
                             if name else None)
         if name == "observer_ground":
@@ -235,10 +236,10 @@ async def test_with_keys_nobody_but_the_other_launcher_is_told_anything(keys, na
         await ground.close()
 
 
-async def test_who_answers_in_the_first_host_s_place_with_a_node_s_key_is_not_believed(keys):
-    async with meeting(shown=credentials_in(str(keys), "router_b")) as (_, where):
+async def test_an_impostor_of_the_first_host_with_another_router_s_key_is_refused(keys):
+    async with meeting(credentials=credentials_in(str(keys), "router_b")) as (_, where):
         ground = Attendance("ground", where, FIRST, credentials_in(str(keys), "observer_ground"))
-        with pytest.raises(MeetingError, match="somebody else answers in the first host's place"):
+        with pytest.raises(MeetingError, match="has not the certificate of router_a"):
             await ground.ask()
         await ground.close()
 
@@ -252,7 +253,7 @@ UPGRADE = (b"GET / HTTP/1.1\r\nHost: first\r\nUpgrade: websocket\r\nConnection: 
 
 @contextmanager
 def in_a_thread(talk):
-    """Have somebody talk as far as he does, and then neither read nor close until the end."""
+    """Run a peer that talks, and then neither reads nor closes until the end."""
     is_over = threading.Event()
     thread = threading.Thread(target=talk, args=(is_over.wait,))
     thread.start()
@@ -263,13 +264,14 @@ def in_a_thread(talk):
         thread.join()
 
 
-async def test_with_keys_the_end_waits_for_nobody_who_is_silent(keys):
+async def test_with_keys_the_end_does_not_wait_for_a_silent_host(keys):
     """A line that was cut, a launcher that is stopped: TLS would wait half a minute for a word."""
-    async with meeting(shown=credentials_in(str(keys), DOOR)) as (made, where):
+    async with meeting(credentials=credentials_in(str(keys), DOOR)) as (made, where):
         heard = threading.Event()
 
         def talk(silent):
-            secure = context(credentials_in(str(keys), "observer_ground"), ssl.Purpose.SERVER_AUTH)
+            own = credentials_in(str(keys), "observer_ground")
+            secure = tls_context(own, ssl.Purpose.SERVER_AUTH)
             with secure.wrap_socket(socket.create_connection(where)) as ground:
                 ground.sendall(UPGRADE)
                 assert ground.recv(100_000).startswith(b"HTTP/1.1 101 ")
@@ -282,12 +284,12 @@ async def test_with_keys_the_end_waits_for_nobody_who_is_silent(keys):
                 await made.close()
 
 
-async def test_with_keys_a_first_host_that_is_silent_is_asked_anew_soon(keys):
+async def test_with_keys_a_silent_first_host_is_a_timeout(keys):
     where = ("127.0.0.1", free_port())
     listening = threading.Event()
 
     def talk(silent):
-        secure = context(credentials_in(str(keys), DOOR), ssl.Purpose.CLIENT_AUTH)
+        secure = tls_context(credentials_in(str(keys), DOOR), ssl.Purpose.CLIENT_AUTH)
         with socket.create_server(where) as server:
             listening.set()
             with secure.wrap_socket(server.accept()[0], server_side=True) as first:
@@ -306,7 +308,7 @@ async def test_with_keys_a_first_host_that_is_silent_is_asked_anew_soon(keys):
 
 
 async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path, monkeypatch):
-    """Its launcher was killed and started again, at another rate say: nobody told of an end."""
+    """Its launcher was killed and started again, at another rate say: no end was published."""
     async def nothing(_launcher):
         pass
 
@@ -325,7 +327,7 @@ async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path, mo
     ground = OtherLauncher(own, said.append, link)
     await ground.join()
     starting = asyncio.create_task(ground.start())
-    await first.all_ready(said.append)
+    await first.all_ready(said.append, lambda: False)
     first.begin(100.0)
     await starting
     await ground.end()

@@ -1,4 +1,4 @@
-"""Who runs what, as the hosts come and go: two supervisors' decisions, and never two of a node."""
+"""Placement as hosts are lost and return: two supervisors' decisions, never two of a node."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def row(name: str, incarnation: int, host: str = "ground") -> NodeInfo:
     return NodeInfo(name, "detection", 1, NodeState.RUNNING, incarnation, 0, host=host)
 
 
-LINES = {"cut": set(), "join": {"", "ground"}, "only the robot hears": {""},
-         "only ground hears": {"ground"}}
-"""Who hears the other, by what happens to the line."""
+LINES = {"cut": set(), "join": {"", "ground"}, "only the robot receives": {""},
+         "only ground receives": {"ground"}}
+"""Hosts that receive the other one, by event of the link."""
 
 
 class Side(Placement):
@@ -40,10 +40,10 @@ class Side(Placement):
         super().__init__(host, HOMES, GUARDS, LINK, lambda node: self.issued.get(node, 0),
                          now_s=0.0, rate=rate)
 
-    def told(self, host: str, rows: Iterable[NodeInfo], now_s: float
+    def take_table(self, host: str, rows: Iterable[NodeInfo], now_s: float
              ) -> tuple[list[NodeInfo], list[str]]:
-        news, drop = super().told(host, rows, now_s)
-        self.issued.update({one.name: one.incarnation for one in news})
+        news, drop = super().take_table(host, rows, now_s)
+        self.issued.update({row.name: row.incarnation for row in news})
         return news, drop
 
     def look(self, now_s: float, is_ready: Callable[[str], bool] = lambda _unit: True) -> Changes:
@@ -60,7 +60,7 @@ class Side(Placement):
 
 def robot(issued: Mapping[str, int] = MappingProxyType({})) -> Side:
     made = Side("", issued)
-    made.heard("ground", 0.0)
+    made.note_alive("ground", 0.0)
     return made
 
 
@@ -79,7 +79,7 @@ def test_a_host_that_starts_is_waited_for():
 
 def test_what_a_lost_host_ran_is_taken_over_with_incarnations_that_it_cannot_have_reached():
     made = robot()
-    made.told("ground", [row("hmi", 3), row("DM1", 1), row("DM2", 1)], 0.1)
+    made.take_table("ground", [row("hmi", 3), row("DM1", 1), row("DM2", 1)], 0.1)
     assert made.look(LINK.lost_after_s) == Changes()
     assert made.look(LOST_S) == Changes(
         lost=("ground",), take=(("page", EPOCH), ("modules", EPOCH)))
@@ -94,12 +94,12 @@ def test_it_is_given_back_when_the_host_was_heard_for_a_while_without_a_break():
     made = robot()
     made.look(LOST_S)
     for tenth in range(10, 13):
-        hear_table(made, tenth / 10)
+        publish_table(made, tenth / 10)
         assert made.look(tenth / 10) == Changes()
-    for tenth in range(50, 53):  # after a break: it begins anew
-        hear_table(made, tenth / 10)
+    for tenth in range(50, 53):  # after a break it counts from there
+        publish_table(made, tenth / 10)
         assert made.look(tenth / 10) == Changes()
-    made.heard("ground", 5.4)
+    made.note_alive("ground", 5.4)
     assert made.look(5.4) == Changes(back=("ground",), drop=("page", "modules"))
     assert made.held == {"pilot"}
 
@@ -111,7 +111,7 @@ def over_a_line(made: Placement, is_cut: Callable[[float], bool], until_s: float
     for tick in range(int(20 * until_s)):
         now_s = tick / 20
         if not is_cut(now_s):
-            hear_table(made, now_s)
+            publish_table(made, now_s)
         changes = made.look(now_s)
         taken += [now_s for unit, _ in changes.take if unit == "page"]
         back += [now_s for unit in changes.drop if unit == "page"]
@@ -125,7 +125,7 @@ def test_over_a_line_that_comes_and_goes_little_is_moved_and_in_the_end_it_is_gi
     taken, back = over_a_line(
         robot(), lambda now_s: now_s < over_s and now_s % period_s > up_s, 400.0)
     assert len(taken) == len(back)
-    assert len(taken) <= 5, "each time its modules have to find out anew what is wrong"
+    assert len(taken) <= 5, "each time its modules have to detect all over again"
     assert over_s < back[-1] < over_s + 61.0
 
 
@@ -136,84 +136,84 @@ def test_what_was_taken_over_is_not_moved_again_before_it_can_have_found_out_wha
     assert back_s <= max(taken_s + 4.1, 5.0 + cut_s + LINK.return_after_s + 0.1)
 
 
-def hear_table(made: Placement, now_s: float, *rows: NodeInfo) -> None:
-    made.heard("ground", now_s)
-    made.told("ground", rows, now_s)
+def publish_table(made: Placement, now_s: float, *rows: NodeInfo) -> None:
+    made.note_alive("ground", now_s)
+    made.take_table("ground", rows, now_s)
 
 
-def test_what_the_host_says_it_still_runs_is_not_given_back_until_it_has_heard_of_the_higher_one():
+def test_nothing_is_given_back_to_a_host_that_still_runs_its_own_process():
     made = robot()
-    hear_table(made, 0.1, row("hmi", 1))
+    publish_table(made, 0.1, row("hmi", 1))
     made.look(LOST_S + 0.1)
-    made.heard("ground", 6.0)
-    made.heard("ground", 6.5)
-    assert made.look(6.5) == Changes(back=("ground",))  # it has said nothing since
-    hear_table(made, 6.7, row("hmi", 1))
+    made.note_alive("ground", 6.0)
+    made.note_alive("ground", 6.5)
+    assert made.look(6.5) == Changes(back=("ground",))  # no table since
+    publish_table(made, 6.7, row("hmi", 1))
     assert made.look(6.7) == Changes(drop=("modules",))
-    hear_table(made, 6.9)
+    publish_table(made, 6.9)
     assert made.look(6.9) == Changes(drop=("page",))
     assert made.held == {"pilot"}
 
 
-def test_who_hears_of_a_higher_incarnation_lets_go_of_its_own_and_starts_it_when_it_is_given_back():
+def test_a_home_ends_its_superseded_process_and_starts_it_again_when_it_is_given_back():
     ground = Side("ground", {"hmi": 2})
-    news, drop = ground.told("", [row("hmi", EPOCH + 1, "")], 1.0)
-    assert [(one.name, one.incarnation) for one in news] == [("hmi", EPOCH + 1)]
+    news, drop = ground.take_table("", [row("hmi", EPOCH + 1, "")], 1.0)
+    assert [(row.name, row.incarnation) for row in news] == [("hmi", EPOCH + 1)]
     assert drop == ["page"]
     assert ground.look(1.1).take == ()
-    ground.told("", [row("pilot", 1, "")], 1.2)
+    ground.take_table("", [row("pilot", 1, "")], 1.2)
     assert ground.look(1.3).take == (("page", EPOCH + 1),)
     assert ground.held == {"page", "modules", "world"}
-    ground.told("", [row("hmi", 2 * EPOCH, "ground")], 2.0)  # or of a number that was given back
+    ground.take_table("", [row("hmi", 2 * EPOCH, "ground")], 2.0)  # given back
     assert ground.look(2.1).take == (("page", 2 * EPOCH),)
-    ground.told("", [row("hmi", 3 * EPOCH, "")], 3.0)
-    ground.told("", [], 3.2)
+    ground.take_table("", [row("hmi", 3 * EPOCH, "")], 3.0)
+    ground.take_table("", [], 3.2)
     assert ground.look(5.0).take == (), "an old table"
 
 
-def test_what_another_runs_already_is_not_taken_back_while_that_host_is_heard():
+def test_a_unit_that_runs_at_home_with_a_higher_incarnation_is_ended_here():
     made = robot()
     made.look(LOST_S)
-    made.heard("ground", 2.0)
-    made.told("ground", [row("hmi", 2 * EPOCH)], 2.0)
+    made.note_alive("ground", 2.0)
+    made.take_table("ground", [row("hmi", 2 * EPOCH)], 2.0)
     assert made.held == {"pilot", "modules"}
     assert made.look(2.1) == Changes()
 
 
-def test_a_host_that_was_started_anew_waits_until_it_is_given_what_is_its_own():
+def test_a_host_that_was_started_again_waits_until_its_units_are_given_back():
     ground = Side("ground")
     assert ground.begin([], lambda _node: True) == ["world"]
     assert ground.held == {"world"}
-    ground.told("", [row("hmi", EPOCH + 1, ""), row("DM1", EPOCH + 1, ""), row("DM2", 1, "")],
+    ground.take_table("", [row("hmi", EPOCH + 1, ""), row("DM1", EPOCH + 1, ""), row("DM2", 1, "")],
                 1.0)
     assert ground.look(1.1).take == ()
-    ground.told("", [row("DM1", EPOCH + 1, ""), row("DM2", 1, "")], 1.2)
+    ground.take_table("", [row("DM1", EPOCH + 1, ""), row("DM2", 1, "")], 1.2)
     assert ground.look(1.3).take == (("page", EPOCH + 1),)
 
 
-def test_a_unit_that_was_found_running_here_says_that_its_host_is_lost():
+def test_a_unit_of_another_home_that_runs_here_shows_that_its_host_is_lost():
     made = Side("")
     assert made.begin(["page"], lambda _node: False) == ["pilot", "page"]
     assert made.is_lost("ground")
     assert [unit for unit, _ in made.look(0.1).take] == ["modules"]
 
 
-def test_a_number_that_was_given_back_is_said_until_the_home_runs_a_higher_one():
+def test_an_incarnation_that_was_given_back_is_repeated_until_the_home_runs_a_higher_one():
     made = robot({"pilot": 1})
     made.look(LOST_S)
     assert made.given_back() == []  # it still runs here
     made.held.discard("page")
     assert made.given_back() == [("hmi", "ground", EPOCH + 1)]
-    made.told("ground", [row("hmi", 3)], 1.0)
+    made.take_table("ground", [row("hmi", 3)], 1.0)
     assert made.given_back() == [("hmi", "ground", EPOCH + 1)]
-    made.told("ground", [row("hmi", EPOCH + 2)], 1.1)
+    made.take_table("ground", [row("hmi", EPOCH + 2)], 1.1)
     assert made.given_back() == []
 
 
 @pytest.mark.parametrize(("rate", "times"), [(0.1, 10), (0.5, 2), (1, 1), (4, 1)])
 def test_in_slow_motion_others_are_waited_for_longer(rate, times):
     made = Side("", rate=rate)
-    made.heard("ground", 0.0)
+    made.note_alive("ground", 0.0)
     assert not made.look(times * LINK.lost_after_s).lost
     assert made.look(times * LINK.lost_after_s + 0.01).lost
 
@@ -223,15 +223,15 @@ def test_in_slow_motion_others_are_waited_for_longer(rate, times):
 def test_a_host_is_not_believed_about_what_is_no_node_and_no_guard_of_its_own(name):
     made = robot()
     own = row("router_a_ground", 7)
-    assert made.told("ground", [row(name, 999), own], 1.0) == ([own], [])
+    assert made.take_table("ground", [row(name, 999), own], 1.0) == ([own], [])
     assert made.rows() == [own]
 
 
-@given(st.lists(st.sampled_from(["cut", "join", "only the robot hears", "only ground hears", "wait",
-                                 "robot restarts a unit", "ground restarts a unit"]), max_size=40))
+@given(st.lists(st.sampled_from([
+    *LINES, "wait", "robot restarts a unit", "ground restarts a unit"]), max_size=40))
 def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(steps):
     """Two supervisors that exchange tables while they are joined; the issued numbers decide."""
-    now_s, hears = 0.0, {"", "ground"}
+    now_s, receives = 0.0, {"", "ground"}
     sides = {"": Side("", {"pilot": 1}),
              "ground": Side("ground", {"hmi": 1, "DM1": 1, "DM2": 1, "world": 1})}
 
@@ -242,16 +242,16 @@ def test_however_the_link_comes_and_goes_in_the_end_each_runs_what_is_its_own(st
             now_s += 0.1
             for own, side in sides.items():
                 other = "ground" if own == "" else ""
-                if other in hears:
-                    sides[other].heard(own, now_s)
+                if other in receives:
+                    sides[other].note_alive(own, now_s)
                     rows = [row(node, side.issued[node], own) for unit in side.held
                             for node in HOMES[unit].nodes]
                     rows += [row(node, highest, home) for node, home, highest in side.given_back()]
-                    sides[other].told(own, rows, now_s)
+                    sides[other].take_table(own, rows, now_s)
                 side.look(now_s)
 
     for step in (*steps, "join", "wait"):
-        hears = LINES.get(step, hears)
+        receives = LINES.get(step, receives)
         if step == "robot restarts a unit":
             sides[""].restart("page")
             sides[""].restart("pilot")
