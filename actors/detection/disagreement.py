@@ -1,4 +1,4 @@
-"""`Disagreement` and `Vote`: values that should be alike and are not."""
+"""`Disagreement` and `Vote`: values that should be equal are not."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rampart.manager.spec.tables import NonNegative, Positive
 
 
 class Sample(NamedTuple):
-    """A value, and when it was true (simulated seconds)."""
+    """A value, and when it was true, simulated seconds."""
 
     value: Any
     stamp_s: float
@@ -27,15 +27,15 @@ _NOTHING = Sample(None, -math.inf)
 
 
 def apart(one: Any, other: Any, *, angle: bool) -> float:
-    """Return how far two values are from each other.
+    """Return the distance of two values.
 
     Args:
-        one: a number, a text or a truth value.
-        other: of the same kind.
-        angle: whether they are angles, rad, of which the shorter way counts.
+        one: A number, text or truth value.
+        other: A value of the same kind.
+        angle: Whether they are angles, rad.
 
     Returns:
-        The distance; of a text or a truth value 0 if they are equal, else infinity.
+        The distance; of texts and truth values 0 if they are equal, else infinity.
     """
     if isinstance(one, str | bool) or isinstance(other, str | bool):
         return 0.0 if one == other else math.inf
@@ -46,7 +46,7 @@ def apart(one: Any, other: Any, *, angle: bool) -> float:
 
 
 def agreeing(values: Sequence[Any], within: float, *, angle: bool) -> list[int]:
-    """Return the places of the most values that lie within a distance of one of them."""
+    """Return the indices of the largest group of values within a distance of one of them."""
     clusters = ([i for i, other in enumerate(values)
                  if other is not None and apart(one, other, angle=angle) <= within]
                 for one in values if one is not None)
@@ -54,17 +54,17 @@ def agreeing(values: Sequence[Any], within: float, *, angle: bool) -> list[int]:
 
 
 class _Comparing(DetectionModule):
-    """Receives several fields, and compares values of about the same time."""
+    """Compares values of several fields at about the same time."""
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
-        """How they are compared.
+        """Way of comparison.
 
         Attributes:
             angle: whether they are angles, rad.
-            stale_s: what is older than this does not take part, s.
-            for_s: how long it has to be wrong, s.
-            clear_s: how long it has to be well before the module is idle again, s.
-            suspects: names of nodes to be respawned when it is active; none by default.
+            stale_s: greatest age of a value that takes part, s.
+            for_s: how long they have to disagree, s.
+            clear_s: how long they have to agree before the module is idle again, s.
+            suspects: nodes to be respawned while it is active; none by default.
         """
 
         angle: bool = False
@@ -77,10 +77,10 @@ class _Comparing(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        said = self.parameters
+        chosen = self.parameters
         self.monitor = self.judged_by(Sustained(
-            said.for_s, said.clear_s, self.known_after_s(said.stale_s + said.clear_s)))
-        self._waits_until_s = self.clock.now() + self.grace_s(said.stale_s)
+            chosen.for_s, chosen.clear_s, self.known_after_s(chosen.stale_s + chosen.clear_s)))
+        self._waits_until_s = self.clock.now() + self.grace_s(chosen.stale_s)
         fields = self.compared()
         self._samples = [_NOTHING] * len(fields)
         for i, name in enumerate(fields):
@@ -101,28 +101,28 @@ class _Comparing(DetectionModule):
         self.follow()
 
     def compared(self) -> Sequence[str]:
-        """Return the fields that are compared."""
+        """Return the fields to compare."""
         raise NotImplementedError
 
     def compare(self, values: Sequence[Any]) -> str | None:
-        """Return what is wrong, "" if nothing is, None if that cannot be said.
+        """Return the error, "" for none, None if the values do not show it.
 
         Args:
-            values: in the order of the fields; None for one that is not known.
+            values: In the order of the fields; None for an unknown one.
         """
         raise NotImplementedError
 
 
 class Disagreement(_Comparing):
-    """Active while two fields are further apart than they may be."""
+    """Active while the distance of two fields is too large."""
 
     class Parameters(_Comparing.Parameters, frozen=True, kw_only=True):
-        """Which fields, and how far they may be apart.
+        """Two fields and their greatest distance.
 
         Attributes:
-            one: the one, as "topic:field".
-            other: the other.
-            more_than: greatest distance that is in order.
+            one: first field, as "topic:field".
+            other: second field.
+            more_than: greatest permitted distance.
         """
 
         one: FieldName
@@ -136,26 +136,26 @@ class Disagreement(_Comparing):
         return self.parameters.one, self.parameters.other
 
     def compare(self, values: Sequence[Any]) -> str | None:
-        """Compare the two."""
+        """Compare the two values."""
         one, other = values
-        said = self.parameters
+        chosen = self.parameters
         if one is None or other is None:
             return None
-        if apart(one, other, angle=said.angle) <= said.more_than:
+        if apart(one, other, angle=chosen.angle) <= chosen.more_than:
             return ""
-        return f"{said.one} is {_shown(one)}, {said.other} is {_shown(other)}"
+        return f"{chosen.one} is {_shown(one)}, {chosen.other} is {_shown(other)}"
 
 
 class Vote(_Comparing):
-    """Active while fewer than `agree` of several fields are alike."""
+    """Active while fewer than `agree` of several fields agree."""
 
     class Parameters(_Comparing.Parameters, frozen=True, kw_only=True):
-        """Which fields, and how many of them have to be alike.
+        """Fields, and how many of them have to agree.
 
         Attributes:
-            values: as "topic:field" each.
-            agree: how many.
-            within: greatest distance of those that are alike.
+            values: the fields, each as "topic:field".
+            agree: how many have to agree.
+            within: greatest distance of values that agree.
         """
 
         values: FieldNames
@@ -163,9 +163,9 @@ class Vote(_Comparing):
         within: NonNegative = 0.0
 
         def __post_init__(self) -> None:
-            """Refuse a majority of more than there are."""
+            """Refuse a majority of more values than there are."""
             if self.agree > len(self.values):
-                raise ValueError(f"agree: there are {len(self.values)} values only")
+                raise ValueError(f"agree: there are only {len(self.values)} values")
 
     parameters: Parameters
 
@@ -174,17 +174,17 @@ class Vote(_Comparing):
         return self.parameters.values
 
     def compare(self, values: Sequence[Any]) -> str | None:
-        """Count the largest number that are alike; one that is not known is not."""
-        said = self.parameters
-        alike = agreeing(values, said.within, angle=said.angle)
-        if len(alike) >= said.agree:
+        """Find the largest group of known values that agree."""
+        chosen = self.parameters
+        alike = agreeing(values, chosen.within, angle=chosen.angle)
+        if len(alike) >= chosen.agree:
             return ""
         others = ", ".join(f"{name} is {_shown(values[i])}"
-                           for i, name in enumerate(said.values) if i not in alike)
-        return f"{len(alike)} of {len(values)} agree, {said.agree} have to: {others}"
+                           for i, name in enumerate(chosen.values) if i not in alike)
+        return f"{len(alike)} of {len(values)} agree, expected {chosen.agree}: {others}"
 
 
 def _shown(value: Any) -> str:
     if value is None:
-        return "not known"
+        return "unknown"
     return f"{value:g}" if isinstance(value, float) else str(value)

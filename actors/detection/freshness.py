@@ -1,8 +1,7 @@
 """DM2 and DM6: command not updated, localization not updated (paper, table I); of any topic.
 
-A stream of samples is judged by the time at which their content was true. The age of a sample
-counts from its stamp, not from its arrival: a frozen source that repeats an old sample, and a link
-that delivers each sample seconds late, are as stale as silence.
+The age of a sample counts from its stamp, when its content was true, not from its arrival. A frozen
+source that repeats an old sample, and a link that delivers seconds late, are as stale as silence.
 """
 
 from __future__ import annotations
@@ -21,19 +20,17 @@ from rampart.manager.spec.tables import NonNegative
 class FreshnessMonitor(Sustained):
     """Active while the newest content is older than the timeout.
 
-    It becomes idle again with a sample that comes after content has been fresh for `hold_s`
-    without interruption. So neither a single sample nor a source that stutters makes it flap.
-
-    Content that is old already shows no more than that something is wrong: idle may not be claimed
-    after it, and `expire` makes the monitor active.
+    It becomes idle with a sample after content has been fresh for `hold_s` without a break. So
+    neither a single sample nor a stuttering source makes it flap. A sample that is already old does
+    not make it idle.
 
     Args:
-        subject: what is monitored, for the reason: "command".
-        timeout_s: greatest admissible age, s.
-        hold_s: how long it must have been fresh again, s.
-        start_s: now.
-        grace_s: how long the first sample may take, s.
-        known: whether idle may be claimed before anything was received.
+        subject: Name of the content, for the reason: "command".
+        timeout_s: Greatest admissible age, s.
+        hold_s: How long it must have been fresh again, s.
+        start_s: Present time.
+        grace_s: How long the first sample may take, s.
+        known: Whether to report idle before any input.
     """
 
     def __init__(self, subject: str, timeout_s: float, hold_s: float, start_s: float,
@@ -46,17 +43,17 @@ class FreshnessMonitor(Sustained):
 
     @property
     def due_s(self) -> float:
-        """When time alone changes the finding."""
+        """When the content is too old."""
         is_over = self.active and self._well.since_s == math.inf
         return math.inf if is_over else self._stale_s
 
     def heard(self, stamp_s: float, now_s: float) -> None:
-        """Take note of a sample.
+        """Note a sample.
 
         Args:
-            stamp_s: when its content was true. A stamp from the future, or one that is not a
-                number, counts as nothing: a frozen source with a wrong clock is not fresh.
-            now_s: now.
+            stamp_s: When its content was true. A stamp that is not a number, or in the future, does
+                not count: a frozen source with a wrong clock is not fresh.
+            now_s: Present time.
         """
         if not is_possible(stamp_s, now_s) or not stamp_s > self._newest_s:
             return
@@ -66,7 +63,7 @@ class FreshnessMonitor(Sustained):
             self.note("", now_s)
 
     def expire(self, now_s: float) -> None:
-        """Conclude from the time that has passed."""
+        """Conclude from the time without an event."""
         if now_s >= self._stale_s:
             self.note(f"{self._subject} not updated for {self._timeout_s:g} s"
                       if self._newest_s > -math.inf else f"{self._subject} never heard", now_s)
@@ -76,15 +73,15 @@ class Freshness(DetectionModule):
     """Active while the newest content of a topic is too old."""
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
-        """What is stale, and who is named then.
+        """Topic, limits, and suspects.
 
         Attributes:
             topic: key of the topic.
             timeout_s: greatest admissible age of the content, s.
-            subject: what it is, for the reason; the topic's key if left out.
+            subject: name of the content, for the reason; the topic's key if left out.
             hold_s: how long it must be fresh again before the module is idle, s.
-            suspects: names of nodes to be respawned when it is active, as a rule the one that
-                publishes the topic; none by default, as in the paper.
+            suspects: nodes to be respawned while it is active, as a rule the publisher of the
+                topic; none by default, as in the paper.
         """
 
         topic: TopicHeard
@@ -105,7 +102,7 @@ class Freshness(DetectionModule):
         self.hear_topic(said.topic, self.heard)
 
     def heard(self, _message: Any, header: Header) -> None:
-        """Take note of a sample."""
+        """Note a sample."""
         self.monitor.heard(header.stamp, self.clock.now())
         self.monitor.accused = self.accused(self.parameters.suspects, header)
         self.follow()

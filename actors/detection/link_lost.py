@@ -1,8 +1,4 @@
-"""`LinkLost`: another host of the system cannot be reached.
-
-What follows is up to the mechanism that uses it: to stop, say, if the operator is on that host. To
-go on needs none.
-"""
+"""`LinkLost`: another host of the system cannot be reached; the mechanism decides what follows."""
 
 from __future__ import annotations
 
@@ -15,13 +11,13 @@ from rampart.manager.spec.tables import NonNegative, OptionalName
 
 
 class LinkLost(DetectionModule):
-    """Active while the first host's supervisor counts a host as lost, for long enough."""
+    """Active when the first host's supervisor has counted a host as lost for long enough."""
 
     class Parameters(DetectionModule.Parameters, frozen=True):
-        """Which host, and for how long.
+        """Host and times.
 
         Attributes:
-            host: name of it; "" for any.
+            host: its name; "" for any.
             for_s: how long it has to be lost besides `[link] lost_after_s`, s.
             clear_s: how long it then has to be back, s.
         """
@@ -40,7 +36,7 @@ class LinkLost(DetectionModule):
 
     @on(topics.NODES)
     def nodes(self, table: fm.NodeTable, _header: Header) -> None:
-        """See which hosts are lost."""
+        """Note which hosts are lost."""
         lost = sorted({row.host for row in table.nodes if row.state is fm.NodeState.UNREACHABLE
                        and self.parameters.host in {"", row.host}})
         self.monitor.note(f"no link to {', '.join(lost)}" if lost else "", self.clock.now())

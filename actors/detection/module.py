@@ -1,24 +1,23 @@
-"""What all detection modules have in common: the paper's two states, reports, exact timers.
+"""Base of detection modules: the paper's two states, reports, exact timers.
 
-A detection module is a pure monitor (what it heard, and by when it must have heard more) and an
-actor round it. The actor hands events to the monitor, wakes it when its next deadline is due,
-and publishes on `detection/NAME` what the monitor found: at once when it changes, and at 5 Hz.
+A detection module is a pure monitor inside an actor. The actor hands events to the monitor, wakes
+it at its next deadline, and publishes its finding on `detection/NAME`: each change at once, and the
+present state at 5 Hz.
 
-A missing message is not its sender's fault if the module could not have received it:
+A missing message is not its sender's fault if the module could not receive it:
 
-* A timer that is late shows that the module, too, waits for a processor. It reads its mail for as
-  long as it was late, and then judges.
-* When its router dies a module receives nothing, and blames no node until the bus has
-  gone over to the other one (`FAILOVER_S`).
+* A late timer shows that the module itself lacks processor time. It reads its mail for as long as
+  it was late, and then decides.
+* When its router dies, the module receives nothing. It blames no node until the bus has changed to
+  the other router (`FAILOVER_S`).
+* A module that was stopped finds all deadlines passed, although messages are waiting. It becomes
+  active a little later, if there is still a reason (`Absence`).
 
-Neither counts again within a second. Two more subtleties, about a module that was away for longer:
+The first two excuses count once a second at most.
 
-* A module that was itself stopped and goes on, or a machine that hung, finds every deadline
-  passed while the proof to the contrary is still under way. A module that finds that it has not
-  run for a while (`Absence`) becomes active a little later, if there is still a reason.
-* A respawned module does not know yet whether the fault is there. Had it reported idle from its
-  first moment, the manager would let go of a robot whose fault persists. So from its second
-  incarnation on it is silent until it knows, and the manager takes silence for activity.
+A respawned module does not know whether the fault is present. If it reported idle at once, the
+manager would release a robot whose fault persists. So from its second incarnation on a module is
+silent until it knows, and the manager takes silence for activity.
 """
 
 from __future__ import annotations
@@ -37,27 +36,27 @@ from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import FAILOVER_S
 
 LATE_S = 0.02
-"""A timer that is so late, simulated seconds, shows a lack of processor time."""
+"""A timer this late shows a lack of processor time; simulated seconds."""
 
 EXCUSE_S = 0.1
-"""How long one that was late reads its mail before it judges: a period of the slowest input."""
+"""Longest time for which a late module reads its mail first: a period of the slowest input."""
 
 NEXT_EXCUSE_S = 1.0
-"""Not sooner does another absence count: a module that is always late is not always excused."""
+"""Pause until the next excuse, or a module that is always late would never decide."""
 
 _SHORTEST_SLEEP_S = 1e-4
-"""Rounding must not make a timer that is due now come again now, without end."""
+"""Rounding must not make a timer come again at once, endlessly."""
 
 
 class Monitor(Protocol):
     """The pure part of a detection module. Times are simulated seconds.
 
     Attributes:
-        active: whether the fault is there.
-        reason: why; constant while nothing changes.
-        nodes: the failed nodes, where nodes are the subject.
+        active: Whether the fault is present.
+        reason: Why; constant while nothing changes.
+        nodes: The failed nodes, where nodes are the subject.
         known: False until the monitor has received enough to decide.
-        due_s: when `expire` is to be called next; infinite if only an event can change anything.
+        due_s: When to call `expire` next; infinite if only an event can change the finding.
     """
 
     @property
@@ -72,7 +71,7 @@ class Monitor(Protocol):
     def due_s(self) -> float: ...  # noqa: D102
 
     def expire(self, now_s: float) -> None:
-        """Draw the conclusions from the time that has passed without an event."""
+        """Conclude from the time without an event."""
 
 
 M = TypeVar("M", bound=Monitor)
@@ -82,9 +81,9 @@ class DetectionModule(Actor):
     """Base of every detection module.
 
     A subclass either calls `activate` and `know_idle` itself, or has a `Monitor` (`judged_by`),
-    hands it each event, and calls `follow` afterwards. A module that calls them itself calls
-    `know_idle` whenever an event proves that the fault is not there, idle or not: from its
-    second incarnation on it is silent, and counts as active, until it has called one of the two.
+    hands it each event, and calls `follow` afterwards. In the first case it calls `know_idle`
+    whenever an event proves that the fault is absent, also while idle. From its second incarnation
+    on it is silent, and counts as active, until it has called one of the two.
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.DETECTION,)
@@ -93,18 +92,18 @@ class DetectionModule(Actor):
         super().__init__(context)
         self._report = DetectionReport(DetectionState.IDLE, "", (), self.clock.now())
         self.first_life = context.incarnation == 1
-        self._told = False
+        self._has_reported = False
         self._monitor: Monitor | None = None
         self._wake_s = math.inf
         self._alarm: Timer | None = None
         self._senders: dict[str, int] = Remembered(MANY)
         self._absence = Absence(self.clock.now(), self.clock.rate)
-        self._judges_from_s = context.run.plan.begins_s  # before, the system is starting
+        self._decides_from_s = context.run.plan.begins_s  # before, the system is starting
 
     def grace_s(self, timeout_s: float) -> float:
-        """Return how long the first input may take, s: the timeout, or more while a system starts.
+        """Return how long the first input may take, s.
 
-        A respawned module joins a running system: for it the timeout itself is the grace.
+        The timeout for a respawned module, which joins a running system; longer at the start.
         """
         startup_s = self.context.run.system.timing.startup_grace_s
         return max(timeout_s, startup_s) if self.first_life else timeout_s
@@ -117,7 +116,7 @@ class DetectionModule(Actor):
         return self._report.state
 
     def activate(self, reason: str, nodes: tuple[str, ...] = ()) -> None:
-        """Go from idle to active; when active already, renew reason and nodes. Report changes."""
+        """Become active, or update reason and nodes while active. Report changes."""
         reason = clip(reason)
         nodes = tuple(clip(name, NAME_CHARS) for name in nodes)
         since_s = self.clock.now()
@@ -125,36 +124,36 @@ class DetectionModule(Actor):
             since_s = self._report.since_s
             if (reason, nodes) == (self._report.reason, self._report.nodes):
                 return
-        self._tell(DetectionReport(DetectionState.ACTIVE, reason, nodes, since_s))
+        self._send(DetectionReport(DetectionState.ACTIVE, reason, nodes, since_s))
 
     def know_idle(self) -> None:
-        """Say that the fault is known not to be there: go to idle, or stay. Report what is new."""
+        """Become or stay idle, since the fault is known to be absent. Report changes."""
         if self.state is DetectionState.ACTIVE:
-            self._tell(DetectionReport(DetectionState.IDLE, "", (), self.clock.now()))
-        elif not self._told:
-            self._tell(self._report)
+            self._send(DetectionReport(DetectionState.IDLE, "", (), self.clock.now()))
+        elif not self._has_reported:
+            self._send(self._report)
 
-    def _tell(self, report: DetectionReport) -> None:
+    def _send(self, report: DetectionReport) -> None:
         self._report = report
-        self._told = True
+        self._has_reported = True
         self.publish(topics.DETECTION, report)
 
     @every(0.2, with_heartbeat=True)
     def repeat(self) -> None:
-        """Say it again, for nodes that have joined since."""
+        """Repeat the report for nodes that have joined."""
         self.note_absence()
         self._note_move()
-        if self._told or self.first_life:
+        if self._has_reported or self.first_life:
             self.publish(topics.DETECTION, self._report)
 
     def accused(self, suspects: tuple[str, ...], header: Header) -> tuple[str, ...]:
-        """Return the suspects; those that have sent a message by the incarnation that did last.
+        """Return the suspects, with the incarnation of the last message of each that has sent one.
 
-        A later incarnation has done nothing yet, and a recovery leaves it alone.
+        A recovery leaves a later incarnation alone, since it has done nothing wrong.
 
         Args:
-            suspects: names of nodes.
-            header: of the message that came last.
+            suspects: Names of nodes.
+            header: Of the last message.
         """
         self._senders[header.source] = header.incarnation
         return tuple(f"{name}#{self._senders[name]}" if name in self._senders else name
@@ -163,20 +162,20 @@ class DetectionModule(Actor):
     # -- the monitor ----------------------------------------------------------------------------
 
     def judged_by(self, monitor: M) -> M:
-        """Have a monitor judge from the start on; return it."""
+        """Use a monitor from the start on; return it."""
         self._monitor = monitor
         return monitor
 
     def known_after_s(self, wait_s: float) -> float:
-        """Return when to claim idle though nothing was heard: at once in a system that starts."""
+        """Return when to report idle without any input: at once in a system that starts."""
         return -math.inf if self.first_life else self.clock.now() + wait_s
 
     def on_start(self) -> None:
-        """Start waiting for the first input."""
+        """Wait for the first input."""
         self.follow()
 
     def follow(self) -> None:
-        """Bring the state in line with the monitor, and see to it that its deadline is kept."""
+        """Take over the finding of the monitor, and set a timer for its deadline."""
         monitor = self._monitor
         if monitor is None:
             return
@@ -191,13 +190,13 @@ class DetectionModule(Actor):
         self._sleep_until(monitor.due_s)
 
     def _sleep_until(self, due_s: float) -> None:
-        # A deadline that has moved on does not cancel the timer: that one wakes, finds nothing
-        # due, and sleeps again. One timer per timeout, instead of one per message.
+        # A later deadline does not cancel the timer, which wakes and sleeps again: so there is one
+        # timer per timeout, not one per message.
         if due_s < self._wake_s:
             now_s = self.clock.now()
-            self._wake_s = max(due_s, now_s + _SHORTEST_SLEEP_S)  # it may be over already
+            self._wake_s = max(due_s, now_s + _SHORTEST_SLEEP_S)  # it may have passed
             if self._alarm is not None:
-                self._alarm.cancel()  # or it would wake and sleep again without end
+                self._alarm.cancel()
             self._alarm = self.call_later(self._wake_s - now_s, self._woken)
 
     def _woken(self) -> None:
@@ -212,23 +211,23 @@ class DetectionModule(Actor):
             self._note_move()
             if now_s - due_s > LATE_S:
                 self._read_mail_until(now_s + min(now_s - due_s, EXCUSE_S))
-        if now_s < self._judges_from_s:
-            self._sleep_until(self._judges_from_s)
+        if now_s < self._decides_from_s:
+            self._sleep_until(self._decides_from_s)
         else:
             monitor.expire(now_s)
             self.follow()
 
     def missed(self) -> None:
-        """React to having been stopped: of the messages since then only the newest are there."""
+        """React to having been stopped: only the newest messages of that time are left."""
 
     def note_absence(self) -> None:
-        """Note that it runs, and whether it did not for a while; before what counts is judged."""
+        """Note that the module runs, and whether it did not for a while; before each decision."""
         if self._absence.note(self.clock.now()):
-            self._judges_from_s = max(self._judges_from_s, self._absence.until_s)
+            self._decides_from_s = max(self._decides_from_s, self._absence.until_s)
             self.missed()
 
     def _is_withheld(self) -> bool:
-        """Whether its monitor has found what may only be missing because it was absent itself."""
+        """Whether the monitor may be active only because the module itself did not run."""
         return self.state is DetectionState.IDLE and self._monitor is not None and (
             self._monitor.active and self._absence.excuses(self.clock.now()))
 
@@ -237,5 +236,5 @@ class DetectionModule(Actor):
             self._read_mail_until(self.clock.now() + FAILOVER_S * self.clock.rate)
 
     def _read_mail_until(self, until_s: float) -> None:
-        if self.clock.now() > self._judges_from_s + NEXT_EXCUSE_S:
-            self._judges_from_s = until_s
+        if self.clock.now() > self._decides_from_s + NEXT_EXCUSE_S:
+            self._decides_from_s = until_s

@@ -1,4 +1,4 @@
-"""`ProcessUsage`: a node takes more processor time or memory than it should."""
+"""`ProcessUsage`: a node uses too much processor time or memory."""
 
 from __future__ import annotations
 
@@ -19,21 +19,20 @@ _MB = 1e6
 
 
 class ProcessUsage(DetectionModule):
-    """Active while one of the watched nodes uses too much, for long enough.
+    """Active when a watched node has used too much for long enough.
 
-    Nodes that share a process share what it uses. In virtual time there are no processes, and
-    the module is idle.
+    Nodes that share a process share its usage. In virtual time the module is idle.
     """
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
-        """Whom it watches, and how much is too much.
+        """Nodes and limits.
 
         Attributes:
             watch: names of the nodes.
-            processor_share: of one core, that a process may use.
-            memory_mb: resident memory that it may have, MB (10^6 bytes).
-            for_s: how long it has to be more, s.
-            clear_s: how long it has to be less before the module is idle again, s.
+            processor_share: share of a core that a process may use.
+            memory_mb: resident memory that it may use, MB (10^6 bytes).
+            for_s: how long it has to use more, s.
+            clear_s: how long it has to use less before the module is idle again, s.
         """
 
         watch: NodeNames
@@ -43,7 +42,7 @@ class ProcessUsage(DetectionModule):
         clear_s: NonNegative = 2.0
 
         def __post_init__(self) -> None:
-            """Refuse limits that are none."""
+            """Refuse parameters without a limit."""
             if self.processor_share is None and self.memory_mb is None:
                 raise ValueError("memory_mb: missing; give it, processor_share or both")
 
@@ -51,11 +50,11 @@ class ProcessUsage(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        said = self.parameters
+        chosen = self.parameters
         self._looks: dict[str, tuple[tuple[int, int], float, ProcessCount]] = {}
         self._running: dict[str, tuple[int, int]] = {}
         self.monitor = self.judged_by(Sustained(
-            said.for_s, said.clear_s, self.known_after_s(said.for_s + 2 * PERIOD_S)))
+            chosen.for_s, chosen.clear_s, self.known_after_s(chosen.for_s + 2 * PERIOD_S)))
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
@@ -70,7 +69,7 @@ class ProcessUsage(DetectionModule):
 
     @every(PERIOD_S)
     def look(self) -> None:
-        """See what the processes use."""
+        """Measure the processes."""
         wrong = {node: why for node, (pid, incarnation) in self._running.items()
                  if (why := self._problem(node, pid, incarnation))}
         self.monitor.accused = tuple(f"{node}#{self._running[node][1]}" for node in wrong)
@@ -80,18 +79,18 @@ class ProcessUsage(DetectionModule):
         self.follow()
 
     def _problem(self, node: str, pid: int, incarnation: int) -> str:
-        usage, said = self.context.usage(pid), self.parameters
+        usage, chosen = self.context.usage(pid), self.parameters
         if usage is None:
             return ""
         now_s = self.clock.now() / self.clock.rate  # the processor's time is real
         look = (pid, incarnation), now_s, usage
         process, before_s, before = self._looks.get(node, look)
         self._looks[node] = look
-        if said.memory_mb is not None and usage.memory_bytes > said.memory_mb * _MB:
-            return f"{usage.memory_bytes / _MB:.0f} MB of memory, more than {said.memory_mb:g} MB"
-        if said.processor_share is None or process != look[0] or now_s <= before_s:
+        if chosen.memory_mb is not None and usage.memory_bytes > chosen.memory_mb * _MB:
+            return f"{usage.memory_bytes / _MB:.0f} MB of memory, more than {chosen.memory_mb:g} MB"
+        if chosen.processor_share is None or process != look[0] or now_s <= before_s:
             return ""
         share = (usage.cpu_s - before.cpu_s) / (now_s - before_s)
-        if share > said.processor_share:
-            return f"{share:.2f} of a core, more than {said.processor_share:g}"
+        if share > chosen.processor_share:
+            return f"{share:.2f} of a core, more than {chosen.processor_share:g}"
         return ""

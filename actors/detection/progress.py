@@ -1,4 +1,4 @@
-"""`Progress`: a task goes through its steps in order, and in time (logical supervision)."""
+"""`Progress`: a task takes a wrong step, or too long for one (logical supervision)."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A step of a task.
 
     Attributes:
-        at: value of the field while the task is at this step.
-        within_s: longest time that it takes, simulated seconds.
-        to: values of the steps that may follow; if left out the next in the list, and after the
-            last one the first.
+        at: Value of the field during this step.
+        within_s: Longest time that it takes, simulated seconds.
+        to: Values of the steps that may follow. By default the next one in the list, and the first
+            after the last.
     """
 
     at: str | bool | float
@@ -31,13 +31,13 @@ class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ProgressMonitor(Finding):
-    """Active from a step that is not one of those that follow, or takes too long, until the next.
+    """Active from a step that is not allowed to follow, or takes too long, until the next step.
 
     Args:
-        what: is followed, for the reason.
-        steps: all there are.
-        busy_at_most_s: how much longer a step may take that reports to be busy.
-        known_after_s: when idle may be claimed without anything heard; -inf for at once.
+        what: Name of the field, for the reason.
+        steps: All steps.
+        busy_at_most_s: How much longer a step may take that reports to be busy.
+        known_after_s: When to report idle without any input; -inf for at once.
     """
 
     def __init__(self, what: str, steps: Sequence[Step], busy_at_most_s: float,
@@ -68,7 +68,7 @@ class ProgressMonitor(Finding):
         return max(late_s, min(self._busy_until_s, late_s + self._busy_at_most_s))
 
     def heard(self, at: Any, now_s: float) -> None:
-        """Take note of where the task is."""
+        """Note the present step."""
         self.known = True
         before = None if self._has_missed else self._at
         self._has_missed = False
@@ -77,23 +77,23 @@ class ProgressMonitor(Finding):
             return
         self._at, self._since_s = at, now_s
         if at not in self._steps:
-            self._accuse(f"{self._what} is {at!r}, which is no step")
+            self._accuse(f"{self._what} is {at!r}, not one of its steps")
         elif before in self._steps and at not in self._next[before]:
-            right = " or ".join(map(repr, self._next[before])) or "nothing"
-            self._accuse(f"{self._what} is {at!r} after {before!r}; right is {right}")
+            expected = " or ".join(map(repr, self._next[before])) or "nothing"
+            self._accuse(f"{self._what} is {at!r} after {before!r}, expected {expected}")
         else:
             self.clear()
 
     def missed(self) -> None:
-        """Take note that the task may have gone on by several steps unheard."""
+        """Note that steps may have been missed."""
         self._has_missed = True
 
     def busy(self, until_s: float) -> None:
-        """Take note that the step is busy until then; a time that is not finite counts as never."""
+        """Note until when the step is busy; a time that is not finite counts as never."""
         self._busy_until_s = until_s if math.isfinite(until_s) else -math.inf
 
     def expire(self, now_s: float) -> None:
-        """Conclude from the time that has passed."""
+        """Conclude from the time without an event."""
         super().expire(now_s)
         if not self.active and now_s >= self._late_s:
             self._accuse(f"{self._what} is {self._at!r} for more than "
@@ -104,18 +104,18 @@ class ProgressMonitor(Finding):
 
 
 class Progress(DetectionModule):
-    """Active while a task takes a step that is not next, or stays at one for too long."""
+    """Active while a task is at a step that may not follow, or has been at one for too long."""
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
-        """Which task, and its steps.
+        """A task and its steps.
 
         Attributes:
-            value: the step at which it is, as "topic:field".
-            steps: all there are: `at` with `within_s` and `to`, see `Step`.
-            busy_until: until when it is busy and must not be hurried, in simulated seconds, as
-                "topic:field"; "" if it does not report that.
+            value: the present step, as "topic:field".
+            steps: all steps: `at` with `within_s` and `to`, see `Step`.
+            busy_until: until when it is busy, in simulated seconds, as "topic:field"; "" if the
+                task does not report that.
             busy_at_most_s: by how much that may exceed `within_s`, s.
-            suspects: names of nodes to be respawned when it is active; none by default.
+            suspects: nodes to be respawned while it is active; none by default.
         """
 
         value: FieldName
@@ -125,11 +125,11 @@ class Progress(DetectionModule):
         suspects: Suspects = ()
 
         def __post_init__(self) -> None:
-            """Refuse steps that contradict each other, or lead nowhere."""
+            """Refuse steps that contradict each other, or lead to an unknown one."""
             known = [step.at for step in self.steps]
             for step in self.steps:
                 if known.count(step.at) > 1:
-                    raise ValueError(f"steps: {step.at!r} stands twice")
+                    raise ValueError(f"steps: {step.at!r} is listed twice")
                 if not step.within_s > 0:
                     raise ValueError(f"steps: within_s of {step.at!r} must be above 0")
                 for at in step.to or ():
@@ -140,25 +140,25 @@ class Progress(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        said = self.parameters
+        chosen = self.parameters
         self.monitor = self.judged_by(ProgressMonitor(
-            said.value, said.steps, said.busy_at_most_s, self.known_after_s(1.0)))
-        if said.busy_until:
-            self.hear_field(said.busy_until, self.busy)
-        self.hear_field(said.value, self.heard)
+            chosen.value, chosen.steps, chosen.busy_at_most_s, self.known_after_s(1.0)))
+        if chosen.busy_until:
+            self.hear_field(chosen.busy_until, self.busy)
+        self.hear_field(chosen.value, self.heard)
 
     def missed(self) -> None:
-        """Take the next step that is heard for right, whichever it is."""
+        """Accept any next step."""
         self.monitor.missed()
 
     def heard(self, value: Any, header: Header) -> None:
-        """Take note of where the task is."""
+        """Note the present step."""
         self.note_absence()
         self.monitor.accused = self.accused(self.parameters.suspects, header)
         self.monitor.heard(value, self.clock.now())
         self.follow()
 
     def busy(self, until_s: Any, _header: Header) -> None:
-        """Take note of until when it is busy."""
+        """Note until when the task is busy."""
         self.monitor.busy(until_s)
         self.follow()

@@ -1,4 +1,4 @@
-"""`Rate`: a topic comes too seldom or too often."""
+"""`Rate`: messages of a topic arrive too seldom or too often."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from rampart.actors.runtime.parameters import Suspects, TopicHeard
 from rampart.manager.spec.tables import NonNegative, Positive
 
 _MOST = 10_000
-"""Messages that are counted in a window; more are too often by any measure."""
+"""Most messages that are counted in a window."""
 
 
 class RateMonitor(Sustained):
-    """Counts messages in a window that slides.
+    """Counts messages in a sliding window.
 
     Args:
-        at_least_hz: lowest rate in order, messages per simulated second; 0 for any.
-        at_most_hz: highest rate in order; infinite for any.
-        window_s: over which they are counted.
-        start_s: now.
-        grace_s: how long the first message may take.
-        known: whether idle may be claimed before anything was heard.
-        clear_s: how long the rate has to be in order before it is idle again.
+        at_least_hz: Lowest permitted rate, messages per simulated second; 0 for any.
+        at_most_hz: Highest permitted rate; infinite for any.
+        window_s: Length of the window.
+        start_s: Present time.
+        grace_s: How long the first message may take.
+        known: Whether to report idle before any input.
+        clear_s: How long the rate has to be permitted before it is idle again.
     """
 
     def __init__(self, at_least_hz: float, at_most_hz: float, window_s: float, start_s: float,
@@ -39,35 +39,35 @@ class RateMonitor(Sustained):
         self._window_s = window_s
         self._from_s = start_s + max(grace_s, window_s)
         self._is_first = True
-        self._heard: deque[float] = deque(maxlen=_MOST)
+        self._arrivals: deque[float] = deque(maxlen=_MOST)
 
     @property
     def due_s(self) -> float:
-        """When a message leaves the window, the first one is full, or the rate is well for long."""
-        leaves_s = self._heard[0] + self._window_s if self._heard else math.inf
+        """When a message leaves the window, the first window is full, or `clear_s` is over."""
+        leaves_s = self._arrivals[0] + self._window_s if self._arrivals else math.inf
         begins_s = self._from_s if self._is_first else math.inf
         well_s = self._well.since_s + self._well.enough_s if self.active else math.inf
         return min(leaves_s, begins_s, well_s)
 
     def heard(self, now_s: float) -> None:
         """Count a message."""
-        self._heard.append(now_s)
+        self._arrivals.append(now_s)
         self.expire(now_s)
 
     def missed(self, now_s: float) -> None:
-        """Begin to count again: messages may have been missed."""
-        self._heard.clear()
+        """Start to count again, since messages may have been missed."""
+        self._arrivals.clear()
         self._from_s, self._is_first = now_s + self._window_s, True
 
     def expire(self, now_s: float) -> None:
-        """Forget what has left the window, and judge."""
-        while self._heard and self._heard[0] <= now_s - self._window_s + 1e-9:
-            self._heard.popleft()
+        """Forget the messages that have left the window, and decide."""
+        while self._arrivals and self._arrivals[0] <= now_s - self._window_s + 1e-9:
+            self._arrivals.popleft()
         if now_s >= self._from_s - 1e-9:
             self._is_first = False
-        count = len(self._heard)
+        count = len(self._arrivals)
         if count > self._most + 1e-9:
-            self.note(f"{count} messages in {self._window_s:g} s, at most {self._most:g} are right",
+            self.note(f"{count} messages in {self._window_s:g} s, expected at most {self._most:g}",
                       now_s)
         elif count >= self._least - 1e-9:
             self.note("", now_s)
@@ -76,18 +76,18 @@ class RateMonitor(Sustained):
 
 
 class Rate(DetectionModule):
-    """Active while messages of a topic come too seldom or too often, by their arrival."""
+    """Active while messages of a topic arrive too seldom or too often."""
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
-        """Which topic, and its rate.
+        """Topic and permitted rate.
 
         Attributes:
             topic: key of the topic.
-            at_least_hz: messages per simulated second that there have to be.
-            at_most_hz: that there may be.
-            window_s: over which they are counted, s.
-            clear_s: how long the rate has to be in order before the module is idle again, s.
-            suspects: names of nodes to be respawned when it is active; none by default.
+            at_least_hz: lowest permitted rate, messages per simulated second.
+            at_most_hz: highest permitted rate.
+            window_s: length of the window in which messages are counted, s.
+            clear_s: how long the rate has to be permitted before the module is idle again, s.
+            suspects: nodes to be respawned while it is active; none by default.
         """
 
         topic: TopicHeard
@@ -98,7 +98,7 @@ class Rate(DetectionModule):
         suspects: Suspects = ()
 
         def __post_init__(self) -> None:
-            """Refuse rates that allow all or nothing."""
+            """Refuse rates that permit everything or nothing."""
             if not self.at_least_hz + (self.at_most_hz < math.inf) > 0:
                 raise ValueError("at_least_hz: missing; give it, at_most_hz or both")
             if not self.at_least_hz < self.at_most_hz:
@@ -110,15 +110,15 @@ class Rate(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        said = self.parameters
+        chosen = self.parameters
         self.monitor = self.judged_by(RateMonitor(
-            said.at_least_hz, said.at_most_hz, said.window_s, self.clock.now(),
-            self.grace_s(said.window_s), known=self.first_life, clear_s=said.clear_s))
-        self.monitor.accused = said.suspects
-        self.hear_topic(said.topic, self.heard)
+            chosen.at_least_hz, chosen.at_most_hz, chosen.window_s, self.clock.now(),
+            self.grace_s(chosen.window_s), known=self.first_life, clear_s=chosen.clear_s))
+        self.monitor.accused = chosen.suspects
+        self.hear_topic(chosen.topic, self.heard)
 
     def missed(self) -> None:
-        """Begin to count again."""
+        """Start to count again."""
         self.monitor.missed(self.clock.now())
 
     def heard(self, _message: Any, header: Header) -> None:

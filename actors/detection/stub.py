@@ -1,4 +1,4 @@
-"""A detection module that detects what it is told."""
+"""Stand-in for a detection module, which is set from outside."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from rampart.manager.spec.tables import Positive
 
 
 class StubDetection(DetectionModule):
-    """Active while it is told so on `stub/trigger` (`rampart inject trigger:NAME`).
+    """Active as ordered on `stub/trigger` (`rampart inject trigger:NAME`).
 
-    What it was told dies with its process: the next incarnation is idle from the start.
+    Its next incarnation has no order, and is idle from the start.
     """
 
     class Parameters(DetectionModule.Parameters, frozen=True):
-        """For the analyses alone: it stands for a module that is not written yet.
+        """Parameters of the module that it stands for; only the analyses use them.
 
         Attributes:
-            watch: names of the nodes that it is to watch.
-            timeout_s: within how long it is to detect, s.
-            margin_m: distance at which it is to warn.
+            watch: names of the nodes that it will watch.
+            timeout_s: within how long it will detect, s.
+            margin_m: distance at which it will warn.
         """
 
         watch: NodeNames = ()
@@ -30,13 +30,13 @@ class StubDetection(DetectionModule):
         margin_m: Positive | None = None
 
     def on_start(self) -> None:
-        """As a later incarnation, report at once that it has no order yet."""
+        """From the second incarnation on, report idle at once."""
         if not self.first_life:
             self.know_idle()
 
     @on(topics.STUB_TRIGGER)
     def trigger(self, message: m.StubTrigger, _header: Header) -> None:
-        """Take the state that is asked for."""
+        """Take the ordered state."""
         if message.name != self.name:
             return
         if message.active:

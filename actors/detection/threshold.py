@@ -1,4 +1,4 @@
-"""`Threshold`: a number in a message is too large, too small, or none."""
+"""`Threshold`: a number in a message is too large, too small, or not finite."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from rampart.manager.spec.tables import NonNegative
 
 
 class Threshold(DetectionModule):
-    """Active while a field is above one limit or below another, for long enough."""
+    """Active when a field has been outside its limits for long enough."""
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
-        """Which number, and its limits.
+        """A number and its limits.
 
         Attributes:
             value: the number, as "topic:field".
-            above: active when the number is greater.
-            below: active when it is smaller; with both: when it is outside.
-            absolute: whether its sign does not matter.
-            for_s: how long it has to be so, s.
-            clear_s: how long it has to be in order before the module is idle again, s.
-            hysteresis: how far inside the limits it then has to be.
-            suspects: names of nodes to be respawned when it is active; none by default.
+            above: highest permitted number.
+            below: lowest permitted number.
+            absolute: whether to ignore its sign.
+            for_s: how long it has to be outside, s.
+            clear_s: how long it has to be inside before the module is idle again, s.
+            hysteresis: how far inside it then has to be.
+            suspects: nodes to be respawned while it is active; none by default.
         """
 
         value: FieldName
@@ -39,26 +39,26 @@ class Threshold(DetectionModule):
         suspects: Suspects = ()
 
         def __post_init__(self) -> None:
-            """Refuse limits that are none."""
+            """Refuse parameters without limits, and limits that permit nothing."""
             if self.above is None and self.below is None:
                 raise ValueError("above: missing; give above, below or both")
             if (self.above is not None and self.below is not None
                     and not self.below + 2 * self.hysteresis < self.above):
-                raise ValueError("below: must be smaller than above, by twice the hysteresis at "
-                                 "least")
+                raise ValueError("below: must be smaller than above by more than twice the "
+                                 "hysteresis")
 
     parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        said = self.parameters
+        chosen = self.parameters
         self.monitor = self.judged_by(Sustained(
-            said.for_s, said.clear_s, self.known_after_s(said.for_s + said.clear_s)))
+            chosen.for_s, chosen.clear_s, self.known_after_s(chosen.for_s + chosen.clear_s)))
         self._out = False
-        self.hear_field(said.value, self.heard)
+        self.hear_field(chosen.value, self.heard)
 
     def heard(self, value: Any, header: Header) -> None:
-        """Take note of a number."""
+        """Note a number."""
         if value is None:
             return
         number = abs(value) if self.parameters.absolute else value
@@ -69,11 +69,10 @@ class Threshold(DetectionModule):
         self.follow()
 
     def _problem(self, number: float) -> str:
-        """Return what is wrong with a number, "" if nothing is."""
         limits = self.parameters
         margin = limits.hysteresis if self._out else 0.0
         if not math.isfinite(number):
-            return f"{number} is no number"
+            return f"{number} is not finite"
         if limits.above is not None and number > limits.above - margin:
             return f"{number:g} is above {limits.above:g}"
         if limits.below is not None and number < limits.below + margin:

@@ -1,4 +1,4 @@
-"""`Unchanged`: a value never changes although it should: a frozen sensor, a node in a rut."""
+"""`Unchanged`: a value does not change although it should, as of a frozen sensor."""
 
 from __future__ import annotations
 
@@ -16,21 +16,18 @@ _NOTHING = object()
 
 
 class UnchangedMonitor(Sustained):
-    """Active from a message with the value of the last `for_s`, until that changes again.
+    """Active when the value has been the same for `for_s`, until it changes.
 
-    It is judged when a message comes: a sender that stops is not unchanged but silent. A new
-    process of the sender is given `for_s` of its own.
+    It decides when a message arrives: a sender that stops is silent, not unchanged. For a new
+    process of the sender the time starts again.
 
     Args:
-        what: is watched, for the reason.
-        for_s: how long it has to be the same, simulated seconds.
-        clear_s: how long it then has to go on changing.
-        within: how far two numbers may be apart and are the same.
-        may_last: values that may be said for any time.
-        known_after_s: when idle may be claimed without anything heard; -inf for at once.
-
-    Attributes:
-        accused: whom to name when it becomes active; up to the owner.
+        what: Name of the field, for the reason.
+        for_s: How long the value has to be the same, simulated seconds.
+        clear_s: How long it then has to keep changing.
+        within: Greatest distance of numbers that count as the same.
+        may_last: Values that may last for any time.
+        known_after_s: When to report idle without any input; -inf for at once.
     """
 
     def __init__(self, what: str, for_s: float, clear_s: float = 0.0, *, within: float = 0.0,
@@ -42,12 +39,12 @@ class UnchangedMonitor(Sustained):
         self._since_s = math.inf
 
     def heard(self, value: Any, now_s: float, *, renewed: bool = False) -> None:
-        """Take note of a value.
+        """Note a value.
 
         Args:
-            value: a number, a text or a truth value.
-            now_s: now.
-            renewed: whether another process of its sender published the value before.
+            value: A number, text or truth value.
+            now_s: Present time.
+            renewed: Whether another process of the sender published the value before.
         """
         if value in self._may_last or not self._is_the_same(value):
             if self._value is not _NOTHING or value in self._may_last:
@@ -58,29 +55,29 @@ class UnchangedMonitor(Sustained):
         elif now_s - self._since_s >= self._for_s - 1e-9:
             self.note(f"{self._what} is {self._value} all the time", now_s)
             self.nodes = self.accused
-        self._known_after_s = now_s + self._for_s  # of one value and then silence nothing follows
+        self._known_after_s = now_s + self._for_s  # one value and then silence show nothing
 
     def _is_the_same(self, value: Any) -> bool:
         before = self._value
         if before is _NOTHING:
             return False
-        nan = all(isinstance(one, float) and math.isnan(one) for one in (before, value))
+        nan = all(isinstance(each, float) and math.isnan(each) for each in (before, value))
         return nan or value == before or apart(before, value, angle=False) <= self._within
 
 
 class Unchanged(DetectionModule):
-    """Active while a field has said the same for too long: what is measured has some noise."""
+    """Active when a field has had the same value for too long; a measured value has some noise."""
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
-        """Which field, and for how long.
+        """Field and times.
 
         Attributes:
             value: the field, as "topic:field".
             for_s: how long it has to be the same, s; some periods of its topic.
-            clear_s: how long it has to go on changing before the module is idle again, s.
-            within: how far two numbers may be apart and still count as the same.
-            may_last: values that may last, as that of a rotor which does not turn.
-            suspects: names of nodes to be respawned when it is active; none by default.
+            clear_s: how long it has to keep changing before the module is idle again, s.
+            within: greatest distance of numbers that count as the same.
+            may_last: values that may last, such as 0 of a rotor that does not turn.
+            suspects: nodes to be respawned while it is active; none by default.
         """
 
         value: FieldName
@@ -94,14 +91,14 @@ class Unchanged(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        said = self.parameters
+        chosen = self.parameters
         self.monitor = self.judged_by(UnchangedMonitor(
-            said.value, said.for_s, said.clear_s, within=said.within, may_last=said.may_last,
-            known_after_s=self.known_after_s(said.for_s)))
-        self.hear_field(said.value, self.heard)
+            chosen.value, chosen.for_s, chosen.clear_s, within=chosen.within,
+            may_last=chosen.may_last, known_after_s=self.known_after_s(chosen.for_s)))
+        self.hear_field(chosen.value, self.heard)
 
     def heard(self, value: Any, header: Header) -> None:
-        """Take note of a value."""
+        """Note a value."""
         if value is None:
             return
         before = self._senders.get(header.source, header.incarnation)

@@ -1,15 +1,14 @@
 """DM4, DM5 and DM7: crash of a control node, a non-control node, the localization node.
 
-Two ways, which have nothing in common. The supervisor of the node's host sees what the kernel knows
-and publishes it: the process has ended, is stopped, or is silent although it could run. And the
-module receives the heartbeats itself: without one for twice the timeout the node has failed,
-whatever the supervisor publishes, and also while it is dead. Twice, because the supervisor has the
-patience for a node that only waits for a processor (`rampart.actors.machine.patience`).
+A watchdog has two independent ways. The supervisor of the node's host publishes what the kernel
+shows: the process has ended, is stopped, or is silent although it could run. And the module itself
+receives the heartbeats: after twice the timeout without one the node has failed, whatever the
+supervisor publishes, also while that is dead. Twice, because the supervisor is patient with a node
+that only waits for a processor (`rampart.actors.machine.patience`).
 
-Processes of a node are told apart by their incarnation. The end of one may be reported when the
-next is already at work, and a heartbeat of the old one may arrive after the news of its end;
-neither may be believed of the new one. Being back is proved by a heartbeat: a process that exists
-does not work yet.
+Incarnations distinguish the processes of a node. The end of one may be reported when the next one
+works already, and a heartbeat of the old one may arrive after that report; neither counts for the
+new one. Only a heartbeat proves that a node is back.
 """
 
 from __future__ import annotations
@@ -30,13 +29,12 @@ from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import HeartbeatTimeout, NodeNames
 
 _ALONE = 2
-"""After so many timeouts without a heartbeat a node has failed though the supervisor has not
-published that."""
+"""Timeouts without a heartbeat after which a node has failed, whatever the supervisor publishes."""
 
 
 @dataclass(slots=True)
 class _Watched:
-    """What is known of a watched node: its newest incarnation and how that one is."""
+    """State of a watched node, of its newest incarnation."""
 
     due_s: float
     incarnation: int = 0
@@ -47,14 +45,14 @@ class _Watched:
 
 
 class WatchdogCore:
-    """Active while one of the nodes has failed; `nodes` names those.
+    """Active while a node has failed.
 
     Args:
-        nodes: the watched nodes.
-        timeout_s: a node without a heartbeat for so long has failed, s.
-        start_s: now.
-        grace_s: how long the first heartbeat of a node may take, s.
-        known: whether idle may be claimed before all nodes were heard.
+        nodes: The watched nodes.
+        timeout_s: Time without a heartbeat after which a node has failed, s.
+        start_s: Present time.
+        grace_s: How long the first heartbeat of a node may take, s.
+        known: Whether to report idle before the heartbeats of all nodes.
     """
 
     def __init__(self, nodes: Iterable[str], timeout_s: float, start_s: float, grace_s: float,
@@ -66,81 +64,83 @@ class WatchdogCore:
     @property
     def active(self) -> bool:
         """Whether a node has failed."""
-        return any(one.failure for one in self._watched.values())
+        return any(watched.failure for watched in self._watched.values())
 
     @property
     def nodes(self) -> tuple[str, ...]:
         """The failed nodes."""
-        return tuple(node for node, one in self._watched.items() if one.failure)
+        return tuple(node for node, watched in self._watched.items() if watched.failure)
 
     @property
     def reason(self) -> str:
-        """What happened to each failed node."""
+        """Failure of each failed node."""
         return "; ".join(
-            f"{node}: {one.failure}" for node, one in self._watched.items() if one.failure)
+            f"{node}: {self._watched[node].failure}" for node in self.nodes)
 
     @property
     def known(self) -> bool:
-        """Whether each node was heard, or missed."""
-        return self._known or all(one.heard or one.failure for one in self._watched.values())
+        """Whether each node has sent a heartbeat, or failed."""
+        return self._known or all(
+            watched.heard or watched.failure for watched in self._watched.values())
 
     @property
     def due_s(self) -> float:
         """When a heartbeat is overdue."""
-        return min((one.due_s for one in self._watched.values() if not one.failure),
+        return min((watched.due_s for watched in self._watched.values() if not watched.failure),
                    default=math.inf)
 
     def beat(self, node: str, incarnation: int, stamp_s: float, now_s: float) -> None:
-        """Take note of a heartbeat sent at `stamp_s`."""
-        one = self._watched.get(node)
-        if one is None or incarnation < one.incarnation:
+        """Note a heartbeat sent at `stamp_s`."""
+        watched = self._watched.get(node)
+        if watched is None or incarnation < watched.incarnation:
             return
-        if incarnation > one.incarnation:
-            self._succeed(one, incarnation)
-        elif one.failure and (stamp_s <= one.failed_s or not is_possible(stamp_s, now_s)):
-            return  # sent before it failed, and under way since; or at an impossible time
-        one.heard, one.stamp_s, one.failure = True, stamp_s, ""
-        one.due_s = now_s + self.timeout_s
+        if incarnation > watched.incarnation:
+            self._succeed(watched, incarnation)
+        elif watched.failure and (stamp_s <= watched.failed_s or not is_possible(stamp_s, now_s)):
+            return  # sent before it failed, or at an impossible time
+        watched.heard, watched.stamp_s, watched.failure = True, stamp_s, ""
+        watched.due_s = now_s + self.timeout_s
 
     def event(self, node: str, event: str, incarnation: int, stamp_s: float, now_s: float) -> None:
-        """Take note of what the supervisor published of a process at `stamp_s`."""
-        one = self._watched.get(node)
-        if one is None or incarnation < one.incarnation:
+        """Note an event of a process that the supervisor published at `stamp_s`."""
+        watched = self._watched.get(node)
+        if watched is None or incarnation < watched.incarnation:
             return
-        if event in NEW_PROCESSES and incarnation > one.incarnation:
-            first = one.incarnation == 0
-            self._succeed(one, incarnation)
-            if not first:  # at the very start the grace is longer, and still runs
-                one.due_s = now_s + self.timeout_s
-        elif event in FAILURES and (incarnation > one.incarnation or stamp_s >= one.stamp_s):
-            one.incarnation, one.failed_s = incarnation, stamp_s
-            one.failure = f"process of incarnation {incarnation} is {FAILURES[event]}"
+        if event in NEW_PROCESSES and incarnation > watched.incarnation:
+            first = watched.incarnation == 0
+            self._succeed(watched, incarnation)
+            if not first:  # at the start the longer grace still runs
+                watched.due_s = now_s + self.timeout_s
+        elif event in FAILURES and (
+                incarnation > watched.incarnation or stamp_s >= watched.stamp_s):
+            watched.incarnation, watched.failed_s = incarnation, stamp_s
+            watched.failure = f"process of incarnation {incarnation} is {FAILURES[event]}"
 
     def expire(self, now_s: float) -> None:
-        """Conclude from the time that has passed without a heartbeat."""
-        for one in self._watched.values():
-            if now_s >= one.due_s and not one.failure:
-                one.failed_s = one.stamp_s
-                one.failure = (f"no heartbeat for {self.timeout_s:g} s" if one.heard
+        """Conclude from the time without a heartbeat."""
+        for watched in self._watched.values():
+            if now_s >= watched.due_s and not watched.failure:
+                watched.failed_s = watched.stamp_s
+                watched.failure = (f"no heartbeat for {self.timeout_s:g} s" if watched.heard
                                else "never heard")
 
     @staticmethod
-    def _succeed(one: _Watched, incarnation: int) -> None:
+    def _succeed(watched: _Watched, incarnation: int) -> None:
         """Expect the next process; a failure stays until its first heartbeat."""
-        one.incarnation, one.heard = incarnation, False
-        one.stamp_s = one.failed_s = -math.inf
+        watched.incarnation, watched.heard = incarnation, False
+        watched.stamp_s = watched.failed_s = -math.inf
 
 
 class Watchdog(DetectionModule):
-    """Active while one of the nodes it watches is dead, stopped or wedged."""
+    """Active while a watched node is dead, stopped or hung."""
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
-        """Whom it watches.
+        """Nodes and timeout.
 
         Attributes:
             watch: names of the nodes.
-            timeout_s: that of their heartbeats in the supervisor, s. Without one for twice as long
-                a node has failed here.
+            timeout_s: the supervisor's timeout of their heartbeats, s. Here a node has failed after
+                twice this time without watched.
         """
 
         watch: NodeNames
@@ -162,13 +162,13 @@ class Watchdog(DetectionModule):
 
     @on(topics.HEARTBEAT)
     def heartbeat(self, _message: m.Heartbeat, header: Header) -> None:
-        """Take note that a loop turns."""
+        """Note a heartbeat."""
         self.monitor.beat(header.source, header.incarnation, header.stamp, self.came_s(header))
         self.follow()
 
     @on(ftm_topics.PROCESS_EVENT)
     def process_event(self, message: ProcessEvent, header: Header) -> None:
-        """Take note of what the supervisor of a node's host has seen."""
+        """Note an event that a supervisor has published."""
         self.monitor.event(message.node, message.event, message.incarnation, header.stamp,
                            self.clock.now())
         self.follow()

@@ -1,10 +1,9 @@
-"""What is in force as long as there is a holder: the brake, a bound on the pilot.
+"""Holders of something that is in force while there is one: the brake, a bound on the pilot. Pure.
 
-A holder that is not a recovery module of the system is obeyed all the same: its brake costs
-a mission, one that is not applied may cost more. But no recovery of the system will ever let go for
-it, so it is named as unknown, and an operator can let go in its place
-(`rampart reset NAME`). Of unknown holders so many are told apart; all above them are one, `OTHERS`.
-Pure.
+A holder that is not a recovery module of the system is obeyed too: an unneeded brake costs a
+mission, a missing one may cost more. But no recovery of the system releases it. So it is reported
+as unknown, and an operator can release it (`rampart reset NAME`). Unknown holders beyond a limit
+count as one, `OTHERS`.
 """
 
 from __future__ import annotations
@@ -15,19 +14,18 @@ from typing import Generic, TypeVar
 V = TypeVar("V")
 
 OTHERS = "others"
-"""Holds for all unknown holders above `UNKNOWN`; only an operator lets go for it."""
+"""Stands for all unknown holders above `UNKNOWN`; only an operator releases it."""
 
 UNKNOWN = 16
-"""Unknown holders that are told apart."""
+"""Most unknown holders that are distinguished."""
 
 
 class Holders(Generic[V], dict[str, V]):
-    """What each holder holds, by its name.
+    """What each holder holds, by name.
 
     Args:
-        known: names of the recovery modules of the system; None if they are not known, and then
-            no holder counts as unknown.
-        crowded: what `OTHERS` holds: the strictest there is.
+        known: Names of the recovery modules of the system; None if no holder counts as unknown.
+        crowded: What `OTHERS` holds: the strictest value.
     """
 
     def __init__(self, known: Collection[str] | None, crowded: V) -> None:
@@ -37,25 +35,25 @@ class Holders(Generic[V], dict[str, V]):
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """The holders that are no recovery modules of the system."""
+        """Holders that are not recovery modules of the system."""
         return tuple(filter(self.is_unknown, self))
 
     def is_unknown(self, name: str) -> bool:
-        """Whether a name is that of no recovery module of the system."""
+        """Whether a name is not that of a recovery module of the system."""
         return self._known is not None and name not in self._known
 
     def hold(self, name: str, value: V) -> None:
-        """Note a holder; what it held before is replaced."""
+        """Note a holder, and replace what it held."""
         if name in self or not self.is_unknown(name) or len(self.unknown) < UNKNOWN:
             self[name] = value
         else:
             self[OTHERS] = self._crowded
 
     def let_go(self, name: str) -> None:
-        """Have a holder let go; a holder that holds nothing changes nothing."""
+        """Release what a holder holds, if anything."""
         if name != OTHERS:
             self.pop(name, None)
 
     def reset(self, name: str) -> bool:
-        """Let go in the place of an unknown holder; return whether there was anything to do."""
+        """Release what an unknown holder holds; return whether it held anything."""
         return self.is_unknown(name) and self.pop(name, None) is not None

@@ -1,17 +1,15 @@
-"""Does the machine keep up with the rate that was asked for? From how late its event loops were.
+"""Whether the machine keeps up with the rate of a run, from the lateness of event loops. Pure.
 
-Each node says with its heartbeat how late one of its timers was at the most, and the supervisor's
-table passes that on; so does the simulated world, whose timer steps the physics. With too little
-processor time timers are late, and so are messages, and a timeout that waits for them runs out.
+Each heartbeat carries the greatest lateness of its node's timers, and the supervisor's table passes
+it on. The simulated world, whose timer steps the physics, reports it as well. Too little processor
+time makes timers and messages late, and timeouts expire.
 
-The measure of too late is the shortest slack of the system's timeouts, that is, of each the time
-beyond the period of what it waits for (`[timing]`): a message may be late twice, at its sender and
-at its reader, so either may use up half of it. Lateness is a matter of real seconds, which at a
-lower rate are fewer simulated ones. From that follows the rate with which the machine would have
-kept up: `rate * allowed / late`. It is an estimate on the safe side, for at a lower rate there is
-less to do, and loops are not as late.
+The limit is half the shortest slack of the system's timeouts: the time of each beyond the period of
+its messages (`[timing]`). Half, since a message may be late at its sender and at its reader. A
+lateness in real seconds is shorter in simulated ones at a lower rate. So the machine would have
+kept up with `rate * allowed / late`, or with more, since there is less work at a lower rate.
 
-Pure; times are simulated seconds. In virtual time nothing is ever late.
+Times are simulated seconds. In virtual time no loop is late.
 """
 
 from __future__ import annotations
@@ -30,25 +28,25 @@ WINDOW_S = 2.0
 """Real seconds over which the largest lateness is taken."""
 
 LINE_S = 5.0
-"""Real seconds from one line about it to the next."""
+"""Real seconds between two lines about it."""
 
 _SHARE = 0.9
-"""Of the windows, by whose lateness a rate is judged: a single hiccup does not count."""
+"""Quantile of the windows that decides about the rate, so a single hiccup does not count."""
 
 _MOST = 10_000
 
 
 class KeptUp(msgspec.Struct, frozen=True):
-    """Whether the machine kept up with the rate of a run, and with which one it would have.
+    """Result of a run.
 
     Attributes:
-        rate: Simulated seconds per second that were asked for.
-        with_rate: With which the machine keeps up, by what was measured; `rate` if it did.
-        late_s: By how much a loop was too late at the most.
-        node: Whose loop that was; "" if none was late.
-        world_late_s: By how much the simulated world was.
-        allowed_s: By how much either may be.
-        behind_s: For how long one was later than that.
+        rate: Requested rate, simulated seconds per second.
+        with_rate: Rate that the machine would have kept up with, at most `rate`.
+        late_s: Greatest lateness of a loop.
+        node: Its node; "" if none was late.
+        world_late_s: Greatest lateness of the simulated world.
+        allowed_s: Permitted lateness.
+        behind_s: For how long a loop was later than that.
     """
 
     rate: float
@@ -70,11 +68,11 @@ class KeptUp(msgspec.Struct, frozen=True):
 
 
 class KeepingUp:
-    """Measures it over a run.
+    """Measurement over a run.
 
     Args:
-        timing: Of the system.
-        world: Names of the nodes that simulate the world.
+        timing: Table of the system.
+        world: Nodes that simulate the world.
         rate: Simulated seconds per second.
         begins_s: Simulated time before which the system is starting.
     """
@@ -85,14 +83,14 @@ class KeepingUp:
         self._world = world
         self._rate = rate
         self._begins_s = begins_s
-        self._until_s = self._said_s = -math.inf
+        self._until_s = self._line_s = -math.inf
         self._window = (0.0, "", 0.0)
         self._worst = (0.0, "", 0.0)
         self._late_s: deque[float] = deque(maxlen=_MOST)
         self._behind_s = 0.0
 
     def take(self, table: NodeTable, now_s: float) -> str:
-        """Take a table of the nodes; return a line for people, "" if there is nothing to say."""
+        """Take a table of the nodes; return a line for people, "" for none."""
         if now_s < self._begins_s:
             return ""
         late_s, node = max(((row.late_s, row.name) for row in table.nodes), default=(0.0, ""))
@@ -112,9 +110,9 @@ class KeepingUp:
         if late_s <= self._allowed_s:
             return ""
         self._behind_s += now_s - self._until_s + WINDOW_S * self._rate
-        if now_s < self._said_s + LINE_S * self._rate:
+        if now_s < self._line_s + LINE_S * self._rate:
             return ""
-        self._said_s = now_s
+        self._line_s = now_s
         return str(KeptUp(self._rate, self._with_rate(late_s), late_s, node, world_s,
                           self._allowed_s, 0.0))
 
@@ -122,7 +120,7 @@ class KeepingUp:
         return self._rate * min(1.0, self._allowed_s / late_s) if late_s > 0 else self._rate
 
     def result(self, now_s: float) -> KeptUp:
-        """Return what was measured in a run that is over now."""
+        """Return the result of a run that is over now."""
         if self._until_s > -math.inf:
             self._close(now_s)
         found = sorted(self._late_s)

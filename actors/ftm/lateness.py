@@ -1,4 +1,4 @@
-"""How late the loops of the nodes were, by their heartbeats."""
+"""Lateness of the nodes' loops, by their heartbeats."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from rampart.actors.bus.messages import ON_TIME
 
 
 class Lateness:
-    """The greatest lateness of each node in the last one or two periods; `turn` begins another."""
+    """Greatest lateness of each node in the last one or two periods; `turn` begins a period."""
 
     def __init__(self) -> None:
         self._now: dict[str, float] = {}
@@ -18,13 +18,13 @@ class Lateness:
             self._now[node] = late_s
 
     def turn(self) -> None:
-        """Forget what is older than a period."""
+        """Forget the period before the last one."""
         self._before, self._now = self._now, {}
 
     def count(self, late_s: float) -> int:
-        """Return how many nodes were late by so many simulated seconds or more."""
+        """Return the number of nodes that were at least this late, simulated seconds."""
         return sum(self.of(node) >= late_s for node in self._now.keys() | self._before.keys())
 
     def of(self, node: str) -> float:
-        """Return by how many simulated seconds a node was late at most."""
+        """Return the greatest lateness of a node, simulated seconds."""
         return max(self._now.get(node, 0.0), self._before.get(node, 0.0)) or ON_TIME

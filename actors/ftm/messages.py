@@ -31,15 +31,15 @@ from rampart.actors.bus.messages import ON_TIME, Injection, Message
 from rampart.manager.model.mechanisms import RecoveryPhase
 
 LARGEST_STATE_BYTES = 64 << 10
-"""Of the state that a node keeps: thirty times what states are. A larger one is refused."""
+"""Largest state that a node may keep: thirty times the usual size."""
 
 KeptBytes = Annotated[bytes, msgspec.Meta(max_length=LARGEST_STATE_BYTES)]
 
 
 class Holds(Message, frozen=True):
-    """Who holds the brake, or an order to the pilot, and is no recovery module of the system.
+    """Unknown holders of the brake or of an order to the pilot: not recovery modules of the system.
 
-    `what` is held; `holders` are obeyed until they let go, or an operator does for them.
+    `what` is held. `holders` are obeyed until they, or an operator in their place, release it.
     """
 
     what: Name
@@ -193,10 +193,10 @@ class NodeState(StrEnum):
 class NodeInfo(Message, frozen=True, omit_defaults=True):
     """One row of the supervisor's table.
 
-    `late_s` is how late its loop was at most in the last half or whole second, simulated
-    seconds; left out if none was. `host` is where it runs; "" is the first. `failing`: its last
-    processes each worked for a short time only. `heard_s` is the stamp of its last heartbeat, which
-    says how many messages it has refused so far, and why.
+    `late_s` is the greatest lateness of its loop in the last half or whole second, simulated
+    seconds; left out for none. `host` is where it runs; "" is the first. `failing`: each of its
+    last processes worked for a short time only. `heard_s` is the stamp of its last heartbeat, which
+    carries the numbers of refused payloads and overflows.
     """
 
     name: Name
@@ -222,8 +222,8 @@ class NodeTable(Message, frozen=True):
 class KeptState(Message, frozen=True):
     """The newest state of a node that a host holds; incarnation and generation are 0 for none.
 
-    `issued` is the highest incarnation of the node that host has issued. `final`: no process of the
-    node is there, and this is the last that any has kept.
+    `issued` is the highest incarnation of the node that is known there. `final`: no process of the
+    node runs there any more, and this is the last state.
     """
 
     node: Name
@@ -237,7 +237,7 @@ class KeptState(Message, frozen=True):
 
 
 class Checkpoints(Message, frozen=True):
-    """States that a host holds of nodes that two hosts may run: all, or those that changed."""
+    """States that a host holds of nodes that two hosts may run: all, or the changed ones."""
 
     run: Name
     kept: Many[KeptState]
@@ -253,10 +253,7 @@ class RespawnRequest(Message, frozen=True):
 
 
 class SignalOrder(Message, frozen=True):
-    """An order to signal the process of a node; the same `order` twice is one.
-
-    `signal` is one that `kill-node` has, such as `KILL`.
-    """
+    """An order to signal a node's process, carried out once; `signal` is as for `kill-node`."""
 
     order: Name
     node: Name
@@ -278,7 +275,7 @@ class ProcessEvent(Message, frozen=True):
 
     @property
     def news(self) -> str:
-        """Return "clear" or "fault"; "" of what is routine, or published a second time."""
+        """Return "clear" or "fault"; "" for routine events and repetitions."""
         if self.event in _ROUTINE or self.detail == "already":
             return ""
         return "clear" if self.event in _GOOD_NEWS else "fault"
@@ -295,10 +292,10 @@ class ProgramEnd(Message, frozen=True):
 
 
 FAILURES = {"crashed": "gone", "stopped": "stopped", "wedged": "hung", "given up": "given up"}
-"""Events after which no process of the node works, with what has become of it."""
+"""Events after which no process of the node works, each with the state of the last one."""
 
 NEW_PROCESSES = ("started", "respawned")
-"""Events that name a process which is there, and has not worked yet."""
+"""Events of a process that exists and has not worked yet."""
 
 _ROUTINE = ("started", "running")
 _GOOD_NEWS = ("respawned", "resumed", "adopted", "back")
@@ -307,10 +304,10 @@ _Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]
 
 
 class FaultOrder(Message, frozen=True):
-    """A fault that is no disturbance of a topic: a message on `topic`, as a JSON object.
+    """A fault that does not disturb a topic: a message on `topic`, as a JSON object.
 
-    Its type has the fields `injection` and `duration_s`, filled in when it is ordered; a duration
-    of 0 ends it. The node that carries it out reports on it as on an injection.
+    The fields `injection` and `duration_s` of its type are filled in when it is ordered; a duration
+    of 0 ends it. The node that carries it out reports it as an injection.
     """
 
     topic: Name
@@ -321,9 +318,9 @@ _FaultOrders = Annotated[tuple[FaultOrder, ...], msgspec.Meta(max_length=64)]
 
 
 class NamedFault(Message, frozen=True):
-    """A fault that can be ordered by its name: what the launcher offers to the operator's page.
+    """A fault that the operator's page can order by name.
 
-    `duration_s` is how long it lasts unless told otherwise, simulated seconds; None for ever.
+    `duration_s` is its default duration, simulated seconds; None for permanent.
     """
 
     name: Name

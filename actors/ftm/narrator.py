@@ -1,7 +1,6 @@
-"""What a run is reported to do, in one line per event: for console, report, page and viewers. Pure.
+"""Events of a run in one line each: the same words for console, report, page and viewers. Pure.
 
-All of them use the same words. A line is made when something changes: a detection that is repeated,
-and a router that repeats an event, add nothing.
+A repeated report or event adds no line.
 """
 
 from __future__ import annotations
@@ -19,33 +18,24 @@ from rampart.actors.ftm import messages as fm
 from rampart.manager.strategies.registry import decision_in_words, listing, named
 
 MOST = 500
-"""Modules, nodes and injections that are remembered."""
+"""Most modules, nodes and injections that are remembered."""
 
 Level = Literal["fault", "clear", "note"]
 
 
 class Line(msgspec.Struct, frozen=True):
-    """One line of the story of a run.
-
-    Attributes:
-        level: *fault*, *clear* when a fault is over, *note* otherwise.
-        text: in words.
-    """
+    """One line; the level is *clear* when a fault is over."""
 
     level: Level
     text: str
 
 
 class Narrator:
-    """Describes the messages of one run.
-
-    Args:
-        titles: of modules, mechanisms and recoveries, see `SystemSpec.titles`.
-    """
+    """Describes the messages of one run; `titles` are those of `SystemSpec.titles`."""
 
     def __init__(self, titles: Mapping[str, str] = MappingProxyType({})) -> None:
         self.titles = titles
-        self._said: dict[tuple[str, ...], Any] = Remembered(MOST)
+        self._last: dict[tuple[str, ...], Any] = Remembered(MOST)
         self._injections: dict[str, str] = Remembered(MOST)
         self._silent: tuple[str, ...] = ()
         self._describe: dict[type, Callable[[Any, Header], list[Line]]] = {
@@ -55,7 +45,7 @@ class Narrator:
             bm.Injection: self._ordered, bm.InjectionReport: self._injection}
 
     def describe(self, message: Any, header: Header) -> list[Line]:
-        """Return the lines for a message; none if it brings nothing new."""
+        """Return the lines for a message; none if it is not new."""
         describe = self._describe.get(type(message))
         return describe(message, header) if describe else []
 
@@ -118,7 +108,7 @@ class Narrator:
         return [Line("fault", f"fault injected: {where}{why}")]
 
     def _is_new(self, what: tuple[str, ...], value: Any, at_first: Any = None) -> bool:
-        if self._said.get(what, at_first) == value:
+        if self._last.get(what, at_first) == value:
             return False
-        self._said[what] = value
+        self._last[what] = value
         return True

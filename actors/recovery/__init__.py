@@ -1,1 +1,1 @@
-"""What every recovery module is made of, and the modules that know no robot."""
+"""Base of recovery modules, and the modules that know no robot."""

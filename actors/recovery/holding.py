@@ -1,10 +1,10 @@
-"""Orders that a recovery module keeps in force: what RM1, RM2, RM5 and RM8 have in common.
+"""Base of recoveries that keep an order in force: RM1, RM2, RM5 and RM8.
 
-They act by giving an order to another node and repeating it, have acted when that node's status
-confirms it, and then stay: the robot is in a degraded mode until they are released.
+They give an order to another node and repeat it. When the status of that node confirms it, the
+robot is in a degraded mode until the recovery is released.
 
-The confirmation may be lost again, when the node that obeyed is respawned. The order is then
-given again at once, and only if it is not confirmed again within the deadline is that a failure.
+If the node is respawned, the confirmation is lost. The order is then given again at once; it is a
+failure only if it is not confirmed within the deadline.
 """
 
 from __future__ import annotations
@@ -16,20 +16,19 @@ from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context
 
 _ENDINGS = 5
-"""How often the end of an order is repeated: for one second, for a node that is being respawned."""
+"""Repetitions of the end of an order: one second, for a node that is being respawned."""
 
 
 class HeldRecovery(RecoveryModule):
-    """A recovery that consists of an order, which is in force while the module is activated.
+    """A recovery whose order is in force while the module is activated.
 
-    A subclass gives the order in `give`, and calls `confirm` with each status that shows whether
-    the order is obeyed.
+    A subclass gives the order in `give`, and calls `confirm` with each status of the other node.
     """
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.why = ""
-        self._inherits = context.incarnation > 1  # a predecessor may have left an order behind
+        self._inherits = context.incarnation > 1  # an earlier incarnation may have left an order
         self._endings = 0
         self._lost_s = math.inf
 
@@ -38,12 +37,12 @@ class HeldRecovery(RecoveryModule):
         raise NotImplementedError
 
     def confirm(self, *, in_force: bool, reason: str, stamp_s: float) -> None:
-        """Take note of whether the order is obeyed.
+        """Note whether the order is in force.
 
         Args:
-            in_force: whether it is.
-            reason: in words.
-            stamp_s: when that was true; what was true before the order does not count.
+            in_force: Whether it is.
+            reason: For people.
+            stamp_s: When that was true; a time before the order does not count.
         """
         if not self.activated or stamp_s < self.ordered_s:
             return
@@ -74,13 +73,13 @@ class HeldRecovery(RecoveryModule):
         self.give(False, "")
 
     def stay_idle(self) -> None:
-        """End an order that a predecessor may have left behind."""
+        """End an order that an earlier incarnation may have left."""
         if self._inherits:
             self._inherits = False
             self.let_go()
 
     def repeat(self) -> None:
-        """Repeat the order while it is in force, and for a while its end."""
+        """Repeat the order while it is in force, and then its end for a second."""
         if self.activated:
             self.give(True, self.why)
         elif self._endings > 0:

@@ -1,16 +1,15 @@
-"""What all recovery modules have in common: states, obedience, reports.
+"""Base of recovery modules: states, commands, reports.
 
-A recovery module obeys the FTM Manager's last command, and publishes on `recovery/NAME/state` how
-far it is: at once when that changes, and five times a second.
+A recovery module obeys the last command of the FTM Manager, and publishes its phase on
+`recovery/NAME/state`: each change at once, and the present phase five times a second.
 
-* *The same command again is one command.* The manager repeats what it wants; only a new decision
-  number is a new order, given because the cause has come back.
-* *Never cut off half-way.* A release that arrives while the module is acting is obeyed as soon as
-  the action is finished, has reached its degraded mode, or has failed.
+* *A repeated command is one command.* The manager repeats its commands. Only a new decision number
+  is a new order, given because the cause has come back.
+* *An action is never cut off.* A release that arrives meanwhile is obeyed when the action is done,
+  has reached its degraded mode, or has failed.
 * *A respawned module starts idle.* The manager sees that, and commands it again.
 
-Everything happens in the handler of the command itself, first the action, then the report:
-nothing between a decision and its effect waits for a timer.
+The handler of a command acts first, and then reports: no effect of a decision waits for a timer.
 """
 
 from __future__ import annotations
@@ -36,16 +35,15 @@ TRANSITIONS = {
     _P.DEGRADED: frozenset({_P.ACTING, _P.FAILED, _P.IDLE}),
     _P.FAILED: frozenset({_P.ACTING, _P.DONE, _P.DEGRADED, _P.IDLE}),
 }
-"""The state machine of every recovery module: idle, or activated (paper, figure 4) in one of four
-phases. There is no way from acting to idle: that would be cutting it off. Late success may follow
-failure.
-"""
+"""State machine of recovery modules: idle, or activated (paper, figure 4) in one of four phases.
+No step leads from acting to idle, since an action is never cut off. A late success may follow a
+failure."""
 
 DEFAULT_DEADLINE_S = 2.0
-"""From command to done, without a contract."""
+"""Deadline from command to done of a module without a contract."""
 
 LATE_S = 0.1
-"""A deadline noticed this much late shows that the module itself did not run."""
+"""A deadline noticed this late shows that the module itself did not run."""
 
 _EPSILON_S = 1e-6
 
@@ -53,15 +51,15 @@ _REPEATS_PER_S = 5
 
 
 class IllegalTransitionError(RuntimeError):
-    """A state machine was asked for a step that its table does not have."""
+    """A state machine was asked for a step that is not in its table."""
 
 
 class RecoveryModule(Actor):
     """Base of every recovery module.
 
-    A subclass defines what it does: `act` on each order, `let_go` when released. It calls
-    `succeed`, `degrade` or `fail` when it knows how the action went. The deadline is the one in
-    the contract that the system spec gives for this module.
+    A subclass defines `act` for orders and `let_go` for releases. It calls `succeed`, `degrade` or
+    `fail` with the result of the action. The deadline comes from the module's contract in the
+    system spec.
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.RECOVERY,)
@@ -79,7 +77,7 @@ class RecoveryModule(Actor):
         self._deadline: Timer | None = None
         self._excused = False
         self._release: RecoveryCommand | None = None
-        self._told: RecoveryReport | None = None
+        self._reported: RecoveryReport | None = None
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
@@ -88,20 +86,20 @@ class RecoveryModule(Actor):
 
     @property
     def activated(self) -> bool:
-        """Whether it is activated."""
+        """Whether it is not idle."""
         return self.phase is not RecoveryPhase.IDLE
 
     def on_start(self) -> None:
-        """Report at once that it is there."""
+        """Report at once."""
         self._tell()
 
-    # -- what a subclass defines ----------------------------------------------------------------
+    # -- defined by a subclass ------------------------------------------------------------------
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Take the action.
 
-        Called with the phase acting for a first order; again, in whatever phase it is, for each
-        repetition (it may name further nodes) and for a new order (`renewed`).
+        Called in phase acting for a first order. Called again, in any phase, for each repetition,
+        which may name further nodes, and for a new order (`renewed`).
         """
         raise NotImplementedError
 
@@ -110,16 +108,16 @@ class RecoveryModule(Actor):
         raise NotImplementedError
 
     def stay_idle(self) -> None:
-        """React to a release that finds it idle."""
+        """React to a release while idle."""
 
     def unfinished(self) -> str:
-        """What is still to be done, for the report of a missed deadline."""
+        """Return what is still to do, for the report of a missed deadline."""
         return ""
 
     def repeat(self) -> None:
-        """Do what is to be done five times a second."""
+        """Act five times a second."""
 
-    # -- how the action went --------------------------------------------------------------------
+    # -- result of the action -------------------------------------------------------------------
 
     def succeed(self, reason: str = "") -> None:
         """Report the action done."""
@@ -134,7 +132,7 @@ class RecoveryModule(Actor):
         self._end(RecoveryPhase.FAILED, reason)
 
     def resume(self, reason: str = "") -> None:
-        """Be acting again, with the whole deadline ahead."""
+        """Act again, with the whole deadline."""
         self._begin(reason)
         self._tell_change()
 
@@ -154,7 +152,7 @@ class RecoveryModule(Actor):
         if release is not None:
             self._obey_release(release)
 
-    # -- obedience ------------------------------------------------------------------------------
+    # -- commands -------------------------------------------------------------------------------
 
     @on(topics.RECOVERY_COMMAND)
     def command(self, message: RecoveryCommand, _header: Header) -> None:
@@ -163,7 +161,7 @@ class RecoveryModule(Actor):
             self._release = None
             self._obey_order(message)
         elif not self.activated:
-            self.decision = message.decision  # confirms that it holds nothing
+            self.decision = message.decision  # confirms that nothing is in force
             self.stay_idle()
             self._tell_change()
         elif self.phase is RecoveryPhase.ACTING:
@@ -192,10 +190,10 @@ class RecoveryModule(Actor):
         late_s = self.clock.now() - self._due_s
         if self.phase is not RecoveryPhase.ACTING:
             return
-        if late_s < -_EPSILON_S:  # the first host's clock was followed meanwhile
+        if late_s < -_EPSILON_S:  # this host's clock was corrected meanwhile
             self._look_at(-late_s)
             return
-        if late_s > LATE_S and not self._excused:  # it was stopped itself: read the mail first
+        if late_s > LATE_S and not self._excused:  # it was stopped: read the mail first
             self._excused = True
             self._look_at(LATE_S)
         else:
@@ -217,11 +215,11 @@ class RecoveryModule(Actor):
     # -- reports --------------------------------------------------------------------------------
 
     def _tell(self) -> None:
-        self._told = self._report()
-        self.publish(topics.RECOVERY, self._told)
+        self._reported = self._report()
+        self.publish(topics.RECOVERY, self._reported)
 
     def _tell_change(self) -> None:
-        if self._report() != self._told:
+        if self._report() != self._reported:
             self._tell()
 
     def _report(self) -> RecoveryReport:

@@ -1,22 +1,21 @@
 """RM3 and RM4: respawn control nodes, respawn non-control nodes (paper, table II).
 
-Both do the same; what differs is in the nodes: a control node comes back from its checkpoint
-(backward recovery), a memoryless one needs none (masking).
+Both do the same, and only their nodes differ: a control node continues from its checkpoint
+(backward recovery), a stateless one needs none (masking).
 
-For each failed node the supervisor is asked for a new process, and that proves itself by a
-heartbeat. What makes this more than one message is that a request names the *failed incarnation*,
-so that asking twice, or asking about a node that is back already, kills no process that is well:
+For each failed node the module requests a new process from the supervisor, which proves itself by a
+heartbeat. A request names the *failed incarnation*, so a repeated or outdated request kills no
+working process:
 
-* An incarnation that the supervisor has published as failed, or whose heartbeat is overdue, has
-  failed: it is named.
-* One that was heard a moment ago is not accused. The request names its predecessor, and the
-  supervisor, which holds the process's pidfd and knows better, respawns it or answers that it is
-  there. This happens when this module was itself respawned and is commanded again, and when a
-  stopped process was continued just in time.
-* A node that is well by all signs may be wrong all the same: a module that has compared its
-  messages names the incarnation, `NAME#INCARNATION`. That one is accused, a later one is not.
-* A new process that dies, or is not heard within a while, has failed as well: the next request
-  names it. The supervisor counts, and gives up when there are too many.
+* If the supervisor has published the incarnation as failed, or its heartbeat is overdue, the
+  request names it.
+* If its heartbeat is recent, the request names the incarnation before. The supervisor, which holds
+  the pidfd, respawns the node or answers that it is there. This happens when this module was itself
+  respawned and is commanded again, and when a stopped process was continued just in time.
+* A detection module that has compared messages may accuse the incarnation of a live node,
+  `NAME#INCARNATION`. The request names that incarnation, and no later one.
+* If a new process dies, or sends no heartbeat in time, the next request names it. The supervisor
+  counts the restarts, and gives up after too many.
 """
 
 from __future__ import annotations
@@ -38,20 +37,20 @@ from rampart.actors.runtime.parameters import NodeNames
 
 _REQUESTS_PER_INCARNATION = 1_000_000
 _BLOCKS = 1 << 32
-"""After so many incarnations request numbers begin again: they have to stay below 2^53."""
+"""Incarnations after which request numbers repeat, since they have to stay below 2^53."""
 
 _OVERDUE_S, _OVERDUE = 0.25, 0.57
-"""Age at which a heartbeat is overdue: this, or in a faster system this share of its timeout."""
+"""Age at which a heartbeat is overdue; in a faster system a share of the heartbeat timeout."""
 
 _START_TIMEOUT_S = 1.0
-"""How long a new process may take until it is received."""
+"""How long a new process may take until its first heartbeat."""
 
 
 class Stage(Enum):
-    """How far the respawn of one node is."""
+    """Stage of the respawn of a node."""
 
-    NONE = "not asked for"
-    ASKED = "asked for"
+    NONE = "not requested"
+    ASKED = "requested"
     STARTED = "started"
     BACK = "back"
     FAILED = "failed"
@@ -63,9 +62,9 @@ _LOST = ("crashed", "stopped", "wedged")
 
 @dataclass(slots=True)
 class _Node:
-    """What is known of one node. Times are simulated seconds."""
+    """State of one node. Times are simulated seconds."""
 
-    heard_s: float
+    beat_s: float
     incarnation: int = 0
     gone_s: float = -math.inf
     stage: Stage = Stage.NONE
@@ -77,20 +76,20 @@ class _Node:
 
 
 class RespawnCore:
-    """The respawns of one recovery module. Requests pile up until `take_requests`.
+    """The respawns of one recovery module. Requests wait for `take_requests`.
 
     Args:
-        by: name of the module.
-        nodes: the nodes that it may respawn.
-        first_request: number of the first request.
-        start_s: now.
-        overdue_s: age at which a heartbeat is overdue.
+        by: Name of the module.
+        nodes: Nodes that it may respawn.
+        first_request: Number of the first request.
+        start_s: Present time.
+        overdue_s: Age at which a heartbeat is overdue.
     """
 
     def __init__(self, by: str, nodes: Iterable[str], first_request: int, start_s: float,
                  overdue_s: float = _OVERDUE_S) -> None:
         self._by = by
-        self._nodes = {name: _Node(heard_s=start_s) for name in nodes}
+        self._nodes = {name: _Node(beat_s=start_s) for name in nodes}
         self._next_request = first_request
         self._overdue_s = overdue_s
         self._strangers: tuple[str, ...] = ()
@@ -99,15 +98,15 @@ class RespawnCore:
     # -- orders ---------------------------------------------------------------------------------
 
     def order(self, nodes: Iterable[str], now_s: float, *, renewed: bool) -> bool:
-        """Have nodes respawned: all that are named and not on their way already.
+        """Request the nodes that are not requested already.
 
         Args:
-            nodes: names, each perhaps with the incarnation that is wrong, `NAME#INCARNATION`.
-            now_s: now.
-            renewed: it is a new order, so that what was given up is to be tried again.
+            nodes: Names, perhaps with the accused incarnation, `NAME#INCARNATION`.
+            now_s: Present time.
+            renewed: Whether it is a new order, which also requests nodes that were given up.
 
         Returns:
-            Whether there was anything to ask for.
+            Whether there is a new request.
         """
         requests = len(self._requests)
         named = tuple(map(accused, nodes))
@@ -133,29 +132,29 @@ class RespawnCore:
         requests, self._requests = self._requests, []
         return requests
 
-    # -- what is heard --------------------------------------------------------------------------
+    # -- events ---------------------------------------------------------------------------------
 
     def beat(self, name: str, incarnation: int, stamp_s: float, now_s: float) -> None:
-        """Take note of a heartbeat sent at `stamp_s`."""
+        """Note a heartbeat sent at `stamp_s`."""
         node = self._nodes.get(name)
         if node is None or incarnation < node.incarnation:
             return
         if incarnation == node.incarnation and stamp_s <= node.gone_s:
-            return  # sent before it died, and under way since
-        node.incarnation, node.heard_s, node.gone_s = incarnation, now_s, -math.inf
-        # A heartbeat that was under way when the order came proves nothing.
+            return  # sent before it died
+        node.incarnation, node.beat_s, node.gone_s = incarnation, now_s, -math.inf
+        # A heartbeat that was sent before the order proves nothing.
         if node.stage in (Stage.ASKED, Stage.STARTED, Stage.FAILED) \
                 and incarnation > node.failed_incarnation and stamp_s >= node.asked_s:
             node.stage = Stage.BACK
 
     def event(self, name: str, event: str, incarnation: int, detail: str, now_s: float) -> None:
-        """Take note of what the supervisor has published of a process."""
+        """Note an event of a process that the supervisor has published."""
         node = self._nodes.get(name)
         if node is None:
             return
         if incarnation > node.incarnation:
-            # Not heard yet, but not overdue either.
-            node.incarnation, node.heard_s, node.gone_s = incarnation, now_s, -math.inf
+            # No heartbeat yet, but not overdue.
+            node.incarnation, node.beat_s, node.gone_s = incarnation, now_s, -math.inf
         if event in _LOST and incarnation == node.incarnation:
             node.gone_s = now_s
             if incarnation > node.failed_incarnation and node.stage in _WAITING:
@@ -169,22 +168,22 @@ class RespawnCore:
             node.problem = f"{name}: {event}{f', {detail}' if detail else ''}"
 
     def retry(self, now_s: float) -> None:
-        """Repeat unanswered requests; ask again for a new process without a heartbeat."""
+        """Repeat unanswered requests; request a new process without a heartbeat again."""
         for name, node in self._nodes.items():
             if node.stage is Stage.ASKED:
                 self._request(name, node)
             elif node.stage is Stage.STARTED and now_s - node.started_s >= _START_TIMEOUT_S:
                 self._ask(name, node, now_s)
 
-    # -- how it stands --------------------------------------------------------------------------
+    # -- state ----------------------------------------------------------------------------------
 
     def accuse(self, name: str) -> str:
-        """Return a node with its newest incarnation, to be respawned though it is well."""
+        """Return a working node with its newest incarnation, to have it respawned."""
         return f"{name}#{self._nodes[name].incarnation}"
 
     @property
     def pending(self) -> tuple[str, ...]:
-        """Nodes that are ordered and neither back nor given up."""
+        """Nodes that are requested and neither back nor given up."""
         return tuple(name for name, node in self._nodes.items() if node.stage in _WAITING)
 
     @property
@@ -201,7 +200,7 @@ class RespawnCore:
         return "; ".join(problems)
 
     def _has_failed(self, node: _Node, now_s: float) -> bool:
-        return node.gone_s > -math.inf or now_s - node.heard_s >= self._overdue_s
+        return node.gone_s > -math.inf or now_s - node.beat_s >= self._overdue_s
 
     def _ask(self, name: str, node: _Node, now_s: float, wrong: int = 0) -> None:
         failed = node.incarnation if self._has_failed(node, now_s) else node.incarnation - 1
@@ -223,7 +222,7 @@ def accused(node: str) -> tuple[str, int]:
 
 
 class Respawn(RecoveryModule):
-    """Has the supervisor respawn the nodes that a command names, and waits until they are heard."""
+    """Has the supervisor respawn the nodes of a command, and waits for their heartbeats."""
 
     class Parameters(RecoveryModule.Parameters, frozen=True):
         """What it is for.
@@ -241,7 +240,7 @@ class Respawn(RecoveryModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        # A node that is silent for long enough to be reported is overdue here as well.
+        # A node that is reported as silent is overdue here as well.
         overdue_s = min(_OVERDUE_S, _OVERDUE * context.run.system.timing.heartbeat_timeout_s)
         self._core = RespawnCore(
             self.name, self.parameters.nodes,
@@ -256,18 +255,18 @@ class Respawn(RecoveryModule):
         return super().names(topic, name, parameters)
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Ask for the nodes that the command names."""
+        """Request the nodes of the command."""
         if self._core.order(command.nodes, self.clock.now(), renewed=renewed):
             self._send_requests()
             self.resume(command.reason)
         self._settle()
 
     def let_go(self) -> None:
-        """Forget the nodes: they are back, or no longer this module's concern."""
+        """Forget the nodes."""
         self._core.release()
 
     def repeat(self) -> None:
-        """Repeat what the supervisor has not answered."""
+        """Repeat the requests that the supervisor has not answered."""
         if self.activated:
             self._core.retry(self.clock.now())
             self._settle()
@@ -278,13 +277,13 @@ class Respawn(RecoveryModule):
 
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, _message: Heartbeat, header: Header) -> None:
-        """Note that a node works."""
+        """Note a heartbeat."""
         self._core.beat(header.source, header.incarnation, header.stamp, self.came_s(header))
         self._settle()
 
     @on(topics.PROCESS_EVENT)
     def process_event(self, message: ProcessEvent, _header: Header) -> None:
-        """Note what the supervisor did."""
+        """Note an event of the supervisor."""
         self._core.event(message.node, message.event, message.incarnation, message.detail,
                          self.clock.now())
         self._settle()

@@ -1,7 +1,7 @@
-"""`RespawnGroup`: respawn a node and those that depend on it, one after the other.
+"""`RespawnGroup`: respawn a node and its dependents in order.
 
-After the supervision strategies "rest for one" and "one for all" of Erlang/OTP: a node whose state
-came from another one is not to be trusted when that one was wrong.
+These are the supervision strategies "rest for one" and "one for all" of Erlang/OTP. If a node was
+wrong, the states that others derived from its messages are not trusted.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from rampart.actors.runtime.actor import Context
 
 
 class RespawnGroup(Respawn):
-    """Has nodes respawned in the order of its list, each when the one before is heard again.
+    """Has nodes respawned in the order of its list, each when the one before is back.
 
-    States: of `RecoveryModule`. It is acting until the last node is back; a node that does not come
-    back fails it, and those after that node are left alone.
+    It is acting until the last node is back. If a node does not come back, it fails, and leaves the
+    later nodes alone.
     """
 
     class Parameters(Respawn.Parameters, frozen=True):
-        """Which nodes, and which of them go together.
+        """Nodes, and which others to respawn with one of them.
 
         Attributes:
-            others: "later": with a node those that stand after it in `nodes`; "all": all of them.
+            others: "later": those after it in `nodes`; "all": all of them.
         """
 
         others: Literal["later", "all"] = "later"
@@ -37,7 +37,7 @@ class RespawnGroup(Respawn):
         self._first = len(self.parameters.nodes)
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Begin with the first of the nodes that the command names."""
+        """Begin with the first node of the command."""
         nodes = self.parameters.nodes
         named = dict(map(accused, command.nodes))
         known = [i for i, name in enumerate(nodes) if name in named]
@@ -54,7 +54,7 @@ class RespawnGroup(Respawn):
         self._settle()
 
     def let_go(self) -> None:
-        """Leave alone those that were not respawned yet."""
+        """Leave the remaining nodes alone."""
         self._first, self._waiting = len(self.parameters.nodes), []
         super().let_go()
 

@@ -1,4 +1,4 @@
-"""A recovery module that takes its time and does nothing."""
+"""Stand-in for a recovery module, which only takes time."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class StubRecovery(RecoveryModule):
     """Acts for a while, and then ends as its parameters specify."""
 
     class Parameters(RecoveryModule.Parameters, frozen=True):
-        """What it does.
+        """Duration and result.
 
         Attributes:
-            takes_s: from order to end, s.
-            ends: phase in which.
+            takes_s: time from order to end, s.
+            ends: phase at the end.
         """
 
         takes_s: NonNegative = 0.1
@@ -32,7 +32,7 @@ class StubRecovery(RecoveryModule):
         self._timer: Timer | None = None
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:  # noqa: ARG002
-        """Begin, unless it is under way."""
+        """Begin, unless it acts already."""
         if renewed or (self.phase is RecoveryPhase.ACTING and self._timer is None):
             self._timer = self.call_later(self.parameters.takes_s, self._finish)
 
@@ -46,4 +46,4 @@ class StubRecovery(RecoveryModule):
         self._timer = None
         if self.phase is RecoveryPhase.ACTING:
             ends = RecoveryPhase(self.parameters.ends)
-            self._end(ends, "its parameters say so" if ends is RecoveryPhase.FAILED else "")
+            self._end(ends, "as its parameters specify" if ends is RecoveryPhase.FAILED else "")

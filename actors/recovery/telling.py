@@ -1,6 +1,6 @@
-"""`Hold` and `Call`: recoveries that consist of messages to a node.
+"""`Hold` and `Call`: recoveries that send messages to a node.
 
-The messages are data of the specification, checked against the topic's type before anything runs.
+The messages are data of the specification. They are checked against the topic's type at load.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from rampart.manager.spec.tables import NonNegative, Positive
 Value = str | bool | float
 
 
-class _Telling(RecoveryModule):
-    """Publishes messages that its parameters contain."""
+class _Messaging(RecoveryModule):
+    """Publishes messages from its parameters."""
 
     class Parameters(RecoveryModule.Parameters, frozen=True, kw_only=True):
-        """Where they are published.
+        """Topic of the messages.
 
         Attributes:
             topic: key of the topic.
@@ -44,27 +44,27 @@ class _Telling(RecoveryModule):
         super().__init__(context)
         self._topic = self.chosen_topic(self.parameters.topic)
 
-    def _say(self, fields: dict[str, Any]) -> None:
+    def _publish_fields(self, fields: dict[str, Any]) -> None:
         message: msgspec.Struct = msgspec.convert(fields, self._topic.type)
         self.publish(self._topic, message, name=self._topic.member(self.parameters.topic) or None)
 
 
-class Hold(HeldRecovery, _Telling):
+class Hold(HeldRecovery, _Messaging):
     """Repeats a message while it is in force, and publishes another one when it ends.
 
-    States: acting until the message is confirmed, then degraded; at once without `confirm`.
-    A confirmation that is lost and does not come back within the deadline is a failure.
+    It is acting until the message is confirmed, and then degraded; without `confirm` at once. It
+    fails if a lost confirmation does not come back within the deadline.
     """
 
-    class Parameters(_Telling.Parameters, frozen=True, kw_only=True):
-        """What is published when, and how it is known to be obeyed.
+    class Parameters(_Messaging.Parameters, frozen=True, kw_only=True):
+        """Messages and confirmation.
 
         Attributes:
-            message: its fields; those left out have their defaults.
-            repeat_s: how often the message is repeated, s.
-            back: fields of the message that is published when it is released; none if left out.
-            confirm: where it shows that the message is obeyed, as "topic:field".
-            equals: value of that field when it is.
+            message: fields of the message; others have their defaults.
+            repeat_s: period of the message, s.
+            back: fields of the message on release; none if left out.
+            confirm: field that confirms the message, as "topic:field".
+            equals: value of that field that confirms it.
         """
 
         message: MessageOf
@@ -88,30 +88,30 @@ class Hold(HeldRecovery, _Telling):
             self.hear_field(self.parameters.confirm, self._confirmed)
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Publish the message, and repeat it from now on."""
+        """Publish the message and repeat it."""
         super().act(command, renewed=renewed)
         if not self.parameters.confirm:
-            self.degrade(f"{self.parameters.topic} is told")
+            self.degrade(f"published on {self.parameters.topic}")
         if self._repetition is None:
             self._again_later()
 
     def let_go(self) -> None:
-        """Publish the end, and the message no more."""
+        """Publish the end, and stop the message."""
         if self._repetition is not None:
             self._repetition.cancel()
             self._repetition = None
         super().let_go()
 
     def repeat(self) -> None:
-        """Repeat the end for a while; the message has a period of its own."""
+        """Repeat only the end, since the message has its own period."""
         if not self.activated:
             super().repeat()
 
     def give(self, in_force: bool, why: str) -> None:  # noqa: ARG002
-        """Publish the message, or the one for the end."""
+        """Publish the message, or the one on release."""
         message = self.parameters.message if in_force else self.parameters.back
         if message is not None:
-            self._say(message)
+            self._publish_fields(message)
 
     def _again_later(self) -> None:
         self._repetition = self.call_later(self.parameters.repeat_s, self._again)
@@ -125,24 +125,24 @@ class Hold(HeldRecovery, _Telling):
                      reason=f"{self.parameters.confirm} is {value}")
 
 
-class Call(_Telling):
-    """Publishes commands, each when the one before was answered; done with the last answer.
+class Call(_Messaging):
+    """Publishes commands in order, each when the one before was answered.
 
-    As a node of ROS 2 with a life cycle is restarted: deactivate, clean up, configure, activate.
-    States: acting until the last answer, then done. A command is repeated until it is answered, so
-    a node has to take it as one if it comes twice. Without repetition each answer counts: one that
-    refuses is a failure, unless the command was one `that_may_fail`.
+    Example: restart a ROS 2 node with a life cycle by deactivate, clean up, configure, activate. It
+    is acting until the last answer, and then done. A command is repeated until it is answered, so
+    the node must accept it twice. Without repetition each answer counts, and a refusal is a failure
+    unless the command is in `that_may_fail`.
     """
 
-    class Parameters(_Telling.Parameters, frozen=True, kw_only=True):
-        """Which commands, and which answers.
+    class Parameters(_Messaging.Parameters, frozen=True, kw_only=True):
+        """Commands and answers.
 
         Attributes:
             messages: fields of the commands, in order.
-            answer: where the answer shows, as "topic:field".
-            equals: value of that field when a command has been carried out.
-            repeat_s: after how long without that answer a command is repeated, s; 0: never.
-            that_may_fail: places of commands, from 0, that may be refused.
+            answer: field with the answer, as "topic:field".
+            equals: value of that field after a command was carried out.
+            repeat_s: period of a command without that answer, s; 0 for no repetition.
+            that_may_fail: indices of commands, from 0, that may be refused.
         """
 
         messages: MessagesOf
@@ -161,7 +161,7 @@ class Call(_Telling):
         self.hear_field(self.parameters.answer, self._answered)
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Begin, once for each order."""
+        """Begin, once per order."""
         if renewed:
             self.resume(command.reason)
         if renewed or self._at < 0:
@@ -169,14 +169,14 @@ class Call(_Telling):
             self._next()
 
     def let_go(self) -> None:
-        """Begin again with the next order; nothing is to be taken back."""
+        """Forget the commands; none is taken back."""
         self._at = -1
 
     def unfinished(self) -> str:
-        """Name the command that was not answered."""
-        told = self.parameters
-        return (f"number {self._at + 1} of {len(told.messages)} on {told.topic} was not answered: "
-                f"{told.answer} is not {told.equals}")
+        """Name the command without an answer."""
+        chosen = self.parameters
+        return (f"command {self._at + 1} of {len(chosen.messages)} on {chosen.topic} has no "
+                f"answer: {chosen.answer} is not {chosen.equals}")
 
     def _next(self) -> None:
         self._at += 1
@@ -190,16 +190,16 @@ class Call(_Telling):
         if self._repetition is not None:
             self._repetition.cancel()
         if self.phase is RecoveryPhase.ACTING:
-            self._say(self.parameters.messages[self._at])
+            self._publish_fields(self.parameters.messages[self._at])
             if self.parameters.repeat_s:
                 self._repetition = self.call_later(self.parameters.repeat_s, self._give)
 
     def _answered(self, value: Any, header: Header) -> None:
-        told = self.parameters
+        chosen = self.parameters
         if self.phase is not RecoveryPhase.ACTING or header.stamp < self._given_s:
             return
-        if value == told.equals or self._at in told.that_may_fail:
+        if value == chosen.equals or self._at in chosen.that_may_fail:
             self._next()
-        elif not told.repeat_s:
-            self.fail(f"number {self._at + 1} of {len(told.messages)} on {told.topic}: "
-                      f"{told.answer} is {value}")
+        elif not chosen.repeat_s:
+            self.fail(f"command {self._at + 1} of {len(chosen.messages)} on {chosen.topic}: "
+                      f"{chosen.answer} is {value}")

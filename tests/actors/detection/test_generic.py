@@ -236,7 +236,7 @@ def levels(*heights: float, topic: Any = LEVEL) -> list[tuple[float, Any, Any]]:
     "and well again": ((3, 3, 1, 1, 1, 1), {"above": 2.0}, [(0.1, "3 is above 2"), (0.5, "")]),
     "below": ((1, -1, -1), {"below": 0.0}, [(0.2, "-1 is below 0")]),
     "outside": ((1, 1, 9), {"below": 0.0, "above": 8.0}, [(0.3, "9 is above 8")]),
-    "no number": ((1, math.nan), {"above": 2.0}, [(0.2, "nan is no number")]),
+    "no number": ((1, math.nan), {"above": 2.0}, [(0.2, "nan is not finite")]),
     "its sign does not matter": ((1, -3), {"above": 2.0, "absolute": True},
                                  [(0.2, "3 is above 2")]),
     "on the limit": ((2, 2), {"above": 2.0, "below": 2.0 - 1e-6}, []),
@@ -282,7 +282,7 @@ def test_two_of_three_have_to_agree():
     script = sorted([*levels(1, 1, 1, 1, 1), *levels(1, 1, 5, 5, 5, topic=SECOND),
                      *levels(1, 1, 1, 9, 9, topic=THIRD)], key=lambda e: e[0])
     found = reports(Vote, script, 1.0, values=fields, agree=2, within=0.5, for_s=0.0)
-    assert found[-1] == (0.4, "active", "1 of 3 agree, 2 have to: tank/second:height_m is 5, "
+    assert found[-1] == (0.4, "active", "1 of 3 agree, expected 2: tank/second:height_m is 5, "
                          "tank/third:height_m is 9")
     assert [state for _, state, _ in found] == ["idle", "active"]
 
@@ -296,7 +296,7 @@ def test_a_pump_that_leaves_out_a_step():
                     busy_until="tank/pump:busy_until_s")
     assert [(at_s, state) for at_s, state, _ in found] == [
         (0.0, "idle"), (0.2, "active"), (0.4, "idle"), (2.0, "active")]
-    assert found[1][2] == "tank/pump:phase is 'draining' after 'idle'; right is 'filling'"
+    assert found[1][2] == "tank/pump:phase is 'draining' after 'idle', expected 'filling'"
 
 
 def test_a_list_that_is_too_short_for_a_parameter_s_index_is_reported():
@@ -338,8 +338,8 @@ def test_suspects_are_named_by_the_incarnation_that_was_heard(kind, parameters, 
     (Threshold, {"value": "tank", "above": 1.0}, "value = 'tank'"),
     (Rate, {"topic": "a"}, "at_least_hz: missing"),
     (Rate, {"topic": "a", "at_least_hz": 5.0, "at_most_hz": 5.0}, "at_most_hz = 5.0: must be"),
-    (Vote, {"values": ["a:b", "c:d"], "agree": 3}, "agree = 3: there are 2 values only"),
-    (Progress, {"value": "a:b", "steps": [{"at": "x"}, {"at": "x"}]}, "'x' stands twice"),
+    (Vote, {"values": ["a:b", "c:d"], "agree": 3}, "agree = 3: there are only 2 values"),
+    (Progress, {"value": "a:b", "steps": [{"at": "x"}, {"at": "x"}]}, "'x' is listed twice"),
     (Progress, {"value": "a:b", "steps": [{"at": "x", "to": ["z"]}, {"at": "y"}]},
      "'x' leads to 'z', which is not a step"),
     (ProcessUsage, {"watch": ["a"]}, "memory_mb: missing"),

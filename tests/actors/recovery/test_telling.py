@@ -212,7 +212,7 @@ async def test_a_refused_call_is_a_failure_unless_it_may_be_refused(given):
     system.say(VALVE, Valve(False))
     await system.settle()
     assert case.phase == "failed"
-    assert "number 2 of 3 on tank/order: tank/valve:shut is False" in (
+    assert "command 2 of 3 on tank/order: tank/valve:shut is False" in (
         case.reports[-1].message.reason)
 
 
