@@ -1,10 +1,9 @@
-"""Runs with a common beginning: it is made once, and forked where each of them departs from it.
+"""Runs with a common beginning, which is made once and forked where a run departs from it.
 
-Up to its first fault a run is the run without faults, whatever the fault will be: same system,
-options and seed, same messages. So a worker runs that, and forks itself in the moment of each
-first fault. The child goes on as that run and sends its result through a pipe; the worker waits
-for it, so there is one busy process per worker, and then goes on to the next. A child that fails,
-is killed or does not end is one run that failed.
+Until its first fault a run equals the run without faults: same system, options, seed and messages.
+So a worker makes that run, and forks at each first fault. The child continues as that run and sends
+its result through a pipe. The worker waits for it, so each worker has one busy process, and then
+continues to the next fault. A child that fails, is killed or does not end is one failed run.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from rampart.sim.campaign.job import Job, RunResult, result_of, run_job, virtual
 from rampart.sim.virtual.virtual_loop import fork
 
 LONGEST_S = 3600.0
-"""A branch that has not ended after this time does not end."""
+"""Longest time of a branch; one that takes longer counts as hung."""
 
 AT_MOST = 25
-"""Runs that a worker makes at a time: their results come when all of them are there."""
+"""Most runs in a group of a worker, which returns their results together."""
 
 
 class Attempt(NamedTuple):
-    """What came of a job: its key, and the result or, in one line, why there is none."""
+    """Key of a job, and its result, or an error in one line."""
 
     key: str
     result: RunResult | None
@@ -38,7 +37,7 @@ class Attempt(NamedTuple):
 
 
 def attempt(job: Job) -> Attempt:
-    """Make a run from its start; errors travel as text, since not all of them can be pickled."""
+    """Make a run from its start; an error is returned as text, since not all can be pickled."""
     try:
         return Attempt(job.key, run_job(job))
     except Exception as error:
@@ -50,7 +49,7 @@ def together(jobs: Sequence[Job], workers: int) -> list[list[Job]]:
 
     Args:
         jobs: With different keys.
-        workers: Among which the groups are shared: enough of them for none to be idle for long.
+        workers: Number of workers; there are enough groups to keep all busy.
     """
     beginnings: dict[bytes, list[Job]] = {}
     for job in jobs:
@@ -58,7 +57,7 @@ def together(jobs: Sequence[Job], workers: int) -> list[list[Job]]:
     size = max(1, min(AT_MOST, len(jobs) // (4 * workers)))
     found = []
     for group in beginnings.values():
-        group.sort(key=_first_moment)  # so that most groups need not go far
+        group.sort(key=_first_moment)  # so most groups end early
         found += [group[i:i + size] for i in range(0, len(group), size)]
     return found
 
@@ -68,15 +67,15 @@ def attempt_together(jobs: Sequence[Job], campaign: int) -> list[Attempt]:
 
     Args:
         jobs: A group of `together`.
-        campaign: Process id of the campaign, without which there is nothing to go on for.
+        campaign: Process id of the campaign; without it a worker ends.
     """
     made = _Beginning(jobs, campaign).attempts() if len(jobs) > 1 else {}
-    # What could not depart, because of threads for example, or has no sound plan.
+    # Without a branch, because of threads for example, or of an invalid plan: from the start.
     return [made.get(number) or attempt(job) for number, job in enumerate(jobs)]
 
 
 def _beginning(job: Job) -> bytes:
-    """Return what runs have in common until their first fault; those without any are alone."""
+    """Return what runs have in common until their first fault; runs without faults are alone."""
     row = "" if job.faults else job.key
     return msgspec.msgpack.encode(
         msgspec.structs.replace(job, row=row, faults=()), order="deterministic")
@@ -95,7 +94,7 @@ def _no_result(job: Job, why: str) -> Attempt:
 
 
 class _Beginning:
-    """The common beginning of some runs, and in a child the run that has departed from it."""
+    """The common beginning of some runs, and in a child the run that departs from it."""
 
     def __init__(self, jobs: Sequence[Job], campaign: int) -> None:
         self._jobs = jobs
@@ -107,10 +106,10 @@ class _Beginning:
         self._begun_s = 0.0
 
     def attempts(self) -> dict[int, Attempt]:
-        """Return what came of those that have departed, by number; in a child it does not return.
+        """Return the attempts of the branches, by number; in a child it does not return.
 
-        The loop runs on in the child as well, so all that is above it on the stack does, too. An
-        interrupt may come in the very moment of the fork: whoever is another process ends here.
+        The loop continues in the child, and so does everything above it on the stack. An interrupt
+        may arrive during the fork, so each process other than the worker ends here.
         """
         worker = os.getpid()
         try:
@@ -130,7 +129,7 @@ class _Beginning:
         """Fork; return true in the child, and in the parent false when the child has ended."""
         if os.getpid() != self._campaign != os.getppid():
             os._exit(1)
-        if threading.active_count() > 1:  # of which a child has only this one
+        if threading.active_count() > 1:  # a child has only the forking one
             return False
         receiving, sending = os.pipe()
         try:
@@ -154,7 +153,7 @@ class _Beginning:
 
 
 def _received(job: Job, child: int, receiving: int) -> Attempt:
-    """Return what a child sends of its run; it is gone then."""
+    """Return the attempt of a child, and reap it."""
     poll, until_s, data = select.poll(), time.monotonic() + LONGEST_S, b""
     poll.register(receiving)
     with os.fdopen(receiving, "rb", buffering=0) as pipe:

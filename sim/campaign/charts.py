@@ -1,8 +1,7 @@
-"""Distributions as histograms, one lane per kind of fault, on one axis: geometry to draw. Pure.
+"""Geometry of histograms, one lane per kind of fault, on one axis. Pure.
 
-A lane's bars are scaled to its own tallest, since a kind with few runs is as interesting as one
-with many; how many runs a bar stands for is in its title. Values beyond an end of the axis are
-counted in the outermost bar, and the axis says so.
+The bars of each lane are scaled to its tallest one, so kinds with few runs are visible, too. The
+title of a bar has its number of runs. The outermost bar also counts values beyond the axis.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from rampart.sim.runs.report import MINUS, margin_text
 from rampart.sim.runs.trial import Trial
 
 WIDTH = 520.0
-"""Of the drawing, in its own units; text is 14 of them high."""
+"""Of the drawing, in its own units; text is 14 high."""
 
 _SIDE, _LANE, _TEXT, _BARS, _FOOT = 8.0, 62.0, 20.0, 32.0, 26.0
 _LEAST_HEIGHT = 2.0
-"""A single run among a thousand must be seen."""
+"""A single run among a thousand must be visible."""
 
 _PER_DECADE = 8
 _LEAST_S = 1e-3
-"""Messages take about as long; below it is one bar."""
+"""About the delay of a message; shorter times share one bar."""
 
 _MARGIN_BINS, _MARGIN_TICKS = 20, 2
 """Between 0 and the end of an axis of margins."""
@@ -45,8 +44,8 @@ class Value:
 class Axis:
     """Edges of the bins, one more than bins, and the labels at some of the edges.
 
-    `scale` maps the edges to a line on which all bins are equally wide; `open_ended` tells that
-    the outermost bins stand for all that is beyond.
+    `scale` maps the edges to a line on which all bins are equally wide. With `open_ended` the
+    outermost bins also count the values beyond.
     """
 
     edges: tuple[float, ...]
@@ -56,7 +55,7 @@ class Axis:
     open_ended: bool = False
 
     def place(self, value: float) -> float:
-        """Return where a value is drawn, between the ends of the axis."""
+        """Return the position of a value, between the ends of the axis."""
         low, high = self.scale(self.edges[0]), self.scale(self.edges[-1])
         at = self.scale(min(max(value, self.edges[0]), self.edges[-1]))
         return _SIDE + (WIDTH - 2 * _SIDE) * (at - low) / (high - low)
@@ -124,12 +123,12 @@ def time_axis(values: Sequence[float]) -> Axis:
 
 
 def margin_axis(values: Sequence[float], high: float | None, unit: str) -> Axis:
-    """Return an axis of margins with one more bin at either end for what is beyond.
+    """Return an axis of margins with an additional bin at each end for values beyond.
 
     Args:
-        values: that are to be shown.
-        high: up to where; None for a round number that no value exceeds.
-        unit: of both.
+        values: The values to show.
+        high: Upper end; None for a round number that no value exceeds.
+        unit: Of both.
     """
     if high is None:
         largest = max(*values, 1e-3)
@@ -153,7 +152,7 @@ def margin_axis(values: Sequence[float], high: float | None, unit: str) -> Axis:
 
 def chart(title: str, words: str, axis: Axis,
           lanes: Sequence[tuple[str, Sequence[Value], str]]) -> Chart:
-    """Return the chart of some lanes: label, values, and what is to be said beside the label."""
+    """Return the chart of some lanes: label, values, and text beside the label."""
     drawn = tuple(_lane(i * _LANE, axis, *lane) for i, lane in enumerate(lanes))
     axis_y = len(drawn) * _LANE
     ends = {axis.edges[0]: "start", axis.edges[-1]: "end"}

@@ -1,9 +1,8 @@
-"""What goes into a run besides its job: the system's files and code, as one digest.
+"""Digest of the system's files and code, the content of a run besides its job.
 
-A stored result stands for a run only as long as all of it is the same. So the digest is part of
-the job, and with it of the key under which the result is found again. It covers the specification
-as it was read, the application's files, files that specification and options name, the code of the
-packages of the system's own classes, and the engine.
+A stored result is valid only for the same content. So the digest is part of the job, and of the key
+of the result. It covers the specification, the application's files, files that specification and
+options name, the code of the packages of the system's own classes, and the engine.
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ _DIGITS = 16
 
 
 def with_content(jobs: Iterable[Job]) -> list[Job]:
-    """Return jobs with the digest of what goes into them today.
+    """Return jobs with their present digest.
 
     Raises:
-        ValueError: a system or its options make no sense, or a file cannot be read.
+        ValueError: A system or its options are invalid, or a file cannot be read.
     """
     found: dict[bytes, str] = {}
     made = []
@@ -47,7 +46,7 @@ def with_content(jobs: Iterable[Job]) -> list[Job]:
 
 
 def content_of(job: Job) -> str:
-    """Return the digest of what goes into a job's run; raises as `with_content`."""
+    """Return the digest for a job; raises as `with_content`."""
     file, document = read_document_of(job.system)
     spec = check_document(document, file)
     application = application_of_job(job)
@@ -71,7 +70,7 @@ def content_of(job: Job) -> str:
 
 @cache
 def _engine() -> str:
-    """Return the version of the engine, and a digest of its code."""
+    """Return a digest of the engine's version and code."""
     root = Path(rampart.__file__).parent
     digest = hashlib.sha256(version("rampart-robot").encode())
     for room in _ENGINE_ROOMS:
@@ -82,7 +81,7 @@ def _engine() -> str:
 
 
 def _named(value: Any, beside: Path) -> Iterator[Path]:
-    """Yield the files that texts name, from the working folder or beside the specification."""
+    """Yield files named by texts, in the working folder or beside the specification."""
     if isinstance(value, str) and 0 < len(value) <= _LONGEST_NAME and "\0" not in value:
         yield from (path for path in (Path(value), beside / value) if path.is_file())
     elif isinstance(value, dict):
@@ -92,7 +91,7 @@ def _named(value: Any, beside: Path) -> Iterator[Path]:
 
 
 def _sources(modules: Iterable[str]) -> set[Path]:
-    """Return the code of modules of the user's own: their packages, or the files beside them."""
+    """Return the code of the user's modules: their packages, or the files beside them."""
     found: set[Path] = set()
     for top in {name.partition(".")[0] for name in modules} - {"rampart"}:
         spec = importlib.util.find_spec(top)

@@ -15,7 +15,7 @@ from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import Store
 
 CONNECT_TIMEOUT_S = 10.0
-"""For reaching a cluster."""
+"""Longest time to connect to a cluster."""
 
 _ROUNDS = 4
 
@@ -32,23 +32,23 @@ class JobError(RuntimeError):
 
 def execute(jobs: Sequence[Job], store: Store, *, workers: int = 0, backend: str = "loky",
             address: str = "", progress: Progress = lambda _job, _result: None) -> int:
-    """Run the jobs that are not in the store yet and keep each result as it comes.
+    """Run the jobs that are not in the store yet, and store each result as it arrives.
 
     Args:
-        jobs: Those with the same key are run once.
-        store: Where results are kept, one transaction each: whenever this process ends, what was
-            finished is there, and the next call goes on with the rest.
+        jobs: Jobs with the same key are run once.
+        store: Gets each result in its own transaction. So whenever this process ends, the next call
+            continues with the rest.
         workers: Processes; 0 for one per core, or all of the cluster.
         backend: See `BACKENDS`.
         address: Of the cluster's scheduler.
-        progress: Called after each run that was made.
+        progress: Called after each run.
 
     Returns:
-        How many runs were made.
+        The number of runs made.
 
     Raises:
-        BackendError: The backend is not installed, or there is no cluster at the address.
-        JobError: A job makes no sense, or failed; all others were run.
+        BackendError: The backend is not installed, or no cluster answers at the address.
+        JobError: A job is invalid, or failed; all others were run.
     """
     done = store.keys()
     waiting = {job.key: job for job in jobs if job.key not in done}
@@ -71,7 +71,7 @@ def execute(jobs: Sequence[Job], store: Store, *, workers: int = 0, backend: str
 
 
 def _attempts(jobs: list[Job], workers: int, backend: str) -> Iterator[Attempt]:
-    """Yield what came of jobs, each as soon as it can be had."""
+    """Yield the attempts of jobs as soon as possible."""
     if backend == "loky":
         count = min(workers or os.cpu_count() or 1, len(jobs))
         groups = together(jobs, count)
@@ -79,13 +79,13 @@ def _attempts(jobs: list[Job], workers: int, backend: str) -> Iterator[Attempt]:
                 joblib.delayed(attempt_together)(group, os.getpid()) for group in groups):
             yield from made
         return
-    # A cluster's workers have threads, and cannot fork: there each run is made from its start.
+    # Workers of a cluster have threads and cannot fork, so each run is made from its start.
     count = workers or -1
     attempts = [joblib.delayed(attempt)(job) for job in jobs]
     if backend != "ray":
         yield from _parallel(count)(attempts)
         return
-    # Ray's backend returns nothing before it has all, so it gets a handful at a time.
+    # Ray's backend returns all results together, so it gets few jobs at a time.
     some = _ROUNDS * joblib.effective_n_jobs(count)
     for start in range(0, len(attempts), some):
         yield from joblib.Parallel(n_jobs=count, batch_size=1)(attempts[start:start + some])

@@ -1,7 +1,7 @@
-"""One run of a campaign: what it is, how it is run, and what is kept of it.
+"""One run of a campaign: its job, its execution, its result.
 
-A job is data. The same job gives the same result on any machine of the same architecture, so a
-result is known by its job's key, and a run is repeated by running its job again.
+A job is data. The same job gives the same result on any machine of the same architecture. So the
+key of a job identifies its result, and running the job again repeats the run.
 """
 
 from __future__ import annotations
@@ -41,19 +41,18 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """One run.
 
     Attributes:
-        row: Name of the row of the table that it counts for.
+        row: Name of its row of the table.
         system: Shipped system by name, or path of a spec.
         retuned: Changes to recoveries, detections and mechanisms before the run: name → fields.
         strategy: Of the manager; empty for the spec's.
-        options: Of the system's application; those left out are the spec's.
+        options: Of the system's application; others are the spec's.
         ftm: False for the unprotected baseline.
-        network: What lies between the nodes.
-        faults: What goes wrong.
-        seed: Of everything random.
+        network: Name of the network between the nodes.
+        faults: The planned faults.
+        seed: Of all random numbers.
         patience_s: See `PATIENCE_S`.
-        duration_s: How long a run without a mission takes; None for what the spec says.
-        content: Digest of what else goes into the run, see `rampart.sim.campaign.content`; a
-            result that is stored for another one is none of this job.
+        duration_s: Duration of a run without a mission; None for the spec's.
+        content: Digest of files and code, see `rampart.sim.campaign.content`.
     """
 
     row: str
@@ -71,17 +70,17 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
     @property
     def key(self) -> str:
-        """Short name by which the run is known; it does not depend on the row."""
+        """Short name of the run; it does not depend on the row."""
         return hashlib.sha256(msgspec.msgpack.encode(
             msgspec.structs.replace(self, row=""), order="deterministic")).hexdigest()[:12]
 
     def text(self) -> str:
-        """Return what goes wrong in it, in words."""
+        """Return its faults for people."""
         return ", ".join(fault.text() for fault in self.faults) or "no fault"
 
 
 class DecisionTaken(msgspec.Struct, frozen=True, array_like=True):
-    """A decision of the manager: when, for whom, what."""
+    """A decision of the manager."""
 
     t_s: float
     active: tuple[str, ...]
@@ -89,28 +88,27 @@ class DecisionTaken(msgspec.Struct, frozen=True, array_like=True):
 
 
 class RunResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What is kept of a run. Times are simulated seconds.
+    """Result of a run. Times are simulated seconds.
 
     Attributes:
-        success: The judge found its task done.
-        safe: The judge found it safe all the time, and had the ground truth to know it by.
+        success: Whether the judge found the task done.
+        safe: Whether the judge, by ground truth, found the run safe all the time.
         reasons: Why not.
         duration_s: Length of the run.
         margins: See `Judgement`, as the next two.
         severity: How unsafe it was.
         unsafe_s: When it first became unsafe.
-        injected_s: When the first fault that had an effect was injected.
-        detected_after_s: From then to the first detection.
-        recovered_after_s: From then to the moment when nothing was left to recover.
+        injected_s: When the first effective fault was injected.
+        detected_after_s: Time from then to the first detection.
+        recovered_after_s: Time from then until no recovery was active.
         false_alarms: Detections before any fault.
-        stopped_for_good: The mission failed and the robot was safe.
-        decisions: All of them.
-        outcomes: What became of the faults.
+        decisions: All decisions of the manager.
+        outcomes: Effects of the faults.
         failures: Actors that ended by an error.
-        trace: Hash over every message.
-        wall_s: How long it took; of a run that departed from others, since then.
-        judged: Whether there was a judge; without one success and safety say nothing.
-        restarts: Of all nodes.
+        trace: Hash over all messages.
+        wall_s: Real duration; of a branch, from its fork.
+        judged: Whether there was a judge; without one success and safety are meaningless.
+        restarts: Number of restarts of all nodes.
     """
 
     success: bool
@@ -134,7 +132,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def stopped_for_good(self) -> bool:
-        """Whether the robot stood safe and its mission was lost."""
+        """Whether the mission failed and the robot was safe."""
         return self.safe and not self.success
 
     @property
@@ -144,27 +142,27 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def counts(self) -> bool:
-        """Whether it counts: a fault changed something, or the run ended badly all the same.
+        """Whether the run counts: a fault had an effect, or the run was unsafe or failed.
 
-        A run in which nothing was changed and nothing went wrong survived nothing. One that was
-        unsafe or lost its mission is never left out, whatever its fault is said to have done.
+        A run without an effect shows nothing. An unsafe or failed run is never left out, even if
+        its fault reports no effect.
         """
         return self.effective or not (self.safe and self.success)
 
     @property
     def margin(self) -> float:
-        """The smallest of the margins: how far from unsafe the run was."""
+        """The smallest of the margins: the distance from an unsafe run."""
         return min((m for m in self.margins.values() if m is not None), default=math.inf)
 
 
 def run_job(job: Job) -> RunResult:
-    """Run a job in virtual time and return what is kept of it."""
+    """Run a job in virtual time and return its result."""
     begun_s = time.perf_counter()
     return result_of(run_virtually(job), begun_s)
 
 
 def result_of(result: VirtualResult, begun_s: float) -> RunResult:
-    """Return what is kept of a run that began at a time of `time.perf_counter`."""
+    """Return the result of a run that began at a time of `time.perf_counter`."""
     record, judged, injected_s = result.record, result.judgement, None
     effective = [o.injected_s for o in record.faults if o.effective and o.injected_s is not None]
     if effective:
@@ -184,15 +182,15 @@ def result_of(result: VirtualResult, begun_s: float) -> RunResult:
 
 
 def run_virtually(job: Job) -> VirtualResult:
-    """Run a job in virtual time and return all that is known of it; raises as `virtual_run`."""
+    """Run a job in virtual time and return everything known; raises as `virtual_run`."""
     return virtual_run(job).run()
 
 
 def virtual_run(job: Job) -> VirtualRun:
-    """Return a job's run in virtual time, not yet begun.
+    """Return a job's run in virtual time, not started yet.
 
     Raises:
-        ValueError: The job makes no sense: no such system, mission, fault.
+        ValueError: The job is invalid: unknown system, mission or fault.
     """
     file, document = read_document_of(job.system)
     for name, values in job.retuned.items():
@@ -206,7 +204,7 @@ def virtual_run(job: Job) -> VirtualRun:
     application = _application(msgspec.json.encode(plan.options), file)
     kind = trial_class(spec)
     if not kind.patient and (job.duration_s or spec.end.after_s) is None:
-        raise ValueError(f"{file}: $.end.after_s: missing; in virtual time a run has to end")
+        raise ValueError(f"{file}: $.end.after_s: missing; a run in virtual time needs an end")
     trial = kind(RunContext(plan, spec, document, application),
                  job.patience_s if kind.patient else job.duration_s)
     return VirtualRun(trial, network=find_network(job.network), scenario=job.faults, nodes=nodes)
@@ -239,7 +237,7 @@ def read_document_of(system: str) -> tuple[str, dict[str, Any]]:
 
 
 def _of_system(made: Callable[[SystemSpec], T]) -> Callable[[str], T]:
-    """Return a function of a system's name or file that keeps what is made of its spec."""
+    """Return a cached function of a system's name or file."""
     @lru_cache(maxsize=8)
     def of_system(system: str) -> T:
         file, document = read_document_of(system)
@@ -248,7 +246,7 @@ def _of_system(made: Callable[[SystemSpec], T]) -> Callable[[str], T]:
     return of_system
 
 
-# Each raises a ValueError if there is no such system, or it is unsound.
+# Each raises a ValueError if the system is unknown or unsound.
 faults_of_system = _of_system(faults_of)
 application_of_system = _of_system(application_class)
 trial_of_system = _of_system(trial_class)
@@ -261,6 +259,6 @@ def application_of_job(job: Job) -> Application:
 
 @lru_cache(maxsize=8)
 def _application(options: bytes, file: str) -> Application:
-    """Load what actors have in common; the map of an airport is large, and read-only."""
+    """Load an application once: the map of an airport is large, and read-only."""
     plan = RunPlan(system_file=file, options=msgspec.json.decode(options))
     return load_application(plan, load_system(plan))

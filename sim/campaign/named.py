@@ -1,7 +1,7 @@
-"""Campaigns that a robot's package brings: chosen runs, and what is expected of them.
+"""Campaigns of a robot's package: chosen runs with expected results.
 
-Entry points of the group `rampart.campaigns` name classes derived from `NamedCampaign`; each adds
-options of its own to `rampart campaign`.
+Entry points of the group `rampart.campaigns` name classes derived from `NamedCampaign`. Each adds
+its options to `rampart campaign`.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from rampart.sim.campaign.store import Run
 
 @dataclass(frozen=True)
 class Section:
-    """What the report of a campaign says beyond what it says of any.
+    """Additional section of a campaign's report.
 
     Args:
-        sentence: of the headline.
-        html: makes the section, given the keys of the runs that the page shows one by one, and a
-            function from a run's key to the command that repeats it.
+        sentence: For the headline.
+        html: Makes the section from the keys of the runs shown one by one, and a function from a
+            run's key to the command that repeats it.
     """
 
     sentence: str
@@ -35,13 +35,13 @@ class Section:
 
 
 class NamedCampaign(ABC):
-    """A campaign with an expectation of each of its runs.
+    """A campaign with expected results.
 
     Attributes:
-        flag: option that asks for it.
-        name: of the folder of its results.
-        title: of its report.
-        system: that it is for unless `--system` names another.
+        flag: Its option.
+        name: Name of the folder of its results.
+        title: Title of its report.
+        system: Its system, unless `--system` names another.
     """
 
     flag: str
@@ -57,23 +57,23 @@ class NamedCampaign(ABC):
     @classmethod
     @abstractmethod
     def chosen(cls, options: argparse.Namespace) -> Self | None:
-        """Return the campaign that the options ask for; None for another one.
+        """Return the campaign if the options select it, else None.
 
         Raises:
-            ValueError: they make no sense.
+            ValueError: The options are invalid.
         """
 
     @abstractmethod
     def jobs(self, base: Job) -> list[Job]:
-        """Return its runs; `base` has system, options and seed as they were asked for."""
+        """Return its runs; `base` has the chosen system, options and seed."""
 
     @abstractmethod
     def section(self, spec: SystemSpec, runs: Sequence[Run]) -> Section:
-        """Return what its report says."""
+        """Return its section of the report."""
 
     @abstractmethod
     def show(self, spec: SystemSpec, runs: Sequence[Run]) -> None:
-        """Print what came of it."""
+        """Print its results."""
 
     def expected(self, runs: Sequence[Run], row: Row) -> dict[str, Any]:
         """Return what `--json` adds to a row."""
@@ -81,6 +81,6 @@ class NamedCampaign(ABC):
         return {}
 
     def failed(self, runs: Sequence[Run]) -> bool:
-        """Tell whether the outcome is such that the exit code has to be 1."""
+        """Return whether the exit code has to be 1."""
         del runs
         return False

@@ -1,4 +1,4 @@
-"""Which runs a campaign makes: a cross product, or a sample of all that can go wrong. Pure."""
+"""Runs of a campaign: a cross product, or a random sample of all faults. Pure."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from rampart.sim.faults.scenario import ALL, PlannedFault
 from rampart.sim.faults.topic_faults import systematic_faults
 
 MOMENTS_S = 2.0, 120.0
-"""Random faults are injected between these simulated times, unless the system says otherwise."""
+"""Earliest and latest injection of random faults, simulated s; a system may have others."""
 
 LASTS_S = (0.5, 15.0)
-"""Random transient faults last between these."""
+"""Shortest and longest random transient fault, simulated s."""
 
 _FLICKER_S = (0.2, 2.0)
 _DULL = ("diagnostic/", "inject/", "manager/shadow", "manager/adaptation",
@@ -32,13 +32,13 @@ _DULL = ("diagnostic/", "inject/", "manager/shadow", "manager/adaptation",
 
 
 def fault_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
-    """Return the names of all single faults of a system, by kind.
+    """Return the names of all faults of a system, by kind.
 
-    Topics on which a fault cannot matter to the robot (error reports, greetings, what tools and
-    adaptations say) are left out.
+    Topics without influence on the robot (error reports, greetings, tools, adaptations) are left
+    out.
 
     Raises:
-        ValueError: the spec names an actor class that does not exist, or topics that make no sense.
+        ValueError: The spec names an unknown actor class, or invalid topics.
     """
     nodes, faults = can_be_hit(spec), faults_of(spec)
     keys = [key for key in published_keys(spec)
@@ -59,8 +59,8 @@ def cross(jobs: Sequence[Job], faults: Iterable[tuple[PlannedFault, ...]], seeds
     """Return every job with every set of faults and every seed.
 
     Args:
-        jobs: What they have in common: options, strategy, with or without FTM.
-        faults: One set per run; an empty one is a run without a fault.
+        jobs: Common parts: options, strategy, with or without FTM.
+        faults: One set per run; an empty set is a run without a fault.
         seeds: Of the runs.
     """
     return [_with(job, fault, seed)
@@ -70,25 +70,25 @@ def cross(jobs: Sequence[Job], faults: Iterable[tuple[PlannedFault, ...]], seeds
 def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *, seed: int,
            faults: Faults, together: int = 1, moments: tuple[float, float] = MOMENTS_S,
            seeds: int = SEEDS) -> list[Job]:
-    """Return random runs: kind, fault, moment, length and pattern are drawn.
+    """Return random runs: kind, fault, moment, duration and pattern are drawn.
 
-    A kind is drawn first, by the square root of the number of its faults, then a fault of it. The
-    ten faults of the actuators are neither lost among seven hundred of topics, nor as many as
-    these. A third of the faults is permanent, a third transient, a third intermittent if it hits
-    messages, else transient.
+    A kind is drawn first, weighted by the square root of its number of faults, then one of its
+    faults. So ten faults of actuators are not lost among seven hundred of topics, nor as frequent.
+    A third of the faults is permanent, a third transient, and a third intermittent if it hits
+    messages, else transient. A fault of a process has its default duration.
 
     Args:
         jobs: To choose from.
-        groups: Of fault names, see `fault_groups`.
-        runs: How many.
-        faults: Of the robot: those it names are of topics.
+        groups: Names of faults by kind, see `fault_groups`.
+        runs: Number of runs.
+        faults: Of the robot: its named faults are of topics.
         seed: Of the choice and of the runs; a longer sample begins with the shorter one.
-        together: How many faults at once.
-        moments: Between which simulated times they are injected.
-        seeds: How many: the first so many runs draw theirs, and the others take turns with them.
+        together: Number of faults per run.
+        moments: Earliest and latest injection, simulated s.
+        seeds: Number of seeds: that many runs draw theirs, and the others reuse them in turn.
 
     Raises:
-        ValueError: No jobs or faults to choose from.
+        ValueError: There are no jobs or no faults to choose from.
     """
     weights = {kind: math.sqrt(len(names)) for kind, names in groups.items() if names}
     if not jobs or not weights:

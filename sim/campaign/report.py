@@ -1,7 +1,7 @@
-"""The report of a campaign: one self-contained HTML page, a sibling of the inspection report.
+"""Report of a campaign: one self-contained HTML page.
 
-It says what was run, what came of it, how sure that is, and shows the worst runs so that a reader
-can repeat them. All figures come from the runs; the page needs nothing but itself.
+It shows what was run, the results with their confidence, and the worst runs with the commands that
+repeat them. All figures come from the runs.
 """
 
 from __future__ import annotations
@@ -53,19 +53,19 @@ from rampart.sim.runs.virtual_run import VirtualResult
 FILE_NAME = "report.html"
 
 SHOWN_AT_ONCE = 12
-"""Faults of a kind that are shown; the rest can be unfolded."""
+"""Faults of a kind that are shown; the others are folded."""
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """What was run, so that it can be repeated.
+    """Data that a reader needs to repeat the campaign.
 
     Args:
         title: Of the page.
         command: As typed.
-        seed: Of all that is random.
-        note: Anything else that a reader should know.
-        section: What a named campaign has to say of its runs, if it is one.
+        seed: Of all random numbers.
+        note: Additional text.
+        section: Section of a named campaign.
     """
 
     title: str
@@ -77,14 +77,13 @@ class Campaign:
 
 def write_campaign_report(directory: Path, about: Campaign, runs: Sequence[Run],
                           worst: Mapping[str, VirtualResult] = {}) -> Path:
-    """Write `report.html` into the campaign's directory; it appears complete or not at all.
+    """Write `report.html` into the campaign's directory, atomically.
 
     Args:
-        directory: Of the campaign, as the user names it; it is made if need be.
-        about: What was run.
-        runs: All of them, of one system.
-        worst: What came of the runs to be shown one by one, made again; by key, see
-            `worth_showing`.
+        directory: Of the campaign, as the user names it; made if necessary.
+        about: The campaign.
+        runs: All runs, of one system.
+        worst: Repeated runs to be shown one by one, by key, see `worth_showing`.
 
     Returns:
         The path of the page.
@@ -104,22 +103,22 @@ def render(directory: Path, about: Campaign, runs: Sequence[Run],
     found = conditions(runs)
     trial = trial_of_system(runs[0].job.system) if runs else Trial
     by_key = {run.job.key: run for run in runs}
-    told = [(by_key[key], made) for key, made in worst.items() if key in by_key]
+    shown_runs = [(by_key[key], made) for key, made in worst.items() if key in by_key]
     texts = {run.job.key: condition.text for condition in found for run in condition.runs}
     pages = environment()
     pages.filters["breakable"] = _breakable
     kind = import_class(trial.pictures, RunPictures, "pictures") if trial.pictures else RunPictures
-    pictures = kind([made.record for _, made in told])
-    shown = {run.job.key for run, _ in told}
+    pictures = kind([made.record for _, made in shown_runs])
+    shown = {run.job.key for run, _ in shown_runs}
 
     def replay(key: str) -> str:
         return shlex.join(["rampart", "campaign", "--replay", key, "--out", str(directory)])
 
     def shown_run(run: Run, made: VirtualResult) -> dict[str, Any]:
-        told = story(run, made.record, made.judgement.narrowest_s)
-        picture = pictures.picture(made.record, run.job.key, run.job.text(), told["marks"])
+        chapter = story(run, made.record, made.judgement.narrowest_s)
+        picture = pictures.picture(made.record, run.job.key, run.job.text(), chapter["marks"])
         return {"condition": texts[run.job.key], "command": replay(run.job.key),
-                "margin": _margin(run.result.margin, trial), "picture": picture, **told}
+                "margin": _margin(run.result.margin, trial), "picture": picture, **chapter}
 
     return pages.get_template("campaign/report.html").render(
         about=about, runs=runs, headline=headline(runs), figures=_figures(runs),
@@ -128,13 +127,13 @@ def render(directory: Path, about: Campaign, runs: Sequence[Run],
         summary=[(each, _summary(each, trial)) for each in found],
         every=_every_fault(found, trial), shown_at_once=SHOWN_AT_ONCE,
         charts=distributions(runs, trial), pictures=pictures,
-        tracks=[shown_run(*each) for each in told], shown=shown, failures=_failures(runs),
+        tracks=[shown_run(*each) for each in shown_runs], shown=shown, failures=_failures(runs),
         replay=replay, margins=list(trial.margins.values()), exact_below=trial.exact_below,
         unit=trial.margin_unit, none=NONE)
 
 
 def headline(runs: Sequence[Run]) -> str:
-    """Return the result of the campaign in a sentence or two."""
+    """Return the result of the campaign in one or two sentences."""
     if not runs:
         return "No run was made."
     faulty = [run for run in runs if run.job.faults]
@@ -156,20 +155,20 @@ def headline(runs: Sequence[Run]) -> str:
             parts.append(f"{name} {_many(counted, 'unsafe', more)}; "
                          f"{_many(counted, 'complete')}.")
     if odd:
-        parts.append(f"In {odd:,} of these the fault had no effect; what ends badly counts all "
-                     "the same.")
+        parts.append(f"In {odd:,} of these the fault had no effect; unsafe and failed runs "
+                     "count all the same.")
     if lost := sum(not run.result.counts for run in faulty):
         parts.append(f"In {count(lost, 'run')}{' more' if parts else ''} the fault had no effect.")
     return " ".join(parts).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def _breakable(text: str) -> Markup:
-    """Return a name, escaped, that may be broken behind its separators."""
+    """Return an escaped name with line breaks allowed after its separators."""
     return Markup("<wbr>").join(re.split(r"(?<=[:/_])", text))
 
 
 def _many(runs: Sequence[Run], what: str, more: str = "") -> str:
-    """Return how many of some runs were unsafe, with the interval, or completed the mission."""
+    """Return the number of unsafe runs with its interval, or of completed missions."""
     if what == "complete":
         return f"{sum(run.result.success for run in runs):,} completed the mission"
     found = rate(sum(not run.result.safe for run in runs), len(runs))
@@ -183,7 +182,7 @@ def _many(runs: Sequence[Run], what: str, more: str = "") -> str:
 
 
 def _figures(runs: Sequence[Run]) -> list[tuple[str, str, str]]:
-    """Return name, value and class of the figures at the top; of runs with FTM and a fault."""
+    """Return name, value and class of the figures at the top, of runs with FTM and a fault."""
     figures = [("runs in all", f"{len(runs):,}", "")]
     protected = [run for run in runs if run.job.ftm and run.job.faults]
     if not any(run.result.counts for run in protected):
@@ -208,7 +207,7 @@ def _figures(runs: Sequence[Run]) -> list[tuple[str, str, str]]:
 
 
 def _summary(condition: Condition, trial: type[Trial]) -> list[dict[str, Any]]:
-    """Return one line per kind of fault, and one for all faults if there are several kinds."""
+    """Return one line per kind of fault, and one for all if there are several kinds."""
     kinds = by_kind(condition.runs)
     lines = [_cells(total(runs, kind), condition.ftm, trial) for kind, runs in kinds.items()]
     faulty = [run for run in condition.runs if run.job.faults]
@@ -219,7 +218,7 @@ def _summary(condition: Condition, trial: type[Trial]) -> list[dict[str, Any]]:
 
 def _every_fault(found: Sequence[Condition], trial: type[Trial]
                  ) -> list[tuple[str, int, list[list[dict[str, Any]]]]]:
-    """Return label, number of rows, and the rows by fault, worst fault first, of each kind."""
+    """Return title, number of rows, and rows by fault, worst fault first, of each kind."""
     kinds: dict[str, dict[str, list[tuple[Condition, Row]]]] = {
         kind: {} for kind in by_kind(run for condition in found for run in condition.runs)}
     for condition in found:
@@ -237,7 +236,7 @@ def _every_fault(found: Sequence[Condition], trial: type[Trial]
 
 
 def _how_good(rows: Sequence[tuple[Condition, Row]]) -> tuple[Any, ...]:
-    """Return a key that sorts faults worst first, by their rows with FTM if there are any."""
+    """Return a key that sorts faults worst first, by their rows with FTM if any."""
     with_ftm = [row for condition, row in rows if condition.ftm]
     counted = [row for row in with_ftm or [row for _, row in rows] if row.safe.of]
     least = [s.least for row in counted for s in row.margins.values() if s]
@@ -247,7 +246,7 @@ def _how_good(rows: Sequence[tuple[Condition, Row]]) -> tuple[Any, ...]:
 
 
 def _cells(row: Row, ftm: bool, trial: type[Trial]) -> dict[str, Any]:
-    """Return a row as texts; a pair is a figure and what is said below it."""
+    """Return a row as texts; a pair is a figure and the text below it."""
     counted = row.safe.of
     detected, recovered = row.detected_after_s, row.recovered_after_s
     found = [seconds(detected.median), *_tail(detected)] if ftm and detected else [NONE]
@@ -277,7 +276,7 @@ def _share(number: int, of: int) -> tuple[str, str]:
 
 
 def _tail(found: Spread) -> list[str]:
-    """Return the upper end of a spread; below twenty values the 95th percentile is the maximum."""
+    """Return the upper end of a spread; with fewer than 20 values the p95 is the maximum."""
     most = [f"max {seconds(found.most)}"] if found.n > 1 else []
     return [f"p95 {seconds(found.p95)}", *most] if found.n >= 20 else most
 
@@ -295,11 +294,11 @@ _DECISIONS = 8
 
 
 def worth_showing(runs: Sequence[Run], most: int = 6) -> list[Run]:
-    """Return the runs that are worth a look: the worst ones, worst first.
+    """Return the worst runs, worst first, each with another fault.
 
-    Each shows another fault. An unprotected robot is unsafe as a matter of course, so runs
-    without fault tolerance get at most half of the places that runs with it could fill, and an
-    unsafe run with it comes before all others. Runs in which nothing went wrong are left out.
+    Runs without fault tolerance are expected to be unsafe. So they get at most half of the places
+    that others could fill, and unsafe runs with fault tolerance come first. Runs without any effect
+    are left out.
     """
     ranked = sorted(runs, key=_rank, reverse=True)
     different: dict[tuple[bool, tuple[str, ...]], Run] = {}
@@ -315,12 +314,12 @@ def worth_showing(runs: Sequence[Run], most: int = 6) -> list[Run]:
 
 
 def story(run: Run, record: RunRecord, narrowest_s: float | None) -> dict[str, Any]:
-    """Return what is shown of one of the worst runs: what happened when.
+    """Return the events of one of the worst runs, for the page.
 
     Args:
-        run: of the campaign.
-        record: of the same run, made again.
-        narrowest_s: when the smallest margin was measured.
+        run: Of the campaign.
+        record: Of the repeated run.
+        narrowest_s: When the smallest margin was measured.
     """
     result = run.result
     detected_s = (None if result.injected_s is None or result.detected_after_s is None

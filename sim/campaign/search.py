@@ -1,9 +1,8 @@
-"""The search for the unsafe: an optimiser drives fault, time and place to the smallest margin.
+"""Search for unsafe runs: an optimiser varies faults, times and places to minimise the margin.
 
-Sampling finds what is common; what is rare and bad is found by following the margin down. The
-optimiser is a tree-structured Parzen estimator (Bergstra et al. 2011, by Optuna): it handles the
-mix of names and numbers, and a space in which some numbers exist only with some names. An unsafe
-run is then shrunk: everything that it does not need is taken away.
+Sampling finds common failures; following the margin down finds rare ones. The optimiser is a
+tree-structured Parzen estimator (Bergstra et al. 2011, by Optuna). It handles names and numbers,
+and numbers that exist only with some names. An unsafe run is then shrunk to what it needs.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ if TYPE_CHECKING:
 _LASTS_S = (0.3, 60.0)
 
 Run = Callable[[Sequence[Job]], Sequence[RunResult]]
-"""Runs jobs, perhaps at the same time, and returns their results in the same order."""
+"""Runs jobs, perhaps in parallel, and returns their results in the same order."""
 
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """Where to look.
+    """Search space.
 
     Args:
-        bases: What the runs have in common; the optimiser chooses among them.
+        bases: Jobs without faults to choose from.
         groups: Names of faults by kind.
-        intruder: What may come on top of a fault, see `Faults`.
-        moments: Between which simulated times faults are injected.
-        together: How many faults at once.
+        intruder: Additional fault, see `Faults`.
+        moments: Earliest and latest injection, simulated s.
+        together: Number of faults per run.
     """
 
     bases: tuple[Job, ...]
@@ -48,7 +47,7 @@ class Space:
     together: int = 1
 
     def job(self, trial: optuna.Trial, seed: int) -> Job:
-        """Return the run that the optimiser asks for."""
+        """Return the run that the optimiser chooses."""
         base = self.bases[trial.suggest_int("base", 0, len(self.bases) - 1)]
         faults = [self._fault(trial, f"{number} " if number > 1 else "")
                   for number in range(1, self.together + 1)]
@@ -71,7 +70,7 @@ class Space:
 
 
 def margin(result: RunResult) -> float:
-    """Return what the optimiser makes small: the margin; of an unsafe run less its severity."""
+    """Return the value to minimise: the margin, or minus the severity of an unsafe run."""
     if result.safe:
         return result.margin
     return -result.severity
@@ -80,15 +79,15 @@ def margin(result: RunResult) -> float:
 def search(space: Space, budget: int, run: Run, *, seed: int, seeds: int = 1, at_once: int = 1,
            seen: Callable[[Job, RunResult], None] = lambda _job, _result: None
            ) -> list[tuple[Job, RunResult]]:
-    """Look for small margins; return all runs made, the worst first.
+    """Search for small margins; return all runs made, the worst first.
 
     Args:
-        space: Where to look.
-        budget: How many runs to make.
+        space: Search space.
+        budget: Number of runs.
         run: See `Run`.
         seed: Of the optimiser and the first run.
-        seeds: How many seeds the runs take turns with, from `seed` on.
-        at_once: How many runs are asked for before the first of them is back.
+        seeds: Number of seeds, from `seed` on, which the runs use in turn.
+        at_once: Number of runs per call of `run`.
         seen: Called after each run.
 
     Raises:
@@ -97,7 +96,7 @@ def search(space: Space, budget: int, run: Run, *, seed: int, seeds: int = 1, at
     import optuna  # noqa: PLC0415 an extra
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    with warnings.catch_warnings():  # three of its options are called experimental
+    with warnings.catch_warnings():  # three of its options are experimental
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         sampler = optuna.samplers.TPESampler(
             seed=seed, n_startup_trials=max(10, budget // 4), multivariate=True, group=True,
@@ -110,7 +109,7 @@ def search(space: Space, budget: int, run: Run, *, seed: int, seeds: int = 1, at
         for trial, job, result in zip(trials, jobs, run(jobs), strict=True):
             if result.counts and math.isfinite(margin(result)):
                 study.tell(trial, margin(result))
-            else:  # without effect, or without a margin: worse than any that has one
+            else:  # without effect or margin: worse than any other
                 study.tell(trial, state=optuna.trial.TrialState.PRUNED)
             made.append((job, result))
             seen(job, result)
@@ -121,12 +120,12 @@ def shrink(job: Job, run: Callable[[Job], RunResult] = run_job,
            tried: Callable[[Job, bool], None] = lambda _job, _unsafe: None) -> Job:
     """Return a smaller run that is unsafe still.
 
-    Takes away in turn, as long as the run stays unsafe: whole faults, what its options can do
-    without, the pattern of a fault, half of its duration, digits of its time, the seed.
+    As long as the run stays unsafe, it removes whole faults, needless options, the pattern of a
+    fault, half of its duration, digits of its time, the seed.
 
     Args:
         job: An unsafe run.
-        run: How to run one.
+        run: Runs a job.
         tried: Called with each attempt and whether it was unsafe.
 
     Raises:
@@ -139,7 +138,7 @@ def shrink(job: Job, run: Callable[[Job], RunResult] = run_job,
         return found
 
     if not unsafe(job):
-        raise ValueError(f"run {job.key} ({job.text()}) is safe: there is nothing to shrink")
+        raise ValueError(f"run {job.key} ({job.text()}) is safe, so it cannot be shrunk")
     smaller = True
     while smaller:
         smaller = False

@@ -1,4 +1,4 @@
-"""What a campaign's runs add up to, and its figures as people read them. Pure."""
+"""Statistics of a campaign's runs, and their figures as text. Pure."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ CONFIDENCE_Z = 1.959963984540054
 """Two-sided 95 %."""
 
 FEW_SEEDS = 10
-"""With fewer among many runs an interval says little of what depends on the seed."""
+"""With fewer seeds among many runs, an interval hardly covers effects of the seed."""
 
 NO_EFFECT = "no effect"
-"""The verdict on a row of which no run counts."""
+"""Verdict of a row in which no run counts."""
 
 
 class Rate(msgspec.Struct, frozen=True):
@@ -56,9 +56,8 @@ class Spread(msgspec.Struct, frozen=True):
 class Row(msgspec.Struct, frozen=True, kw_only=True):
     """All runs with one fault under one condition.
 
-    `seeds` is how many different ones the runs have.
-    `ineffective` runs, in which the fault changed nothing, count for nothing else, unless they
-    were unsafe or failed: see `RunResult.counts`.
+    `seeds` is the number of different seeds. Runs without an effect are `ineffective` and count for
+    nothing else, unless they were unsafe or failed: see `RunResult.counts`.
     """
 
     fault: str
@@ -99,7 +98,7 @@ def rate(count: int, of: int) -> Rate:
 
 
 def spread(values: Iterable[float | None]) -> Spread | None:
-    """Return the spread of those values that there are, or None if there are none."""
+    """Return the spread of the finite values, None without any."""
     known = sorted(v for v in values if v is not None and math.isfinite(v))
     if not known:
         return None
@@ -114,19 +113,19 @@ def verdict(run: Run) -> str:
 
 
 def badness(run: Run) -> tuple[bool, bool, float]:
-    """Return how bad a run was, to sort by: unsafe, failed, and how little room was left."""
+    """Return a key to sort runs by: unsafe, failed, small margin."""
     return (not run.result.safe, not run.result.success, -run.result.margin)
 
 
 def worst(runs: Iterable[Run]) -> Run:
-    """Return the worst run: the verdict of a row is that of its worst run (paper, section V)."""
+    """Return the worst run, whose verdict is that of the row (paper, section V)."""
     return max(runs, key=badness)
 
 
 def table(runs: Iterable[Run]) -> list[Row]:
-    """Return one row per fault and condition, in order of first appearance.
+    """Return one row per fault and condition (options, FTM, strategy, retuned modules).
 
-    The condition: options, FTM, strategy, and what was retuned.
+    Rows are in order of first appearance.
     """
     rows: dict[tuple[object, ...], list[Run]] = {}
     for run in runs:
@@ -137,7 +136,7 @@ def table(runs: Iterable[Run]) -> list[Row]:
 
 
 def total(runs: Sequence[Run], name: str) -> Row:
-    """Return all runs as one row; there must be one at least."""
+    """Return all runs, at least one, as one row."""
     return _row(Job(row=name), runs)
 
 
@@ -165,7 +164,7 @@ def _row(condition: Job, runs: Sequence[Run]) -> Row:
 
 
 def as_json(row: Row) -> dict[str, object]:
-    """Return a row as scripts get it: options and margins among the figures, rates as counts."""
+    """Return a row for scripts: options and margins among the figures, rates as counts."""
     more = msgspec.to_builtins(row)
     options, margins = more.pop("options"), more.pop("margins")
     if not row.judged:
@@ -177,7 +176,7 @@ def as_json(row: Row) -> dict[str, object]:
 
 
 def seeds_in_words(runs: Sequence[Run]) -> str:
-    """Return what runs that share their seeds lack in independence; "" if each has its own."""
+    """Return a note on runs that share seeds; "" if each has its own."""
     seeds = len({run.job.seed for run in runs})
     if seeds == len(runs):
         return ""
@@ -201,7 +200,7 @@ def percent(share: float) -> str:
 
 
 def interval(found: Rate) -> str:
-    """Return the confidence interval of a share, or nothing if there were no runs."""
+    """Return the confidence interval of a share, "" without runs."""
     return f"{percent(found.low)} to {percent(found.high)} %" if found.of else ""
 
 
@@ -221,7 +220,7 @@ def count(number: int, what: str) -> str:
 
 @dataclass(frozen=True)
 class Condition:
-    """What some runs have in common besides their faults; `text` names only what varies."""
+    """Runs with the same condition; `text` names only what varies."""
 
     text: str
     ftm: bool
@@ -229,7 +228,7 @@ class Condition:
 
 
 def kind_of(job: Job) -> str:
-    """Return in words the kind of what goes wrong in a run."""
+    """Return the title of the kind of a run's faults."""
     faults = faults_of_system(job.system)
     if len(job.faults) == 1:
         return faults.kinds[faults.kind_of(job.faults[0].fault)]
@@ -237,7 +236,7 @@ def kind_of(job: Job) -> str:
 
 
 def by_kind(runs: Iterable[Run]) -> dict[str, list[Run]]:
-    """Return the runs by kind, in the order of the robot's; kinds without runs are left out."""
+    """Return the runs by kind, in the robot's order; kinds without runs are left out."""
     found: dict[str, list[Run]] = {}
     for run in runs:
         for kind in faults_of_system(run.job.system).kinds.values():
@@ -247,13 +246,13 @@ def by_kind(runs: Iterable[Run]) -> dict[str, list[Run]]:
 
 
 def conditions(runs: Sequence[Run]) -> list[Condition]:
-    """Return the runs by condition: the unprotected first, then by mechanisms and strategy."""
-    said = _values(runs)
-    varying = [name for name, values in said.items() if len(set(values) - {""}) > 1]
+    """Return the runs by condition: without FTM first, then by mechanisms and strategy."""
+    values_of = _values(runs)
+    varying = [name for name, values in values_of.items() if len(set(values) - {""}) > 1]
     groups: dict[tuple[str, ...], list[Run]] = {}
     for number, run in enumerate(runs):
         key = ("with FTM" if run.job.ftm else "without FTM",
-               *(said[name][number] for name in varying))
+               *(values_of[name][number] for name in varying))
         groups.setdefault(key, []).append(run)
     found = [Condition(", ".join(filter(None, key)), there[0].job.ftm, there)
              for key, there in groups.items()]
@@ -261,20 +260,20 @@ def conditions(runs: Sequence[Run]) -> list[Condition]:
 
 
 def in_common(runs: Sequence[Run]) -> list[str]:
-    """Return in words what is the same in all runs."""
+    """Return the conditions that all runs have in common."""
     found = [set(values) - {""} for values in _values(runs).values()]
     return [next(iter(values)) for values in found if len(values) == 1]
 
 
 def varying_options(runs: Iterable[Run]) -> list[str]:
-    """Return the options of the application that are not the same in all runs."""
+    """Return the options of the application that differ among runs."""
     options = [run.job.options for run in runs]
     return [name for name in dict.fromkeys(name for each in options for name in each)
             if any(each.get(name) != options[0].get(name) for each in options)]
 
 
 def _values(runs: Sequence[Run]) -> dict[str, list[str]]:
-    """Return what makes up a condition besides FTM: what is said of each run, "" for nothing."""
+    """Return the parts of a condition besides FTM: a text per run, "" for none."""
     jobs = [run.job for run in runs]
     return {
         "mechanisms": [_mechanisms(job) for job in jobs],

@@ -1,4 +1,4 @@
-"""Where a campaign's results are kept: an SQLite file, each run once, safe against any end."""
+"""Store of a campaign's results: an SQLite file with each run once, sound after any crash."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ create table if not exists runs (
 _FORMAT = "2"
 
 MAX_VALUE_BYTES = 16 << 20
-"""Of a job or a result; those of the paper's campaign have some kilobytes."""
+"""Largest job or result; those of the paper's campaign have some kilobytes."""
 
 
 class StoreError(ValueError):
-    """The file cannot be used, or not any more; the message is one line."""
+    """The file cannot be used; the message is one line."""
 
 
 class Run(NamedTuple):
-    """A run that was made."""
+    """A job and its result."""
 
     job: Job
     result: RunResult
@@ -41,14 +41,14 @@ class Run(NamedTuple):
 class Store:
     """Results by the keys of their jobs.
 
-    A run is kept whole or not at all: a disk that fills up costs none of those before it. Every
-    method raises `StoreError` when the file cannot be read or written.
+    Each run is stored in a transaction, so a full disk damages no earlier run. Every method raises
+    `StoreError` if the file cannot be read or written.
 
     Args:
-        directory: Of the campaign; it is made if need be.
+        directory: Of the campaign; made if necessary.
 
     Raises:
-        StoreError: There is a file that is no store, or one of another version.
+        StoreError: The file is not a store, or one of another version.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -71,50 +71,34 @@ class Store:
             foreign = self._database.execute(
                 "select name from sqlite_master where type in ('view', 'trigger')").fetchone()
         except (sqlite3.Error, ValueError, TypeError) as error:
-            raise StoreError(f"{self.path}: no store of campaign results: {error}") from None
-        if foreign is not None:  # what it computes nobody bounds
-            raise StoreError(f"{self.path}: no store of campaign results: it has a view or trigger")
+            raise StoreError(f"{self.path}: not a store of campaign results: {error}") from None
+        if foreign is not None:  # their computations have no bound
+            raise StoreError(f"{self.path}: not a store of campaign results: has a view or trigger")
         if found != _FORMAT:
-            raise StoreError(f"{self.path}: format {shown(found)}, this program reads {_FORMAT}; "
+            raise StoreError(f"{self.path}: format {shown(found)}, expected {_FORMAT}; "
                              "choose another --out")
 
     def keys(self) -> set[str]:
-        """Return the keys of the runs that are there.
-
-        Raises:
-            StoreError: the file is damaged.
-        """
+        """Return the keys of all runs."""
         with self._using():
             return {key for (key,) in self._database.execute("select key from runs")}
 
     def add(self, job: Job, result: RunResult) -> None:
-        """Keep a run; one that is there already stays as it is.
-
-        Raises:
-            StoreError: it cannot be written.
-        """
+        """Store a run, unless it is there already."""
         with self._using(), self._database:
             self._database.execute(
                 "insert or ignore into runs (key, job, result) values (?, ?, ?)",
                 (job.key, msgspec.msgpack.encode(job), msgspec.msgpack.encode(result)))
 
     def find(self, key: str) -> Run | None:
-        """Return the run whose key begins so, if there is exactly one.
-
-        Raises:
-            StoreError: the file is damaged.
-        """
+        """Return the run whose key begins with a text, if there is exactly one."""
         with self._using():
             found = self._database.execute(
                 "select job, result from runs where key like ? limit 2", (f"{key}%",)).fetchall()
             return _run(*found[0]) if len(found) == 1 else None
 
     def runs(self, keys: set[str] | None = None) -> Iterator[Run]:
-        """Yield the runs in the order in which they were made; all, or those with the keys.
-
-        Raises:
-            StoreError: the file is damaged.
-        """
+        """Yield the runs, all or those with the keys, in the order of their completion."""
         with self._using():
             for key, job, result in self._database.execute(
                     "select key, job, result from runs order by rowid"):
@@ -136,7 +120,7 @@ class Store:
 
 
 _NO_RUN = (ValueError, TypeError, LookupError, RecursionError, OSError)
-"""What decoding raises that meets other bytes, or no bytes at all."""
+"""Errors of decoding other bytes, or none."""
 
 
 def _run(job: bytes, result: bytes) -> Run:

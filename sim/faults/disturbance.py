@@ -1,7 +1,7 @@
-"""What a fault on topics is: disturbances of single topics, under a name, for a while.
+"""Faults on topics: named disturbances of single topics for some time.
 
-A disturbance acts in the process that publishes its topic (see `rampart.actors.runtime.injection`),
-so what the rest of the system sees is what a real failure of that node would show.
+A disturbance acts in the process that publishes its topic (`rampart.actors.runtime.injection`), so
+the rest of the system receives what it would receive after a real failure of that node.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from rampart.actors.bus.messages import Injection
 
 
 class UnknownFaultError(ValueError):
-    """No fault of this name; the message is one line and says where the known ones are."""
+    """Unknown name of a fault; the message is one line, with a hint to the known ones."""
 
 
 class Disturbance(Struct, frozen=True):
-    """What happens to one topic; the fields are those of `Injection`."""
+    """Disturbance of one topic; the fields are those of `Injection`."""
 
     topic: str
     mode: str
@@ -37,7 +37,7 @@ class Disturbance(Struct, frozen=True):
     stamp_s: float = 0.0
 
     def order(self, injection: str, duration_s: float) -> Injection:
-        """Return the message that orders it, under an id, for simulated seconds."""
+        """Return the message that orders it, with an id and a duration in simulated seconds."""
         return Injection(injection, duration_s=duration_s, **asdict(self))
 
 
@@ -45,12 +45,12 @@ class Fault(Struct, frozen=True):
     """A named fault.
 
     Args:
-        name: as typed by the user.
-        title: one line for people.
-        disturbances: what it does.
-        detected_by: detection modules that should see it; empty if none is meant to.
-        duration_s: how long it lasts unless told otherwise, simulated seconds; infinity for ever.
-        group: part of the catalogue that it belongs to.
+        name: As typed by the user.
+        title: One line for people.
+        disturbances: Its effects.
+        detected_by: Detection modules that should detect it; empty if none should.
+        duration_s: Default duration, simulated seconds; infinity for permanent.
+        group: Its part of the catalogue.
     """
 
     name: str
@@ -64,8 +64,8 @@ class Fault(Struct, frozen=True):
         """Return the injections that make up the fault.
 
         Args:
-            injection: id; several disturbances get "ID.1", "ID.2" and so on.
-            duration_s: simulated seconds, infinity for permanent; the fault's own if None.
+            injection: Id; several disturbances get "ID.1", "ID.2" and so on.
+            duration_s: Simulated seconds, infinity for permanent; None for the default.
         """
         lasts_s = self.duration_s if duration_s is None else duration_s
         several = len(self.disturbances) > 1
@@ -74,13 +74,13 @@ class Fault(Struct, frozen=True):
 
     def varied(self, *, share: float | None = None, on_s: float | None = None,
                off_s: float | None = None, seed: int | None = None) -> Fault:
-        """Return the fault for a share of the messages, intermittent, or with other chance.
+        """Return the fault for a share of the messages, intermittent, or with another seed.
 
         Args:
-            share: probability that a message is affected.
-            on_s: how long an intermittent fault is in force, simulated seconds.
-            off_s: how long it is away in between, simulated seconds.
-            seed: of all that is random; each disturbance gets one of its own. None keeps.
+            share: Probability that a message is affected.
+            on_s: How long an intermittent fault is in force, simulated seconds.
+            off_s: How long it is absent in between, simulated seconds.
+            seed: Of the first disturbance; the others get the next ones. None keeps the seeds.
         """
         given = {"share": share, "on_s": on_s, "off_s": off_s}
         changed = {name: value for name, value in given.items() if value is not None}

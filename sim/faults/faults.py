@@ -1,7 +1,6 @@
-"""The faults of a robot that have names of their own, and how any fault is found by its name.
+"""Named faults of a robot, and the search for any fault by its name.
 
-Any system has `MODE:TOPIC` (`topic_faults`) and those of processes (`scenario`). Crashes are not
-here: to crash a node, kill it (`kill-node`).
+Every system has `MODE:TOPIC` (`topic_faults`) and faults of processes (`scenario`).
 """
 
 from __future__ import annotations
@@ -26,22 +25,22 @@ from rampart.sim.faults.wrong_numbers import Sizes
 
 PROCESS_FAULTS = ("kill", "stop", "wedge", "slow", "hang")
 
-_TOLD_LATER_S = 0.0
-"""Of an order in the plan: how long it lasts is filled in when the page orders it."""
+_FILLED_IN_S = 0.0
+"""Duration of an order in the plan; the page fills it in."""
 
 
 class Faults:
-    """The faults of a robot that declares none; the application of another names its own.
+    """Faults of a robot; a robot with named faults has a derived class.
 
     Class attributes:
-        named: disturbances of topics by name; the group of each is its kind.
-        left_out: names that somebody may try, and why there is no such fault.
-        others: by kind, faults that are no disturbances of topics, as a campaign draws them.
-        titled: those that the operator's page offers: name → kind and title.
-        kinds: all kinds in the order in which they are shown, and how they are called.
-        sizes: how wrong numbers can be, if the robot knows better than their fields say.
-        intruder: a fault whose last part is a number that a search may choose to add, and the
-            range of the number; None for none.
+        named: Disturbances of topics by name; the group of each is its kind.
+        left_out: Names that a user may try, and why there is no such fault.
+        others: By kind, faults that do not disturb topics, as a campaign draws them.
+        titled: Those of `others` that the operator's page offers: name → kind and title.
+        kinds: All kinds with their titles, in the order of tables.
+        sizes: Sizes of errors that count before those of the fields.
+        intruder: A fault that a search may add, and the range of the number at its end; None for
+            none.
     """
 
     named: Mapping[str, Fault] = {}
@@ -55,18 +54,18 @@ class Faults:
     intruder: ClassVar[tuple[str, float, float] | None] = None
 
     def own(self, fault: str, injection: str, duration_s: float | None) -> object | None:
-        """Return what a fault does that is no disturbance of a topic; None for other names.
+        """Return the action of a fault that does not disturb a topic; None for other names.
 
         Args:
-            fault: name with its details.
-            injection: id under which its effect is reported.
-            duration_s: simulated seconds; None for the fault's own.
+            fault: Name with its details.
+            injection: Id under which its effect is reported.
+            duration_s: Simulated seconds; None for the default.
 
         Returns:
-            A tuple of `Order`, or what the robot's injector carries out itself.
+            A tuple of `Order`, or an object that the robot's injector carries out.
 
         Raises:
-            ScenarioError: its details make no sense.
+            ScenarioError: The details are invalid.
         """
         del fault, injection, duration_s
         return None
@@ -75,12 +74,12 @@ class Faults:
         """Return a fault on topics by name: one of the robot's, or `MODE:TOPIC`.
 
         Args:
-            name: as typed.
-            seed: of all that is random in it.
-            known: all topics of the system, see `system_topics`.
+            name: As typed.
+            seed: Of its random parts.
+            known: All topics of the system, see `system_topics`.
 
         Raises:
-            UnknownFaultError: there is none of this name.
+            UnknownFaultError: There is no fault of this name.
         """
         if name in self.named:
             return self.named[name].varied(seed=seed)
@@ -95,7 +94,7 @@ class Faults:
             f"unknown fault {name!r}; {hint}`rampart inject --list` lists the known ones")
 
     def kind_of(self, name: str) -> str:
-        """Return the kind of a fault: one of `kinds`."""
+        """Return the kind of a fault, one of `kinds`."""
         if name in self.named:
             return self.named[name].group
         prefix = name.partition(":")[0]
@@ -107,35 +106,35 @@ class Faults:
                      if any(other.partition(":")[0] == prefix for other in names)), "topic")
 
     def offered(self) -> tuple[NamedFault, ...]:
-        """Return what the operator's page offers by name, as data for the plan of a run.
+        """Return the faults that the operator's page offers by name, as data for a run's plan.
 
-        A crash is a button of the node, and `MODE:TOPIC` the page puts together itself.
+        The page itself has crashes of nodes, and composes `MODE:TOPIC`.
         """
         found = [NamedFault(f.name, f.title, f.group, _for_the_plan(f.duration_s),
-                            injections=f.orders("", _TOLD_LATER_S))
+                            injections=f.orders("", _FILLED_IN_S))
                  for f in self.named.values()]
         for name, (kind, title) in self.titled.items():
             orders = self.own(name, "", None)
             if not isinstance(orders, tuple):
-                raise TypeError(f"{name}: the page can order messages only")
+                raise TypeError(f"{name}: the page can only publish; expected a tuple of orders")
             lasts_s = _for_the_plan(orders[0].message.duration_s)
-            plain = [o.with_(duration_s=_TOLD_LATER_S) for o in orders]
+            plain = [o.with_(duration_s=_FILLED_IN_S) for o in orders]
             found.append(NamedFault(name, title, kind, lasts_s, orders=tuple(
                 FaultOrder(o.topic.key, msgspec.json.encode(o.message).decode()) for o in plain)))
         return tuple(found)
 
 
 def _for_the_plan(lasts_s: float) -> float | None:
-    """Return how long a fault lasts as the plan says it, which is JSON and has no infinity."""
+    """Return a duration for the plan, since JSON has no infinity; None for permanent."""
     return None if math.isinf(lasts_s) else lasts_s
 
 
 def faults_of(spec: SystemSpec) -> Faults:
-    """Return the faults of the robot that a system is for.
+    """Return the faults of a system's robot.
 
     Raises:
-        ValueError: its application, or the class of faults that this names, does not exist, or a
-            fault of the specification makes no sense.
+        ValueError: The application or its class of faults does not exist, or a fault of the
+            specification is invalid.
     """
     path = application_class(spec).faults
     found = import_class(path, Faults, "faults")() if path else Faults()
@@ -149,11 +148,6 @@ def faults_of(spec: SystemSpec) -> Faults:
 
 
 def _specified(spec: SystemSpec, faults: Faults) -> dict[str, Fault]:
-    """Return the faults that a specification names.
-
-    Raises:
-        ValueError: one makes no sense in the system; the message names it.
-    """
     known, published = system_topics(spec), published_keys(spec)
     made = {}
     for row in spec.faults:
@@ -163,7 +157,7 @@ def _specified(spec: SystemSpec, faults: Faults) -> dict[str, Fault]:
             stamp_s=row.stamp_s)
         topic = find_topic(row.topic, known)
         if row.name in faults.named:
-            raise ValueError(f"fault {row.name}: the robot has one of this name")
+            raise ValueError(f"fault {row.name}: the robot has a fault of this name already")
         reason = closed(row.topic)
         if topic is None or not (reason or row.topic in published):
             near = difflib.get_close_matches(row.topic, published, 3)

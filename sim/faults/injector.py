@@ -1,8 +1,8 @@
-"""The injector: carries out the planned faults of a run, and watches whether they had an effect.
+"""The injector: carries out the planned faults of a run, and watches their effects.
 
-It runs beside the observer, outside the system under test. Faults of topics and actuators are
-ordered over the bus and reported by those they hit; processes are hit through a `ProcessControl`. A
-robot whose faults are more than that has an injector of its own, derived from this one.
+It runs beside the observer, outside the system under test. It orders faults of topics and actuators
+over the bus, and the affected nodes report them. It acts on processes through a `ProcessControl`. A
+robot with further faults has a derived injector.
 """
 
 from __future__ import annotations
@@ -33,45 +33,45 @@ from rampart.sim.faults.scenario import FaultOutcome, OnProcess, PlannedFault, a
 INJECTOR = "injector"
 
 SIGNALS = {"kill": "KILL", "stop": "STOP", "resume": "CONT", "wedge": "WEDGE"}
-"""What is done to a process, as `kill-node` calls it; how slow one is, is up to the machine."""
+"""Signals of `kill-node` by fault."""
 
 _ENDS = {"stop": "resume", "slow": "slow", "hang": "resume"}
-"""What ends that which is done to a process for a while."""
+"""Action that ends a temporary fault of a process."""
 
 _HANGS_WITHIN_S = 0.02
-"""Simulated seconds after its start within which a process that hangs each time is stopped."""
+"""Time after its start within which a process that hangs each time is stopped; simulated s."""
 
 
 ProcessControl = Callable[[str, str, float], bool]
-"""Does something to the process of a node, and tells whether there was one to do it to.
+"""Acts on the process of a node; returns False if there is none.
 
-What is `kill`, `stop`, `resume` (SIGKILL, SIGSTOP, SIGCONT), `wedge` (its event loop turns no more)
-or `slow` (each message takes so many seconds, the third argument; 0 ends that).
+The action is `kill`, `stop`, `resume` (SIGKILL, SIGSTOP, SIGCONT), `wedge` (blocks its event loop)
+or `slow` (each message takes the third argument, in seconds; 0 ends it).
 """
 
 
 Branch = Callable[[int], bool]
-"""Asked, in the moment in which a scenario departs from others with the same beginning, whether
-this is the run that goes on with it: the number of the scenario, counted from 0."""
+"""Decides whether this run continues with a scenario, given by its number from 0. It is called when
+the scenario departs from others with the same beginning."""
 
 
 def can_be_hit(spec: SystemSpec) -> tuple[str, ...]:
-    """Return the nodes whose processes a fault may hit: all but the world, the supervisor too."""
+    """Return the nodes whose processes a fault may hit: all but the world, and the supervisor."""
     return (SUPERVISOR, *(node.name for node in spec.actors() if node.kind is not Kind.WORLD))
 
 
 class PlannedAction(msgspec.Struct, eq=False):
-    """A planned fault and what has become of it.
+    """A planned fault and its effect.
 
     Attributes:
-        planned: what, and when.
-        action: see `action_of`.
-        watch: what is reported, if the action is a tuple of orders.
-        scenario: number of the scenario that it is of.
-        timer: until its moment.
-        injected_s: simulated time, None until then.
-        hit: 1 as soon as anything else was hit, a process for example.
-        reason: why it has no effect, if it has none.
+        planned: The fault.
+        action: See `action_of`.
+        watch: Reports, if the action is a tuple of orders.
+        scenario: Number of its scenario.
+        timer: Until its injection.
+        injected_s: Simulated time of its injection, None before.
+        hit: 1 if it has affected something that does not report, such as a process.
+        reason: Why it has no effect, if it has none.
     """
 
     planned: PlannedFault
@@ -84,7 +84,7 @@ class PlannedAction(msgspec.Struct, eq=False):
     reason: str = ""
 
     def outcome(self) -> FaultOutcome:
-        """Return what has become of it so far."""
+        """Return its effect so far."""
         affected = self.watch.affected + self.hit
         reason = ""
         if self.injected_s is None:
@@ -98,19 +98,19 @@ class Injector(Actor):
     """Carries out a scenario of planned faults.
 
     Args:
-        context: of the actor.
-        scenario: what goes wrong, and when.
-        processes: by which processes are hit.
-        nodes: names that may be hit.
-        known: all topics of the system.
-        faults: of the robot.
+        context: Of the actor.
+        scenario: The planned faults.
+        processes: Acts on processes.
+        nodes: Nodes whose processes may be hit.
+        known: All topics of the system.
+        faults: Of the robot.
 
     Raises:
-        ScenarioError: a planned fault makes no sense in this system.
+        ScenarioError: A planned fault is invalid in this system.
 
     Attributes:
-        planned: all planned faults; none while it is open which of several scenarios this is.
-        open: the scenarios that the run may still turn out to be, by number.
+        planned: All planned faults; empty while the scenario is open.
+        open: Scenarios that the run may still become, by number.
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (bus_topics.INJECT, ftm_topics.SIGNAL)
@@ -139,32 +139,31 @@ class Injector(Actor):
                 fault, clip(name, NAME_CHARS), self._nodes, self._known, self._faults)
             planned.append(PlannedAction(
                 fault, action, FaultWatch(action if isinstance(action, tuple) else ()), number))
-        self._may_publish.update(  # a robot orders its own faults on topics of its own
+        self._may_publish.update(  # a robot has its own topics for faults
             order.topic.key for each in planned for order in each.watch.orders)
         return planned
 
     def outcomes(self) -> tuple[FaultOutcome, ...]:
-        """Return what became of the faults so far."""
+        """Return the effects of the faults so far."""
         return tuple(fault.outcome() for fault in self.planned)
 
     # -- one of several scenarios ---------------------------------------------------------------
 
     def one_of(self, scenarios: Sequence[Sequence[PlannedFault]], branch: Branch) -> None:
-        """Leave open which of several scenarios this run is; to be called before it is started.
+        """Leave the scenario of this run open; call it before the start.
 
-        In the moment of a scenario's first fault `branch` is asked. If it returns true, this is
-        that scenario from then on, and has been from the beginning as far as a message can tell;
-        if not, it is one of the others.
+        `branch` is called at the first fault of a scenario. If it returns true, the run is that
+        scenario, and no message shows that it was open before. Otherwise it is another one.
 
         Raises:
-            ScenarioError: a planned fault makes no sense in this system.
+            ScenarioError: A planned fault is invalid in this system.
         """
         self.open = {i: self._plan(scenario, i) for i, scenario in enumerate(scenarios)}
         self.planned = []
         self._branch = branch
 
     def decide(self, number: int) -> None:
-        """Have it decided whether this run is a scenario, unless that is known."""
+        """Decide whether this run is a scenario, unless that is known."""
         if number not in self.open or self._branch is None:
             return
         faults = self.open.pop(number)
@@ -185,13 +184,13 @@ class Injector(Actor):
     # -- when -----------------------------------------------------------------------------------
 
     def on_start(self) -> None:
-        """Wait for the times that are known."""
+        """Wait for the known times."""
         for fault in self._awaited():
             if not fault.planned.goal:
                 self._later(fault, fault.planned.at_s - self.clock.now())
 
     def goals_begun(self, number: int) -> None:
-        """Note that so many goals of the mission have begun; for the injector of a robot."""
+        """Note the number of goals that have begun; called by the injector of a robot."""
         while self._begun < number:
             self._begun += 1
             for fault in self._awaited():
@@ -199,12 +198,12 @@ class Injector(Actor):
                     self._later(fault, fault.planned.at_s)
 
     def carry_out(self, fault: PlannedAction) -> None:
-        """Do what only the injector of a robot knows to do."""
-        raise TypeError(f"{fault.action!r}: nothing that this injector can do")
+        """Carry out an action that only the injector of a robot knows."""
+        raise TypeError(f"{fault.action!r}: this injector cannot carry it out")
 
     @on(bus_topics.INJECTION_REPORT)
     def report(self, report: InjectionReport, header: Header) -> None:
-        """Note what an injection has changed; a node that was restarted counts anew."""
+        """Note the effect of an injection; a restarted node counts from 0."""
         for fault in self.planned:
             if fault.injected_s is not None:
                 fault.watch.hear(report, header.incarnation)
@@ -213,7 +212,7 @@ class Injector(Actor):
 
     def _later(self, fault: PlannedAction, delay_s: float) -> None:
         delay_s = max(delay_s, 0.0)
-        if self.open:  # decided first, and outside of the mailbox, whose items are counted
+        if self.open:  # decide first, outside the mailbox, whose items are counted
             asyncio.get_running_loop().call_at(
                 self.clock.source_time(self.clock.now() + delay_s), self.decide, fault.scenario)
         fault.timer = self.call_later(delay_s, lambda: self._inject(fault))
@@ -239,7 +238,7 @@ class Injector(Actor):
                             lambda: self._do(_ENDS[action.what], fault, action, 0.0))
 
     def _hang(self, fault: PlannedAction, action: OnProcess, until_s: float) -> None:
-        """Stop the process of a node of this host, and each that follows, until it is over."""
+        """Stop the process of a node of this host, and each later one, until the fault ends."""
         if self.clock.now() < until_s:
             if self._control("stop", action.node, 0.0):
                 fault.hit = 1
@@ -248,7 +247,7 @@ class Injector(Actor):
             self.call_later(_HANGS_WITHIN_S, lambda: self._hang(fault, action, until_s))
 
     def _do(self, what: str, fault: PlannedAction, action: OnProcess, pace_s: float) -> None:
-        """Do something to one process, or to all; what runs on another host its supervisor hits."""
+        """Act on one process, or on all; processes of another host through its supervisor."""
         for node in (action.node,) if action.node else self._nodes:
             if self._control(what, node, pace_s):
                 fault.hit = 1
@@ -261,7 +260,7 @@ class Injector(Actor):
                 fault.reason = f"{node} had no running process"
 
     def _signalled(self, event: ProcessEvent, _header: Header) -> None:
-        """Note what the supervisor of another host has done to a process."""
+        """Note the answer of the supervisor of another host."""
         name, _, number = event.by.rpartition("-")
         if name == self.name and number.isdecimal() and 0 < int(number) <= len(self._ordered):
             fault = self._ordered[int(number) - 1]

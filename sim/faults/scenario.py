@@ -1,16 +1,15 @@
-"""What goes wrong in a run, and when: faults planned for a time or a point of the mission. Pure.
+"""Planned faults of a run, at a time or a point of the mission. Pure.
 
 A planned fault is written `FAULT[@WHEN][+DURATION]`:
 
-* FAULT is a name of the catalogue (`rampart inject --list`), `MODE:TOPIC` for any topic,
-  `kill:NODE`, `stop:NODE`, `wedge:NODE`, `slow:NODE[:SECONDS]` or `hang:NODE` for any process,
-  `slow:all` for every one at once, as on a machine that is overloaded, `stop:all`, as when a
-  container is paused, or one that the robot declares (`Faults.own`), which may have details behind
-  a colon, too. `hang` stops each process of the node that there is or will be, right after its
-  start.
-* WHEN is simulated seconds, or `goalN` for the moment in which goal N of the mission begins,
-  or `goalN:SECONDS` for so long after it. Left out it is 10 s.
-* DURATION is simulated seconds, or `inf` for the rest of the run. Left out it is the fault's own.
+* FAULT is a name of the catalogue (`rampart inject --list`), `MODE:TOPIC` for any topic, or a fault
+  of a process: `kill:NODE`, `stop:NODE`, `wedge:NODE`, `slow:NODE[:SECONDS]`, `hang:NODE`. `hang`
+  stops each present and future process of the node right after its start. `slow:all` (an overloaded
+  machine) and `stop:all` (a paused container) hit all processes. A robot may declare further faults
+  with details behind a colon (`Faults.own`).
+* WHEN is simulated seconds; `goalN` for the beginning of goal N of the mission; or `goalN:SECONDS`
+  for a time after it. The default is 10 s.
+* DURATION is simulated seconds, or `inf` for the rest of the run. The default is the fault's own.
 """
 
 from __future__ import annotations
@@ -31,26 +30,26 @@ DEFAULT_AT_S = 10.0
 _MAX_DIGITS = 9
 _SLOW_S = 0.1
 ALL = "all"
-"""In place of a node, of `slow` and `stop`: all of them."""
+"""Stands for all nodes, in `slow` and `stop`."""
 _LASTS_S = {"kill": 0.0, "wedge": math.inf, "stop": 5.0, "slow": 10.0, "hang": math.inf}
 
 
 class ScenarioError(ValueError):
-    """A planned fault that makes no sense; the message is one line."""
+    """An invalid planned fault; the message is one line."""
 
 
 class PlannedFault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One fault, when it comes, and how long it stays.
+    """One fault with its time and duration.
 
     Args:
-        fault: What, as described above, without WHEN and DURATION.
+        fault: FAULT as above, without WHEN and DURATION.
         at_s: Simulated seconds; after the beginning of `goal`, if there is one.
         goal: Goal of the mission, counted from 1; 0 for none.
         duration_s: Simulated seconds; None for the fault's own.
-        share: Of the messages that are affected, for faults of topics.
-        on_s: For an intermittent fault of a topic: in force so long ...
-        off_s: ... and then away so long.
-        seed: Of all that is random in it.
+        share: Share of messages that a fault of a topic affects.
+        on_s: How long an intermittent fault of a topic is in force ...
+        off_s: ... and then absent.
+        seed: Of its random parts.
     """
 
     fault: str
@@ -63,7 +62,7 @@ class PlannedFault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int = 0
 
     def text(self) -> str:
-        """Return it as it is typed; what cannot be typed is put in brackets."""
+        """Return it as typed, with the rest in brackets."""
         when = f"{self.at_s:g}"
         if self.goal:
             when = f"goal{self.goal}:{when}" if self.at_s else f"goal{self.goal}"
@@ -75,7 +74,7 @@ class PlannedFault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OnProcess(msgspec.Struct, frozen=True):
-    """Something done to the process of a node, "" for those of all; `pace_s` is for slow."""
+    """An action on the process of a node, "" for all; `pace_s` is for `slow`."""
 
     what: str
     node: str
@@ -87,7 +86,7 @@ def parse_fault(text: str) -> PlannedFault:
     """Read `FAULT[@WHEN][+DURATION]`.
 
     Raises:
-        ScenarioError: It is not of this form.
+        ScenarioError: The text has another form.
     """
     rest, plus, lasts = text.strip().partition("+")
     fault, at, when = rest.partition("@")
@@ -116,18 +115,18 @@ def _seconds(text: str, value: str, what: str, *, infinite: bool = False) -> flo
 
 def action_of(planned: PlannedFault, injection: str, nodes: Collection[str],
               known: Sequence[Topic[Any]], faults: Faults) -> object:
-    """Return what is to be done: a tuple of `Order`, `OnProcess`, or what the robot knows to do.
+    """Return the action of a fault: a tuple of `Order`, `OnProcess`, or an action of the robot.
 
     Args:
         planned: The fault.
         injection: Id under which its effect is reported.
-        nodes: Names of all nodes with a process that a fault may hit.
+        nodes: Nodes whose processes a fault may hit.
         known: All topics of the system, see `system_topics`.
         faults: Of the robot.
 
     Raises:
-        ScenarioError: There is no such node, or the details of the fault make no sense.
-        UnknownFaultError: There is no such fault.
+        ScenarioError: The node is unknown, or the details of the fault are invalid.
+        UnknownFaultError: The fault is unknown.
     """
     kind, *details = planned.fault.split(":")
     lasts_s = planned.duration_s
@@ -149,10 +148,10 @@ def action_of(planned: PlannedFault, injection: str, nodes: Collection[str],
 
 
 def number(fault: str, details: Sequence[str], default: float, most: float = 1.0) -> float:
-    """Return the one number in the details of a fault, from 0 to `most`; the default without any.
+    """Return the only detail of a fault, a number from 0 to `most`; the default without details.
 
     Raises:
-        ScenarioError: It is none, or out of range, or there is more.
+        ScenarioError: It is not a number, out of range, or not the only detail.
     """
     if not details:
         return default
@@ -164,7 +163,7 @@ def number(fault: str, details: Sequence[str], default: float, most: float = 1.0
 
 
 def _number(text: str) -> float:
-    """Return the number in a text, which is none (nan) of one that is none."""
+    """Return the number in a text, NaN if there is none."""
     try:
         return float(text)
     except ValueError:
@@ -172,12 +171,12 @@ def _number(text: str) -> float:
 
 
 class FaultOutcome(msgspec.Struct, frozen=True):
-    """What became of a planned fault.
+    """Effect of a planned fault.
 
     Attributes:
         fault: As planned, in text.
-        injected_s: When it was injected, simulated seconds; None if its moment never came.
-        affected: How many messages or ticks it changed, or 1 for a process or an obstacle.
+        injected_s: When it was injected, simulated seconds; None if it was not.
+        affected: Number of messages or ticks that it changed, or 1 for a process or an obstacle.
         reason: Why it had no effect, else empty.
     """
 

@@ -1,21 +1,17 @@
-"""The systematic faults: every topic that a node publishes, with every mode, as `MODE:TOPIC`.
+"""Systematic faults: every topic that a node publishes, in every mode, as `MODE:TOPIC`.
 
-`corrupt:TOPIC` needs no knowledge of the message. It adds a constant offset to every number in
-it, also to those in nested structs, sequences and arrays. The offset is drawn once per fault from
-a range that its unit makes plausible (`SPREADS`): the message stays one that a node could have
-sent, and each number in it is wrong, every time by the same. Its sign is random, but durations,
-illuminances, intensities and whole numbers only grow, since hardly any of them can be negative;
-whole numbers by 1 to 3. Truth values, words and texts stay. So does `pid`: the supervisor kills
-by it, and a wrong one may be a stranger's process.
+`corrupt:TOPIC` adds a constant offset to every number in a message, also in nested structs,
+sequences and arrays. Each offset is drawn once per fault, from a range that is plausible for its
+unit (`wrong_numbers`), so the message stays possible. Truth values, words and texts stay. So does
+`pid`: the supervisor kills by it, and a wrong one may be another process.
 
-`restamp:TOPIC` is a clock that is wrong by a constant, ahead or behind, drawn as well.
+`restamp:TOPIC` is a clock with a constant error, ahead or behind, drawn as well.
 
-A *nonsense reading* (`NONSENSE`) is one that no sound device gives: zeros, numbers that are
-negative or beyond all measure, arrays of another length. Every topic that carries measurements,
-and every one that a device publishes, has them: `nan:TOPIC`.
+A *nonsense reading* (`NONSENSE`) is impossible for a sound device: zeros, negative or huge numbers,
+arrays of another length. Topics of sensors and devices have them: `nan:TOPIC`.
 
-The topics below `world/` are left out, because the judge goes by them and a fault there would
-falsify the verdict, and so are those that carry the injections themselves.
+Topics below `world/` are left out, since the judge uses them and a fault there would falsify the
+verdict. Topics that carry injections are left out, too.
 """
 
 from __future__ import annotations
@@ -39,12 +35,12 @@ GROUP, READING = "topic", "reading"
 DURATION_S = 10.0
 
 DELAY_S = 1.5
-"""Delay of `delay:TOPIC`: half as long again as the longest freshness timeout that is derived
-for the shipped system (0.99 s), so that a delay is one that should be detected."""
+"""Delay of `delay:TOPIC`: half longer than the longest freshness timeout of the shipped system
+(0.99 s), so it should be detected."""
 
 STAMPS_S = (0.02, 5.0)
-"""Least and greatest error of a stamp: from one that need not be noticed to one beyond every
-freshness timeout. Drawn by its logarithm, so that the small ones are as frequent as the large."""
+"""Least and greatest error of a stamp, from a harmless one to one beyond every freshness timeout.
+Drawn by its logarithm, so small errors are as frequent as large ones."""
 
 _TITLES = {
     "drop": "nothing on {} arrives",
@@ -58,8 +54,8 @@ _TITLES = {
 _NUMBERS = {"zero": 0, "negative": -1, "huge": 10**6, "infinite": math.inf, "nan": math.nan}
 _ARRAYS = {"tiny": 0.01, "single": struct.pack("<f", 0.0), "short": None}
 NONSENSE = (*_NUMBERS, *_ARRAYS)
-"""Readings that no sound device gives. The last three are of arrays: smaller than any range,
-a single element, no more than the first and the last element."""
+"""Readings that are impossible for a sound device. The last three are for arrays: smaller than any
+range, a single element, only the first and the last element."""
 
 
 def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]],
@@ -67,17 +63,16 @@ def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]],
     """Return the fault `MODE:TOPIC`.
 
     Args:
-        mode: one of `MODES` or `NONSENSE`.
-        key: of a declared topic or one member of a family, with or without `rampart/`.
-        seed: of what `restamp` and `corrupt` draw, and of the gate's chance. An even one corrupts
-            every number of a message, as a wrong sender does; an odd one only one of them, which
-            leaves whatever the others can be checked by. So it is with nonsense, but that an even
-            one leaves all but the arrays alone in a message that has some: a ray is a reading.
-        known: all topics of the system, see `system_topics`.
-        sizes: how wrong a number of the robot's can be, where its field does not say.
+        mode: One of `MODES` or `NONSENSE`.
+        key: Key of a topic or of a member of a family, with or without `rampart/`.
+        seed: Of random numbers. An even seed changes all numbers of a message, like a wrong sender;
+            an odd one changes a single number, so the others may reveal it. In a message with
+            arrays, an even seed puts nonsense only into the arrays.
+        known: All topics of the system, see `system_topics`.
+        sizes: Sizes of errors that count before those of the fields.
 
     Raises:
-        UnknownFaultError: no such mode or topic, or the two do not go together.
+        UnknownFaultError: The mode or topic is unknown, or the mode is senseless on this topic.
     """
     short = key.removeprefix("/").removeprefix(f"{ROOT}/")
     if mode not in (*MODES, *NONSENSE):
@@ -92,7 +87,7 @@ def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]],
     draw = Random(f"{short} {seed}")  # noqa: S311 no secret
     if mode in NONSENSE:
         what = _nonsense(mode, topic.type, draw if seed % 2 else None)
-        assert what is not None, "it makes sense"  # noqa: S101
+        assert what is not None, "checked above"  # noqa: S101
         fields = ", ".join((*what.set_fields, *what.keep_ends))
         return Fault(f"{mode}:{short}", f"nonsense on {short}, {mode}: {fields}",
                      (msgspec.structs.replace(what, topic=short, seed=seed),), (), DURATION_S,
@@ -114,23 +109,23 @@ def systematic_faults(keys: Iterable[str], known: Sequence[Topic[Any]],
     """Return every fault `MODE:TOPIC` of the given topics.
 
     Args:
-        keys: of single topics, e.g. those that `published_keys` of a system gives; those that must
-            not be disturbed are passed over, and so are modes that make no sense on a topic.
-        known: see `topic_fault`.
-        seed: likewise.
+        keys: Keys of topics, such as `published_keys` of a system. Topics that must not be
+            disturbed are left out, and so are senseless modes.
+        known: See `topic_fault`.
+        seed: See `topic_fault`.
 
     Raises:
-        UnknownFaultError: a key is none.
+        UnknownFaultError: A topic is unknown.
     """
     return tuple(topic_fault(mode, key, seed, known)
                  for key in keys for mode in modes_of(key, known))
 
 
 def modes_of(key: str, known: Sequence[Topic[Any]]) -> tuple[str, ...]:
-    """Return the modes in which a topic can fail; none for one that must not be disturbed.
+    """Return the modes in which a topic can fail; none if it must not be disturbed.
 
     Raises:
-        UnknownFaultError: there is no such topic.
+        UnknownFaultError: The topic is unknown.
     """
     topic = find_topic(key, known)
     if topic is None:
@@ -141,18 +136,18 @@ def modes_of(key: str, known: Sequence[Topic[Any]]) -> tuple[str, ...]:
 
 
 def stamp_error_s(draw: Random) -> float:
-    """Return by how much a stamp is wrong, s, above 0 for ahead; never 0."""
+    """Return the error of a stamp, s, above 0 for ahead; never 0."""
     size_s = math.exp(draw.uniform(*map(math.log, STAMPS_S)))
     return round(draw.choice((-1.0, 1.0)) * size_s, 3)
 
 
 def _nonsense(mode: str, kind: type[msgspec.Struct], draw: Random | None) -> Disturbance | None:
-    """Return the disturbance, without a topic; None if no number in a message can be so.
+    """Return the disturbance, without a topic; None if no number in a message can have the value.
 
     Args:
-        mode: one of `NONSENSE`.
-        kind: of the messages.
-        draw: chooses one number; None changes all readings.
+        mode: One of `NONSENSE`.
+        kind: Type of the messages.
+        draw: Chooses one number; None changes all readings.
     """
     value = {**_NUMBERS, **_ARRAYS}[mode]
     found: dict[str, Disturbance] = {}
@@ -180,14 +175,14 @@ def _fits(change: Disturbance, kind: type[msgspec.Struct]) -> bool:
 
 
 def _senseless(mode: str, topic: Topic[Any]) -> str:
-    """Return why a topic's messages cannot fail in a mode, or an empty text."""
+    """Return why a mode is senseless on a topic, or an empty text."""
     kind = topic.type
     if mode in {"corrupt", *NONSENSE} and kind.__struct_config__.array_like:
         return f"{kind.__name__} is array_like: its fields have no names on the way"
     if mode in NONSENSE and topic.qos is not Qos.SENSOR and not topic.outside:
         return f"{topic.key} carries no readings"
     if mode in NONSENSE and _nonsense(mode, kind, None) is None:
-        return f"no number in a {kind.__name__} can be so"
+        return f"no number in a {kind.__name__} can have this value"
     if mode == "corrupt" and next(numbers(kind), None) is None:
         return f"there is no number to corrupt in a {kind.__name__}"
     if mode == "stuck" and not msgspec.structs.fields(kind):
@@ -198,7 +193,7 @@ def _senseless(mode: str, topic: Topic[Any]) -> str:
 def closed(key: str) -> str:
     """Return why a topic must not be disturbed, or an empty text."""
     if key.startswith("world/"):
-        return "the judge goes by world/, a fault there would falsify the verdict"
+        return "the judge uses world/, so a fault there would falsify the verdict"
     if key in UNTOUCHED:
         return "it carries the injections themselves"
     return ""

@@ -1,8 +1,8 @@
-"""How wrong a number in a message can be and still be one that a node could have sent.
+"""Sizes of plausible errors of the numbers in a message.
 
-A field says so itself: by its range (`Annotated[float, Meta(ge=0, le=1)]`), by its unit
-(`Meta(extra={"unit": "m"})`), or by the unit at the end of its name. A robot that knows better has
-a table of its own (`Faults.sizes`), which counts first.
+The size comes from the field's range (`Annotated[float, Meta(ge=0, le=1)]`), its unit
+(`Meta(extra={"unit": "m"})`), or the unit at the end of its name. A robot's own table
+(`Faults.sizes`) counts first.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rampart.actors.bus.bounds import narrow_range
 from rampart.actors.runtime.corruption import field_types, is_array
 
 OF_RANGE = (0.05, 0.3)
-"""Of a field's range, the least and greatest share that it is wrong by."""
+"""Least and greatest error as a share of the field's range."""
 
 UNITS: dict[str, tuple[float, float]] = {
     "m": (0.5, 3.0), "cm": (5.0, 50.0), "mm": (5.0, 50.0), "rad": (0.3, 1.5), "deg": (15.0, 90.0),
@@ -26,21 +26,21 @@ UNITS: dict[str, tuple[float, float]] = {
     "nm": (1.0, 10.0), "pa": (1e3, 2e4), "bar": (0.2, 1.0), "k": (5.0, 40.0),
     "degc": (5.0, 40.0), "v": (1.0, 10.0), "a": (0.5, 5.0), "w": (10.0, 200.0),
     "percent": (10.0, 50.0)}
-"""Unit, in lower case → least and greatest amount of a field that declares no range."""
+"""Unit, in lower case → least and greatest error of a field without range."""
 
 NO_UNIT = (0.1, 0.5)
-"""Of numbers without range and unit, such as ratios and stick positions."""
+"""Least and greatest error of numbers without range and unit, such as ratios."""
 
 NEVER_NEGATIVE = frozenset({"s", "ms", "hz", "kg", "k"})
-"""Of such a unit a number only grows, as does one that its type keeps from being negative."""
+"""Numbers of these units only grow, like those that their type keeps from being negative."""
 
 
 class Sizes(NamedTuple):
     """A robot's own sizes.
 
     Attributes:
-        by_end: End of a field's path → least and greatest amount; the first that fits counts.
-        only_grow: Ends of those that are only made larger.
+        by_end: End of a field's path, least and greatest error; the first match counts.
+        only_grow: Ends of paths whose numbers only grow.
     """
 
     by_end: tuple[tuple[str, float, float], ...] = ()
@@ -48,7 +48,7 @@ class Sizes(NamedTuple):
 
 
 class Number(NamedTuple):
-    """A number in a message: its path, its type without bounds, and what is declared of it."""
+    """A number in a message: path, type without bounds, and declarations of its field."""
 
     path: str
     kind: Any
@@ -56,7 +56,7 @@ class Number(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """What is declared, else the last word of its name, in lower case."""
+        """Declared unit, else the last word of its name, in lower case."""
         for meta in self.metas:
             if unit := (meta.extra or {}).get("unit"):
                 return str(unit).lower()
@@ -65,7 +65,7 @@ class Number(NamedTuple):
 
 def plausible_offsets(kind: type[msgspec.Struct], draw: Random, sizes: Sizes = Sizes()  # noqa: B008
                       ) -> dict[str, float]:
-    """Return an offset for every number in a message type: path → amount, never 0."""
+    """Return a plausible offset for every number in a message type: path → amount, never 0."""
     return {number.path: _offset(number, draw, sizes) for number in numbers(kind)}
 
 

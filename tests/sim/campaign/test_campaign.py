@@ -124,10 +124,10 @@ def test_a_file_that_is_no_store_or_one_of_another_format_is_refused_and_left_al
     with sqlite3.connect(tmp_path / "runs.sqlite") as database:
         database.execute("update about set value = '99'")
     database.close()
-    with pytest.raises(StoreError, match="format '99', this program reads 2"):
+    with pytest.raises(StoreError, match="format '99', expected 2"):
         Store(tmp_path)
     (tmp_path / "runs.sqlite").write_text("my shopping list\n" * 100)
-    with pytest.raises(StoreError, match="no store of campaign results"):
+    with pytest.raises(StoreError, match="not a store of campaign results"):
         Store(tmp_path)
     assert "shopping" in (tmp_path / "runs.sqlite").read_text()
 
@@ -433,7 +433,7 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
     fault, = small.faults
     assert (fault.fault, fault.at_s, fault.on_s, fault.seed) == ("laser-stuck", 40.0, 0.0, 0)
     assert 5 <= fault.duration_s < 10
-    with pytest.raises(ValueError, match="is safe: there is nothing to shrink"):
+    with pytest.raises(ValueError, match="is safe, so it cannot be shrunk"):
         shrink(job, lambda _job: result())
 
 
