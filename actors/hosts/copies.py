@@ -30,7 +30,7 @@ class _State:
     Attributes:
         other: Host that holds the second copy.
         mine: The newest on this host.
-        theirs: What the other host published last; None if nothing since it was lost.
+        theirs: Last state from the other host; None if there is none since it was lost.
     """
 
     other: str

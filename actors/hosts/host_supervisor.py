@@ -64,7 +64,7 @@ class HostSupervisor(Supervisor):
     """Keeps the processes of one host of several running."""
 
     class Parameters(Supervisor.Parameters, frozen=True):
-        """Besides: names of its own host and of the others."""
+        """Names of this host and of the others."""
 
         host: str = ""
         others: tuple[str, ...] = ()
@@ -110,7 +110,7 @@ class HostSupervisor(Supervisor):
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Supervisor.Parameters) -> Members:
-        """Receive the tables of all other supervisors, and states from those that share some."""
+        """Receive the tables of all other supervisors, and states from hosts that share some."""
         if topic in (topics.HOST_NODES, topics.CHECKPOINTS):
             assert isinstance(parameters, HostSupervisor.Parameters)  # noqa: S101 for the type checker
             shares_all = topic is topics.HOST_NODES or parameters.host == FIRST
@@ -127,7 +127,7 @@ class HostSupervisor(Supervisor):
         return super().output_names(topic, name, parameters)
 
     def units_at_start(self, running: Collection[str]) -> Iterable[str]:
-        """Return the units of this home, and those that run here already in another one's place.
+        """Return the units of this home, and the units of other homes that run here.
 
         A unit that ran on another host last starts here only when the first host gives it back.
         """
@@ -247,7 +247,7 @@ class HostSupervisor(Supervisor):
     def _drop(self, unit: str) -> None:
         process = self.hand_over(unit)
         if process is not None:
-            for node in process.names:  # the one that was requested may have started
+            for node in process.names:  # a requested process may have started
                 self._issue(node, process.highest + process.waits)
             self._copies.unsettle(process.names)
             self._ending.update(process.names)

@@ -2,7 +2,7 @@
 
 Each of them sends questions over a WebSocket. The answers carry the plan of the run, whether this
 host's files are the same, when simulated time begins, and the first host's clock. At the end of the
-run the first host closes all connections with a close code of its own. A broken connection is made
+run the first host closes all connections with a special close code. A broken connection is made
 again; the run does not depend on it.
 """
 
@@ -287,7 +287,7 @@ def joined(plan: RunPlan, own: RunPlan) -> RunPlan:
 
 
 def contents_of(plan: RunPlan, application: Application | None = None) -> dict[str, str]:
-    """Return hashes of what must be the same on all hosts: program, system, application.
+    """Return hashes of the files that all hosts share: program, system, application.
 
     Args:
         plan: Of the run.

@@ -132,7 +132,7 @@ class Placement:
         return self._others[host].is_lost
 
     def begin(self, running: Collection[str], is_elsewhere: Callable[[str], bool]) -> list[str]:
-        """Return the units to begin with: those of this host, and those that run here already.
+        """Return the units to begin with: of this home, or running here already.
 
         If a unit of another home runs here, that host was lost. A unit of this home that may run on
         the first host is not begun; it will be given back.
@@ -222,7 +222,7 @@ class Placement:
         return Changes(tuple(lost), tuple(back), tuple(take), tuple(drop))
 
     def rows(self) -> list[NodeInfo]:
-        """Return the rows of what other hosts run and this one does not."""
+        """Return the rows of nodes that run on other hosts and not on this one."""
         return [row for other in self._others.values() for row in other.runs.values()
                 if self._unit_of.get(row.name, "") not in self.held]
 

@@ -1,4 +1,4 @@
-"""A module that could not have heard anything blames nobody for it, and not for long."""
+"""A module that could not receive anything blames no node for that, for a short time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Source(Actor):
 
 
 def watched(script):
-    """Run a script with DM6, what it watches, and who hears it."""
+    """Run a script with DM6, the source that it watches, and a reader of its reports."""
     async def scenario():
         async with System() as system:
             ear, source = system.start("ear", Ear), system.start("localization", Source)
@@ -69,7 +69,7 @@ def test_a_module_that_was_late_reads_its_mail_before_it_judges(held_until_s, ac
     assert active_after_s(disturb) == pytest.approx(active_s, abs=2e-3)
 
 
-def test_one_that_was_stopped_does_not_blame_those_that_go_on_a_little_later():
+def test_a_module_that_was_stopped_does_not_blame_nodes_that_continue_a_little_later():
     async def script(system, ear, source, module):
         await publish(source, 40)
         module.hold(True)
@@ -84,7 +84,7 @@ def test_one_that_was_stopped_does_not_blame_those_that_go_on_a_little_later():
     watched(script)
 
 
-def test_one_that_concludes_nothing_yet_is_not_silent():
+def test_a_module_that_does_not_decide_yet_is_not_silent():
     async def script(system, ear, source, module):
         await publish(source, 2)
         module.hold(True)

@@ -1,4 +1,4 @@
-"""Detection modules that a specification alone makes: timelines, and what they say on the bus."""
+"""Ready-made detection modules: timelines of monitors, and reports on the bus."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ def noted(monitor: Sustained):
     return handle
 
 
-# g: all is well, w: something is wrong, ?: nothing can be said; wrong for 300 ms, well for 200 ms.
+# g: no error, w: error, ?: unknown; error for 300 ms, none for 200 ms.
 @pytest.mark.parametrize(("events", "expected"), **table({
     "well": ("gggg", "----"),
     "wrong for long enough": ("gwwwwgggg", "----AAA--"),
     "wrong for a moment": ("gwwgww", "------"),
-    "wrong, then silence: what was said last stands": ("gw......", "----AAAA"),
+    "an error, then silence: the last note stands": ("gw......", "----AAAA"),
     "well, then silence: not cured": ("wwwwg...", "---AAAAA"),
     "a source that stutters": ("wwwwgwgwggg", "---AAAAAAA-"),
-    "nothing can be said: what lasted begins anew": ("ww?wwww", "------A"),
+    "unknown: both times start again": ("ww?wwww", "------A"),
 }))
 def test_what_lasts(events, expected):
     monitor = Sustained(0.3, 0.2)
@@ -148,7 +148,7 @@ def test_a_step_is_not_busy_for_longer_than_it_may_be():
     "it changes once": ("aaaabbbbbb", "---AAAAAAA"),
     "silence is not the same": ("aa......", "--------"),
     "the same after silence": ("a...a", "----A"),
-    "active, then silence: what was said last stands": ("aaaa...", "---AAAA"),
+    "active, then silence: the last value stands": ("aaaa...", "---AAAA"),
     "what may last": ("xxxxxx", "------"),
     "what may last is a change": ("aaaaxxx", "---AAA-"),
     "a new process is given time": ("aaAaaaa", "-----AA"),
@@ -162,8 +162,8 @@ def test_what_never_changes(events, expected):
     "silence": ("......", "???---"),
     "the same from the start": ("aaaaa", "???AA"),
     "a change": ("abbb", "?---"),
-    "one value says nothing": ("a.....", "???---"),
-    "what may last says something": ("xxxx", "----"),
+    "a single value shows nothing": ("a.....", "???---"),
+    "a value that may last shows that the fault is absent": ("xxxx", "----"),
 }))
 def test_what_never_changes_to_a_module_that_was_respawned(events, expected):
     monitor = UnchangedMonitor("it", 0.3, 0.2, may_last=("x",), known_after_s=0.3)
@@ -207,7 +207,7 @@ def test_who_agrees(values, places):
 
 def reports(kind: type, script: list[tuple[float, Any, Any]], until_s: float,
             respawned: bool = False, **parameters: Any) -> list[tuple[float, str, str]]:
-    """Return when a module said what, and why; of a script of (time, topic, message)."""
+    """Return time, state and reason of the reports, for a script of (time, topic, message)."""
 
     async def scenario() -> list[tuple[float, str, str]]:
         async with VirtualSystem(topics=TOPICS) as system:

@@ -1,4 +1,4 @@
-"""A host that cannot be reached: when it is told, of which host, and when it is over."""
+"""A host that cannot be reached: when it is reported, which host, and when it is over."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def test_few_or_a_little_late_are_no_overload(script):
 
 
 def test_one_that_was_late_for_long_counts_for_as_long():
-    """A loop that turns every 0.9 s says so every 0.9 s; another one says so in between."""
+    """A loop that turns every 0.9 s reports every 0.9 s; another one reports in between."""
     script = [(1.0 + 0.45 * i, "ab"[i % 2], 0.9) for i in range(8)]
     assert [state for _, state in states(script, until_s=4.0)] == ["idle", "active"]
 

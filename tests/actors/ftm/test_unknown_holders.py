@@ -1,4 +1,4 @@
-"""Who makes the robot stand and is no recovery module is obeyed, named, and can be made to let go.
+"""Holders that are not recovery modules are obeyed and reported, and can be released.
 
 Nor does a forged later incarnation mute a recovery module, or a source of commands.
 """
@@ -21,7 +21,7 @@ FORGED = 999_999
 
 
 class World:
-    """One actor of the paper's system, what it says, and anybody who tells it something."""
+    """One actor of the paper's system, its messages, and any sender."""
 
     def __init__(self, system, name):
         self.system = system

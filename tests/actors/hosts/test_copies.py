@@ -122,7 +122,7 @@ def test_a_state_of_an_incarnation_that_is_not_known_to_be_issued_is_not_taken_y
     robot.issued["camera"] = 1
     robot.receive("ground", ground.message())
     assert robot.disk == {}
-    robot.issued["camera"] = 2  # the table of what runs there has come
+    robot.issued["camera"] = 2  # its table has arrived
     robot.receive("ground", ground.message())
     assert robot.disk == {"camera": state(2, 1)}
 
@@ -166,7 +166,7 @@ def test_what_a_superseded_process_keeps_meanwhile_never_wins(robot, ground):
 
 def test_where_a_node_runs_nothing_is_taken_but_of_a_higher_incarnation(robot, ground):
     taken_over(robot, ground)
-    del robot.disk["camera"]  # it was set aside, say
+    del robot.disk["camera"]  # perhaps it was set aside
     robot.copies.note_kept("camera", None)
     ground.keep("camera", state(1, 500))
     exchange(robot, ground)

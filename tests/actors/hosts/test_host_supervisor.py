@@ -1,4 +1,4 @@
-"""Two supervisors in virtual time, on simulated machines and disks: what runs where, from what."""
+"""Two supervisors in virtual time, on simulated machines and disks: which host runs a node."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Host(Machine):
         self.begin(incarnation)
 
     def begin(self, incarnation: int) -> None:
-        """Begin a supervisor, the first one or one that replaces another."""
+        """Begin a supervisor, the first one or its replacement."""
         world, plan = self._world, self._plan
         spec = load_system(plan)
         layout = Layout(plan, spec)
@@ -247,7 +247,7 @@ async def test_a_process_that_ends_while_it_is_given_back_is_not_restarted(made,
 
 @within(world)
 async def test_one_that_is_being_forked_when_its_home_is_back_gives_way(made, monkeypatch):
-    """The root may be slow; what it forks yet must not have the number of what the home forks."""
+    """The root may be slow; its fork must not have the incarnation of the home's process."""
     fork, asked = made.robot.fork, []
 
     def slow(names, incarnation, answer):
@@ -352,7 +352,7 @@ async def test_a_host_that_starts_again_with_an_empty_disk_goes_on_from_the_firs
     made.ground = Host(made, "ground", EPOCH + 1)
     for name in ("camera", "part_finder", "D_VISION_CRASH"):
         run_folder.issue(made.ground.folder, [name], EPOCH + 1)
-    await asyncio.sleep(0.26)  # out of step with what is repeated
+    await asyncio.sleep(0.26)  # out of step with the repetitions
     made.is_cut = False
     await asyncio.sleep(0.1 + 4 * DELAY_S + 0.01)  # a heartbeat, and what the first holds
     assert made.ground.disk == {"camera": record(EPOCH + 1, 3)}

@@ -1,4 +1,4 @@
-"""The launchers come together: who waits for whom, what has to be the same, and how it ends."""
+"""Rendezvous of the launchers: readiness, equal files, the end of the run."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ async def test_an_impostor_of_the_first_host_with_another_router_s_key_is_refuse
         await ground.close()
 
 
-# ---- one that is silent -------------------------------------------------------------------------
+# ---- silent peers -------------------------------------------------------------------------------
 
 
 UPGRADE = (b"GET / HTTP/1.1\r\nHost: first\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -308,7 +308,7 @@ async def test_with_keys_a_silent_first_host_is_a_timeout(keys):
 
 
 async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path, monkeypatch):
-    """Its launcher was killed and started again, at another rate say: no end was published."""
+    """Its launcher was killed and started again, perhaps at another rate; no end was published."""
     async def nothing(_launcher):
         pass
 
@@ -331,7 +331,7 @@ async def test_a_host_does_not_stay_in_another_run_of_the_first_one(tmp_path, mo
     first.begin(100.0)
     await starting
     await ground.end()
-    await first.close()  # it cannot be told
+    await first.close()  # the other one cannot be reached
     again = Meeting(msgspec.structs.replace(plan, run_id="r2"), ("ground",), contents, dict)
     await again.open("127.0.7.1", port)
     with pytest.raises(MeetingError, match=r"the first host has begun another run \(r2\)"):

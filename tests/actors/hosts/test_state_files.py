@@ -41,17 +41,17 @@ def store(folder: Path, incarnation: int = 1) -> Iterator[FileCheckpoints]:
 
 
 class Watched:
-    """The files of a camera and of nothing else, and what is told of them."""
+    """The files of a camera, and the reports about them."""
 
     def __init__(self, folder: Path) -> None:
-        self.told: queue.SimpleQueue = queue.SimpleQueue()
+        self.reported: queue.SimpleQueue = queue.SimpleQueue()
         self.problems: list[tuple[str, str]] = []
         self.files = StateFiles(
             folder, "r", ["camera"],
-            lambda *what: self.told.put(what), lambda *what: self.problems.append(what))
+            lambda *what: self.reported.put(what), lambda *what: self.problems.append(what))
 
     def next(self):
-        return self.told.get(timeout=10)
+        return self.reported.get(timeout=10)
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def test_a_copy_of_a_higher_incarnation_replaces_what_has_gone_on_here_meanwhile
 def test_a_damaged_file_is_told_once_and_what_comes_after_it_is_seen(folder, watched):
     folder.mkdir()
     (folder / "camera.1.1").write_bytes(b"no state" * 999)
-    wait_until(lambda: watched.problems, 10, "it was not told")
+    wait_until(lambda: watched.problems, 10, "it was not reported")
     time.sleep(5 * LOOK_S)
     [(node, problem)] = watched.problems
     assert node == "camera"
@@ -146,5 +146,5 @@ def test_a_place_that_cannot_be_written_is_told(folder):
     made.files.start()
     made.files.take("camera", record(1, 3))
     wait_until(lambda: any("a state of another host is not kept" in problem
-                           for _, problem in made.problems), 10, "it was not told")
+                           for _, problem in made.problems), 10, "it was not reported")
     made.files.close()

@@ -1,4 +1,4 @@
-"""RM3 and RM4: what is asked of the supervisor, and when a node counts as back."""
+"""RM3 and RM4: requests to the supervisor, and when a node counts as back."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def seen(core: RespawnCore, node: str = "a", incarnation: int = 1, now_s: float 
 @pytest.mark.parametrize(("heard", "died", "at_s", "failed"), [
     (True, True, 1.06, 3),  # it is dead
     (True, False, 1.4, 3),  # its heartbeat is overdue
-    (True, False, 1.05, 2),  # it was heard a moment ago: its predecessor is accused
-    (False, False, 0.0, 0)])  # it was never heard of
+    (True, False, 1.05, 2),  # its heartbeat is recent: the incarnation before is named
+    (False, False, 0.0, 0)])  # it is unknown
 def test_a_node_is_asked_for_once_with_the_incarnation_that_failed(heard, died, at_s, failed):
     rm = core()
     if heard:
@@ -79,8 +79,8 @@ async def test_in_a_fast_system_a_heartbeat_is_overdue_before_the_watchdog_repor
 
 # what comes between the request for node a, whose life 3 died at 1 s, and the end
 STORIES = {
-    "respawned and heard": (["started 4", "beat 4"], "back"),
-    "heard before the supervisor says so": (["beat 4", "started 4"], "back"),
+    "respawned, then its heartbeat": (["started 4", "beat 4"], "back"),
+    "its heartbeat, then the answer": (["beat 4", "started 4"], "back"),
     "the answer is lost": (["beat 4"], "back"),
     "a process is not enough": (["started 4", "born 4"], "pending"),
     "a heartbeat of the dead life": (["started 4", "beat 3"], "pending"),
@@ -148,7 +148,7 @@ def test_a_new_life_that_dies_or_is_not_heard_is_asked_for_again(dies):
 
 def test_a_wedged_life_that_the_supervisor_takes_for_well_is_named_in_the_next_request():
     rm = core()
-    rm.event("a", "adopted", 3, "", 0.0)  # not heard yet
+    rm.event("a", "adopted", 3, "", 0.0)  # no heartbeat yet
     rm.order(["a"], 0.01, renewed=False)
     assert rm.take_requests() == [request(100, "a", 2)]
     rm.event("a", "respawned", 3, "already", 0.02)

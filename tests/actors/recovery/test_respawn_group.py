@@ -1,4 +1,4 @@
-"""A node and those that depend on it, respawned one after the other."""
+"""A node and its dependents, respawned in order."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Node(Actor):
 
 
 class FakeSupervisor(Actor):
-    """Respawns what it is asked for, if the incarnation that runs is one that failed."""
+    """Respawns a requested node, if the running incarnation is the failed one."""
 
     outputs = (topics.PROCESS_EVENT,)
 

@@ -26,7 +26,7 @@ SHUT = {"topic": "tank/order", "message": {"shut": True, "opening": 0}}
 
 
 class Case:
-    """A recovery module and what it says, with a manager who commands it."""
+    """A recovery module and its messages, with a manager that commands it."""
 
     def __init__(self, system: VirtualSystem, kind: type, **parameters: Any) -> None:
         self.system, self.kind, self.parameters = system, kind, parameters
@@ -72,7 +72,7 @@ async def test_a_message_is_held_for_as_long_as_the_recovery_is_in_force(given):
     assert len(case.orders) == 8
     case.command(2, activate=False)
     await asyncio.sleep(5.0)
-    assert case.orders[8:] == [Valve(False)] * 6, "the end is said for a second"
+    assert case.orders[8:] == [Valve(False)] * 6, "the end is repeated for a second"
     assert case.phase == "idle"
 
 
@@ -111,7 +111,7 @@ CONFIRMED = {**SHUT, "confirm": "tank/valve:shut", "equals": True}
 @within(partial(played, Hold, **CONFIRMED, back={"shut": False}))
 async def test_a_mode_is_reached_when_the_node_says_so_and_lost_when_it_no_longer_does(given):
     system, case = given
-    system.say(VALVE, Valve(True))  # before the order: says nothing
+    system.say(VALVE, Valve(True))  # before the order: does not count
     case.command(1)
     await asyncio.sleep(0.1)
     assert case.phase == "acting"
@@ -244,7 +244,7 @@ def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, wor
 
 
 class Gauge(Actor):
-    """Publishes the level and hears orders."""
+    """Publishes the level and receives orders."""
 
     outputs = (LEVEL, VALVE)
 

@@ -36,7 +36,7 @@ made = branches.attempt_together(jobs, {campaign})
 print(msgspec.json.encode([(a.key, a.result and msgspec.to_builtins(a.result), a.error)
                            for a in made]).decode())
 """
-"""Made in a process of its own: one that tests run in may have threads."""
+"""Made in a separate process, since that of the tests may have threads."""
 
 
 def job(*faults: str, system: str = "paper", **changes) -> Job:

@@ -1,4 +1,4 @@
-"""The report of a campaign: what it says of the runs, which it shows, and how it is written."""
+"""The report of a campaign: figures, runs shown one by one, atomic writing."""
 
 from __future__ import annotations
 

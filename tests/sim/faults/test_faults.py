@@ -1,4 +1,4 @@
-"""The catalogue of faults: each does what its name says to a real message of its topic."""
+"""The catalogue of faults: each has the named effect on a real message of its topic."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Publisher:
         assert self.gate.order(self.order, self.now_s, self.topic.type) == ""
 
     def next(self) -> tuple[Any, Any]:
-        """Return (what the node said, what left it)."""
+        """Return the message of the node, and the message that left it."""
         self.n += 1
         self.now_s += 0.25
         body = sample(self.topic.type, self.n)

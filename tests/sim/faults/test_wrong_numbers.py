@@ -18,7 +18,7 @@ from tests import TANK
 
 
 class Joint(Message, frozen=True):
-    """What an arm's joint says; no unit of Osmosis is in it."""
+    """Message of an arm's joint, without units of Osmosis."""
 
     torque: Annotated[float, msgspec.Meta(ge=-40, le=40)]
     valve: Annotated[float, msgspec.Meta(ge=0, le=1)]
