@@ -1,7 +1,6 @@
 /* The tug's controller in C, without any library: turns to the goal, and drives there.
  *
- * `make` builds it. nodes.Controller plays it in virtual time, where there are no processes; the
- * tests hold the two to the same numbers.
+ * `make` builds it. In virtual time nodes.Controller takes its place; a test compares the two.
  */
 #include <math.h>
 #include <poll.h>
@@ -17,7 +16,7 @@ static double limited(double value, double most)
     return fmin(fmax(value, -most), most);
 }
 
-/* Tell the run that this process still turns: WATCHDOG=1 of sd_notify(3). */
+/* Send a heartbeat: WATCHDOG=1 of sd_notify(3). */
 static void beat(int notify)
 {
     struct sockaddr_un to = {.sun_family = AF_UNIX};
@@ -40,13 +39,13 @@ int main(void)
     }
     int rampart = atoi(given); /* an open descriptor: one packet is one message */
     int notify = socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);
-    double goal_x_m = 1.0, goal_y_m = 0.9, goal_s = 0.0; /* the dock, until a goal is heard */
+    double goal_x_m = 1.0, goal_y_m = 0.9, goal_s = 0.0; /* the dock, until a goal arrives */
     for (;;) {
         beat(notify);
         struct pollfd ready = {.fd = rampart, .events = POLLIN};
         if (poll(&ready, 1, 100) == 0)
             continue;
-        char packet[4096], said[200];
+        char packet[4096], out[200];
         ssize_t size = recv(rampart, packet, sizeof packet - 1, 0);
         if (size <= 0)
             return 0; /* the other end is closed */
@@ -61,10 +60,10 @@ int main(void)
             double turn = remainder(atan2(dy, dx) - heading_rad, 2 * M_PI);
             double speed_mps = fabs(turn) < 0.3 ? fmin(0.8, 0.8 * away_m) : 0.0;
             double turn_radps = fmin(1.0, 4.0 * away_m) * limited(2.0 * turn, 1.0);
-            /* What it says is as old as what it follows from. */
-            size = snprintf(said, sizeof said, "controller/motion %.9f\n{\"speed_mps\":%.9f,\"turn_radps\":%.9f}",
+            /* The output has the time stamp of its inputs. */
+            size = snprintf(out, sizeof out, "controller/motion %.9f\n{\"speed_mps\":%.9f,\"turn_radps\":%.9f}",
                             fmin(stamp_s, goal_s + 0.2), speed_mps, turn_radps);
-            if (send(rampart, said, size, MSG_DONTWAIT) < 0)
+            if (send(rampart, out, size, MSG_DONTWAIT) < 0)
                 perror("controller/motion is not sent");
         }
     }

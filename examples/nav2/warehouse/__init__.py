@@ -1,1 +1,1 @@
-"""A robot in a warehouse whose navigation is three ROS 2 nodes that somebody else wrote."""
+"""A warehouse robot with a navigation of three foreign ROS 2 nodes."""

@@ -1,4 +1,4 @@
-"""The guard, which stands between the navigation and the base."""
+"""The guard between the navigation and the base."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from warehouse.topics import GuardState, Order, Velocity
 
 
 class Guard(Actor):
-    """Passes a velocity on that is young, within bounds, and leads into no obstacle."""
+    """Passes velocities that are recent, within bounds, and free of obstacles."""
 
     class Parameters(Actor.Parameters, frozen=True, kw_only=True):
-        """Which topics of the gateway it hears, and its bounds.
+        """Topics of the gateway, and bounds.
 
         Attributes:
-            command: velocity that the navigation commands.
-            scan: of the laser; it has a field `nearest_m`.
-            top_mps, top_radps: bounds.
-            stop_m: nothing may be nearer to the robot's middle than that: its radius of 0.3 m, what
-                it goes in 0.2 s, the age of a sweep, and what it needs to stop from 0.8 m/s.
-            stale_s: a command or sweep that is older stops the robot.
+            command: topic of the navigation's velocity.
+            scan: topic of the laser, with a field `nearest_m`.
+            top_mps, top_radps: largest velocities.
+            stop_m: smallest distance of an obstacle from the robot's centre: its radius of 0.3 m,
+                the way in 0.2 s, the age of a sweep, and the braking distance from 0.8 m/s.
+            stale_s: an older command or sweep stops the robot.
         """
 
         command: TopicHeard
@@ -39,48 +39,48 @@ class Guard(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        said = self.parameters
+        given = self.parameters
         self._nearest_m, self._seen_s = math.nan, -math.inf
-        self._told_s = -math.inf
-        self._stop, self._why = False, "nothing was commanded"
+        self._commanded_s = -math.inf
+        self._stop, self._why = False, "no command"
         self._linear_mps = 0.0
-        self.hear_topic(said.command, self._commanded)
-        self.hear_topic(said.scan, self._scanned)
+        self.hear_topic(given.command, self._command)
+        self.hear_topic(given.scan, self._scan)
 
-    def _scanned(self, message: Any, header: Header) -> None:
+    def _scan(self, message: Any, header: Header) -> None:
         self._nearest_m, self._seen_s = message.nearest_m, header.stamp
 
     @on(topics.ORDER)
     def order(self, message: Order, _header: Header) -> None:
-        """Stand still while a recovery says so."""
+        """Stop or release the robot, as a recovery orders."""
         self._stop = message.stop
 
-    def _commanded(self, message: Any, header: Header) -> None:
-        said, now_s = self.parameters, self.clock.now()
-        self._told_s = header.stamp
+    def _command(self, message: Any, header: Header) -> None:
+        bounds, now_s = self.parameters, self.clock.now()
+        self._commanded_s = header.stamp
         linear, angular = message.linear_mps, message.angular_radps
         self._why = ""
         if self._stop:
-            self._why = "a recovery has it stand"
+            self._why = "stopped by a recovery"
         elif not (math.isfinite(linear) and math.isfinite(angular)):
             self._why = f"{linear} m/s, {angular} rad/s"
-        elif now_s - self._seen_s > said.stale_s:
+        elif now_s - self._seen_s > bounds.stale_s:
             self._why = "no sweep of the laser"
-        elif not self._nearest_m > said.stop_m and linear > 0:
+        elif not self._nearest_m > bounds.stop_m and linear > 0:
             self._why = f"{self._nearest_m:.2f} m to the next obstacle"
         if self._why:
             linear, angular = 0.0, angular if self._why.endswith("obstacle") else 0.0
-        linear = max(-said.top_mps, min(said.top_mps, linear))
-        angular = max(-said.top_radps, min(said.top_radps, angular))
+        linear = max(-bounds.top_mps, min(bounds.top_mps, linear))
+        angular = max(-bounds.top_radps, min(bounds.top_radps, angular))
         self._linear_mps = linear
         self.publish(topics.CHECKED, Velocity(linear, angular, header.stamp),
                      stamp=header.stamp)
 
     @every(0.1)
     def look(self) -> None:
-        """Stop when the navigation is silent, and say what it does."""
+        """Stop when the navigation is silent, and publish the state."""
         now_s = self.clock.now()
-        if now_s - self._told_s > self.parameters.stale_s:
+        if now_s - self._commanded_s > self.parameters.stale_s:
             self._why = "the navigation is silent"
             self._linear_mps = 0.0
             self.publish(topics.CHECKED, Velocity(0.0, 0.0, now_s))

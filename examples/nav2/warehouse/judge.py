@@ -1,4 +1,4 @@
-"""What a run was worth."""
+"""Verdict on a run of the warehouse robot."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from warehouse.topics import Truth
 
 
 class Rounds(Judge):
-    """Success: the robot has been round the rack. Safe: it touched nothing."""
+    """Success: a round of the rack. Safe: it touched nothing."""
 
     class Parameters(Judge.Parameters, frozen=True):
-        """rounds: how many are enough."""
+        """rounds: number of rounds for a success."""
 
         rounds: float = 1.0
 
@@ -23,18 +23,18 @@ class Rounds(Judge):
 
     @on(topics.TRUTH)
     def truth(self, message: Truth, header: Header) -> None:
-        """Note what was worst."""
+        """Note the smallest clearance."""
         self._clearance_m = min(message.clearance_m, self._clearance_m or message.clearance_m)
         self._rounds = message.rounds
         if message.clearance_m < 0 and self._unsafe_s is None:
             self._unsafe_s = header.stamp
 
     def over(self, _now_s: float) -> str | None:
-        """Say that the work is done."""
+        """Return that the work is done."""
         return "all rounds made" if self._rounds >= self.parameters.rounds else None
 
     def verdict(self) -> Verdict:
-        """Return what it was worth."""
+        """Return the verdict so far."""
         success = self._rounds >= self.parameters.rounds
         return Verdict(
             success=success, safe=None if self._clearance_m is None else self._unsafe_s is None,

@@ -1,6 +1,6 @@
-"""What stands in for the three nodes of the navigation, which in a robot come from Nav2.
+"""Stand-ins for the three nodes of the navigation, which on a robot come from Nav2.
 
-Each says and hears what the real one does, as far as the way round a rack needs it.
+Each has the topics and services of the real node that the way around a rack needs.
 """
 
 from __future__ import annotations
@@ -29,35 +29,35 @@ def heading_rad(rotation: Any) -> float:
 
 
 class Amcl(StandIn):
-    """Localization: /amcl_pose of /odom."""
+    """Localization: /amcl_pose from /odom."""
 
     node_name = "amcl"
     _skew_m = 0.0
 
     def declare(self) -> None:
-        """Hear the odometry."""
+        """Declare topics."""
         self._odometry: Any = None
-        self._say = self.publisher("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped",
+        self._publish = self.publisher("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped",
                                    Qos(transient_local=True, depth=1))
-        self.subscribe("/odom", "nav_msgs/msg/Odometry", self._heard)
+        self.subscribe("/odom", "nav_msgs/msg/Odometry", self._take_odometry)
 
-    def _heard(self, message: Any) -> None:
+    def _take_odometry(self, message: Any) -> None:
         self._odometry = message
 
     @on(topics.SKEW)
     def skew(self, message: Skew, _header: Header) -> None:
-        """Be wrong by so much."""
+        """Take the error to add to the pose."""
         self._skew_m = message.x_m
 
     @every(0.1)
-    def tell(self) -> None:
-        """Say the pose."""
+    def pose(self) -> None:
+        """Publish the pose."""
         if self._odometry is not None:
             message = self.types.blank("geometry_msgs/msg/PoseWithCovarianceStamped")
             message.header.frame_id = "map"
             message.pose.pose = self._odometry.pose.pose
             message.pose.pose.position.x += self._skew_m
-            self._say(message)
+            self._publish(message)
             self._odometry = None
 
 
@@ -67,10 +67,10 @@ class PlannerServer(StandIn):
     node_name = "planner_server"
 
     def declare(self) -> None:
-        """Be active."""
+        """Declare topics and services."""
         self._is_active, self._is_cancelled = True, False
-        self._say_plan = self.publisher("/plan", "nav_msgs/msg/Path")
-        self._say_map = self.publisher("/global_costmap/costmap", "nav_msgs/msg/OccupancyGrid",
+        self._publish_plan = self.publisher("/plan", "nav_msgs/msg/Path")
+        self._publish_map = self.publisher("/global_costmap/costmap", "nav_msgs/msg/OccupancyGrid",
                                        Qos(transient_local=True, depth=1))
         self.serve("/planner_server/change_state", "lifecycle_msgs/srv/ChangeState", self._change)
         self.serve("/navigate_to_pose/_action/cancel_goal", "action_msgs/srv/CancelGoal",
@@ -86,7 +86,7 @@ class PlannerServer(StandIn):
 
     @every(0.5)
     def plan(self) -> None:
-        """Say the way, and what is in it."""
+        """Publish plan and costmap."""
         if not self._is_active:
             return
         path = self.types.blank("nav_msgs/msg/Path")
@@ -95,26 +95,26 @@ class PlannerServer(StandIn):
             pose = self.types.blank("geometry_msgs/msg/PoseStamped")
             pose.pose.position.x, pose.pose.position.y = x_m, y_m
             path.poses.append(pose)
-        self._say_plan(path)
+        self._publish_plan(path)
         grid = self.types.blank("nav_msgs/msg/OccupancyGrid")
         grid.header.frame_id = "map"
         grid.info.resolution = 0.5
         grid.info.width, grid.info.height = int(WIDTH_M * 2), int(DEPTH_M * 2)
         grid.data = self.types.numbers([0] * (grid.info.width * grid.info.height), "int8")
-        self._say_map(grid)
+        self._publish_map(grid)
 
 
 class ControllerServer(StandIn):
-    """Controller: /cmd_vel_nav by /plan and /amcl_pose."""
+    """Controller: /cmd_vel_nav from /plan and /amcl_pose."""
 
     node_name = "controller_server"
 
     def declare(self) -> None:
-        """Hear the plan and the pose."""
+        """Declare topics."""
         self._plan: list[tuple[float, float]] = []
         self._pose: tuple[float, float, float] | None = None
         self._next: int | None = None
-        self._say = self.publisher("/cmd_vel_nav", "geometry_msgs/msg/Twist")
+        self._publish = self.publisher("/cmd_vel_nav", "geometry_msgs/msg/Twist")
         self.subscribe("/plan", "nav_msgs/msg/Path", self._planned)
         self.subscribe("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped", self._located,
                        Qos(transient_local=True, depth=1))
@@ -127,7 +127,7 @@ class ControllerServer(StandIn):
         self._pose = pose.position.x, pose.position.y, heading_rad(pose.orientation)
 
     def _off_m(self, place: int) -> float:
-        """Return how far it is from the leg that begins at a corner."""
+        """Return the distance from the leg that begins at a corner, m."""
         assert self._pose is not None  # noqa: S101 for the type checker
         (x_m, y_m), there = self._plan[place], self._plan[(place + 1) % len(self._plan)]
         dx, dy = there[0] - x_m, there[1] - y_m
@@ -142,10 +142,10 @@ class ControllerServer(StandIn):
 
     @every(0.05)
     def control(self) -> None:
-        """Say how fast to go."""
+        """Publish the velocity."""
         message = self.types.blank("geometry_msgs/msg/Twist")
         if self._plan and self._pose is not None:
-            if self._next is None:  # a new process goes on where the robot is
+            if self._next is None:  # a new process continues where the robot is
                 self._next = min(range(len(self._plan)), key=self._off_m) + 1
             if self._away_m(self._next % len(self._plan)) < 0.5:
                 self._next += 1
@@ -154,4 +154,4 @@ class ControllerServer(StandIn):
             off = math.atan2(math.sin(off), math.cos(off))
             message.angular.z = max(-1.2, min(1.2, 2 * off))
             message.linear.x = SPEED_MPS * max(0.0, math.cos(off))
-        self._say(message)
+        self._publish(message)

@@ -1,4 +1,4 @@
-"""What the guard and the judge hear and say; all that is of ROS 2 is in warehouse.toml."""
+"""Topics of guard and judge; those of ROS 2 are in warehouse.toml."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rampart import Message, Qos, Topic
 class Velocity(Message, frozen=True):
     """Velocity of `base_link` in its own axes, and the stamp of the command that it follows.
 
-    Without a command `command_s` is now. So it never stays the same unless the guard is stuck.
+    Without a command `command_s` is the present time, so it changes unless the guard is stuck.
     """
 
     linear_mps: float
@@ -17,7 +17,7 @@ class Velocity(Message, frozen=True):
 
 
 class Order(Message, frozen=True):
-    """What the guard is to do besides: stand still."""
+    """Order to the guard to stop the robot."""
 
     stop: bool
 
@@ -31,7 +31,7 @@ class GuardState(Message, frozen=True):
 
 
 class Truth(Message, frozen=True):
-    """What really happens: where the robot is in `map`, and how close to what it may not touch."""
+    """Ground truth: position in `map`, clearance, and rounds made."""
 
     x_m: float
     y_m: float
@@ -40,14 +40,14 @@ class Truth(Message, frozen=True):
 
 
 class Skew(Message, frozen=True):
-    """By how much the localization is wrong; 0 unless a fault says otherwise."""
+    """Error of the localization, 0 without a fault."""
 
     x_m: float
 
 
 CHECKED = Topic("guard/velocity", Velocity, Qos.SENSOR, 20, "base_link",
-                "What the navigation commands, as far as the guard lets it.")
-ORDER = Topic("guard/order", Order, Qos.STATE, 5, "", "What a recovery has the guard do.")
-STATE = Topic("guard/state", GuardState, Qos.STATE, 5, "", "What the guard does.")
-TRUTH = Topic("world/truth", Truth, Qos.STATE, 10, "map", "For the judge alone.")
+                "The navigation's command within the guard's limits.")
+ORDER = Topic("guard/order", Order, Qos.STATE, 5, "", "Orders of a recovery to the guard.")
+STATE = Topic("guard/state", GuardState, Qos.STATE, 5, "", "State of the guard.")
+TRUTH = Topic("world/truth", Truth, Qos.STATE, 10, "map", "Ground truth, for the judge only.")
 SKEW = Topic("hall/skew", Skew, Qos.STATE, 10, "map", "For faults of the localization.")

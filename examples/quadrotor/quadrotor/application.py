@@ -1,4 +1,4 @@
-"""What the quadrotor adds to the engine: faults with names of their own."""
+"""The quadrotor's application: its topics, model and faults."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What the pilot and the estimator each make of the sensors for themselves. Pure.
+"""Filters of the sensors, for the pilots and the estimator. Pure.
 
-`ImuVote` takes the middle one of three IMUs, `AttitudeFilter` integrates it, `VerticalFilter` finds
-the vertical speed from acceleration and air pressure.
+`ImuVote` takes the median of three IMUs, `AttitudeFilter` integrates it, `VerticalFilter` finds the
+vertical speed from acceleration and air pressure.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from quadrotor.topics import Imu
 from quadrotor.vehicle import G_MPS2, Vector
 
 FRESH_S = 0.06
-"""Older readings of an IMU do not count."""
+"""Older readings of an IMU are ignored."""
 
 _REPEATS = 5
-"""A sensor with noise does not say the same so many times in a row."""
+"""An IMU that repeats a reading this often is stuck, since a sound one has noise."""
 
 _FAR = (0.4, 0.4, 0.4, 4.0, 4.0, 4.0)
-"""How far from the middle one a reading is outvoted, rad/s and m/s²."""
+"""Difference from the median at which an IMU is outvoted, rad/s and m/s²."""
 
 _SMOOTHING = 0.1
 
@@ -28,7 +28,7 @@ class ImuVote:
     """Three IMUs, of which one may be wrong.
 
     Attributes:
-        sound: how many took part in the last vote.
+        sound: number of sound IMUs in the last vote.
     """
 
     def __init__(self) -> None:
@@ -38,14 +38,14 @@ class ImuVote:
         self._apart = [[0.0] * 6 for _ in range(3)]
 
     def take(self, which: int, imu: Imu, stamp_s: float) -> None:
-        """Take a reading of one of them, from 0."""
+        """Take a reading of an IMU, numbered from 0."""
         values = (imu.gyro_x_radps, imu.gyro_y_radps, imu.gyro_z_radps,
                   imu.accel_x_mps2, imu.accel_y_mps2, imu.accel_z_mps2)
         self._same[which] = self._same[which] + 1 if values == self._newest[which][0] else 0
         self._newest[which] = (values, stamp_s)
 
     def vote(self, now_s: float) -> tuple[Vector, Vector] | None:
-        """Return angular rate, rad/s, and specific force, m/s²; None if there is no IMU left."""
+        """Return angular rate, rad/s, and specific force, m/s²; None without a sound IMU."""
         there = [i for i, (values, stamp_s) in enumerate(self._newest)
                  if now_s - stamp_s <= FRESH_S and self._same[i] < _REPEATS
                  and all(map(math.isfinite, values))]
@@ -70,12 +70,12 @@ def _middle(values: list[float]) -> float:
 
 
 class AttitudeFilter:
-    """Integrates the angular rate, and follows slowly what the accelerometer takes for up.
+    """Integrates the angular rate, and corrects it slowly by the accelerometer.
 
-    In flight the accelerometer feels the thrust and not the tilt, so it counts little.
+    In flight the accelerometer measures the thrust and not the tilt, so its weight is small.
 
     Attributes:
-        q: attitude.
+        q: attitude, from `base_link` to `map`.
         known: whether it was ever set.
     """
 
@@ -86,11 +86,11 @@ class AttitudeFilter:
         self.known = False
 
     def begin(self, q: Quaternion) -> None:
-        """Go on from what somebody else knows."""
+        """Begin with an attitude."""
         self.q, self.known = normal(q), True
 
     def level(self, force_mps2: Vector, yaw_rad: float) -> None:
-        """Begin from the accelerometer alone, as at rest."""
+        """Begin with the accelerometer's vertical, as at rest, and a yaw."""
         length = math.sqrt(sum(part * part for part in force_mps2))
         if length > 1.0:
             x, y, z = (part / length for part in force_mps2)
@@ -100,7 +100,7 @@ class AttitudeFilter:
 
     def step(self, rate_radps: Vector, force_mps2: Vector, yaw_rad: float | None,
              step_s: float) -> None:
-        """Go on by a time; the yaw is the magnetometer's, None if that is silent."""
+        """Integrate over `step_s`; the yaw is the magnetometer's, None if that is silent."""
         length = math.sqrt(sum(part * part for part in force_mps2))
         gx, gy, gz = rate_radps
         if abs(length - G_MPS2) < 2.0:
@@ -117,7 +117,7 @@ class AttitudeFilter:
         self.q = normal(q)
 
     def upward(self, force_mps2: Vector) -> float:
-        """Return the vertical acceleration, m/s², gravity taken off."""
+        """Return the vertical acceleration without gravity, m/s²."""
         return turn(self.q, force_mps2)[2] - G_MPS2
 
     @property
@@ -129,8 +129,8 @@ class AttitudeFilter:
 class VerticalFilter:
     """Height and vertical speed from acceleration and air pressure.
 
-    A barometer that jumps is taken for wrong, as far as speed goes: from then on it counts from
-    where it is now. A speed that followed it would hit the ground when the bias goes away again.
+    A jump of the barometer sets the height and leaves the speed. If the speed followed it, the
+    vehicle would hit the ground when the bias ends.
 
     Attributes:
         height_m, speed_mps: upwards.
@@ -144,12 +144,12 @@ class VerticalFilter:
         self._last_m = math.nan
 
     def step(self, upward_mps2: float, step_s: float) -> None:
-        """Go on by a time."""
+        """Integrate an acceleration."""
         self.height_m += self.speed_mps * step_s
         self.speed_mps += upward_mps2 * step_s
 
     def measured(self, altitude_m: float, step_s: float) -> None:
-        """Take the height that the barometer says, each so many seconds."""
+        """Take a height of the barometer, `step_s` after the one before."""
         if not math.isfinite(altitude_m) or altitude_m == self._last_m:
             return
         self._last_m = altitude_m

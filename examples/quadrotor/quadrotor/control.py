@@ -1,7 +1,7 @@
 """The control loops: position → velocity → acceleration → attitude → rotors. Pure.
 
-The first half belongs to the flight controller, and to the pilot when it flies by itself; the
-rest is the pilot's alone.
+`PositionControl` runs in the flight controller, and in a pilot that flies without setpoints;
+`AttitudeControl` runs in the pilots.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from quadrotor.topics import Estimate, Goal
 from quadrotor.vehicle import G_MPS2, HOVER_N, INERTIA_KGM2, MASS_KG, Thrusts, Vector, mix, wrench
 
 MOST_ACCEL_MPS2 = 3.0
-"""Horizontally: a tilt of 17°."""
+"""Horizontal; a tilt of 17°."""
 CLIMB_MPS = 1.5
 _FOLLOW_SHARE = 0.02
-"""Of what another one's trim differs, with each word of the speed controllers (50 Hz): 1 s."""
+"""Share of the other pilot's trim taken over with each message at 50 Hz: a time constant of 1 s."""
 _LIGHT_SHARE = 0.85
-"""With less thrust than this share of the weight it may stand on the ground: no trim is learnt."""
+"""Below this share of the weight the integrals rest, since the vehicle may stand on the ground."""
 STEP_S = 0.01
-"""Of the pilot's loops."""
+"""Period of the pilots' and the estimator's loops."""
 
 
 def bounded(value: float, most: float) -> float:
@@ -39,11 +39,11 @@ class PositionControl:
         self._rest = [0.0, 0.0, 0.0]
 
     def reset(self) -> None:
-        """Forget what wind and weak rotors are made up for."""
+        """Reset the integrals, which compensate wind and weak rotors."""
         self._rest = [0.0, 0.0, 0.0]
 
     def step(self, goal: Goal, at: Estimate, step_s: float) -> Vector:
-        """Return the acceleration to ask for, m/s², towards a goal."""
+        """Return the acceleration towards a goal, m/s²."""
         east, north = (self._POSITION_HZ * (goal.x_m - at.x_m),
                        self._POSITION_HZ * (goal.y_m - at.y_m))
         shorter = min(1.0, goal.speed_mps / max(math.hypot(east, north), 1e-6))
@@ -51,7 +51,7 @@ class PositionControl:
         return self.towards((east * shorter, north * shorter, upward), at, step_s)
 
     def towards(self, velocity_mps: Vector, at: Estimate, step_s: float) -> Vector:
-        """Return the acceleration to ask for, m/s², towards a velocity in `map`."""
+        """Return the acceleration towards a velocity in `map`, m/s²."""
         now = at.velocity_x_mps, at.velocity_y_mps, at.velocity_z_mps
         asked = []
         for i, (wanted, have) in enumerate(zip(velocity_mps, now, strict=True)):
@@ -82,13 +82,13 @@ class AttitudeControl:
         self.trim = 0.0
 
     def reset(self) -> None:
-        """Forget the trim: on the ground it says nothing."""
+        """Reset the trim, which is meaningless on the ground."""
         self._rest, self.trim = [0.0, 0.0, 0.0], 0.0
 
     def follow(self, thrusts_n: Thrusts) -> None:
-        """Take over the trim of another one that flies, from what it asks of the rotors.
+        """Follow the trim of the other pilot, from the thrusts that it commands.
 
-        Torques that last are what the vehicle has to be trimmed by: on average it does not turn.
+        On average the vehicle does not turn, so a lasting torque is a trim.
         """
         if all(map(math.isfinite, thrusts_n)):
             for i, torque_nm in enumerate(wrench(thrusts_n)[1]):
@@ -100,11 +100,11 @@ class AttitudeControl:
         """Return the thrust of each rotor, N.
 
         Args:
-            accel_mps2: asked for in `map`, gravity not included.
-            yaw_rad: asked for.
+            accel_mps2: demanded acceleration in `map`, without gravity.
+            yaw_rad: demanded yaw.
             q: attitude.
-            rate_radps: in `base_link`.
-            flies: whether this is carried out; nothing is learnt from what is not.
+            rate_radps: angular rate in `base_link`.
+            flies: whether the rotors obey; otherwise the integrals rest.
         """
         force = accel_mps2[0], accel_mps2[1], max(accel_mps2[2] + G_MPS2, 2.0)
         length = math.sqrt(sum(part * part for part in force))

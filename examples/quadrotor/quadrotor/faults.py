@@ -1,8 +1,8 @@
 """The quadrotor's faults: its sensors, its rotors, its battery.
 
-Any topic can be disturbed (`drop:sensors/gps`) and any process hit (`kill:pilot`) without being
-listed here. A rotor that fails altogether is not among them: four rotors without one cannot hold
-the attitude, and this controller does not try to fly on while it spins.
+Faults of topics (`drop:sensors/gps`) and processes (`kill:pilot`) need no entry here. The total
+loss of a rotor is left out: three rotors cannot hold the attitude, and this controller cannot fly
+while the vehicle spins.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def _sensor(name: str, title: str, topic: Topic[Any], mode: str, lasts_s: float,
 
 
 class QuadrotorFaults(Faults):
-    """Besides those of any system: sensors by name, `weak-rotor[:ROTOR[:SHARE]]`,
+    """Faults besides those of any system: sensors by name, `weak-rotor[:ROTOR[:SHARE]]`,
     `battery-drain[:FACTOR]`.
     """  # noqa: D205 names that must not be broken
 
@@ -34,11 +34,11 @@ class QuadrotorFaults(Faults):
                 add_fields={"x_m": 8.0}),
         _sensor("gps-drift", "the GPS drifts north by 0.5 m/s", t.GPS, "corrupt", 60.0,
                 ramp_fields={"y_m": 0.5}),
-        _sensor("gps-dropout", "the GPS has no fix any more", t.GPS, "drop", math.inf),
-        _sensor("barometer-bias", "the barometer says 6 m too little", t.BAROMETER, "corrupt", 30.0,
+        _sensor("gps-dropout", "the GPS loses its fix", t.GPS, "drop", math.inf),
+        _sensor("barometer-bias", "the barometer reads 6 m too low", t.BAROMETER, "corrupt", 30.0,
                 add_fields={"altitude_m": -6.0}),
         _sensor("barometer-stuck", "the barometer repeats itself", t.BAROMETER, "stuck", 60.0),
-        _sensor("imu-bias", "an IMU turns and falls, by what it says", t.IMU_1, "corrupt", 30.0,
+        _sensor("imu-bias", "an IMU reads a rotation and a fall", t.IMU_1, "corrupt", 30.0,
                 add_fields={"gyro_x_radps": 1.0, "accel_z_mps2": -6.0}),
         _sensor("imu-noise", "an IMU is noisy", t.IMU_2, "corrupt", 30.0,
                 noise_fields={"gyro_x_radps": 2.0, "gyro_y_radps": 2.0, "accel_x_mps2": 8.0}),
@@ -64,10 +64,10 @@ class QuadrotorFaults(Faults):
             rotor = int(details.pop(0)) if weak and details else 0
             factor = float(details.pop(0)) if details else _WEAK if weak else _DRAIN
         except ValueError:
-            raise ScenarioError(f"fault {fault!r}: rotor and share are numbers") from None
+            raise ScenarioError(f"fault {fault!r}: expected numbers for rotor and share") from None
         most = 1.0 if weak else 1000.0
         if details or not 0 <= rotor <= 3 or not 0 <= factor <= most:
-            raise ScenarioError(f"fault {fault!r}: rotors are 0 to 3, the number after it lies "
-                                f"between 0 and {most:g}")
+            raise ScenarioError(f"fault {fault!r}: expected a rotor of 0 to 3, then a number of 0 "
+                                f"to {most:g}")
         return (Order(t.BODY_FAULT, t.BodyFault(
             injection, _KINDS[kind], rotor, factor, lasts_s)),)

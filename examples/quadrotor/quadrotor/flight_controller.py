@@ -1,4 +1,4 @@
-"""The flight controller: from the goal to the acceleration that the pilot is asked for."""
+"""The flight controller: from the goal to the acceleration that it demands of the pilots."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _GOAL_S = 1.0
 
 
 class FlightController(Actor):
-    """Answers each estimate with a setpoint. Without a fresh goal it brakes and holds its place."""
+    """Answers each estimate with a setpoint. Without a fresh goal it brakes and hovers."""
 
     outputs = (t.SETPOINT,)
 
@@ -32,14 +32,14 @@ class FlightController(Actor):
 
     @on(t.PILOT)
     def pilot(self, message: t.PilotStatus, _header: Header) -> None:
-        """Do not wind up while somebody else flies, or nobody does."""
+        """Let the integrals rest while the pilot does not follow the setpoint."""
         self._heeded = message.source == "setpoint" and not message.landed
         if message.landed:
             self._control.reset()
 
     @on(t.ESTIMATE)
     def estimate(self, at: t.Estimate, _header: Header) -> None:
-        """Ask for the acceleration that leads to the goal."""
+        """Publish the acceleration towards the goal."""
         goal = self._goal
         if goal is None or not math.isfinite(at.speed_mps + at.x_m + at.y_m + at.z_m):
             return

@@ -1,4 +1,4 @@
-"""The judge: what a flight was worth, by ground truth alone."""
+"""The judge of a flight, by ground truth alone."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class FlightJudge(Judge):
 
         Attributes:
             waypoints: x, y, z in `map`, m.
-            reach_m: how near it has to come to each.
-            home_m: how near home it has to land.
-            fence_m: the geofence is a square round home, so far from it.
-            ceiling_m: greatest height.
-            touch_mps: greatest vertical speed of a touch of the ground.
-            touch_tilt_rad: greatest tilt at one.
-            tilt_rad: greatest tilt at all.
+            reach_m: largest distance at which a waypoint counts as reached.
+            home_m: largest distance of the landing from home.
+            fence_m: distance of the square geofence from home.
+            ceiling_m: largest height.
+            touch_mps: largest vertical speed of a touchdown.
+            touch_tilt_rad: largest tilt of a touchdown.
+            tilt_rad: largest tilt in flight.
         """
 
         waypoints: Annotated[tuple[Waypoint, ...], msgspec.Meta(min_length=1)]
@@ -59,25 +59,26 @@ class FlightJudge(Judge):
 
     @on(t.TRUTH)
     def truth(self, truth: t.Truth, header: Header) -> None:
-        """Compare what is so with the limits."""
-        said, now_s = self.parameters, header.stamp
+        """Compare the truth with the limits."""
+        limits, now_s = self.parameters, header.stamp
         self._heard, self._last = True, truth
         self._flown = self._flown or truth.z_m > 1.0
         if not self._flown or truth.turning or not truth.grounded:
             self._stands_s = math.inf
         else:
             self._stands_s = min(self._stands_s, now_s)
-        left = {"fence_m": said.fence_m - max(abs(truth.x_m), abs(truth.y_m)),
-                "ceiling_m": said.ceiling_m - truth.z_m}
+        left = {"fence_m": limits.fence_m - max(abs(truth.x_m), abs(truth.y_m)),
+                "ceiling_m": limits.ceiling_m - truth.z_m}
         self._least = {name: min(self._least[name], value) for name, value in left.items()}
         self._narrowest = min(self._narrowest, (min(left.values()), now_s))
         self._hold("outside of the geofence", -left["fence_m"], 0.0, now_s)
         self._hold("too high", -left["ceiling_m"], 0.0, now_s)
-        self._hold("touched the ground too fast", truth.touch_speed_mps, said.touch_mps, now_s)
-        self._hold("touched the ground tilted", truth.touch_tilt_rad, said.touch_tilt_rad, now_s)
-        self._hold("tilted too far", truth.highest_tilt_rad, said.tilt_rad, now_s)
-        if self._reached < len(said.waypoints) and math.dist(
-                said.waypoints[self._reached], (truth.x_m, truth.y_m, truth.z_m)) < said.reach_m:
+        self._hold("touched the ground too fast", truth.touch_speed_mps, limits.touch_mps, now_s)
+        self._hold("touched the ground tilted", truth.touch_tilt_rad, limits.touch_tilt_rad, now_s)
+        self._hold("tilted too far", truth.highest_tilt_rad, limits.tilt_rad, now_s)
+        at = truth.x_m, truth.y_m, truth.z_m
+        if (self._reached < len(limits.waypoints)
+                and math.dist(limits.waypoints[self._reached], at) < limits.reach_m):
             self._reached += 1
 
     def _hold(self, what: str, value: float, most: float, now_s: float) -> None:
@@ -88,7 +89,7 @@ class FlightJudge(Judge):
             self._severity = max(self._severity, *self._wrong.values())
 
     def over(self, now_s: float) -> str | None:
-        """Return that it stands on the ground again, or lies there."""
+        """Return that the vehicle stands on the ground, or has crashed."""
         if now_s - self._stands_s > _STOOD_S:
             return "it stands on the ground"
         last = self._last
@@ -97,14 +98,14 @@ class FlightJudge(Judge):
         return None
 
     def verdict(self) -> Verdict:
-        """Return what the flight was worth so far."""
-        said, reasons = self.parameters, [*self._wrong]
-        if self._reached < len(said.waypoints):
+        """Return the verdict on the flight so far."""
+        limits, reasons = self.parameters, [*self._wrong]
+        if self._reached < len(limits.waypoints):
             reasons.append(f"waypoint {self._reached + 1} was not reached")
         if self._stands_s == math.inf:
             reasons.append("did not land")
         elif self._last is not None and math.dist(
-                (self._last.x_m, self._last.y_m), HOME) > said.home_m:
+                (self._last.x_m, self._last.y_m), HOME) > limits.home_m:
             reasons.append("did not land at home")
         return Verdict(
             success=not reasons, safe=not self._wrong if self._heard else None,

@@ -1,6 +1,6 @@
 """The mission: takeoff, one leg to each waypoint, landing at home.
 
-It remembers the step in its checkpoint, so that a successor goes on with the same leg.
+Its checkpoint contains the step, so a restarted process continues with the same leg.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from rampart import Actor, Context, Header, Positive, StateFormat, every, on
 
 _BEGIN_S = 2.0
 _DOWN_M = -20.0
-"""The landing's goal lies below the ground, wherever that is."""
+"""Height of the landing's goal, safely below the ground."""
 
 Coordinate = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 Waypoint = tuple[Coordinate, Coordinate, Annotated[float, msgspec.Meta(gt=0, le=120)]]
 
 
 class Memory(msgspec.Struct, frozen=True):
-    """What outlives the process: how many steps are done."""
+    """State that survives the process: the number of steps that are done."""
 
     step: Annotated[int, msgspec.Meta(ge=0, le=1000)]
 
@@ -32,17 +32,17 @@ MEMORY = StateFormat(Memory)
 
 
 class Mission(Actor):
-    """Says where to fly, and at which step it is: waiting, takeoff, leg 1 …, land, done."""
+    """Publishes goal and step: waiting, takeoff, leg 1 …, land, done."""
 
     class Parameters(Actor.Parameters, frozen=True, kw_only=True):
-        """What to fly.
+        """The flight.
 
         Attributes:
             waypoints: x, y, z in `map`, m.
-            takeoff_m: height to which it climbs first.
-            speed_mps: of the legs.
-            descent_mps: of the landing.
-            reach_m: a waypoint is reached when it is no further off.
+            takeoff_m: height of the takeoff.
+            speed_mps: speed on the legs.
+            descent_mps: speed of the landing.
+            reach_m: largest distance at which a waypoint counts as reached.
         """
 
         waypoints: Annotated[tuple[Waypoint, ...], msgspec.Meta(min_length=1, max_length=100)]
@@ -63,19 +63,19 @@ class Mission(Actor):
         self._pilot: t.PilotStatus | None = None
 
     def on_start(self) -> None:
-        """Go on where the last incarnation was."""
+        """Load the step."""
         kept = self.kept(MEMORY)
         if kept is not None:
             self._step = min(kept.step, len(self._steps) - 1)
 
     @on(t.PILOT)
     def pilot(self, message: t.PilotStatus, _header: Header) -> None:
-        """Note whether the pilot follows, and whether it has landed."""
+        """Note whether the pilot follows the setpoint, and whether it has landed."""
         self._pilot = message
 
     @on(t.ESTIMATE)
     def estimate(self, at: t.Estimate, _header: Header) -> None:
-        """See whether the step is done."""
+        """Go to the next step if this one is done."""
         pilot = self._pilot
         if pilot is None or pilot.mode != "NORMAL":
             return
@@ -92,32 +92,29 @@ class Mission(Actor):
         if done:
             self._step += 1
             self.keep(MEMORY, Memory(self._step))
-            self._say_step()
-            self.say()
+            self.publish_step()
+            self.publish_goal()
 
     def _place(self) -> tuple[float, float, float]:
-        said, number = self.parameters, self._step
+        flight, number = self.parameters, self._step
         if number <= 1:
-            return *HOME, said.takeoff_m
-        if number < 2 + len(said.waypoints):
-            return said.waypoints[number - 2]
+            return *HOME, flight.takeoff_m
+        if number < 2 + len(flight.waypoints):
+            return flight.waypoints[number - 2]
         return *HOME, _DOWN_M
 
     @every(0.1)
-    def say(self) -> None:
-        """Say where to fly."""
-        said, step = self.parameters, self._steps[self._step]
+    def publish_goal(self) -> None:
+        """Publish where to fly."""
+        flight, step = self.parameters, self._steps[self._step]
         x_m, y_m, z_m = self._place()
-        descent_mps = said.descent_mps if step == "land" else 1.0
+        descent_mps = flight.descent_mps if step == "land" else 1.0
         self.publish(t.GOAL, t.Goal(
-            step not in ("waiting", "done"), x_m, y_m, z_m, 0.0, said.speed_mps, descent_mps))
+            step not in ("waiting", "done"), x_m, y_m, z_m, 0.0, flight.speed_mps, descent_mps))
 
     @every(0.2)
-    def say_step(self) -> None:
-        """Say it again."""
-        self._say_step()
-
-    def _say_step(self) -> None:
+    def publish_step(self) -> None:
+        """Publish the step, and that it cannot advance while the pilot does not follow."""
         now_s = self.clock.now()
         follows = self._pilot is not None and self._pilot.mode == "NORMAL"
         self.publish(t.MISSION, t.MissionState(

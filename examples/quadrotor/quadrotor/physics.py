@@ -35,7 +35,7 @@ _GPS_XY_M, _GPS_Z_M, _GPS_MPS, _BARO_M, _HEADING_RAD = 0.35, 0.6, 0.08, 0.12, 0.
 
 @dataclass(slots=True)
 class Health:
-    """What works how well: share of the thrust of each rotor, and how fast the battery drains."""
+    """Share of the thrust of each rotor, and how fast the battery drains."""
 
     rotors: list[float] = field(default_factory=lambda: [1.0] * 4)
     drain: float = 1.0
@@ -45,10 +45,10 @@ class Physics:
     """The vehicle on flat ground, feet at the origin of `map`.
 
     Args:
-        seed: of wind and noise.
+        seed: seed of wind and noise.
         wind_mps: mean wind; its direction follows from the seed.
-        charge: of the battery, from 0 to 1.
-        rotors: what drives them.
+        charge: charge of the battery, from 0 to 1.
+        rotors: their speed controllers.
         start_s: simulated time now.
     """
 
@@ -74,7 +74,7 @@ class Physics:
 
     @property
     def turning(self) -> bool:
-        """Whether the rotors lift anything."""
+        """Whether a rotor turns."""
         return bool(max(self._data.ctrl) > 1e-6)
 
     def step_to(self, time_s: float) -> None:
@@ -84,11 +84,11 @@ class Physics:
 
     @property
     def data(self) -> mujoco.MjData:
-        """What MuJoCo knows of the state."""
+        """MuJoCo's state."""
         return self._data
 
     def skip(self, time_s: float) -> None:
-        """Let time pass in which nothing moves: the process was stopped."""
+        """Let time pass without motion, after the process was stopped."""
         self._start_s += max(0.0, time_s - self.now_s)
         self.now_s = self._start_s + self._steps * STEP_S
 
@@ -111,7 +111,7 @@ class Physics:
             self._air_s = 0.0
 
     def _slow_forces(self) -> None:
-        """What changes slowly: wind, battery, and what the speed controllers make of commands."""
+        """Update wind, battery and rotors, every fifth step."""
         data, each_s = self._data, 5 * STEP_S
         self._gust += (-self._gust * each_s / _GUST_S + self._dice.normal(0.0, 1.0, 3)
                        * _GUST_MPS * math.sqrt(2 * each_s / _GUST_S))
@@ -122,7 +122,7 @@ class Physics:
         self.charge = max(0.0, self.charge - self.health.drain * self.current_a * each_s
                           / _CAPACITY_AS)
 
-    # -- what the sensors say ---------------------------------------------------------------------
+    # -- sensors ----------------------------------------------------------------------------------
 
     @property
     def attitude(self) -> Quaternion:
@@ -132,7 +132,7 @@ class Physics:
 
     @property
     def current_a(self) -> float:
-        """Drawn from the battery: 0.3 A for the electronics, the rest for the rotors."""
+        """Current of the battery: 0.3 A for the electronics, the rest for the rotors."""
         return 0.3 + float(np.sum(np.maximum(self._data.act, 0.0) ** 1.5)) * 0.65
 
     def imu(self, which: int) -> t.Imu:
@@ -165,7 +165,7 @@ class Physics:
                            self._rotors.thrusts)
 
     def truth(self) -> t.Truth:
-        """Return what is so."""
+        """Return the ground truth."""
         x, y, z = self._data.qpos[:3].tolist()
         return t.Truth(x, y, z, float(np.linalg.norm(self._velocity())), tilt(self.attitude),
                        bool(self._data.ncon > 0), self.turning, self.touch_speed_mps,
@@ -190,7 +190,7 @@ _GPS_NOISE = np.array([_GPS_XY_M, _GPS_XY_M, _GPS_Z_M])
 
 
 class QuadrotorModel(RobotModel):
-    """The vehicle of a replay: it is where it believes to be."""
+    """The vehicle of a replay, at its estimate."""
 
     def __init__(self, _application: Application) -> None:
         super().__init__(mujoco.MjModel.from_xml_path(str(_MODEL)))

@@ -1,19 +1,18 @@
-"""A pilot: the last instance before the rotors. Keeps the attitude, and chooses whom to follow.
+"""A pilot: keeps the attitude, and chooses the input to fly by.
 
-In flight there is no standing still: whoever does nothing falls. So the pilot always flies, by the
-best that it has, from top to bottom:
+A vehicle in the air cannot stop: without thrust it falls. So the pilot always flies, by the first
+of these that it can:
 
-1. mode NORMAL, and the setpoint is fresh and sound: it follows the setpoint;
-2. the estimate is fresh and sound: it flies by that itself, holding its place in NORMAL and HOVER,
-   going home and down in RETURN, straight down in LAND;
-3. neither, or mode LEVEL: it levels, keeps its height for two seconds by its own vertical filter,
-   and then goes down gently. Wind carries it along.
+1. in mode NORMAL by the setpoint, if that is fresh and sound;
+2. by the estimate, if that is fresh and sound: it hovers in NORMAL and HOVER, flies home and lands
+   in RETURN, and lands in LAND;
+3. otherwise, and in mode LEVEL, by its sensors: level, for two seconds at its height, then down
+   gently. Wind carries it along.
 
-The attitude loop runs here and not in the flight controller, so that the death of that one costs
-nothing. There are two pilots, and both fly all the time; the speed controllers of the rotors say
-whom they obey (`rotors.py`). The other one learns nothing from what it asks for in vain, follows
-the trim of the one that flies, and keeps silent on `pilot/status`. A pilot that is restarted takes
-over the attitude that the estimator knows.
+The attitude loop runs here, so that the death of the flight controller costs nothing. Two pilots
+fly all the time, and the rotors' speed controllers choose one (`rotors.py`). The other pilot
+integrates nothing, follows the trim of the first, and does not publish `pilot/status`. A restarted
+pilot begins with the estimator's attitude.
 """
 
 from __future__ import annotations
@@ -24,22 +23,23 @@ from typing import Annotated
 import msgspec
 
 from quadrotor import topics as t
-from quadrotor.attitude import AttitudeFilter, ImuVote, VerticalFilter
+from quadrotor.attitude import VerticalFilter
 from quadrotor.control import STEP_S, AttitudeControl, PositionControl, bounded
 from quadrotor.rotation import tilt, yaw
+from quadrotor.sensing import Sensing
 from quadrotor.vehicle import G_MPS2, HOME, MASS_KG, Thrusts, Vector
-from rampart import Actor, Context, Header, Positive, StateFormat, every, on
+from rampart import Context, Header, Positive, StateFormat, every, on
 
 MODES = ("NORMAL", "HOVER", "RETURN", "LAND", "LEVEL")
-"""From the one that trusts most in others to the one that trusts in nobody."""
+"""In order of strictness: each trusts fewer inputs than the one before."""
 
 FRESH_S = 0.15
-"""Older setpoints and estimates do not count."""
+"""Older setpoints and estimates are ignored."""
 
 _BLIND_S = 5.0
-"""For so long without a fix the estimate's horizontal velocity is worth braking by."""
+"""Without a fix for longer, the estimate's horizontal velocity is ignored."""
 
-_HOLD_S, _WAIT_S = 2.0, 0.08
+_HOLD_S = 2.0
 _MOST_ACCEL_MPS2, _MOST_SPEED_MPS, _MOST_PLACE_M, _JUMP_M, _JUMP_S = 5.0, 12.0, 1000.0, 1.0, 1.0
 _STANDS_S, _STANDS_SHARE = 0.3, 0.75
 _NEAR_HOME_M = 1.0
@@ -47,11 +47,11 @@ _IDLE: Thrusts = (0.0, 0.0, 0.0, 0.0)
 
 
 class Memory(msgspec.Struct, frozen=True):
-    """What outlives the process.
+    """State that survives the process.
 
     Attributes:
-        landed: whether it stands on the ground.
-        stays: whether it is to stay there, because it did not land as the mission wanted.
+        landed: whether the vehicle stands on the ground.
+        stays: whether it must stay there, since it landed in another mode than NORMAL.
     """
 
     landed: bool
@@ -62,9 +62,9 @@ MEMORY = StateFormat(Memory)
 
 
 class Believed:
-    """The estimate as far as it can be believed: fresh, finite, and without jumps.
+    """Passes the estimates that are fresh, finite and without jumps.
 
-    After a jump it is refused for a second, and then taken for what it is now.
+    After a jump it refuses estimates for one second.
     """
 
     def __init__(self) -> None:
@@ -94,22 +94,22 @@ class Believed:
         self._last, self._stamp_s, self._refused_s = at, stamp_s, -math.inf
 
     def at(self, now_s: float) -> t.Estimate | None:
-        """Return it, None if there is none to be believed."""
+        """Return the last sound estimate, None if it is too old."""
         return self._last if now_s - self._stamp_s <= FRESH_S else None
 
 
-class Pilot(Actor):
-    """Turns setpoints into thrusts of the rotors, and flies by itself when there are none."""
+class Pilot(Sensing):
+    """Converts setpoints to thrusts of the rotors, and flies without setpoints if need be."""
 
-    class Parameters(Actor.Parameters, frozen=True):
-        """How it flies by itself.
+    class Parameters(Sensing.Parameters, frozen=True):
+        """Speeds and limits of flights without setpoints.
 
         Attributes:
-            descent_mps: in LAND, and in RETURN above home.
-            level_descent_mps: without an estimate.
-            return_mps: on the way home.
-            most_tilt_rad: asked of the attitude loop.
-            first: whether it takes itself for the one that flies while it hears nothing of that.
+            descent_mps: speed of descent in LAND, and in RETURN above home.
+            level_descent_mps: speed of descent without an estimate.
+            return_mps: speed of the flight home.
+            most_tilt_rad: largest tilt demanded of the attitude loop.
+            first: whether it assumes to fly while the speed controllers are silent.
         """
 
         descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 0.9
@@ -120,17 +120,17 @@ class Pilot(Actor):
 
     parameters: Parameters
     outputs = (t.ROTORS, t.PILOT)
+    wait_s = 0.08
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._imus, self._filter, self._vertical = ImuVote(), AttitudeFilter(), VerticalFilter()
+        self._vertical = VerticalFilter()
         self._attitude, self._position = AttitudeControl(), PositionControl()
         self._believed = Believed()
         self._setpoint: t.Setpoint | None = None
         self._setpoint_s = -math.inf
         self._refused = 0.0
         self._orders: dict[str, str] = {}
-        self._yaw_rad: float | None = None
         self._held_yaw_rad = 0.0
         self._rest_mps2 = 0.0
         self._held: tuple[str, Vector] | None = None
@@ -141,45 +141,23 @@ class Pilot(Actor):
         self._light_s = 0.0
         self._landed = context.incarnation == 1
         self._stays = False
-        self._born_s = self.clock.now()
 
     def on_start(self) -> None:
-        """Learn from the last incarnation whether it stood on the ground."""
+        """Load whether the vehicle stands on the ground."""
         kept = self.kept(MEMORY)
         if kept is not None:
             self._landed, self._stays = kept.landed, kept.stays
 
-    # -- what it hears ----------------------------------------------------------------------------
-
-    @on(t.IMU_1)
-    def imu_1(self, message: t.Imu, header: Header) -> None:
-        """Take a reading."""
-        self._imus.take(0, message, header.stamp)
-
-    @on(t.IMU_2)
-    def imu_2(self, message: t.Imu, header: Header) -> None:
-        """Take a reading."""
-        self._imus.take(1, message, header.stamp)
-
-    @on(t.IMU_3)
-    def imu_3(self, message: t.Imu, header: Header) -> None:
-        """Take a reading."""
-        self._imus.take(2, message, header.stamp)
+    # -- inputs -----------------------------------------------------------------------------------
 
     @on(t.BAROMETER)
     def barometer(self, message: t.Barometer, _header: Header) -> None:
         """Take a height."""
         self._vertical.measured(message.altitude_m, 1 / t.BAROMETER.rate_hz)
 
-    @on(t.HEADING)
-    def heading(self, message: t.Heading, _header: Header) -> None:
-        """Take a yaw."""
-        if math.isfinite(message.yaw_rad):
-            self._yaw_rad = message.yaw_rad
-
     @on(t.ESC)
     def esc(self, message: t.EscStatus, header: Header) -> None:
-        """Hear whom the rotors obey; follow the trim of another one."""
+        """Note which pilot the rotors obey; if it is the other one, follow its trim."""
         self._esc, self._esc_s = message, header.stamp
         if not self._flies():
             self._attitude.follow(message.thrust_n)
@@ -192,7 +170,7 @@ class Pilot(Actor):
 
     @on(t.ESTIMATE)
     def estimate(self, message: t.Estimate, header: Header) -> None:
-        """Take an estimate; begin with its attitude when joining in flight."""
+        """Take an estimate; after a restart begin with its attitude."""
         self._believed.take(message, header.stamp)
         if not self._filter.known and all(map(math.isfinite, message.attitude)):
             self._filter.begin(message.attitude)
@@ -209,9 +187,9 @@ class Pilot(Actor):
 
     @on(t.PILOT_ORDER)
     def order(self, message: t.PilotOrder, header: Header) -> None:
-        """Fly in a mode for whoever says so; NORMAL takes that back. The strictest one holds."""
+        """Enter a mode for the sender, or with NORMAL leave it. The strictest mode holds."""
         if message.mode not in MODES:
-            self.report_diagnostic("order", f"there is no mode {message.mode!r}", header.source)
+            self.report_diagnostic("order", f"unknown mode {message.mode!r}", header.source)
         elif message.mode == MODES[0]:
             self._orders.pop(header.source, None)
         elif header.source in self._orders or len(self._orders) < 16:
@@ -219,26 +197,20 @@ class Pilot(Actor):
 
     @property
     def mode(self) -> str:
-        """The strictest mode that anybody asks for."""
+        """The strictest mode that is ordered."""
         return max(self._orders.values(), key=MODES.index, default=MODES[0])
 
     # -- flying -----------------------------------------------------------------------------------
 
     @every(STEP_S)
     def step(self) -> None:
-        """Go through the loops once."""
-        now_s = self.clock.now()
-        voted = self._imus.vote(now_s)
-        if voted is None:
-            return  # nothing to stay upright by: the speed controllers go on for a while
-        rate, force = voted
-        if not self._filter.known:
-            if now_s - self._born_s > _WAIT_S and self._yaw_rad is not None:
-                self._filter.level(force, self._yaw_rad)
-            return
-        self._filter.step(rate, force, self._yaw_rad, STEP_S)
+        """Run the loops once."""
+        sensed = self._sense()
+        if sensed is None:
+            return  # the speed controllers hold the last command for a while
+        rate, force = sensed
         self._vertical.step(self._filter.upward(force), STEP_S)
-        asked, yaw_rad = self._asked(now_s)
+        asked, yaw_rad = self._asked(self.clock.now())
         self._see_ground(asked[2], force[2])
         if self._landed:
             self._attitude.reset()
@@ -249,13 +221,13 @@ class Pilot(Actor):
         self.publish(t.ROTORS, t.RotorCommand(self._last_n))
 
     def _asked(self, now_s: float) -> tuple[Vector, float]:
-        """Return the acceleration in `map`, m/s², and the yaw to fly with."""
-        mode, at, said = self.mode, self._believed.at(now_s), self._setpoint
-        if mode == MODES[0] and said is not None and now_s - self._setpoint_s <= FRESH_S:
+        """Return the acceleration in `map`, m/s², and the yaw, rad, to fly with."""
+        mode, at, setpoint = self.mode, self._believed.at(now_s), self._setpoint
+        if mode == MODES[0] and setpoint is not None and now_s - self._setpoint_s <= FRESH_S:
             self._follows("setpoint", now_s)
-            self._held_yaw_rad = said.yaw_rad
-            wanted = said.accel_x_mps2, said.accel_y_mps2, said.accel_z_mps2
-            if self._landed and not said.fly:
+            self._held_yaw_rad = setpoint.yaw_rad
+            wanted = setpoint.accel_x_mps2, setpoint.accel_y_mps2, setpoint.accel_z_mps2
+            if self._landed and not setpoint.fly:
                 wanted = 0.0, 0.0, -G_MPS2
         elif at is not None and mode != MODES[-1]:
             self._follows("estimate", now_s)
@@ -277,15 +249,15 @@ class Pilot(Actor):
             self._held = None
 
     def _by_estimate(self, mode: str, at: t.Estimate) -> Vector:
-        said = self.parameters
-        # Half from its own sensors: an estimate that is wrong then brings it down half as wrongly.
+        limits = self.parameters
+        # Half of the vertical speed is its own, so that a wrong estimate does half the harm.
         at = msgspec.structs.replace(
             at, velocity_z_mps=(at.velocity_z_mps + self._vertical.speed_mps) / 2)
         if self._held is None or self._held[0] != mode:
             self._held = mode, (at.x_m, at.y_m, at.z_m)
         x_m, y_m, z_m = self._held[1]
         if mode == "LAND":
-            velocity = 0.0, 0.0, -said.descent_mps
+            velocity = 0.0, 0.0, -limits.descent_mps
             if at.gps_age_s < _BLIND_S:
                 return self._position.towards(velocity, at, STEP_S)
             return 0.0, 0.0, self._position.towards(velocity, at, STEP_S)[2]
@@ -293,11 +265,12 @@ class Pilot(Actor):
             (x_m, y_m), z_m = HOME, max(z_m, 3.0)
             if math.hypot(at.x_m - x_m, at.y_m - y_m) < _NEAR_HOME_M:
                 z_m = -20.0
-        goal = t.Goal(True, x_m, y_m, z_m, self._held_yaw_rad, said.return_mps, said.descent_mps)
+        goal = t.Goal(True, x_m, y_m, z_m, self._held_yaw_rad, limits.return_mps,
+                      limits.descent_mps)
         return self._position.step(goal, at, STEP_S)
 
     def _by_own_sensors(self, now_s: float, *, hold: bool) -> Vector:
-        """Level, and after a while, which may mend what is wrong, gently down."""
+        """Return a level acceleration: hold the height for a while, then descend gently."""
         waits = hold and now_s - self._source_s < _HOLD_S
         wanted_mps = 0.0 if waits else -self.parameters.level_descent_mps
         wrong_mps = wanted_mps - self._vertical.speed_mps
@@ -305,16 +278,17 @@ class Pilot(Actor):
         return 0.0, 0.0, bounded(2.0 * wrong_mps + self._rest_mps2, 3.0)
 
     def _see_ground(self, upward_mps2: float, force_mps2: float) -> None:
-        """Whoever asks for little thrust and feels his whole weight stands on the ground.
+        """Detect takeoff and landing: little thrust at full weight means standing on the ground.
 
-        If the rotors obey the other pilot, that one has to ask for little, too.
+        If the rotors obey the other pilot, its thrust must be little too.
         """
         before = self._landed
-        told_n = self._last_n if self._flies() or self._esc is None else self._esc.thrust_n
-        thrust_mps2 = max(sum(self._last_n), sum(told_n)) / MASS_KG
+        flown_n = self._last_n if self._flies() or self._esc is None else self._esc.thrust_n
+        thrust_mps2 = max(sum(self._last_n), sum(flown_n)) / MASS_KG
         if self._landed:
-            said = self._setpoint if self._source == "setpoint" and not self._stays else None
-            self._landed = not (said is not None and said.fly and upward_mps2 > 0.5)
+            follows = self._source == "setpoint" and not self._stays
+            self._landed = not (follows and self._setpoint is not None and self._setpoint.fly
+                                and upward_mps2 > 0.5)
         elif thrust_mps2 < _STANDS_SHARE * G_MPS2 and force_mps2 > 0.85 * G_MPS2:
             self._light_s += STEP_S
             self._landed = self._light_s > _STANDS_S
@@ -327,7 +301,7 @@ class Pilot(Actor):
 
     @every(0.05)
     def say(self) -> None:
-        """Say how it flies, if it does."""
+        """Publish its status, if the rotors obey it."""
         if self._filter.known and self._flies():
             self.publish(t.PILOT, t.PilotStatus(
                 self.mode, self._source, self._landed, tilt(self._filter.q), self._filter.q,

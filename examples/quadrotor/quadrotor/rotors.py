@@ -1,8 +1,8 @@
-"""The rotors' speed controllers: whose commands they carry out, and what they do without. Pure.
+"""The rotors' speed controllers, which choose the pilot that they obey. Pure.
 
-They choose by regularity alone, as simple hardware can: the first pilot while it commands in time,
-else the next. So a pilot that is dead, stopped, slow or late costs nothing, and nobody has to
-notice it first. One that is wrong and in time they cannot tell from one that is right.
+They choose by regularity alone, as simple hardware can: the first pilot while it is in time, else
+the next. So a pilot that is dead, stopped, slow or late costs nothing, without any detection. They
+cannot notice a pilot that is wrong and in time.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from dataclasses import dataclass
 from quadrotor.vehicle import MOST_THRUST_N, Thrusts
 
 IDLE_N = 0.3
-"""Thrust of a rotor whose speed controller gets no commands any more: it turns, no more."""
+"""Thrust of an idle rotor, whose speed controller gets no commands."""
 
 LATE_S = 0.03
-"""A pilot whose newest command is older is late; it commands every 10 ms."""
+"""A pilot is late if its newest command is older; pilots command every 10 ms."""
 
 IN_TIME_S = 0.5
-"""For so long a pilot must not have been late before it is gone back to."""
+"""A pilot is obeyed again after it was in time for this long."""
 
 
 @dataclass(slots=True)
 class _Line:
-    """What one pilot said last, and when it was late last."""
+    """A pilot's last command, and when the pilot was late last."""
 
     thrusts: Thrusts = (0.0,) * 4
     stamp_s: float = -math.inf
@@ -36,11 +36,11 @@ class SpeedControllers:
     """Carry out the commands of one of several pilots.
 
     Args:
-        pilots: their names; the one that comes first is preferred.
-        hold_s: how long a command is carried out that is not renewed by anybody.
+        pilots: their names, the preferred one first.
+        hold_s: how long the last command is carried out.
 
     Attributes:
-        obeys: the pilot whose command is carried out.
+        obeys: name of the pilot in command.
         thrusts: its command.
     """
 
@@ -50,7 +50,7 @@ class SpeedControllers:
         self.obeys = pilots[0]
 
     def command(self, pilot: str, thrusts: Thrusts, stamp_s: float) -> bool:
-        """Take a command; return whether it makes sense. One that is not newer changes nothing."""
+        """Take a command if it is newer; return whether it is possible."""
         line = self._lines.get(pilot)
         if line is None or not all(0.0 <= f <= MOST_THRUST_N * 1.01 for f in thrusts):
             return False
@@ -60,16 +60,16 @@ class SpeedControllers:
 
     @property
     def thrusts(self) -> Thrusts:
-        """What the pilot that is obeyed asked for."""
+        """The command in force."""
         return self._lines[self.obeys].thrusts
 
     def age_s(self, now_s: float) -> float:
-        """For how long no command came, s; 0 before the first."""
+        """Return the age of the command in force, s; 0 before the first."""
         stamp_s = self._lines[self.obeys].stamp_s
         return max(now_s - stamp_s, 0.0) if stamp_s > -math.inf else 0.0
 
     def turn(self, now_s: float) -> Thrusts:
-        """Choose a pilot, and return what each rotor is driven with, N."""
+        """Choose a pilot, and return the thrust of each rotor, N."""
         lines = self._lines
         for line in lines.values():
             if now_s - line.stamp_s > LATE_S:

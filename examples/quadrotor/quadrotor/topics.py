@@ -1,4 +1,4 @@
-"""What the nodes of the quadrotor say to each other: messages and topics.
+"""Messages and topics of the quadrotor.
 
 Frames: `map` is east, north, up, with its origin at the place of takeoff; `base_link` is forward,
 left, up. Quaternions (w, x, y, z) turn from `base_link` to `map`. SI units stand in the names.
@@ -59,9 +59,9 @@ class Battery(Message, frozen=True):
 
 
 class Estimate(Message, frozen=True):
-    """Where the vehicle is, in `map`.
+    """Position, velocity and attitude of the vehicle, in `map`.
 
-    `attitude` turns from `base_link` to `map`; `gps_age_s` is for how long there was no fix.
+    `attitude` turns from `base_link` to `map`; `gps_age_s` is the time since the last fix.
     """
 
     x_m: float
@@ -76,7 +76,7 @@ class Estimate(Message, frozen=True):
 
 
 class Goal(Message, frozen=True):
-    """Where to fly, in `map`. `fly` is false before takeoff and after landing."""
+    """Goal in `map`. `fly` is false before takeoff and after landing."""
 
     fly: bool
     x_m: float
@@ -88,14 +88,14 @@ class Goal(Message, frozen=True):
 
 
 class MissionState(Message, frozen=True):
-    """Step of the mission; before `busy_until_s` it cannot advance, since somebody else flies."""
+    """Step of the mission; before `busy_until_s` it cannot advance: the pilot does not follow."""
 
     step: Text
     busy_until_s: float
 
 
 class Setpoint(Message, frozen=True):
-    """Acceleration that is asked for in `map`, gravity not included, and yaw."""
+    """Demanded acceleration in `map`, without gravity, and yaw."""
 
     fly: bool
     accel_x_mps2: float
@@ -105,23 +105,23 @@ class Setpoint(Message, frozen=True):
 
 
 class PilotOrder(Message, frozen=True):
-    """The mode in which the pilot is to fly, for whoever sent this; the strictest one holds."""
+    """The mode that the sender demands of the pilots; the strictest one holds."""
 
     mode: Text
 
 
 class PilotStatus(Message, frozen=True):
-    """What the pilot does.
+    """Status of the pilot that the rotors obey.
 
     Attributes:
         mode: NORMAL, HOVER, RETURN, LAND or LEVEL.
-        source: by what it flies: setpoint, estimate, or its own sensors.
+        source: the input that it flies by: setpoint, estimate or own sensors.
         landed: whether it stands on the ground, rotors off.
-        tilt_rad: between the rotors' axis and the vertical.
+        tilt_rad: angle between the rotors' axis and the vertical.
         attitude: turns from `base_link` to `map`.
-        imus_sound: how many of the three agree with each other.
-        trim: share of the hover thrust that one rotor is trimmed by to stay level.
-        refused: 1 if the last setpoint made no sense, else 0.
+        imus_sound: number of IMUs that agree.
+        trim: largest trim of a rotor, as a share of the hover thrust.
+        refused: 1 if the last setpoint was refused, else 0.
     """
 
     mode: Text
@@ -141,13 +141,13 @@ class RotorCommand(Message, frozen=True):
 
 
 class EscStatus(Message, frozen=True):
-    """What the rotors' speed controllers do.
+    """Status of the rotors' speed controllers.
 
     Attributes:
-        command_age_s: of the command that they carry out.
+        command_age_s: age of the command in force.
         turning: whether the rotors turn.
-        obeys: name of the pilot whose command it is.
-        thrust_n: what that one asked for.
+        obeys: name of the pilot in command.
+        thrust_n: the command in force.
     """
 
     command_age_s: float
@@ -157,17 +157,17 @@ class EscStatus(Message, frozen=True):
 
 
 class Truth(Message, frozen=True):
-    """Where the vehicle really is, in `map`; for judge and tests only.
+    """Ground truth in `map`, for judge and tests only.
 
     Attributes:
-        x_m, y_m, z_m: of its feet.
-        speed_mps: over ground and vertically.
-        tilt_rad: between the rotors' axis and the vertical.
+        x_m, y_m, z_m: position of the feet.
+        speed_mps: magnitude of the velocity.
+        tilt_rad: angle between the rotors' axis and the vertical.
         grounded: whether it touches the ground.
         turning: whether its rotors turn.
-        touch_speed_mps: vertical speed of the hardest touch so far.
-        touch_tilt_rad: tilt at the most tilted touch so far.
-        highest_tilt_rad: so far.
+        touch_speed_mps: largest vertical speed of a touchdown so far.
+        touch_tilt_rad: largest tilt of a touchdown so far.
+        highest_tilt_rad: largest tilt so far.
     """
 
     x_m: float
@@ -186,11 +186,11 @@ class BodyFault(Message, frozen=True):
     """A fault of the vehicle itself.
 
     Attributes:
-        injection: id under which its effect is reported.
+        injection: id that reports name.
         kind: "rotor" or "battery".
         rotor: 0 to 3, as in `RotorCommand`.
-        factor: share of its thrust that the rotor keeps, or how much faster the battery drains.
-        duration_s: simulated seconds, perhaps infinite.
+        factor: remaining share of the rotor's thrust, or factor of the battery's drain.
+        duration_s: simulated seconds; may be infinite.
     """
 
     injection: Annotated[str, msgspec.Meta(max_length=256)]
@@ -209,15 +209,15 @@ BAROMETER = Topic("sensors/barometer", Barometer, Qos.SENSOR, 20.0, "map", "Heig
 HEADING = Topic("sensors/heading", Heading, Qos.SENSOR, 20.0, "map", "Yaw by the magnetometer.")
 BATTERY = Topic("sensors/battery", Battery, Qos.SENSOR, 5.0, "", "The battery under load.")
 ESC = Topic("sensors/esc", EscStatus, Qos.SENSOR, 50.0, "", "The rotors' speed controllers.")
-TRUTH = Topic("world/truth", Truth, Qos.SENSOR, 20.0, "map", "What is so, for the judge.")
+TRUTH = Topic("world/truth", Truth, Qos.SENSOR, 20.0, "map", "Ground truth, for the judge.")
 BODY_FAULT = Topic("world/fault", BodyFault, Qos.COMMAND, 0.0, "", "Faults of the vehicle.",
                    outside=True)
 ESTIMATE = Topic("estimate", Estimate, Qos.SENSOR, 50.0, "map", "Position, velocity, attitude.")
-GOAL = Topic("mission/goal", Goal, Qos.STATE, 10.0, "map", "Where to fly.")
+GOAL = Topic("mission/goal", Goal, Qos.STATE, 10.0, "map", "The goal.")
 MISSION = Topic("mission/state", MissionState, Qos.STATE, 5.0, "", "Step of the mission.")
-SETPOINT = Topic("setpoint", Setpoint, Qos.SENSOR, 50.0, "map", "What the pilot is asked for.")
-PILOT_ORDER = Topic("pilot/order", PilotOrder, Qos.COMMAND, 0.0, "", "Mode asked of the pilot.")
+SETPOINT = Topic("setpoint", Setpoint, Qos.SENSOR, 50.0, "map", "Demanded acceleration.")
+PILOT_ORDER = Topic("pilot/order", PilotOrder, Qos.COMMAND, 0.0, "", "Mode demanded of the pilots.")
 PILOT = Topic("pilot/status", PilotStatus, Qos.STATE, 20.0, "map",
-              "What the pilot does whom the rotors obey.", several=True)
+              "Status of the pilot that the rotors obey.", several=True)
 ROTORS = Topic("rotors/{name}", RotorCommand, Qos.SENSOR, 100.0, "base_link",
                "Thrust of the rotors, by each pilot.")

@@ -1,4 +1,4 @@
-"""The vehicle's figures, as `quadrotor.xml` has them, and the mixer that follows from them."""
+"""Data of the vehicle, as in `quadrotor.xml`, and the mixer of its rotors."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ G_MPS2 = 9.81
 MASS_KG = 1.5
 INERTIA_KGM2: Vector = (0.018, 0.018, 0.032)
 ARM_M = 0.16
-"""Of each rotor from the middle, forward and sideways alike (an X)."""
+"""Distance of each rotor from the centre, forward and sideways."""
 DRAG_M = 0.016
-"""Yaw torque of a rotor by its thrust, N m / N."""
+"""Yaw torque of a rotor per thrust, N m / N."""
 MOST_THRUST_N = 7.5
-"""Of one rotor: twice the weight in all."""
+"""Largest thrust of one rotor; all four lift twice the weight."""
 HOVER_N = MASS_KG * G_MPS2 / 4
 HOME = (0.0, 0.0)
-"""Where it takes off and returns to, x and y in `map`, m."""
+"""Place of takeoff and return, x and y in `map`, m."""
 
 _PLACES = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
-"""Of each rotor: sign of x, sign of y, sign of its yaw torque."""
+"""Signs of x, y and yaw torque of each rotor."""
 
 
 def mix(thrust_n: float, torque_nm: Vector) -> Thrusts:
-    """Return the thrust of each rotor, N, within what it can do.
+    """Return the thrust of each rotor, N, within its limits.
 
-    Where not all is possible, roll and pitch come first, then the thrust, then yaw.
+    At the limits, roll and pitch come first, then the thrust, then yaw.
 
     Args:
-        thrust_n: of all four, along the axis of the rotors.
-        torque_nm: round x, y and z of `base_link`.
+        thrust_n: total thrust.
+        torque_nm: torque about x, y and z of `base_link`.
     """
     roll_n, pitch_n = torque_nm[0] / (4 * ARM_M), torque_nm[1] / (4 * ARM_M)
     yaw_n = min(max(torque_nm[2] / (4 * DRAG_M), -0.8), 0.8)
@@ -48,7 +48,7 @@ def mix(thrust_n: float, torque_nm: Vector) -> Thrusts:
 
 
 def wrench(thrusts_n: Sequence[float]) -> tuple[float, Vector]:
-    """Return the thrust of all rotors, N, and their torque round x, y, z of `base_link`, N m."""
+    """Return total thrust, N, and torque about x, y and z of `base_link`, N m."""
     return sum(thrusts_n), (
         sum(y * ARM_M * f for (_, y, _), f in zip(_PLACES, thrusts_n, strict=True)),
         -sum(x * ARM_M * f for (x, _, _), f in zip(_PLACES, thrusts_n, strict=True)),

@@ -1,7 +1,6 @@
-"""The world: the simulated vehicle as an actor. A real one's drivers would stand behind its topics.
+"""The world: the simulated vehicle as an actor. On a real vehicle, drivers take its place.
 
-A timer of 10 ms steps the physics to the clock's time, in real time as in virtual time, and says
-what every sensor reads that is due.
+Every 10 ms a timer steps the physics to the clock's time, and publishes the sensors that are due.
 """
 
 from __future__ import annotations
@@ -31,22 +30,22 @@ from rampart.sim.runs.physics import report_instability
 
 _TICK_S = 0.01
 _MOST_BEHIND_S = 0.5
-"""What the clock was further ahead, because this process was stopped, is left out."""
+"""After a longer stop of this process, the time of the stop is skipped."""
 
 
 class World(Actor):
-    """Runs the `Physics` on the actor's clock, and knows what is so."""
+    """Runs the `Physics` on the actor's clock, and publishes sensors and ground truth."""
 
     class Parameters(Actor.Parameters, frozen=True):
-        """The day; the run says `seed`, `dead_man` and `dead_man_timeout_s`.
+        """Conditions of a flight; the run sets `seed`, `dead_man` and `dead_man_timeout_s`.
 
         Attributes:
-            seed: of wind and noise.
+            seed: seed of wind and noise.
             dead_man: whether the speed controllers idle when commands cease.
-            dead_man_timeout_s: how long they carry out the last one.
-            pilots: whom they obey; the one that comes first is preferred.
-            wind_mps: mean wind, from a direction that the seed chooses.
-            charge: of the battery at the start, from 0 to 1.
+            dead_man_timeout_s: how long they carry out the last command.
+            pilots: names of the pilots, the preferred one first.
+            wind_mps: mean wind; its direction follows from the seed.
+            charge: charge of the battery at the start, from 0 to 1.
         """
 
         seed: int = 0
@@ -61,11 +60,11 @@ class World(Actor):
 
     def on_start(self) -> None:
         """Put the vehicle on the ground."""
-        said = self.parameters
+        given = self.parameters
         self._rotors = SpeedControllers(
-            said.pilots, said.dead_man_timeout_s if said.dead_man else math.inf)
+            given.pilots, given.dead_man_timeout_s if given.dead_man else math.inf)
         self.physics = physics = Physics(
-            said.seed, said.wind_mps, said.charge, self._rotors, self.clock.now())
+            given.seed, given.wind_mps, given.charge, self._rotors, self.clock.now())
         self._faults: dict[tuple[str, int], tuple[t.BodyFault, float, int]] = {}
         self._ticks = 0
         read: list[tuple[Topic[Any], Callable[[], Any]]] = [
@@ -79,21 +78,23 @@ class World(Actor):
         """Pass a command to the speed controllers."""
         stamp_s = min(header.stamp, self.clock.now())
         if not self._rotors.command(header.source, message.thrust_n, stamp_s):
-            self.report_diagnostic("rotors", "a thrust that no rotor has", header.source)
+            self.report_diagnostic(
+                "rotors", f"thrust {message.thrust_n} N: impossible", header.source)
 
     @on(t.BODY_FAULT)
     def fault(self, message: t.BodyFault, _header: Header) -> None:
         """Put a fault of the vehicle in force."""
         place = message.kind, message.rotor
         if message.kind not in ("rotor", "battery"):
-            self._tell(message, 0, finished=True, why=f"no fault of kind {message.kind!r}")
+            self._report(message, 0, finished=True, why=f"kind {message.kind!r}: expected rotor or "
+                                                        "battery")
             return
         self._faults[place] = (message, self.clock.now() + message.duration_s, 0)
         self._set(message, message.factor)
 
     @every(_TICK_S)
     def tick(self) -> None:
-        """Step the physics, and say what is due."""
+        """Step the physics, and publish the sensors that are due."""
         now_s, physics = self.clock.now(), self.physics
         if now_s - physics.now_s > _MOST_BEHIND_S:
             physics.skip(now_s - _TICK_S)
@@ -105,16 +106,16 @@ class World(Actor):
             if self._ticks % each == 0:
                 self.publish(topic, read())
         if self._faults:
-            self._go_on(now_s)
+            self._advance_faults(now_s)
 
-    def _go_on(self, now_s: float) -> None:
+    def _advance_faults(self, now_s: float) -> None:
         for place, (fault, until_s, ticks) in list(self._faults.items()):
             self._faults[place] = fault, until_s, ticks + 1
             if over := now_s >= until_s:
                 del self._faults[place]
                 self._set(fault, 1.0)
             if over or ticks == 0:
-                self._tell(fault, ticks + 1, finished=over)
+                self._report(fault, ticks + 1, finished=over)
 
     def _set(self, fault: t.BodyFault, factor: float) -> None:
         if fault.kind == "rotor":
@@ -122,6 +123,6 @@ class World(Actor):
         else:
             self.physics.health.drain = factor
 
-    def _tell(self, fault: t.BodyFault, ticks: int, *, finished: bool, why: str = "") -> None:
+    def _report(self, fault: t.BodyFault, ticks: int, *, finished: bool, why: str = "") -> None:
         self.publish(INJECTION_REPORT, InjectionReport(
             fault.injection, self.name, ticks, finished, why))

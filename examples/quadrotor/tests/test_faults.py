@@ -1,4 +1,4 @@
-"""Its faults by hand: listed, on the operator's page, and on processes; those of its file too."""
+"""Faults by hand: listed, on the operator's page, and on processes; also those of the file."""
 
 import asyncio
 import signal
@@ -22,13 +22,13 @@ kind = "non-control"
 
 [[fault]]
 name = "battery-gauge-high"
-title = "The battery says a tenth too much"
+title = "The battery reads a tenth too high"
 topic = "sensors/battery"
 mode = "corrupt"
 add = { charge = 0.1 }
 kind = "sensor"
 """
-"""What a quadrotor with an operator's page has besides."""
+"""Added to the specification: an operator's page, and a fault."""
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def file(tmp_path):
 
 
 def unjudged(file):
-    """Have a run go on whatever becomes of the vehicle on a machine that is busy."""
+    """Remove the judge, so that the run continues on a busy machine."""
     head, _, rest = file.read_text(encoding="utf-8").partition("[judge]\n")
     file.write_text(head + rest[rest.index("[end]\n"):])
     return file
@@ -51,7 +51,7 @@ def test_they_are_listed(file, capsys):
             for line in capsys.readouterr().out.splitlines() if line}
     assert rows["weak-rotor"] == "inf the front left rotor loses 30 % of its thrust"
     assert rows["gps-dropout"].startswith("inf ")
-    assert rows["battery-gauge-high"] == "10 The battery says a tenth too much"
+    assert rows["battery-gauge-high"] == "10 The battery reads a tenth too high"
     assert "weak-rotor:3:0.7" in rows
 
 
@@ -88,7 +88,7 @@ def test_on_processes_they_come_by_hand_and_as_planned(file, tmp_path, monkeypat
     planned = [word for fault in ("weak-rotor:1:0.95@2+1", "battery-gauge-high@2+1")
                for word in ("--fault", fault)]
     with RealRun(tmp_path, unjudged(file), "--hmi-port", str(free_base_port()), *planned,
-                 hmi=True) as flight:  # its page is told of faults that last for ever
+                 hmi=True) as flight:  # its page shows permanent faults
         flight.sleep_until(4)
         by_hand = {fault: flight.tool("inject", fault, "--duration", "1")
                    for fault in ("weak-rotor:2:0.95", "battery-gauge-high")}

@@ -1,4 +1,4 @@
-"""Single nodes on a virtual bus: what the pilot flies by, what mission and controller say."""
+"""Single nodes on a virtual bus: pilot, mission and flight controller."""
 
 import asyncio
 import math
@@ -21,7 +21,7 @@ def noisy():
 
 
 class Bench:
-    """A pilot, and whoever keeps it supplied with what a test says."""
+    """A pilot, and its inputs as a test sets them."""
 
     def __init__(self, system, name="pilot"):
         self.system = system
@@ -125,7 +125,7 @@ def test_a_pilot_whom_the_rotors_do_not_obey_commands_on_and_says_nothing():
         await bench.feed(0.5, obeys="reserve")
         assert len(bench.status) <= said + 1
         assert len(bench.rotors) > told + 40
-        await bench.feed(0.5)  # nothing is heard of the speed controllers: it takes itself for it
+        await bench.feed(0.5)  # without the speed controllers it assumes to fly
         assert len(bench.status) > said + 5
 
     on_the_bench(scenario)

@@ -1,4 +1,4 @@
-"""The speed controllers: whose command they carry out, and what they do when nobody commands."""
+"""The speed controllers: which pilot they obey, and what they do without commands."""
 
 import math
 
@@ -9,7 +9,7 @@ FIRST, SECOND = (3.0,) * 4, (4.0,) * 4
 
 
 class Bench:
-    """Speed controllers, and two pilots that command every 10 ms as long as they are told to."""
+    """Speed controllers, and two pilots that command every 10 ms."""
 
     def __init__(self, hold_s=0.4):
         self.rotors = SpeedControllers(("pilot", "reserve"), hold_s)

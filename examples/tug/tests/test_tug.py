@@ -85,7 +85,7 @@ def test_the_mission_goes_on_where_the_process_before_was():
                 system.say(topics.POSE, Place(x_m, 0.9, 0.0, 0.5), source="localization")
                 await system.settle()
                 await system.kill("mission")
-            assert [heard.message.step for heard in goals] == [1, 1, 1]  # it hears the last pose
+            assert [heard.message.step for heard in goals] == [1, 1, 1]  # it receives the last pose
 
     run(scenario)
 
@@ -160,7 +160,7 @@ def controller():
 
 
 def told_in_c(controller, said):
-    """Have the program hear messages, and return what it says: stamp and motion."""
+    """Send messages to the program, and return its output: stamp and motion."""
     ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, its:
         ours.settimeout(10)

@@ -1,4 +1,4 @@
-"""The floor as it was built: walls, shelves, stations, and how far the tug is from what stands."""
+"""The floor: walls, shelves, stations, and distances to them."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator
 
 RADIUS_M = 0.35
-"""Of the tug, which is round."""
+"""Radius of the tug."""
 
 FIELD_M = 0.2
-"""Width of the protective field round it."""
+"""Width of the protective field around the tug."""
 
 DOCK, PICK_UP, DROP_OFF = (1.0, 0.9), (7.0, 3.0), (1.0, 3.0)
 
@@ -19,21 +19,21 @@ SOLID = (  # x and y from, x and y to, m: four walls, two shelves
 
 
 def _nearest(x_m: float, y_m: float) -> Iterator[tuple[float, float, float]]:
-    """Yield for each solid thing how far its nearest point is from the tug: gap, and x and y."""
+    """Yield the gap to each wall and shelf, and x and y of its nearest point from the tug."""
     for x0, y0, x1, y1 in SOLID:
         dx, dy = min(max(x_m, x0), x1) - x_m, min(max(y_m, y0), y1) - y_m
         yield math.hypot(dx, dy) - RADIUS_M, dx, dy
 
 
 def clearance_m(x_m: float, y_m: float) -> float:
-    """Return the gap between the tug and what is nearest, m."""
+    """Return the gap between the tug and the nearest obstacle, m."""
     return min(gap_m for gap_m, _, _ in _nearest(x_m, y_m))
 
 
 def free_m(x_m: float, y_m: float, heading_rad: float) -> float:
-    """Return how far it can go straight on before something is in its field; 20 m at most.
+    """Return how far it can go straight on with its field free, at most 20 m.
 
-    All that stands is convex: going away from the nearest point of it leads to no other.
+    All obstacles are convex, so only their nearest points count.
     """
     free = 20.0
     for gap_m, dx, dy in _nearest(x_m, y_m):

@@ -1,4 +1,4 @@
-"""What a run of the tug was worth: trailers delivered, shelves untouched, nobody overrun."""
+"""Verdict on a run of the tug: trailers delivered, nothing touched, never too fast."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class Deliveries(Judge):
     """Success: all trailers delivered, and home. Safe: never too near, never too fast."""
 
     class Parameters(Judge.Parameters, frozen=True):
-        """deliveries: how many; nearest_m: to what stands; fastest_mps: ever."""
+        """deliveries: number; nearest_m: smallest gap; fastest_mps: largest speed."""
 
         deliveries: int = 2
         nearest_m: Positive = 0.05
         fastest_mps: Positive = 1.3
 
     parameters: Parameters
-    margins = {"gap": "to what stands"}
+    margins = {"gap": "to the nearest obstacle"}
     _gap_m: float | None = None
     _fastest_mps = 0.0
     _delivered, _home = 0, False
@@ -30,7 +30,7 @@ class Deliveries(Judge):
 
     @on(topics.TRUTH)
     def truth(self, message: Truth, header: Header) -> None:
-        """Note what was worst."""
+        """Note the smallest gap and the largest speed."""
         if self._gap_m is None or message.clearance_m < self._gap_m:
             self._gap_m, self._narrowest_s = message.clearance_m, header.stamp
         self._fastest_mps = max(self._fastest_mps, abs(message.speed_mps))
@@ -40,11 +40,11 @@ class Deliveries(Judge):
             self._unsafe_s = header.stamp
 
     def over(self, _now_s: float) -> str | None:
-        """Say that the work is done."""
+        """Return that the work is done."""
         return "all delivered, and home" if self._done() else None
 
     def verdict(self) -> Verdict:
-        """Return what it was worth."""
+        """Return the verdict so far."""
         wrong, done = self._wrong(), self._done()
         safe = None if self._gap_m is None else not wrong
         missed = () if done else (f"{self._delivered} delivered, at home: {self._home}",)
@@ -56,7 +56,7 @@ class Deliveries(Judge):
         return self._delivered >= self.parameters.deliveries and self._home
 
     def _wrong(self) -> tuple[str, ...]:
-        said, gap_m = self.parameters, self._gap_m
-        near = gap_m is not None and gap_m < said.nearest_m and f"{gap_m:.2f} m from what stands"
-        fast = self._fastest_mps > said.fastest_mps and f"{self._fastest_mps:.2f} m/s"
+        limits, gap_m = self.parameters, self._gap_m
+        near = gap_m is not None and gap_m < limits.nearest_m and f"a gap of {gap_m:.2f} m"
+        fast = self._fastest_mps > limits.fastest_mps and f"{self._fastest_mps:.2f} m/s"
         return tuple(why for why in (near, fast) if why)

@@ -1,4 +1,4 @@
-"""The tug's own nodes: where it is, where it goes, how it moves, and whether it may."""
+"""The tug's nodes: localization, mission, controller, pilot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tug.topics import Base, Free, Goal, Motion, Order, Place, Status
 
 
 class Localization(Actor):
-    """Counts the wheels, and is corrected by the markers."""
+    """Integrates the motion of the wheels, corrected by the markers."""
 
     outputs = (topics.POSE,)
     _at: tuple[float, float, float] | None = None
@@ -21,7 +21,7 @@ class Localization(Actor):
 
     @on(topics.WHEELS)
     def wheels(self, message: Motion, header: Header) -> None:
-        """Go on by what the wheels did."""
+        """Integrate the motion of the wheels."""
         lasted_s = min(max(header.stamp - self._wheels_s, 0.0), 0.2)
         self._wheels_s = header.stamp
         if self._at is not None:
@@ -33,7 +33,7 @@ class Localization(Actor):
 
     @on(topics.MARKER)
     def marker(self, message: Place, header: Header) -> None:
-        """Take a part of what the markers say, all of it at first; and say where it is."""
+        """Correct the pose by a part of the difference to the markers, and publish it."""
         seen = (message.x_m, message.y_m, message.heading_rad)
         x_m, y_m, heading_rad = self._at or seen
         turned = math.remainder(seen[2] - heading_rad, math.tau)
@@ -47,17 +47,17 @@ AISLES = ((1.0, 0.9), (7.0, 0.9)), ((1.0, 5.1), (7.0, 5.1))
 STEPS = *((*place, hitched) for aisle in AISLES for place, hitched in (
     *((corner, False) for corner in aisle), (PICK_UP, False), (PICK_UP, True), (DROP_OFF, True),
     (DROP_OFF, False))), (*DOCK, False)
-"""Places to reach one after the other, and whether the hitch is closed then."""
+"""Places in order, each with the state of the hitch there."""
 
 
 class Progress(msgspec.Struct, frozen=True):
-    """How far the mission is: the step that is next."""
+    """State that survives the process: the next step."""
 
     step: int = 0
 
 
 FORMAT = StateFormat(Progress, objection=lambda progress: (
-    "" if 0 <= progress.step < len(STEPS) else f"step {progress.step}: there is none"))
+    "" if 0 <= progress.step < len(STEPS) else f"step {progress.step}: unknown"))
 
 
 class Mission(Actor):
@@ -67,7 +67,7 @@ class Mission(Actor):
     _step, _hitched = 0, False
 
     def on_start(self) -> None:
-        """Go on where the process before this one was."""
+        """Load the step."""
         self._step = (self.kept(FORMAT) or Progress()).step
 
     @on(topics.BASE)
@@ -77,7 +77,7 @@ class Mission(Actor):
 
     @on(topics.POSE)
     def pose(self, message: Place, header: Header) -> None:
-        """Go on to the next step if this one is done; say which it is."""
+        """Go to the next step if this one is done; publish the goal."""
         x_m, y_m, hitched = STEPS[self._step]
         reached = math.dist((x_m, y_m), (message.x_m, message.y_m)) < 0.25
         if reached and hitched is self._hitched and self._step + 1 < len(STEPS):
@@ -95,12 +95,12 @@ class Controller(Actor):
 
     @on(topics.GOAL)
     def goal(self, message: Goal, header: Header) -> None:
-        """Note where to go."""
+        """Note the goal."""
         self._goal, self._goal_s = message, header.stamp
 
     @on(topics.POSE)
     def pose(self, message: Place, header: Header) -> None:
-        """Say how to move; what it says is as old as what it follows from."""
+        """Publish the motion, with the time stamp of its inputs."""
         dx, dy = self._goal.x_m - message.x_m, self._goal.y_m - message.y_m
         away_m = math.hypot(dx, dy)
         turn = math.remainder(math.atan2(dy, dx) - message.heading_rad, math.tau)
@@ -111,7 +111,7 @@ class Controller(Actor):
 
 
 class Pilot(Actor):
-    """Has the last word on how the tug moves: never too fast for what is free, nor on old news."""
+    """Limits the motion: never too fast for the free way, and never by stale inputs."""
 
     outputs = (topics.DRIVE, topics.STATUS)
     _motion, _motion_s = Motion(0.0, 0.0), 0.0
@@ -120,12 +120,12 @@ class Pilot(Actor):
 
     @on(topics.MOTION)
     def motion(self, message: Motion, header: Header) -> None:
-        """Note how the controller wants to move."""
+        """Note the controller's motion."""
         self._motion, self._motion_s = message, header.stamp
 
     @on(topics.FREE)
     def free(self, message: Free, header: Header) -> None:
-        """Note what the laser sees."""
+        """Note the free way."""
         self._free_m, self._free_s = message.free_m, header.stamp
 
     @on(topics.ORDER)
@@ -135,15 +135,15 @@ class Pilot(Actor):
 
     @every(0.05)
     def drive(self) -> None:
-        """Say what the wheels are to do: half of the braking that they are capable of is enough."""
+        """Command the wheels, so that half of their braking power suffices to stop."""
         self._why = self._why_not()
         most_mps = math.sqrt(max(0.0, self._free_m))
         self.publish(topics.DRIVE, Motion(0.0, 0.0) if self._why else Motion(
             min(self._motion.speed_mps, most_mps), self._motion.turn_radps))
 
     @every(0.1)
-    def say(self) -> None:
-        """Say whether it has stopped the tug."""
+    def publish_status(self) -> None:
+        """Publish whether it stops the tug, and why."""
         self.publish(topics.STATUS, Status(bool(self._why), self._why))
 
     def _why_not(self) -> str:

@@ -1,4 +1,4 @@
-"""What the nodes say to each other."""
+"""Messages and topics of the tug."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from rampart import Message, Qos, Topic
 
 
 class Motion(Message, frozen=True):
-    """How it moves, or is to move."""
+    """Actual or demanded motion."""
 
     speed_mps: float
     turn_radps: float
 
 
 class Place(Message, frozen=True):
-    """Where it is on the floor, and what the map says is the gap to the nearest thing."""
+    """Pose on the floor, and by the map the gap to the nearest obstacle."""
 
     x_m: float
     y_m: float
@@ -22,14 +22,14 @@ class Place(Message, frozen=True):
 
 
 class Free(Message, frozen=True):
-    """What the laser sees: how far it can go on as it goes, and the gap to the nearest thing."""
+    """Laser: free way in the direction of motion, and gap to the nearest obstacle."""
 
     free_m: float
     clearance_m: float
 
 
 class Goal(Message, frozen=True):
-    """Where to go, the number of the step, and whether the hitch is to be closed."""
+    """Number of the step, its place, and whether the hitch is closed there."""
 
     step: int
     x_m: float
@@ -38,14 +38,14 @@ class Goal(Message, frozen=True):
 
 
 class Base(Message, frozen=True):
-    """What the base does besides driving."""
+    """State of brake and hitch."""
 
     braked: bool
     hitched: bool
 
 
 class Order(Message, frozen=True):
-    """To the pilot: stop; to the base: brake."""
+    """Order to the pilot to stop, or to the base to brake."""
 
     stop: bool
 
@@ -58,7 +58,7 @@ class Status(Message, frozen=True):
 
 
 class Truth(Message, frozen=True):
-    """What is true, for the judge."""
+    """Ground truth, for the judge."""
 
     x_m: float
     y_m: float
@@ -69,13 +69,13 @@ class Truth(Message, frozen=True):
 
 WHEELS = Topic("tug/wheels", Motion, Qos.SENSOR, 20, "", "Motion by the wheels' encoders.")
 MARKER = Topic("tug/marker", Place, Qos.SENSOR, 10, "map", "Place by markers on the ceiling.")
-FREE = Topic("tug/free", Free, Qos.SENSOR, 20, "", "What the laser sees.")
+FREE = Topic("tug/free", Free, Qos.SENSOR, 20, "", "Free way, by the laser.")
 BASE = Topic("tug/base", Base, Qos.STATE, 10, "", "State of brake and hitch.")
-DRIVE = Topic("tug/drive", Motion, Qos.SENSOR, 20, "", "What the wheels are to do.")
+DRIVE = Topic("tug/drive", Motion, Qos.SENSOR, 20, "", "Motion commanded to the wheels.")
 BRAKE = Topic("tug/brake", Order, Qos.COMMAND, 0, "", "Applies the brake, and lifts it.")
-POSE = Topic("localization/pose", Place, Qos.SENSOR, 10, "map", "Where it is.")
-GOAL = Topic("mission/goal", Goal, Qos.STATE, 10, "map", "Where it is to go.")
-MOTION = Topic("controller/motion", Motion, Qos.SENSOR, 10, "", "How it is to move.")
-ORDER = Topic("pilot/order", Order, Qos.COMMAND, 0, "", "Has the pilot stop the tug.")
-STATUS = Topic("pilot/status", Status, Qos.STATE, 10, "", "What the pilot does.")
-TRUTH = Topic("world/truth", Truth, Qos.SENSOR, 20, "map", "What is true.")
+POSE = Topic("localization/pose", Place, Qos.SENSOR, 10, "map", "Pose of the tug.")
+GOAL = Topic("mission/goal", Goal, Qos.STATE, 10, "map", "Goal of the tug.")
+MOTION = Topic("controller/motion", Motion, Qos.SENSOR, 10, "", "Demanded motion.")
+ORDER = Topic("pilot/order", Order, Qos.COMMAND, 0, "", "Orders the pilot to stop the tug.")
+STATUS = Topic("pilot/status", Status, Qos.STATE, 10, "", "Status of the pilot.")
+TRUTH = Topic("world/truth", Truth, Qos.SENSOR, 20, "map", "Ground truth.")

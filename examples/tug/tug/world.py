@@ -1,4 +1,4 @@
-"""The world: the tug's base on the floor, its sensors, and what is true."""
+"""The world: the tug's base on the floor, its sensors, and the ground truth."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ FASTEST_MPS, DRIVES_MPS2, BRAKES_MPS2 = 1.6, 1.0, 2.5
 
 
 class World(Actor):
-    """Moves as it is told: by wheels that brake when they are told nothing, and by a brake."""
+    """Simulates the tug: its wheels, which brake without a command, and its brake."""
 
     class Parameters(Actor.Parameters, frozen=True):
-        """seed: of noise; dead_man: whether the wheels brake, dead_man_timeout_s: after what."""
+        """seed: of the noise; dead_man, dead_man_timeout_s: whether the wheels brake, and when."""
 
         seed: int = 1
         dead_man: bool = True
@@ -28,18 +28,18 @@ class World(Actor):
     outputs = (topics.WHEELS, topics.MARKER, topics.FREE, topics.BASE, topics.TRUTH)
 
     _x_m, _y_m, _heading_rad = *DOCK, 0.0
-    _moves = _told = Motion(0.0, 0.0)
-    _told_s, _deliveries = 0.0, 0
+    _moves = _commanded = Motion(0.0, 0.0)
+    _commanded_s, _deliveries = 0.0, 0
     _braked = _hitched = _wants_hitch = False
 
     def on_start(self) -> None:
-        """Take its seed."""
+        """Seed the noise."""
         self._dice = Random(f"tug {self.parameters.seed}")  # noqa: S311 no secret
 
     @on(topics.DRIVE)
     def drive(self, message: Motion, header: Header) -> None:
-        """Have the wheels turn."""
-        self._told, self._told_s = message, header.stamp
+        """Take a command of the wheels."""
+        self._commanded, self._commanded_s = message, header.stamp
 
     @on(topics.BRAKE)
     def brake(self, message: Order, _header: Header) -> None:
@@ -53,16 +53,16 @@ class World(Actor):
 
     @every(STEP_S)
     def step(self) -> None:
-        """Let time pass, and measure."""
-        age_s = self.clock.now() - self._told_s
+        """Advance by one step, and measure."""
+        age_s = self.clock.now() - self._commanded_s
         lost = self.parameters.dead_man and not -0.1 < age_s < self.parameters.dead_man_timeout_s
-        told = Motion(0.0, 0.0) if self._braked or lost else self._told
+        wanted = Motion(0.0, 0.0) if self._braked or lost else self._commanded
         most = (BRAKES_MPS2 if self._braked or lost else DRIVES_MPS2) * STEP_S
         speed = self._moves.speed_mps
-        speed += min(max(told.speed_mps - speed, -most), most)
+        speed += min(max(wanted.speed_mps - speed, -most), most)
         speed = min(max(speed, -FASTEST_MPS), FASTEST_MPS)
-        self._moves = Motion(speed, told.turn_radps)
-        self._heading_rad += told.turn_radps * STEP_S
+        self._moves = Motion(speed, wanted.turn_radps)
+        self._heading_rad += wanted.turn_radps * STEP_S
         self._x_m += speed * math.cos(self._heading_rad) * STEP_S
         self._y_m += speed * math.sin(self._heading_rad) * STEP_S
         self._couple()
@@ -86,7 +86,7 @@ class World(Actor):
 
     @every(2 * STEP_S)
     def look_up(self) -> None:
-        """Read the markers, and say how the base is."""
+        """Read the markers and the base."""
         noise = self._dice.gauss
         self.publish(topics.MARKER, Place(
             self._x_m + noise(0.0, 0.02), self._y_m + noise(0.0, 0.02),
