@@ -1,13 +1,13 @@
-"""What a strategy decides, checked for every set of active mechanisms.
+"""Checks what a strategy decides for every set of active mechanisms.
 
-Exhaustive: all 2^n - 1 sets, and for a strategy that asks which mechanisms are late, all ways in
-which some of them can be. Counterexamples are found smallest first.
+The check is exhaustive: all 2^n - 1 sets. For a patient strategy, each set is checked with every
+subset of late mechanisms. Counterexamples are found smallest first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from functools import cache
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import cache, partial
 from itertools import chain, combinations, product
 
 import msgspec
@@ -26,15 +26,15 @@ KEPT = 3
 
 
 class Property(msgspec.Struct, frozen=True):
-    """One property of one strategy, as checked.
+    """The verdict on one property of one strategy.
 
     Attributes:
         name: See `docs/explanation/arbitration.md`.
-        strategy: Of which strategy; "" if it does not depend on one.
+        strategy: Name of the strategy; "" if the property does not depend on one.
         holds: No counterexample exists.
         cases: How many cases were checked.
         count: In how many of them it fails.
-        counterexamples: The first few, shortest first; each a trace, one line a step.
+        counterexamples: The first few, shortest first; each is a trace, one line a step.
     """
 
     name: str
@@ -49,14 +49,14 @@ Trace = tuple[str, ...]
 
 
 class Case(msgspec.Struct, frozen=True):
-    """A question to a strategy, and its answer."""
+    """What a strategy decides for one set of active and late mechanisms."""
 
     active: tuple[str, ...]
     late: frozenset[str]
     decision: Decision
 
     def describe(self) -> str:
-        """Say what is active and what is run."""
+        """Return one line: what is active, and what runs."""
         late = f", {listing(sorted(self.late))} late" if self.late else ""
         return (f"{listing(self.active)} active{late}: runs {listing(self.decision.recoveries)} "
                 f"(rule {self.decision.rule})")
@@ -66,9 +66,9 @@ class ActiveSets:
     """All active sets of an arrangement under one strategy.
 
     Args:
-        arrangement: Mechanisms, tree, the order that the strategy uses.
-        safety: The order that says what is safer.
-        strategy: To check.
+        arrangement: Mechanisms, tree, and the order that the strategy uses.
+        safety: The order that defines which recovery is safer.
+        strategy: The strategy to check.
     """
 
     def __init__(self, arrangement: Arrangement, safety: PartialOrder, strategy: Strategy) -> None:
@@ -76,18 +76,21 @@ class ActiveSets:
         self.safety = safety
         self.strategy = strategy
         names = arrangement.mechanisms.names
+        # Millions of cases share some thousand sets.
+        late_set: Callable[[tuple[str, ...]], frozenset[str]] = cache(frozenset)
         self.cases = [
             Case(active, late, strategy.choose(active, arrangement, late))
             for active in subsets(names) if active
-            for late in map(frozenset, subsets(active) if strategy.patient else ((),))]
+            for late in map(late_set, subsets(active) if strategy.patient else ((),))]
         self._by_set = {(case.active, case.late): case for case in self.cases}
         self._recover = arrangement.mechanisms.recover
         self._contracts = arrangement.mechanisms.contracts
         self.last_resort = frozenset(self._recover[arrangement.tree.root])
-        self._find_milder = cache(self._compare)
+        # Of a bound method it would be a cycle, and millions of cases left to the collector.
+        self._find_milder = cache(partial(_find_milder, safety))
 
     def check(self) -> Iterator[Property]:
-        """Check every property in turn."""
+        """Check every property."""
         for name, find in (
                 ("one-decision", self._no_single_decision),
                 ("no-conflicting-claims", self._conflicting_claims),
@@ -103,7 +106,7 @@ class ActiveSets:
 
     @property
     def stops_for_good(self) -> int:
-        """In how many sets a recovery is run that stays until an operator resets it."""
+        """In how many sets a recovery runs that stays until an operator resets it."""
         return sum(any(self._contracts[r].latched for r in case.decision.recoveries)
                    for case in self.cases if not case.late)
 
@@ -111,22 +114,21 @@ class ActiveSets:
     def stuck_behind_last_resort(self) -> int:
         """In how many sets a latched last resort runs, and a repair that is needed never does.
 
-        `repairs-run` exempts these: the robot stands, and an operator has to come anyhow. But the
-        reset is refused as long as the last resort is decided on, which is until the repair has
-        been made by hand.
+        `repairs-run` exempts these sets: the robot stands, and an operator has to come in any
+        case. But the arbiter refuses the reset until the repair has been made by hand.
         """
         return sum(self._starve(case)[1] for case in self.cases if not case.late)
 
-    # -- the properties: each yields what is wrong if the case violates it -----------------------
+    # -- properties: each method yields what is wrong if the case violates it --------------------
 
     def _no_single_decision(self, case: Case) -> Iterator[Trace]:
         taken = case.decision.recoveries
         if self.strategy.choose(case.active, self.arrangement, case.late) != case.decision:
-            yield ("asked again, it decides otherwise",)
+            yield ("the same question gets another answer",)
         if not taken or not set(taken) <= self._contracts.keys() or len(set(taken)) != len(taken):
-            yield ("that is not a set of known recoveries, each once",)
+            yield ("this is not a set of known recoveries, each listed once",)
         if self.strategy.exclusive and not self.arrangement.compound and len(taken) != 1:
-            yield ("a strategy that runs one at a time has to take one",)
+            yield ("an exclusive strategy must run exactly one",)
 
     def _conflicting_claims(self, case: Case) -> Iterator[Trace]:
         for one, other in combinations(case.decision.recoveries, 2):
@@ -136,7 +138,7 @@ class ActiveSets:
     def _too_unsafe(self, case: Case) -> Iterator[Trace]:
         for name in case.active:
             for asked in self._recover[name]:
-                if not self._covered(asked, case.decision.recoveries):
+                if not _is_covered(self.safety, asked, case.decision.recoveries):
                     yield (f"{name} asks for {asked}, and nothing that runs is as safe",)
 
     def _stop_not_taken(self, case: Case) -> Iterator[Trace]:
@@ -164,18 +166,6 @@ class ActiveSets:
                 yield more.describe(), (f"with {extra} active as well, {milder[1]} runs instead of "
                                         f"{milder[0]}, which is safer")
 
-    def _compare(self, before: tuple[str, ...], after: tuple[str, ...]) -> tuple[str, str] | None:
-        """Return a recovery that ran before, and a less safe one that runs instead of it.
-
-        Compared is what is safest of each: repairs that run beneath make nothing less safe.
-        """
-        safest = self.safety.maximal(after)
-        for had in self.safety.maximal(before):
-            lower = [r for r in safest if self.safety.is_above(had, r)]
-            if lower and not self._covered(had, safest):
-                return had, lower[0]
-        return None
-
     def _harm(self, case: Case) -> Iterator[Trace]:
         for one, other in product(case.decision.recoveries, repeat=2):
             harmed = self.arrangement.mechanisms.harms(one, other)
@@ -183,9 +173,9 @@ class ActiveSets:
                 yield (f"{one} disables {', '.join(sorted(harmed))}, which {other} needs",)
 
     def _starving_repair(self, case: Case) -> Iterator[Trace]:
-        """Find a repair that is asked for and never run, though all recoveries succeed.
+        """Yield how a needed repair never runs, though all recoveries succeed.
 
-        Exempt is what starves while a latched last resort runs (`stuck_behind_last_resort`).
+        Sets in which a latched last resort runs are exempt (`stuck_behind_last_resort`).
         """
         trace, behind = self._starve(case)
         if trace and not behind:
@@ -194,8 +184,8 @@ class ActiveSets:
     def _starve(self, case: Case) -> tuple[Trace, bool]:
         """Return how a repair starves, if one does, and whether behind a latched last resort.
 
-        What a repair is asked for persists until that repair has run, and so do the consequences
-        that are detected above it. Everything else may go away by itself, and is let go.
+        The cause of a repair persists until that repair has run, and so do the consequences that
+        are detected above it. Everything else may disappear by itself, and does so here.
         """
         recover, tree = self._recover, self.arrangement.tree
         repairs = {name for name, c in self._contracts.items() if c.kind.repairs}
@@ -212,14 +202,28 @@ class ActiveSets:
             cured = {n for n in broken if set(recover[n]) <= set(decision.recoveries)}
             if not cured:
                 waiting = listing(sorted({r for n in broken for r in recover[n]}))
-                trace.append(f"{waiting} never runs, so {listing(broken)} stays active for ever")
+                trace.append(f"{waiting} never runs, so {listing(broken)} stays active forever")
                 return tuple(trace), bool(stops.intersection(decision.recoveries))
             active = tuple(n for n in lasting if n not in cured)
             trace.append(f"{listing(decision.recoveries)} done")
         return (), False
 
-    def _covered(self, recovery: str, by: tuple[str, ...]) -> bool:
-        return any(one == recovery or self.safety.is_above(one, recovery) for one in by)
+def _is_covered(safety: PartialOrder, recovery: str, by: tuple[str, ...]) -> bool:
+    return any(other == recovery or safety.is_above(other, recovery) for other in by)
+
+
+def _find_milder(safety: PartialOrder, before: tuple[str, ...], after: tuple[str, ...]
+                 ) -> tuple[str, str] | None:
+    """Return a recovery that ran before, and a less safe one that runs instead of it.
+
+    Only the safest of each are compared: repairs that run beneath make nothing less safe.
+    """
+    safest = safety.maximal(after)
+    for earlier in safety.maximal(before):
+        lower = [recovery for recovery in safest if safety.is_above(earlier, recovery)]
+        if lower and not _is_covered(safety, earlier, safest):
+            return earlier, lower[0]
+    return None
 
 
 def order_agrees_with_tree(arrangement: Arrangement, safety: PartialOrder) -> Property:
@@ -240,6 +244,6 @@ def judge(name: str, strategy: str, cases: int, found: Sequence[Trace]) -> Prope
 
 
 def subsets(names: Collection[str], most: int | None = None) -> Iterator[tuple[str, ...]]:
-    """Yield all sets of some names, of `most` at most, smaller ones before larger."""
+    """Yield all subsets of some names, smaller ones first, of at most `most` names."""
     sizes = range(1 + (len(names) if most is None else most))
     return chain.from_iterable(combinations(names, size) for size in sizes)

@@ -1,8 +1,7 @@
-"""Which mechanisms stand between causes and the top event.
+"""Finds the mechanisms that stand between causes and the top event.
 
-A mechanism on event *e* is a *barrier on a cut set* if the top does not occur from exactly the
-events of that set once *e* is kept from occurring. Where two barriers are wanted on every way to
-the top, this shows where one is missing.
+A mechanism on event *e* is a *barrier on a cut set* if preventing *e* keeps the events of that set
+from making the top occur. So it shows on which paths to the top a second barrier is missing.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ class Guarded(msgspec.Struct, frozen=True):
 
 
 class Outlook(msgspec.Struct, frozen=True):
-    """What is left before the top event, given what has occurred.
+    """What is left before the top event in a situation.
 
     Attributes:
-        occurred: Events that have occurred by what is detected.
-        left: For each active mechanism the barriers above it that are still idle.
-        next_events: Basic events, each of which by itself, with what has occurred, would make the
-            top occur; with the idle barriers that are then left, those with the fewest first.
+        occurred: Events of the active mechanisms.
+        left: For each active mechanism, the idle barriers above it.
+        next_events: Basic events that each alone would now make the top occur, with the idle
+            barriers that are then left; events with the fewest barriers first.
     """
 
     occurred: tuple[str, ...]
@@ -47,7 +46,7 @@ def guard(spec: SystemSpec, sets: Iterable[Sequence[str]]) -> tuple[Guarded, ...
 
 def _guarded(tree: FaultTree, events: Sequence[str], occurred: Sequence[str],
              mechanisms: Iterable[str], event_of: Mapping[str, str]) -> Guarded:
-    """Return some events with the mechanisms that keep the top from occurring."""
+    """Return some events with the mechanisms that can prevent the top."""
     return Guarded(tuple(events), tuple(
         name for name in mechanisms if tree.top not in tree.occurring(occurred, event_of[name])))
 
@@ -57,18 +56,18 @@ def outlook(spec: SystemSpec, active: Iterable[str]) -> Outlook:
 
     Args:
         spec: The system.
-        active: Active mechanisms: the event of each has occurred, for its detection says so.
+        active: Active mechanisms; the event of each counts as occurred.
     """
     tree = spec.build_fault_tree()
     ftms = spec.build_ftm_tree()
     event_of = {m.name: m.event for m in spec.mechanisms}
-    wanted = set(active)
-    breached = [name for name in ftms.names if name in wanted]
-    idle = [name for name in ftms.names if name not in wanted]
+    named = set(active)
+    breached = [name for name in ftms.names if name in named]
+    idle = [name for name in ftms.names if name not in named]
     occurred = tuple(event_of[name] for name in breached)
     left = {name: tuple(upper for upper in ftms.chain(ftms.root, name) if upper in idle)
             for name in breached}
-    # If what has occurred suffices already, the next event is looked at by itself.
+    # If these events suffice already, each next event is considered alone.
     base = () if tree.top in tree.occurring(occurred) else occurred
     following = [
         _guarded(tree, (name,), (*base, name), idle, event_of)

@@ -1,15 +1,15 @@
-"""Minimal cut sets: counted from decision diagrams, not listed.
+"""Minimal cut sets, counted from decision diagrams without listing them.
 
-A minimal cut set is a set of basic events that makes the top occur, and no part of which does
-(IEC 61025). Where a formula has negations, a set means that exactly its events occur and no others
-do, and minimal are those sets of which no part makes the top occur: the minimal p-cuts of Rauzy.
+A minimal cut set is a set of basic events that makes the top occur while no proper subset does
+(IEC 61025). If the formula has negations, a set means that exactly its events occur; the minimal
+sets are then Rauzy's minimal p-cuts.
 
-The way, for trees with hundreds of events and millions of cut sets:
+The steps, for trees with hundreds of events and millions of cut sets:
 
-1. *Modules* (`rampart.manager.analysis.formula`): parts that are analysed by themselves.
-2. *A binary decision diagram* of each module, by a library (OxiDD), with the variables in the
-   sequence of one of several depth-first searches; the first that stays within bounds is taken.
-3. *Minimal solutions* of the diagram as a zero-suppressed one (Rauzy 1993); from that the number
+1. *Modules* (`rampart.manager.analysis.formula`): each is analysed alone.
+2. *A binary decision diagram* of each module, by the library OxiDD. Several depth-first searches
+   give variable orders; the first order that keeps the diagram within bounds is taken.
+3. *Minimal solutions* of the diagram, as a zero-suppressed one (Rauzy 1993). They give the number
    of sets of each size, by multiplication where a variable stands for a module.
 """
 
@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import reduce
+from functools import cache, reduce
 from itertools import chain, islice
 from operator import and_, or_
 
@@ -40,31 +40,31 @@ BOUNDS = (30_000, 300_000, 1_000_000, 5_000_000, 20_000_000)
 """Nodes of a decision diagram: each bound is tried with every variable order before the next."""
 
 _LEVELS = 20_000
-"""Variables of a diagram: the library recurses by level, and ends the process without a stack."""
+"""Variables of a diagram: the library recurses by level, and aborts when its stack is full."""
 
 _STACK = str(64 << 20)
-"""Bytes for each thread of the library, which takes 1 GB of address space unless told otherwise."""
+"""Bytes for each thread of the library; its default takes 1 GB of address space."""
 
 _LISTING_LEVELS = 800
-"""Modules within modules, and events in one, for listing; counting has no such limit."""
+"""Nested modules, and events in one, up to which sets are listed; counting has no such limit."""
 
 Progress = Callable[[str], None]
 _Way = Callable[[tuple[str, ...]], Sequence[str]]
 
 
 class TooLargeError(ValueError):
-    """A fault tree that no variable order makes small enough."""
+    """A fault tree whose diagram exceeds the bounds with every variable order."""
 
 
 class _Module(msgspec.Struct, frozen=True):
     """Minimal solutions of one module.
 
     Attributes:
-        names: Of its variables, from the top.
+        names: Names of its variables, from the top.
         families: Store of the family.
         family: The minimal solutions.
-        sizes: How many cut sets of each size there are below each node of the family, those of the
-            modules below multiplied out.
+        sizes: For each node of the family, the number of cut sets of each size below it, those of
+            inner modules multiplied out.
     """
 
     names: tuple[str, ...]
@@ -78,7 +78,7 @@ class CutSets:
 
     Args:
         formula: The fault tree.
-        progress: Told in words what is being done.
+        progress: Called with a line on each step.
         max_order: Sets with more events are neither listed nor counted; None for all.
 
     Attributes:
@@ -94,10 +94,10 @@ class CutSets:
         self._gates, modules = prepare(formula)
         self._modules: dict[str, _Module] = {}
         self._constants = dict(formula.house)
-        managers = _Managers()
+        manager_of = cache(_new_manager)  # one for each bound: they keep their stacks for a while
         for number, name in enumerate(modules, 1):
             progress(f"module {number} of {len(modules)}: {name}")
-            module = self._modules[name] = self._solve(name, progress, managers)
+            module = self._modules[name] = self._solve(name, progress, manager_of)
             if module.family in {EMPTY, UNIT}:  # by house events below it
                 self._constants[name] = module.family == UNIT
         weight = self._weight(formula.top)
@@ -114,7 +114,7 @@ class CutSets:
         """Yield minimal cut sets, smaller ones first.
 
         Args:
-            limit: No more than so many.
+            limit: At most this many; None for all.
 
         Raises:
             TooLargeError: The tree is nested too deeply to list its sets; they can be counted.
@@ -125,12 +125,12 @@ class CutSets:
             depth[name] = 1 + max((depth.get(entry, 0) for entry in module.names), default=0)
             levels = max(levels, depth[name] + len(module.names))
         if levels > _LISTING_LEVELS:
-            raise TooLargeError(f"nested {levels} levels deep, too deeply to list the sets; they "
-                                "can be counted, --count")
+            raise TooLargeError(f"nested {levels} levels deep: expected at most {_LISTING_LEVELS} "
+                                "to list the sets; --count counts them")
         found = chain.from_iterable(
             self._of_size(self.formula.top, size) for size in range(len(self.sizes)))
-        for one in islice(found, None if limit is None else max(0, limit)):
-            yield tuple(sorted(one))
+        for events in islice(found, limit):
+            yield tuple(sorted(events))
 
     def _weight(self, name: str) -> Mapping[int, int]:
         """Return how many sets of each size a name stands for."""
@@ -149,7 +149,7 @@ class CutSets:
             yield frozenset((name,)) if size else frozenset()
 
     def _paths(self, module: _Module, node: int, size: int) -> Iterator[frozenset[str]]:
-        if size not in module.sizes[node]:  # so no way is a dead end
+        if size not in module.sizes[node]:  # so no branch is a dead end
             return
         if node == UNIT:
             yield frozenset()
@@ -162,17 +162,17 @@ class CutSets:
                     yield own | rest
         yield from self._paths(module, families.low[node], size)
 
-    def _solve(self, top: str, progress: Progress, managers: _Managers) -> _Module:
+    def _solve(self, top: str, progress: Progress, manager_of: Callable[[int], BDDManager]
+               ) -> _Module:
         inside = _Inside(self._gates, self._modules, self._constants, top)
         if len(inside.leaves) > _LEVELS:
-            raise TooLargeError(f"gate {top!r} with {len(inside.leaves)} inputs and modules: more "
-                                f"than {_LEVELS}")
+            raise TooLargeError(f"gate {top!r}: {len(inside.leaves)} inputs and modules; expected "
+                                f"at most {_LEVELS}")
         for bound in BOUNDS:
             progress(f"{top}: up to {bound} nodes")
             # To build a diagram is cheap, to find its minimal solutions is not: try all orders.
             built = [(diagram, order) for order in inside.orders()
-                     if (diagram := inside.diagram(order, managers.of(bound, len(order))))
-                     is not None]
+                     if (diagram := inside.diagram(order, manager_of(bound))) is not None]
             for diagram, order in sorted(built, key=lambda found: len(found[0].level)):
                 families = Families(bound)
                 try:
@@ -187,25 +187,10 @@ class CutSets:
                             f"{BOUNDS[-1]} nodes with every variable order tried")
 
 
-class _Managers:
-    """Managers of decision diagrams, one for each bound, used again for each diagram.
-
-    Each has two threads of its own and its stacks, which it keeps for a while after its end.
-    """
-
-    def __init__(self) -> None:
-        self._of: dict[int, BDDManager] = {}
-
-    def of(self, bound: int, variables: int) -> BDDManager:
-        """Return the empty manager of so many nodes, with so many variables at least."""
-        manager = self._of.get(bound)
-        if manager is None:
-            os.environ.setdefault("OXIDD_STACK_SIZE", _STACK)  # read when a manager is made
-            manager = self._of[bound] = BDDManager(bound, max(1024, bound // 4), 1)
-        manager.gc()
-        if (more := variables - manager.num_vars()) > 0:
-            manager.add_vars(more)
-        return manager
+def _new_manager(bound: int) -> BDDManager:
+    """Return a manager of decision diagrams with at most `bound` nodes."""
+    os.environ.setdefault("OXIDD_STACK_SIZE", _STACK)  # read when a manager is made
+    return BDDManager(bound, max(1024, bound // 4), 1)
 
 
 class _Inside:
@@ -221,7 +206,7 @@ class _Inside:
         self._users = Counter(entry for name in self._sequence for entry in gates[name].inputs)
 
     def _search(self, way: _Way) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Search with the inputs of each gate in a sequence of choice; return gates and leaves."""
+        """Search with the inputs of each gate ordered by `way`; return gates and leaves."""
         gates, leaves = search(self._top, lambda name: () if name != self._top and (
             name in self._modules or name not in self._gates) else way(self._gates[name].inputs))
         return gates, tuple(name for name in leaves if name not in self._house)
@@ -242,6 +227,9 @@ class _Inside:
 
     def diagram(self, order: tuple[str, ...], manager: BDDManager) -> Diagram | None:
         """Return the module's decision diagram, or None if it grows beyond the manager's bound."""
+        manager.gc()
+        if (more := len(order) - manager.num_vars()) > 0:
+            manager.add_vars(more)
         try:
             return _as_numbers(self._build(manager, order))
         except DDMemoryError:
@@ -255,7 +243,7 @@ class _Inside:
         for name in self._sequence:
             gate = self._gates[name]
             value[name] = _gate(manager, gate, [value[entry] for entry in gate.inputs])
-            for entry in gate.inputs:  # what is not needed any more can be collected
+            for entry in gate.inputs:  # so that the manager can collect it
                 left[entry] -= 1
                 if not left[entry] and entry in inner:
                     del value[entry]
@@ -278,9 +266,9 @@ def _gate(manager: BDDManager, gate: Connective, inputs: list[BDDFunction]) -> B
 def _at_least(manager: BDDManager, inputs: list[BDDFunction], required: int) -> BDDFunction:
     """Build k-of-n from the last input to the first: `rest[j]` is j of those seen so far."""
     rest = [manager.true(), *[manager.false()] * required]
-    for one in reversed(inputs):
+    for entry in reversed(inputs):
         for j in range(required, 0, -1):
-            rest[j] = one.ite(rest[j - 1], rest[j])
+            rest[j] = entry.ite(rest[j - 1], rest[j])
     return rest[required]
 
 

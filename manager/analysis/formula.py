@@ -1,8 +1,8 @@
-"""A fault tree as a Boolean formula, with all the connectives that other tools know.
+"""A fault tree as a Boolean formula, with all connectives of other tools.
 
-`rampart.manager.model.fault_tree` is what a system spec can say, coherent and with one top. This is
-what can be analysed: negation, exclusive or, cardinality, house events. Everything is a gate that
-holds when the number of its inputs that hold lies between two bounds, or when it does not.
+A system spec has coherent trees with one top (`rampart.manager.model.fault_tree`). The analysis
+also takes negation, exclusive or, cardinality and house events. Every gate holds if the number of
+its inputs that hold lies between two bounds; a negated gate holds if it does not.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rampart.manager.model.order import find_cycle
 Node = TypeVar("Node", bound=Hashable)
 
 GENERATED = ".."
-"""Stands in the names of gates and events that are made up; no name in a file can hold it."""
+"""Part of the names of generated gates and events; no name in a file can contain it."""
 
 
 class FormulaError(ValueError):
@@ -27,7 +27,7 @@ class FormulaError(ValueError):
 
 
 class Connective(msgspec.Struct, frozen=True):
-    """A gate: between `low` and `high` of its inputs hold; or, `negated`, they do not.
+    """A gate: between `low` and `high` of its inputs hold; if `negated`, they do not.
 
     An OR is 1 to n, an AND n to n, an exclusive or 1 to 1 of two, a NOT the negation of 1 to 1.
     """
@@ -39,7 +39,7 @@ class Connective(msgspec.Struct, frozen=True):
 
     @property
     def is_monotone(self) -> bool:
-        """Whether more inputs never make it cease to hold."""
+        """Whether a further input that holds never makes the gate cease to hold."""
         return not self.negated and self.high == len(self.inputs)
 
 
@@ -48,9 +48,9 @@ class Formula:
 
     Args:
         gates: By name.
-        basic: Names of basic events; those that no gate below the top uses do not matter.
+        basic: Names of basic events; those that no gate below the top uses are ignored.
         house: Names of house events, each with its state.
-        top: Name of the top gate or event; "" for the only gate that no other one uses.
+        top: Name of the top gate or event; "" for the only gate that no other gate uses.
 
     Raises:
         FormulaError: An unknown name, a cycle, no or several tops.
@@ -82,13 +82,13 @@ class Formula:
         tops = self.gates.keys() - {entry for gate in self.gates.values() for entry in gate.inputs}
         if len(tops) != 1:
             raise FormulaError(
-                f"{len(tops)} gates are no input of another: {first_few(tops)}; say which is the "
-                "top" if tops else "no gates; a top is needed")
+                f"{len(tops)} gates are not an input of another gate: {first_few(tops)}; name the "
+                "top gate" if tops else "no gates; expected a top gate")
         return tops.pop()
 
 
 def first_few(names: Collection[str]) -> str:
-    """Return the first eight names of some, for a message."""
+    """Return the first eight names, for a message."""
     return ", ".join(sorted(names)[:8]) + (", ..." if len(names) > 8 else "")
 
 
@@ -97,7 +97,7 @@ def search(top: Node, inputs: Callable[[Node], Sequence[Node]]
     """Search depth first, from the left.
 
     Returns:
-        What has inputs, each after these; and what has none, as it is met.
+        Nodes with inputs, each after its inputs; and nodes without, in the sequence of the search.
     """
     gates: list[Node] = []
     leaves: list[Node] = []
@@ -128,15 +128,15 @@ def formula_of(tree: FaultTree) -> Formula:
 def prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
     """Return the gates, with lone inputs gathered, and the modules, inner ones first.
 
-    A module is a gate whose events occur nowhere else. It is analysed by itself and counts as one
-    event above (Dutuit and Rauzy 1996). Inputs of a gate that no other gate uses are gathered into
-    a gate of their own first, which is a module then.
+    A module is a gate whose events occur nowhere else. It is analysed alone, and counts as one
+    event above (Dutuit and Rauzy 1996). Inputs that only one gate uses are gathered into a new
+    gate first, which is then a module.
     """
     gates = {name: formula.gates[name] for name in formula.sequence}
     if formula.top not in gates:
         return gates, []
     if not formula.is_monotone:
-        return gates, [formula.top]  # below a negation a module's cut sets are not its own
+        return gates, [formula.top]  # below a negation a module cannot be analysed alone
     modules = _modules(gates, formula.top)
     users = Counter(entry for gate in gates.values() for entry in gate.inputs)
     for name in list(gates):
@@ -154,10 +154,10 @@ def prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
 
 
 def _modules(gates: dict[str, Connective], top: str) -> list[str]:
-    """Return the gates of which no descendant is used elsewhere, inner ones first.
+    """Return the gates whose descendants are used nowhere else, inner ones first.
 
-    Dates of a depth-first search (Dutuit and Rauzy 1996): all descendants are met for the first
-    time after the gate, and for the last time before the search leaves it.
+    By the dates of a depth-first search (Dutuit and Rauzy 1996): it meets all descendants for the
+    first time after the gate, and for the last time before it leaves the gate.
     """
     first: dict[str, int] = {}
     last: dict[str, int] = {}
@@ -175,7 +175,7 @@ def _modules(gates: dict[str, Connective], top: str) -> list[str]:
             if name in gates:
                 stack.append((name, True))
                 stack.extend((entry, False) for entry in reversed(gates[name].inputs))
-    earliest, latest = dict(first), dict(last)  # of what is below, too
+    earliest, latest = dict(first), dict(last)  # descendants included
     modules = []
     for name, left_at in left.items():
         below = gates[name].inputs

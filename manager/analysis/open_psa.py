@@ -1,12 +1,12 @@
 """Fault trees in the Open-PSA Model Exchange Format (MEF 2.0d), in and out.
 
-Read are fault trees with everything that decides which sets of events make the top occur: gates
-with all standard connectives, nested formulas, components with private names, house events.
-Probabilities, parameters, labels, attributes and event trees are accepted and left aside: cut sets
-do not depend on them. Common-cause groups, substitutions and includes would change the cut sets.
-They are refused, and so is every other element, attribute or text that the reader does not know.
+The reader takes everything that decides which sets of events make the top occur: gates with all
+standard connectives, nested formulas, components with private names, house events. It skips
+probabilities, parameters, labels, attributes and event trees, on which cut sets do not depend.
+Common-cause groups, substitutions and includes would change the cut sets. The reader refuses them,
+and every other element, attribute or text that it does not know.
 
-XML from strangers is read without document type definitions, entities, or anything external.
+Document type definitions, entities and external references are refused as well.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from __future__ import annotations
 import difflib
 import xml.etree.ElementTree as ET
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator
-from functools import partial
+from collections.abc import Callable, Collection
 from itertools import count
+from typing import Any
 
 import msgspec
 from defusedxml import DefusedXmlException
@@ -42,23 +42,18 @@ REFERENCES = ("event", "gate", "basic-event", "house-event")
 MAX_BYTES = 16 << 20
 """Of a file; published fault trees with thousands of gates have one or two million."""
 
-_PATH_SHOWN = 300
-"""Characters of a path beyond which nothing is added to it."""
-
-_ASIDE = frozenset({"label", "attributes"})
+_SKIPPED_IN_FORMULAS = frozenset({"label", "attributes"})
 _CONTAINERS = ("define-fault-tree", "define-component", "model-data")
-_DEFINITIONS = {"define-gate": "gate", "define-basic-event": "basic-event",
-                "define-house-event": "house-event"}
+_DEFINITIONS = ("define-gate", "define-basic-event", "define-house-event")
 _JOIN = "other files are not read; join them first, for example with 'xmllint --xinclude'"
 _UNSUPPORTED = {
     "define-CCF-group": "common-cause groups would change the cut sets",
     "define-substitution": "substitutions would change the cut sets",
     "include": _JOIN, "{http://www.w3.org/2001/XInclude}include": _JOIN,
 }
-_OF_EVENT_TREES = frozenset({
+_SKIPPED = _SKIPPED_IN_FORMULAS | {
     "define-alignment", "define-consequence", "define-consequence-group", "define-event-tree",
-    "define-functional-event", "define-initiating-event", "define-rule", "define-sequence"})
-_LEFT_ASIDE = _ASIDE | _OF_EVENT_TREES | {
+    "define-functional-event", "define-initiating-event", "define-rule", "define-sequence",
     "define-parameter", "define-extern-library", "define-extern-function"}
 _ATTRIBUTES = {
     "constant": {"value"}, "event": {"name", "type"}, "gate": {"name"}, "basic-event": {"name"},
@@ -67,53 +62,46 @@ _ATTRIBUTES = {
     "define-house-event": {"name", "role"}, "define-fault-tree": {"name", "role"},
     "define-component": {"name", "role"}}
 _XML = "{http://www.w3.org/XML/1998/namespace}"
-_WARNED_OF = 20
+_MAX_DOUBTS = 20
 """Doubts that are reported of a file; more say nothing new."""
 
 _Path = tuple[str, ...]
 
 
 class OpenPsaError(ValueError):
-    """A file that cannot be read. The message is one line: file, line, path, what is wrong.
+    """A file that cannot be read. The message is one line: file, line, element, problem."""
 
-    Args:
-        file: Name of the file.
-        path: Of the element.
-        problem: What is wrong with it.
-        line: Of the element in the file; 0 if the problem is the file's.
-    """
-
-    def __init__(self, file: str, path: str, problem: str, line: int = 0) -> None:
-        where = f"{file}:{line}" if line else file
-        super().__init__(one_line(f"{where}: {path}: {problem}"))
-
-
-class _Element(ET.Element):
-    """An element that knows its line."""
-
-    line = 0
+    def __init__(self, where: str, problem: str) -> None:
+        super().__init__(one_line(f"{where}: {problem}"))
 
 
 class _Builder(ET.TreeBuilder):
-    """Makes elements of XML that know their line; `line` returns where the parser is."""
+    """Makes elements of XML and notes the line of each."""
 
-    line: Callable[[], int]
+    parser: Any  # expat's
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: dict[ET.Element, int] = {}
 
     def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
         """Open an element."""
         element = super().start(tag, attrs)
-        element.line = self.line()  # type: ignore[attr-defined]  # made by the factory
+        self.lines[element] = self.parser.CurrentLineNumber
         return element
 
 
 class _Definition(msgspec.Struct, frozen=True):
-    """A definition, before names are resolved."""
+    """A definition whose formula has not been read yet."""
 
-    kind: str
-    path: str
+    element: ET.Element
     place: _Path
     private: bool
-    element: _Element
+
+    @property
+    def kind(self) -> str:
+        """As references name it: "gate", "basic-event" or "house-event"."""
+        return self.element.tag.removeprefix("define-")
 
     @property
     def name(self) -> str:
@@ -137,281 +125,265 @@ def read_open_psa(text: str | bytes, file: str, top: str = "",
             refuse the file it raises what it is given.
 
     Raises:
-        OpenPsaError: The text is not XML, or not MEF, or has something that is not understood.
+        OpenPsaError: The text is not XML, is not MEF, or holds something unknown.
     """
     try:
         check_size(text, MAX_BYTES)
-        builder = _Builder(element_factory=_Element)
+        builder = _Builder()
         parser = DefusedXMLParser(target=builder, forbid_dtd=True, forbid_entities=True,
                                   forbid_external=True)
-        builder.line = lambda: parser.parser.CurrentLineNumber
+        builder.parser = parser.parser
         parser.feed(text)
         root = parser.close()
     except DefusedXmlException as error:
-        raise OpenPsaError(file, "/", f"{type(error).__name__}: document type definitions and "
-                                      "entities are not read; leave them out") from None
+        raise OpenPsaError(file, f"{type(error).__name__}: expected a file without document type "
+                                 "definitions and entities") from None
     except FileError as error:
-        raise OpenPsaError(file, "/", str(error)) from None
+        raise OpenPsaError(file, str(error)) from None
     except (ET.ParseError, ValueError, LookupError) as error:
-        raise OpenPsaError(file, "/", f"not well-formed XML: {error}") from None
+        raise OpenPsaError(file, f"not well-formed XML: {error}") from None
     if root.tag != "opsa-mef":
-        raise OpenPsaError(file, f"/{root.tag[:60]}", "expected the root element 'opsa-mef'")
-    return _Reader(root, file, doubt).formula(top)
+        raise OpenPsaError(file, f"{root.tag[:60]}: expected the root element 'opsa-mef'")
+    return _Reader(root, builder.lines, file, doubt).formula(top)
 
 
 class _Reader:
     """Reads one document."""
 
-    def __init__(self, root: _Element, file: str, doubt: Doubt) -> None:
-        self._error = partial(OpenPsaError, file)
-        self._doubts = 0
+    def __init__(self, root: ET.Element, lines: dict[ET.Element, int], file: str, doubt: Doubt
+                 ) -> None:
+        self._lines = lines
+        self._file = file
         self._report = doubt
-        self._undeclared: dict[str, tuple[str, int]] = {}
-        self._definitions: dict[_Path, _Definition] = {}
-        self._public: dict[str, _Definition] = {}
+        self._doubts = 0
+        self._inside: ET.Element | None = None  # the definition that is being read
+        self._undeclared: dict[str, tuple[ET.Element | None, ET.Element]] = {}
+        self._definitions: list[_Definition] = []
+        self._defined: dict[_Path, _Definition] = {}
         self._gates: dict[str, Connective] = {}
         self._basic: set[str] = set()
         self._house: dict[str, bool] = {}
-        for definition in self._find(root):
-            name = definition.place[-1]
-            earlier = self._definitions.get(definition.place) or (
-                None if definition.private else self._public.get(name))
-            if earlier is not None:
-                raise self._error(definition.path,
-                                  f"duplicate name {name!r}, already defined at {earlier.path}",
-                                  definition.element.line)
-            self._definitions[definition.place] = definition
-            if not definition.private:
-                self._public[name] = definition
+        self._find_definitions(root)
+
+    def _error(self, element: ET.Element | None, problem: str) -> OpenPsaError:
+        if element is None:
+            return OpenPsaError(self._file, problem)
+        around = {} if self._inside is None else {self._inside: None}
+        named = ", ".join(map(_label, {**around, element: None}))
+        return OpenPsaError(f"{self._file}:{self._lines[element]}: {named}", problem)
+
+    def _doubt(self, element: ET.Element | None, problem: str) -> None:
+        self._doubts += 1
+        if self._doubts <= _MAX_DOUBTS:
+            self._report(self._error(element, problem))
 
     # -- definitions ----------------------------------------------------------------------------
 
-    def _find(self, root: _Element) -> Iterator[_Definition]:
-        stack: list[tuple[_Element, str, _Path, bool]] = [(root, "/opsa-mef", (), False)]
-        containers: dict[_Path, str] = {}
+    def _find_definitions(self, root: ET.Element) -> None:
+        self._check_text(root)
+        stack: list[tuple[ET.Element, _Path, bool]] = [
+            (child, (), False) for child in reversed(root)]
+        containers: dict[_Path, ET.Element] = {}
         while stack:
-            parent, path, place, private = stack.pop()
-            inner = []
-            counts = Counter[str]()
-            self._check_text(parent, path)
-            element: _Element
-            for element in parent:  # type: ignore[assignment]  # made by the factory
-                tag, line = element.tag, element.line
-                counts[tag] += 1
-                name = element.get("name", "").strip()
-                here = f"{path}/{tag}[{f'@name={shown(name)}' if name else counts[tag]}]"
-                if tag in _UNSUPPORTED:
-                    raise self._error(here, f"not supported: {_UNSUPPORTED[tag]}", line)
-                if tag in _LEFT_ASIDE:
-                    if tag == "define-alignment":
-                        self._doubt(here, "alignments are left aside: each house event has the "
-                                          "state of its definition", line)
-                    continue
-                self._check_known(element, here, (*_CONTAINERS, *_DEFINITIONS))
-                role = element.get("role", "").strip()
-                if role not in {"", "public", "private"}:
-                    raise self._error(here, f"role {shown(role)}: expected 'public' or 'private'",
-                                      line)
-                hidden = role == "private" or (private and role != "public")
-                if tag == "model-data":
-                    inner.append((element, here, place, hidden))
-                    continue
-                own = (*place, self._checked(name, here, line))
-                if tag in _DEFINITIONS:
-                    yield _Definition(_DEFINITIONS[tag], here, own, hidden, element)
-                    continue
-                if own in containers:
-                    raise self._error(here, f"duplicate name {name!r}, already defined at "
-                                            f"{containers[own]}", line)
-                containers[own] = f"{here}, line {line}"
-                inner.append((element, here, own, hidden))
-            stack.extend(reversed(inner))
+            element, place, private = stack.pop()
+            tag = element.tag
+            if tag in _UNSUPPORTED:
+                raise self._error(element, f"not supported: {_UNSUPPORTED[tag]}")
+            if tag == "define-alignment":
+                self._doubt(element, "alignments are skipped: each house event has the state of "
+                                     "its definition")
+            if tag in _SKIPPED:
+                continue
+            self._check_known(element, (*_CONTAINERS, *_DEFINITIONS))
+            role = element.get("role", "").strip()
+            if role not in {"", "public", "private"}:
+                raise self._error(element, f"role {shown(role)}: expected 'public' or 'private'")
+            private = role == "private" or (private and role != "public")
+            if tag != "model-data":
+                name = _name(element)
+                if not name or "." in name:
+                    raise self._error(element, f"name {shown(name)}: expected a name without dots")
+                place = (*place, name)
+            if tag in _DEFINITIONS:
+                definition = _Definition(element, place, private)
+                for path in {place, place if private else (name,)}:
+                    if path in self._defined:
+                        raise self._twice(element, self._defined[path].element)
+                    self._defined[path] = definition
+                self._definitions.append(definition)
+                continue
+            if tag != "model-data" and containers.setdefault(place, element) is not element:
+                raise self._twice(element, containers[place])
+            self._check_text(element)
+            stack += [(child, place, private) for child in reversed(element)]
 
-    def _checked(self, name: str, path: str, line: int) -> str:
-        if not name or "." in name:
-            raise self._error(path, f"name {shown(name)}: expected a name without dots", line)
-        return name
+    def _twice(self, element: ET.Element, first: ET.Element) -> OpenPsaError:
+        return self._error(element, f"duplicate name, already defined in line "
+                                    f"{self._lines[first]}")
 
-    def _check_known(self, element: _Element, path: str, known: Collection[str],
+    def _check_known(self, element: ET.Element, known: Collection[str],
                      what: str = "element") -> None:
-        """Refuse an element, or an attribute of one, that the format does not have here."""
-        tag, line = element.tag, element.line
+        """Refuse an element, or an attribute of it, that the format does not have here."""
+        tag = element.tag
         if tag not in known:
             near = difflib.get_close_matches(tag.rpartition("}")[2], known, 1)
             hint = f"did you mean {near[0]!r}? " if near else ""
-            raise self._error(path, f"unknown {what}; {hint}known: {', '.join(known)}", line)
+            raise self._error(element, f"unknown {what}; {hint}known: {', '.join(known)}")
         allowed = _ATTRIBUTES.get(tag, set())
         for name in element.attrib:
             if name not in allowed and not name.startswith(_XML):
-                raise self._error(path, f"unknown attribute {shown(name)}; known: "
-                                        f"{', '.join(sorted(allowed)) or 'none'}", line)
+                raise self._error(element, f"unknown attribute {shown(name)}; known: "
+                                           f"{', '.join(sorted(allowed)) or 'none'}")
 
-    def _check_text(self, element: _Element, path: str, *, empty: bool = False) -> None:
-        """Refuse text where only elements have a meaning, and where it has to be `empty` these."""
+    def _check_text(self, element: ET.Element, *, empty: bool = False) -> None:
+        """Refuse text where only elements have a meaning, and elements too if `empty`."""
         texts = (element.text, *(child.tail for child in element))
         stray = next((text.strip() for text in texts if text and text.strip()), "")
         if stray:
-            raise self._error(path, f"unexpected text {shown(stray)}", element.line)
+            raise self._error(element, f"unexpected text {shown(stray)}")
         if empty and len(element):
-            raise self._error(path, f"unexpected element {shown(element[0].tag)} inside",
-                              element.line)
-
-    def _doubt(self, path: str, problem: str, line: int) -> None:
-        self._doubts += 1
-        if self._doubts <= _WARNED_OF:
-            self._report(self._error(path, problem, line))
+            raise self._error(element, f"unexpected element {shown(element[0].tag)} inside")
 
     # -- formulas -------------------------------------------------------------------------------
 
     def formula(self, top: str) -> Formula:
         """Return the formula of all definitions."""
-        for definition in self._definitions.values():
+        for definition in self._definitions:
+            self._inside = definition.element
             if definition.kind == "gate":
                 self._define_gate(definition)
             elif definition.kind == "house-event":
-                self._house[definition.name] = self._state(definition)
+                self._house[definition.name] = self._state(definition.element)
             else:
                 self._define_basic_event(definition)
+        self._inside = None
         if top and top not in self._gates:
-            raise self._error("/opsa-mef", f"unknown top gate {top!r}; known: "
-                                           f"{first_few(self._gates)}")
+            raise self._error(None, f"unknown top gate {top!r}; known: {first_few(self._gates)}")
         self._warn_of_names()
         try:
             return Formula(self._gates, frozenset(self._basic), self._house, top)
         except FormulaError as error:
-            raise self._error("/opsa-mef", str(error)) from None
+            raise self._error(None, str(error)) from None
 
-    def _state(self, definition: _Definition) -> bool:
-        """Return the state of a house event: false, as the format has it, unless it says one."""
-        bodies = self._bodies(definition)
+    def _state(self, element: ET.Element) -> bool:
+        """Return the state of a house event; without a constant it is false."""
+        bodies = self._bodies(element)
         for body in bodies:
-            self._check_known(body, f"{definition.path}/{body.tag}", ("constant",))
+            self._check_known(body, ("constant",))
         if len(bodies) > 1:
-            raise self._error(definition.path, f"{len(bodies)} constants; a house event has one",
-                              definition.element.line)
-        return bool(bodies) and self._truth(bodies[0], definition.path)
+            raise self._error(element, f"{len(bodies)} constants; expected one")
+        return bool(bodies) and self._truth(bodies[0])
 
     def _define_basic_event(self, definition: _Definition) -> None:
-        """Note a basic event. Its probability is left aside, and must be one, not a formula."""
-        for inner in definition.element.iter():
+        for inner in definition.element.iter():  # its probability does not matter
             if inner.tag in REFERENCES:
-                raise self._error(definition.path, f"a basic event has no formula, found "
-                                                   f"{inner.tag!r}", definition.element.line)
+                raise self._error(definition.element, f"unexpected {inner.tag!r}; a basic event "
+                                                      "has no formula")
         self._basic.add(definition.name)
 
-    def _bodies(self, definition: _Definition) -> list[_Element]:
-        self._check_text(definition.element, definition.path)
-        return [child for child in definition.element  # type: ignore[misc]  # of the factory
-                if child.tag not in _ASIDE]
+    def _bodies(self, element: ET.Element) -> list[ET.Element]:
+        self._check_text(element)
+        return [child for child in element if child.tag not in _SKIPPED_IN_FORMULAS]
 
-    def _truth(self, constant: _Element, path: str) -> bool:
-        self._check_text(constant, f"{path}/constant", empty=True)
+    def _truth(self, constant: ET.Element) -> bool:
+        self._check_text(constant, empty=True)
         value = constant.get("value", "").strip()
         if value not in {"true", "false"}:
-            raise self._error(f"{path}/constant", f"value {value!r}: expected 'true' or 'false'",
-                              constant.line)
+            raise self._error(constant, f"value {value!r}: expected 'true' or 'false'")
         return value == "true"
 
     def _define_gate(self, definition: _Definition) -> None:
-        bodies = self._bodies(definition)
+        bodies = self._bodies(definition.element)
         if len(bodies) != 1:
-            raise self._error(definition.path, f"{len(bodies)} formulas; a gate has exactly one",
-                              definition.element.line)
+            raise self._error(definition.element, f"{len(bodies)} formulas; expected one")
         name = definition.name
-        pending = [(name, bodies[0], definition.path)]
+        pending = [(name, bodies[0])]
         place = definition.place[:-1]
         numbers = count(1)
         while pending:  # nested formulas become gates named after the one they are in
-            own, body, path = pending.pop()
-            here = f"{path}/{body.tag}" if len(path) < _PATH_SHOWN else f"{path[:_PATH_SHOWN]}..."
-            if body.tag not in REFERENCES:
-                self._check_known(body, here[:200], (*CONNECTIVES, "constant"), "connective")
+            own, body = pending.pop()
             if body.tag in REFERENCES:
-                self._gates[own] = Connective((self._refer(body, place, here),), 1, 1)
-            elif body.tag == "constant":
-                self._house[f"{own}{GENERATED}constant"] = self._truth(body, path)
+                self._gates[own] = Connective((self._refer(body, place),), 1, 1)
+                continue
+            self._check_known(body, (*CONNECTIVES, "constant"), "connective")
+            if body.tag == "constant":
+                self._house[f"{own}{GENERATED}constant"] = self._truth(body)
                 self._gates[own] = Connective((f"{own}{GENERATED}constant",), 1, 1)
-            else:
-                self._check_text(body, here)
-                inputs = []
-                child: _Element
-                for child in body:  # type: ignore[assignment]  # made by the factory
-                    if child.tag in REFERENCES:
-                        inputs.append(self._refer(child, place, here))
-                    elif child.tag not in _ASIDE:
-                        nested = f"{name}{GENERATED}{next(numbers)}"
-                        pending.append((nested, child, here))
-                        inputs.append(nested)
-                self._gates[own] = self._connective(own, body, inputs, here)
+                continue
+            inputs = []
+            for child in self._bodies(body):
+                if child.tag in REFERENCES:
+                    inputs.append(self._refer(child, place))
+                else:
+                    inputs.append(f"{name}{GENERATED}{next(numbers)}")
+                    pending.append((inputs[-1], child))
+            self._gates[own] = self._connective(own, body, inputs)
 
-    def _refer(self, element: _Element, place: _Path, path: str) -> str:
-        name = element.get("name", "").strip()
-        here = f"{path}/{element.tag}[@name={shown(name)}]"
-        self._check_known(element, here, REFERENCES)
-        self._check_text(element, here, empty=True)
+    def _refer(self, element: ET.Element, place: _Path) -> str:
+        self._check_known(element, REFERENCES)
+        self._check_text(element, empty=True)
+        name = _name(element)
         found = self._resolve(name, place)
         kind = element.get("type", "").strip() if element.tag == "event" else element.tag
         if found is None:
             if kind in {"", "basic-event"} and name and "." not in name:
                 self._basic.add(name)  # MEF lets basic events be declared by their use
-                self._undeclared.setdefault(name, (here, element.line))
+                self._undeclared.setdefault(name, (self._inside, element))
                 return name
-            raise self._error(here, f"there is no {kind or 'event'} {name!r}", element.line)
+            raise self._error(element, f"there is no {kind or 'event'} {name!r}")
         if kind and kind != found.kind:
-            raise self._error(here, f"{name!r} is a {found.kind}, not a {kind}", element.line)
+            raise self._error(element, f"{name!r} is a {found.kind}, not a {kind}")
         return found.name
 
     def _resolve(self, name: str, place: _Path) -> _Definition | None:
         """Look a name up: in the innermost container first, then outwards, then in public."""
         parts = tuple(name.split("."))
         candidates = ((*place[:depth], *parts) for depth in range(len(place), -1, -1))
-        return next((self._definitions[candidate] for candidate in candidates
-                     if candidate in self._definitions), self._public.get(name))
+        return next((self._defined[candidate] for candidate in candidates
+                     if candidate in self._defined), None)
 
     def _warn_of_names(self) -> None:
         """Report events that are used and not defined, and names that differ only in case."""
-        used = list(self._undeclared)
         defined = sorted(name for name in (*self._basic, *self._gates, *self._house)
                          if name not in self._undeclared and GENERATED not in name)
         if self._undeclared and self._undeclared.keys() >= self._basic:
-            self._doubt("/opsa-mef", f"none of the {len(self._undeclared)} basic events is "
-                                     "defined; a misspelt name counts as another event", 0)
-            self._undeclared.clear()
-        for name, (path, line) in self._undeclared.items():
-            if self._doubts >= _WARNED_OF:
-                break
-            near = difflib.get_close_matches(name, defined, 1)
-            self._doubt(path, f"event {name!r} is not defined, and counts as an independent basic "
-                              "event" + (f"; did you mean {near[0]!r}?" if near else ""), line)
+            self._doubt(None, f"none of the {len(self._undeclared)} basic events is defined; a "
+                              "misspelt name counts as another event")
+        else:
+            for name, (definition, element) in self._undeclared.items():
+                if self._doubts >= _MAX_DOUBTS:
+                    break
+                self._inside = definition
+                near = difflib.get_close_matches(name, defined, 1)
+                self._doubt(element, f"event {name!r} is not defined, and counts as an independent "
+                            "basic event" + (f"; did you mean {near[0]!r}?" if near else ""))
         alike = defaultdict[str, list[str]](list)
-        for name in (*defined, *used):
+        for name in (*defined, *self._undeclared):
             alike[name.casefold()].append(name)
         for names in alike.values():
             if len(names) > 1:
-                self._doubt("/opsa-mef", "names that differ only in case: "
-                                         f"{first_few(names)}", 0)
+                self._doubt(None, f"names that differ only in case: {first_few(names)}")
 
-    def _connective(self, name: str, element: _Element, inputs: list[str], path: str
-                    ) -> Connective:
-        tag, count, line = element.tag, len(inputs), element.line
+    def _connective(self, name: str, element: ET.Element, inputs: list[str]) -> Connective:
+        tag, count = element.tag, len(inputs)
         if not count:
-            raise self._error(path, "empty gate; it needs inputs", line)
+            raise self._error(element, "empty gate; expected inputs")
         if count != _TAKES.get(tag, count):
-            raise self._error(path, f"{count} inputs; {tag!r} takes {_TAKES[tag]}", line)
+            raise self._error(element, f"{count} inputs; {tag!r} takes {_TAKES[tag]}")
         if twice := next((entry for entry, times in Counter(inputs).items() if times > 1), ""):
-            problem = f"input {shown(twice)} is there twice"
+            problem = f"input {shown(twice)} is listed twice"
             if tag not in {"and", "or", "nand", "nor"}:  # which do not count
-                raise self._error(path, f"{problem}; {tag!r} counts its inputs", line)
-            self._doubt(path, problem, line)
+                raise self._error(element, f"{problem}; {tag!r} counts its inputs")
+            self._doubt(element, problem)
         low, high = 1, count
         match tag:
             case "atleast":
-                low = self._number(element, "min", count, path)
+                low = self._number(element, "min", count)
             case "cardinality":
-                low = self._number(element, "min", count, path)
-                high = self._number(element, "max", count, path)
+                low = self._number(element, "min", count)
+                high = self._number(element, "max", count)
                 if low > high:
-                    raise self._error(path, f"min = {low} is more than max = {high}", line)
+                    raise self._error(element, f"min = {low} is more than max = {high}")
             case "imply":
                 self._gates[f"{name}{GENERATED}not"] = Connective((inputs[0],), 1, 1, negated=True)
                 inputs = [f"{name}{GENERATED}not", inputs[1]]
@@ -421,19 +393,28 @@ class _Reader:
                 low = count
         return Connective(tuple(inputs), low, high, negated=tag in _NEGATED)
 
-    def _number(self, element: _Element, attribute: str, count: int, path: str) -> int:
+    def _number(self, element: ET.Element, attribute: str, count: int) -> int:
         text = element.get(attribute, "").strip()
         least = 1 if element.tag == "atleast" else 0
         if not text.isdecimal() or len(text) > 9 or not least <= int(text) <= count:
-            raise self._error(path, f"{attribute} = {text!r}: expected a number from {least} to "
-                                    f"{count}, the inputs", element.line)
+            raise self._error(element, f"{attribute} = {text!r}: expected a number from {least} to "
+                                       f"{count}, the number of inputs")
         return int(text)
+
+
+def _name(element: ET.Element) -> str:
+    return element.get("name", "").strip()
+
+
+def _label(element: ET.Element) -> str:
+    name = _name(element)
+    return f"{element.tag[:60]} {shown(name)}" if name else element.tag[:60]
 
 
 def write_open_psa(spec: SystemSpec) -> str:
     """Return a system's fault tree as MEF.
 
-    Titles become labels; on which events mechanisms are barriers becomes an attribute.
+    Titles become labels. An event with a barrier gets an attribute that names the mechanism.
     """
     root = ET.Element("opsa-mef")
     tree = ET.SubElement(root, "define-fault-tree", name=spec.name)

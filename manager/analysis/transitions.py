@@ -1,26 +1,25 @@
-"""The arbiter's transition system, explored exhaustively.
+"""Explores the arbiter's transition system exhaustively.
 
-What is explored is the arbiter itself (`Arbiter.step`), in two compositions:
+The exploration runs the arbiter itself (`Arbiter.step`), in two compositions:
 
-* *one recovery with its module and the bus between them*: the module, as it is specified in
-  `rampart.actors.recovery.module`, obeys, finishes, fails, dies and comes back at any moment. It
-  shows that a module never holds its resources unless the arbiter knows that it may;
-* *several recoveries together*, by what the arbiter knows: anything that modules can report may be
-  reported at any moment. It shows that the arbiter never lets two hold the same resource.
+* *One recovery with its module and the bus between them.* The module obeys, finishes, fails, dies
+  and comes back at any moment, as `rampart.actors.recovery.module` specifies. This shows that a
+  module never holds its resources unless the arbiter knows that it may.
+* *Several recoveries together.* A module may report anything at any moment. This shows that the
+  arbiter never lets two recoveries hold the same resource.
 
 In both, detection modules change at any moment, a message takes any time or is lost, and any
-deadline may pass. Three reductions keep that finite and small;
+deadline may pass. Three reductions keep the exploration finite and small;
 `docs/explanation/arbitration.md` argues for each:
 
-* *Time.* A deadline may pass whenever it runs. That is more than can happen, so what holds here
-  holds in time.
-* *Channels.* Commands and reports are states: the latest one counts, it is repeated, and no older
-  one overtakes it. So a module may at any moment take note of what is wanted of it now, and the
-  arbiter of how the module is now; a message that is lost or late is one not taken note of yet.
-* *Recoveries.* Every property speaks of one recovery or of two, and one recovery touches another
-  only by being in its way. So it is enough to explore every choice of two, while the rest of the
-  world asks for any of them at any time, as far as the strategy ever does. Any larger number can
-  be explored together as well; it takes longer and finds the same.
+* *Time.* A deadline may pass whenever it runs. This covers more executions than are possible, so a
+  property that holds here also holds with time.
+* *Channels.* Commands and reports are states: they are repeated, and the newest one counts. So a
+  module may read its present command at any moment, and the arbiter the present state of a module.
+  A lost or late message is one that has not been read yet.
+* *Recoveries.* Every property concerns one recovery or two, and one recovery influences another
+  only by blocking it. So every pair is explored alone, while the environment asks for any of them
+  at any moment, as far as the strategy can. Larger groups take longer and give the same verdicts.
 """
 
 from __future__ import annotations
@@ -50,22 +49,22 @@ from rampart.manager.strategies.decision import Decision, Late
 
 Steps = Iterator[tuple[str, "Situation"]]
 Violations = dict[str, tuple[str, ...]]
-"""Properties that fail, each with the shortest way there."""
+"""Properties that fail, each with the shortest trace to a violation."""
 
 _OVER = -1e9
 _OLD, _CURRENT = 5, 10
 _NUMBER = 100
 _EXCUSE, _EXCUSED = "D_excuse", "F_excuse"
-"""What excuses a latch, whatever that is in the system: detected, and the mechanism for it."""
+"""The detection module and the mechanism that stand for whatever excuses a latch."""
 
 
 class Module(msgspec.Struct, frozen=True):
-    """A recovery module as it really is.
+    """The true state of a recovery module.
 
     Attributes:
         phase: What it does.
-        current: It has taken note of the arbiter's present command.
-        excused: It was given up on, and others no longer wait for it.
+        current: It has read the arbiter's present command.
+        excused: The arbiter has given it up, and others no longer wait for it.
     """
 
     phase: RecoveryPhase = RecoveryPhase.IDLE
@@ -74,16 +73,16 @@ class Module(msgspec.Struct, frozen=True):
 
 
 class Situation(msgspec.Struct, frozen=True):
-    """One state of the whole: the arbiter's, and each module's where modules are explored."""
+    """One state of the composition: the arbiter, and the modules where these are explored."""
 
     state: State
     modules: tuple[Module, ...]
 
 
-class AsTold:
-    """A strategy that runs what is asked for: the environment decides."""
+class AsAsked:
+    """A strategy that runs what the environment asks for."""
 
-    name = "as-told"
+    name = "as-asked"
     patient = False
     rules: dict[int, str] = {1: "it is asked for"}
 
@@ -92,12 +91,12 @@ class AsTold:
 
     def choose(self, active: tuple[str, ...], arrangement: Arrangement, late: Late  # noqa: ARG002
                ) -> Decision:
-        """Run the recovery of every active mechanism; an excuse asks for nothing."""
+        """Run the recovery of every active mechanism but the excuse."""
         active = tuple(name for name in active if name != _EXCUSED)
         return Decision(active, 1, arrangement.demanded(active), active)
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:  # noqa: ARG002
-        """There is nothing to explain."""
+        """Return the decision as it is."""
         return decision
 
 
@@ -105,12 +104,12 @@ class Transitions:
     """The transition system for a few recoveries.
 
     Args:
-        contracts: Of these recoveries.
+        contracts: Contracts of these recoveries.
         order: The RM order over them.
-        asked: Sets of them that the strategy may ask for; the empty set is always among them.
-        exclusive: The strategy runs one at a time.
-        urgent: Those that must never wait: last resorts.
-        with_modules: Explore the modules themselves; else anything that they can report.
+        asked: Sets of recoveries that the strategy may ask for; the empty set is always added.
+        exclusive: The strategy runs one recovery at a time.
+        urgent: Last resorts, which must never wait.
+        with_modules: Explore the modules themselves; else modules may report anything.
         deaths: Modules may die and come back.
     """
 
@@ -136,19 +135,19 @@ class Transitions:
         mechanisms = Mechanisms([Mechanism(f, d, n) for f, (d, n) in answers.items()],
                                 list(self.contracts.values()))
         tree = Tree({f: None if f == f"F_{top}" else f"F_{top}" for f in answers})
-        self.arbiter = Arbiter(Arrangement(mechanisms, tree, local), AsTold(exclusive=exclusive),
+        self.arbiter = Arbiter(Arrangement(mechanisms, tree, local), AsAsked(exclusive=exclusive),
                                DetectionRules(1.0, 0.0, 0.0, 0.0))
 
     def initial(self) -> Situation:
-        """Return the state in which all are idle and have been heard.
+        """Return the state in which every module has reported that it is idle.
 
-        Before that an arbiter adopts what an earlier one ordered; it is not explored.
+        Until then an arbiter adopts running recoveries; that phase is not explored.
         """
         return self._canonical(replace(self.arbiter.initial(0.0), oriented=True),
                                tuple(Module() for _ in self.names) if self.with_modules else ())
 
     def successors(self, now: Situation) -> Steps:
-        """Yield everything that may happen next, in words, with the state that follows."""
+        """Yield every possible next event in words, with the state that follows."""
         active = {t.name for t in now.state.detections if t.active}
         for asked in self.asked:
             changes = {f"D_{n}": n in asked for n in self.names
@@ -158,7 +157,7 @@ class Transitions:
                        self._detect(now, changes))
         for t in now.state.detections:
             if t.name == _EXCUSE:
-                yield ("the excuse ends" if t.active else "what excuses is found",
+                yield ("the excuse ends" if t.active else "an excuse is detected",
                        self._detect(now, {_EXCUSE: not t.active}))
         for index, name in enumerate(self.names):
             if f"D_{name}" in active and self.contracts[name].kind.repairs:
@@ -196,7 +195,7 @@ class Transitions:
             for phase, words in ((RecoveryPhase.DONE, "is done"), (RecoveryPhase.FAILED, "fails")):
                 yield f"{name} {words}", self._with_module(
                     now, index, replace(module, phase=phase))
-        yield f"the arbiter hears {name}", self._hear(
+        yield f"the arbiter receives {name}'s report", self._hear(
             now, name, module.phase, current=module.current)
         if module.phase is not RecoveryPhase.IDLE and self.deaths:
             yield f"{name} dies and comes back idle", self._with_module(
@@ -205,7 +204,7 @@ class Transitions:
     # -- single steps ---------------------------------------------------------------------------
 
     def _detect(self, now: Situation, changes: Mapping[str, bool]) -> Situation:
-        """Return what follows when detection modules become active, or idle."""
+        """Return the state after detection modules become active or idle."""
         tracks = tuple(
             replace(t, active=changes[t.name], reported=changes[t.name], rises=2)
             if t.name in changes else t for t in now.state.detections)
@@ -213,12 +212,12 @@ class Transitions:
 
     def _hear(self, now: Situation, name: str, phase: RecoveryPhase, *, current: bool = True
               ) -> Situation:
-        """Return what follows when the arbiter hears a module, on its present command or not."""
+        """Return the state after a report, on the present command or on an older one."""
         return self._step(now, now.state, RecoveryHeard(
             name, phase is not RecoveryPhase.IDLE, phase, _CURRENT if current else _OLD))
 
     def pass_deadline(self, now: Situation, index: int) -> Situation:
-        """Return what follows when the deadline of a recovery passes."""
+        """Return the state after the deadline of a recovery passes."""
         tracks = list(now.state.recoveries)
         tracks[index] = replace(tracks[index], ordered_s=_OVER)
         return self._step(now, replace(now.state, recoveries=tuple(tracks)), Tick())
@@ -243,7 +242,7 @@ class Transitions:
         return self._canonical(after, tuple(modules))
 
     def _canonical(self, state: State, modules: tuple[Module, ...]) -> Situation:
-        """Forget what makes no difference: numbers, times, words."""
+        """Drop what makes no difference: numbers, times, reasons."""
         rises = {t.name: t.rises for t in state.detections if t.active}
         detections = tuple(DetectionTrack(
             t.name, 0.0, ever_heard=True, reported=t.active, active=t.active, rises=1)
@@ -267,7 +266,7 @@ class Transitions:
     # -- properties -----------------------------------------------------------------------------
 
     def faults(self, now: Situation) -> Iterator[tuple[str, str]]:
-        """Yield each property that fails in a state, and what is wrong."""
+        """Yield each property that fails in a state, and how."""
         for problem in self._conflicts(now):
             yield "no-conflicting-claims", problem
         in_force = [t.name for t in now.state.recoveries if t.wanted and not t.draining]
@@ -281,10 +280,13 @@ class Transitions:
                     self.pass_deadline(now, index).state.recoveries[index]):
                 yield "recovery-ends", f"{track.name}'s deadline passes and nothing follows"
             if waits and not self._starts(now, index):
-                yield "recovery-ends", f"{track.name} waits for ever"
+                yield "recovery-ends", f"{track.name} waits forever"
 
     def _conflicts(self, now: Situation) -> Iterator[str]:
-        """Yield in words who may hold what another one holds, or holds it unknown."""
+        """Yield in words two recoveries that may hold one resource, or one that holds on unknown.
+
+        A recovery that has failed is exempt: its successor must not wait.
+        """
         tracks = now.state.recoveries
         holding = [t for t in tracks if (t.wanted or t.letting_go) and not t.failure]
         for one, other in combinations(holding, 2):
@@ -293,10 +295,10 @@ class Transitions:
         for track, module in zip(tracks, now.modules, strict=self.with_modules):
             holds = module.phase is not RecoveryPhase.IDLE and not module.excused
             if holds and not (track.wanted or track.letting_go):
-                yield f"{track.name} holds on, and nobody knows"
+                yield f"{track.name} holds its claims, and the arbiter does not know"
 
     def _starts(self, now: Situation, waiting: int) -> bool:
-        """Tell whether a recovery that waits starts once all deadlines of others have passed."""
+        """Return whether a waiting recovery starts once the deadlines of all others have passed."""
         for index in range(len(self.names)):
             if index != waiting:
                 now = self.pass_deadline(now, index)
@@ -304,10 +306,10 @@ class Transitions:
             or self.names[waiting] not in now.state.decision.recoveries
 
     def cut_off(self, before: Situation, after: Situation) -> str:
-        """Return which recovery is released half-way in a step, "" if none.
+        """Return the recovery that a step releases half-way, "" if none.
 
-        Where modules die and come back unheard, the arbiter cannot know that one has begun anew;
-        then it is the module that finishes first (`rampart.actors.recovery.module`).
+        Where a module may die and come back unnoticed, the arbiter cannot know that it has started
+        again. There the module itself finishes first (`rampart.actors.recovery.module`).
         """
         if self.deaths:
             return ""
@@ -321,7 +323,7 @@ class Transitions:
 
 
 def _is_due(track: RecoveryTrack) -> bool:
-    """Whether a recovery is at work that has to end."""
+    """Return whether a recovery acts, and its deadline has to end that."""
     return track.unfinished and not track.failure
 
 

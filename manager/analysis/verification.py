@@ -1,8 +1,8 @@
-"""Verification of a system's arbitration: every active set, every reachable state.
+"""Verifies a system's arbitration: every active set, every reachable state.
 
-`verify` puts together what `rampart.manager.analysis.active_sets` finds about decisions and what
-`rampart.manager.analysis.transitions` finds about their execution. What each property means, why it
-matters, and what was found about the paper's strategy is in `docs/explanation/arbitration.md`.
+`verify` combines the verdicts of `rampart.manager.analysis.active_sets` on decisions with those of
+`rampart.manager.analysis.transitions` on their execution. `docs/explanation/arbitration.md`
+explains each property, and what it found about the paper's strategy.
 """
 
 from __future__ import annotations
@@ -39,18 +39,16 @@ MEANING = {
     "none-cut-off": "no recovery is released half-way",
     "monotone": "one more active mechanism never leads to a less safe recovery",
     "no-harm": "no recovery disables what it or another one needs",
-    "repairs-run": "a repair that is needed is run some time, unless the last resort latches",
+    "repairs-run": "a needed repair runs at some time, unless the last resort latches",
     "order-agrees-with-tree": "no mechanism is safer than one above it",
 }
 """Names of the properties, each with its meaning in one line."""
 
 _ALL_FAILURES_OF = 10
-"""Of so many recoveries that escalation can lead to, every combination may have failed when the
-sets that can be asked for are collected; of more recoveries only
-"""
+"""Of up to this many recoveries that escalation can lead to, any combination may have failed."""
 
 _FAILURES_AT_ONCE = 3
-"""so many."""
+"""Of more recoveries, at most this many."""
 
 Progress = Callable[[str], None]
 
@@ -60,8 +58,8 @@ class Report(msgspec.Struct, frozen=True):
 
     Attributes:
         system: Name of the system.
-        strategy: The one that the system uses.
-        active_sets: How many sets of active mechanisms were decided, for each strategy.
+        strategy: The strategy that the system uses.
+        active_sets: How many sets of active mechanisms were checked for each strategy.
         states: How many states of the arbiter were visited, over all strategies.
         permissiveness: For each strategy, in how many active sets the robot must stop until
             an operator resets it.
@@ -80,7 +78,7 @@ class Report(msgspec.Struct, frozen=True):
 
 
 class TooLargeError(ValueError):
-    """A system with more active sets than can be looked at."""
+    """A system with more active sets than can be checked."""
 
 
 def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
@@ -89,10 +87,10 @@ def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
 
     Args:
         spec: The system.
-        strategies: Names; the system's own and all others if none is given.
+        strategies: Names; all of them, the system's own first, if none is given.
         together: How many recoveries to explore at a time; two suffice
             (`rampart.manager.analysis.transitions`).
-        progress: Told in words what is being done.
+        progress: Called with a line on each step.
 
     Raises:
         TooLargeError: The system has too many mechanisms.
@@ -132,7 +130,7 @@ _OF_STATES = ("one-decision", "no-conflicting-claims", "emergency-stop-at-once",
 
 def _merge(strategy: str, statically: dict[str, Property], states: int,
            violations: list[tuple[str, Trace]]) -> Iterator[Property]:
-    """Yield one verdict a property, where it was checked on sets and on states on both."""
+    """Yield one verdict a property, over sets and states if it was checked on both."""
     for name in MEANING:
         if name in _OF_STATES:
             base = statically.get(name, Property(name, strategy, True, 0, 0, ()))
@@ -144,17 +142,17 @@ def _merge(strategy: str, statically: dict[str, Property], states: int,
 
 
 class _Explorer:
-    """Explores the transition systems of a system's recoveries; the same one only once."""
+    """Explores the recoveries of a system; equal transition systems only once."""
 
     def __init__(self, arrangement: Arrangement, together: int) -> None:
         self.arrangement = arrangement
         self.together = together
         self.states = 0
-        self._known: dict[object, tuple[int, Violations]] = {}
+        self._explored: dict[object, tuple[int, Violations]] = {}
         self._urgent = frozenset(arrangement.mechanisms.recover[arrangement.tree.root])
 
     def run(self, sets: ActiveSets) -> Iterator[tuple[str, int, Violations]]:
-        """Yield, for each choice of recoveries, which they are, the states, the violations."""
+        """Yield the names, the number of states and the violations of each choice of recoveries."""
         asked = _askable(sets)
         names = self.arrangement.mechanisms.recoveries
         exclusive = sets.strategy.exclusive and not self.arrangement.compound
@@ -169,22 +167,22 @@ class _Explorer:
                  exclusive: bool, with_modules: bool = False, deaths: bool = True
                  ) -> tuple[str, int, Violations]:
         mechanisms, order = self.arrangement.mechanisms, self.arrangement.order
-        # One that is not among them may make one of them wait: as if it were not asked for yet.
+        # A recovery outside may make one of these wait, as if it were not asked for yet.
         here = frozenset(
-            frozenset(part) for one in asked for part in subsets(one.intersection(names)))
+            frozenset(part) for taken in asked for part in subsets(taken.intersection(names)))
         shape = _shape(names, here, self._urgent, self.arrangement)
         key = (shape, exclusive, with_modules, deaths)
-        if key not in self._known:
+        if key not in self._explored:
             contracts = [mechanisms.contracts[n] for n in names]
-            self._known[key] = explore(Transitions(
+            self._explored[key] = explore(Transitions(
                 contracts, order, here, self._urgent.intersection(names), exclusive=exclusive,
                 with_modules=with_modules, deaths=deaths))
-            self.states += self._known[key][0]
-        return " and ".join(names), *self._known[key]
+            self.states += self._explored[key][0]
+        return " and ".join(names), *self._explored[key]
 
 
 def _askable(sets: ActiveSets) -> frozenset[frozenset[str]]:
-    """Return the sets of recoveries that a strategy can ask for, after escalations as well."""
+    """Return the sets of recoveries that a strategy can ask for, also after escalations."""
     arrangement = sets.arrangement
     decisions = {(c.decision.recoveries, c.decision.mechanisms): c.decision for c in sets.cases}
     found = set()
@@ -193,14 +191,14 @@ def _askable(sets: ActiveSets) -> frozenset[frozenset[str]]:
         concerned = [n for n in arrangement.mechanisms.recoveries if n in reachable]
         most = len(concerned) if len(concerned) <= _ALL_FAILURES_OF else _FAILURES_AT_ONCE
         for failed in subsets(concerned, most):
-            if not failed or set(failed).intersection(decision.recoveries):  # of what runs
+            if not failed or set(failed).intersection(decision.recoveries):
                 found.add(frozenset(escalate(
                     decision, dict.fromkeys(failed, "failed"), arrangement).recoveries))
     return frozenset(found)
 
 
 def _reachable(decision: Decision, arrangement: Arrangement) -> set[str]:
-    """Return what escalation can lead to from a decision."""
+    """Return all recoveries that escalation from a decision can lead to."""
     tree, contracts = arrangement.tree, arrangement.mechanisms.contracts
     found = set(decision.recoveries)
     for mechanism in decision.mechanisms:
@@ -214,7 +212,7 @@ def _reachable(decision: Decision, arrangement: Arrangement) -> set[str]:
 
 def _shape(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: frozenset[str],
            arrangement: Arrangement) -> object:
-    """Return what two choices of recoveries have in common if they behave alike."""
+    """Return a key that is equal for choices of recoveries that behave alike."""
     if len(names) > 3:
         return names, asked
     return min((_profile(some, asked, urgent, arrangement) for some in permutations(names)),
@@ -231,4 +229,4 @@ def _profile(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: f
         for n in names for c in [mechanisms.contracts[n]])
     pairs = tuple((order.is_above(a, b), mechanisms.overlap(a, b), bool(mechanisms.harms(a, b)))
                   for a, b in permutations(names, 2))
-    return alone, pairs, tuple(sorted(tuple(sorted(number[n] for n in one)) for one in asked))
+    return alone, pairs, tuple(sorted(tuple(sorted(number[n] for n in taken)) for taken in asked))

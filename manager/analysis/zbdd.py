@@ -1,8 +1,8 @@
-"""Families of sets as zero-suppressed decision diagrams, as far as minimal cut sets need them.
+"""Families of sets as zero-suppressed decision diagrams, for minimal cut sets.
 
-A node stands for a family of sets of variables: those with the node's variable, continued by
-`high`, and those without, continued by `low` (Minato 1993). 0 is the empty family, 1 the family of
-the empty set alone. Variables are numbered from the top.
+A node is a family of sets of variables (Minato 1993): `high` continues the sets with the node's
+variable, `low` those without. 0 is the empty family, 1 the family that holds only the empty set.
+Variables are numbered from the top.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ EMPTY, UNIT = 0, 1
 
 
 class TooManyNodesError(ValueError):
-    """A diagram that grows beyond its limit."""
+    """A diagram exceeds its limit of nodes."""
 
 
 class Diagram:
-    """A binary decision diagram as plain numbers: 0 is false, 1 is true, inputs come first."""
+    """A binary decision diagram as plain numbers: 0 is false, 1 is true, children come first."""
 
     def __init__(self) -> None:
         self.level = [1 << 60, 1 << 60]
@@ -39,7 +39,7 @@ class Diagram:
     def minimal_solutions(self, top: int, families: Families, *, monotone: bool) -> int:
         """Return the family of minimal sets of variables for which a node's function holds."""
         known = {EMPTY: EMPTY, UNIT: UNIT}
-        for node in range(2, top + 1):  # inputs come before what uses them
+        for node in range(2, top + 1):
             low, high = known[self.low[node]], known[self.high[node]]
             rest = families.outside(high, self, self.low[node]) if monotone \
                 else families.without(high, low)
@@ -51,7 +51,7 @@ class Families:
     """A store of families; equal families have equal numbers.
 
     Args:
-        limit: Nodes that may be made.
+        limit: Largest number of nodes.
     """
 
     def __init__(self, limit: int) -> None:
@@ -108,7 +108,7 @@ class Families:
     def outside(self, u: int, diagram: Diagram, f: int) -> int:
         """Return the sets of `u` for which the monotone function `f` does not hold.
 
-        For the minimal solutions of a function the same as `without`, with half the steps.
+        For minimal solutions this equals `without`, with half the steps.
         """
         if EMPTY in (f, u):
             return u
@@ -133,12 +133,12 @@ class Families:
 
     def sizes(self, family: int, weights: Sequence[Mapping[int, int]]
               ) -> dict[int, Mapping[int, int]]:
-        """Return how many sets of each size there are below each node of a family.
+        """Return for each node of a family the number of sets of each size below it.
 
         Args:
             family: The family.
-            weights: For each variable, how many sets of each size it stands for: one of size 1
-                if it stands for itself.
+            weights: For each variable, the number of sets of each size that it stands for: one of
+                size 1 if it stands for itself.
         """
         found: dict[int, Mapping[int, int]] = {EMPTY: {}, UNIT: {0: 1}}
         nodes, _ = search(family, lambda node: (
@@ -154,7 +154,7 @@ class Families:
 
 @contextmanager
 def deep_recursion(levels: int) -> Iterator[None]:
-    """Allow recursion as deep as a diagram has levels; these frames lie on the heap."""
+    """Allow recursion as deep as a diagram has levels; the frames lie on the heap."""
     before = sys.getrecursionlimit()
     sys.setrecursionlimit(max(before, 1000 + 6 * levels))
     try:

@@ -132,7 +132,7 @@ def test_thousands_of_gates_in_a_chain_are_no_problem():
     gates["g2000"] = any_of("last")
     found = CutSets(formula(gates))
     assert found.count == 1001
-    with pytest.raises(TooLargeError, match="levels deep, too deeply to list the sets"):
+    with pytest.raises(TooLargeError, match="levels deep: expected at most"):
         list(found.sets())
 
 
@@ -154,7 +154,7 @@ def test_max_order_counts_modules_within_modules_as_the_events_they_stand_for():
 
 def test_a_tree_of_more_variables_than_the_library_can_recurse_through_is_refused():
     """The process ended with a segmentation fault."""
-    with pytest.raises(TooLargeError, match="more than 20000"):
+    with pytest.raises(TooLargeError, match="expected at most 20000"):
         CutSets(formula({"top": all_of(*(f"e{i}" for i in range(30_000)))}))
 
 
@@ -186,10 +186,10 @@ def test_a_tree_beyond_every_bound_is_refused_in_one_line(monkeypatch):
 
 
 @pytest.mark.parametrize(("gates", "words"), [
-    ({}, "no gates; a top is needed"),
+    ({}, "no gates; expected a top gate"),
     ({"a": any_of("b"), "b": any_of("a")}, "cycle a > b > a"),
     ({"top": any_of("a"), "a": any_of("b"), "b": any_of("a")}, "cycle a > b > a"),
-    ({"x": any_of("e"), "y": any_of("e")}, "2 gates are no input of another: x, y; say which"),
+    ({"x": any_of("e"), "y": any_of("e")}, "2 gates are not an input of another gate: x, y"),
 ])
 def test_a_formula_without_a_single_top_or_with_a_cycle_is_refused(gates, words):
     with pytest.raises(FormulaError, match=words):

@@ -1,7 +1,9 @@
 """What verification finds about the shipped system, and that it finds what is broken on purpose."""
 
+import gc
 import json
 import math
+import weakref
 from collections import defaultdict
 from itertools import combinations
 
@@ -69,7 +71,7 @@ def test_exactly_these_properties_fail_on_the_papers_system(report):
             "with FTM2 active as well, RM2 runs instead of RM1, which is safer"),
         "repairs-run": (
             "FTM2 and FTM4 active: runs RM2 (rule 2)",
-            "RM3 never runs, so FTM4 stays active for ever")}
+            "RM3 never runs, so FTM4 stays active forever")}
 
 
 @pytest.mark.parametrize(("strategy", "failing", "stuck"), [
@@ -193,7 +195,7 @@ def test_a_latch_is_explored_with_what_excuses_it_and_without():
     assert states > explore(two("RM1", "RM2"))[0]
     stopped = dict(system.successors(system.initial()))["asked for: RM1"]
     assert stopped.state.latched == ("RM1",)
-    excused = dict(system.successors(stopped))["what excuses is found"]
+    excused = dict(system.successors(stopped))["an excuse is detected"]
     assert excused.state.latched == ()
     assert dict(system.successors(excused))["the excuse ends"].state.latched == ("RM1",)
 
@@ -222,7 +224,7 @@ def found_in(strategy, arrangement=ARRANGEMENT) -> dict[str, tuple[str, ...]]:
 @pytest.mark.parametrize(("active", "taken", "name", "trace"), [
     ("FTM1", (), "one-decision", (
         "FTM1 active: runs nothing (rule 1)",
-        "that is not a set of known recoveries, each once")),
+        "this is not a set of known recoveries, each listed once")),
     ("FTM2 FTM6", ("RM2", "RM5"), "no-conflicting-claims", (
         "FTM2 and FTM6 active: runs RM2 and RM5 (rule 4)", "RM2 and RM5 claim the same resource")),
     ("FTM1 FTM6", ("RM1", "RM5"), "no-harm", (
@@ -238,7 +240,7 @@ def test_a_broken_strategy_is_found_out(active, taken, name, trace):
     assert found_in(strategy)[name] == trace
     strategy.exclusive = True
     assert len(taken) < 2 or found_in(strategy)["one-decision"][-1] == (
-        "a strategy that runs one at a time has to take one")
+        "an exclusive strategy must run exactly one")
 
 
 def test_a_strategy_that_takes_what_there_is_not_or_one_twice_is_found_out():
@@ -256,7 +258,7 @@ def test_a_strategy_that_changes_its_mind_is_found_out():
         asked.append(decision)
         return ("RM1",) if len(asked) > 127 else None
 
-    assert found_in(Mutant(moody))["one-decision"][-1] == "asked again, it decides otherwise"
+    assert found_in(Mutant(moody))["one-decision"][-1] == "the same question gets another answer"
 
 
 def test_a_recovery_that_disables_what_it_needs_itself_is_found_out():
@@ -287,7 +289,19 @@ def test_a_strategy_that_never_repairs_is_found_out():
 
     assert "repairs-run" not in found_in(GuardedRepair())
     assert found_in(OnlyGuards())["repairs-run"][-1] == (
-        "RM3 never runs, so FTM4 stays active for ever")
+        "RM3 never runs, so FTM4 stays active forever")
+
+
+def test_millions_of_cases_go_when_they_are_checked_and_not_when_the_process_ends():
+    gc.disable()
+    try:
+        sets = ActiveSets(ARRANGEMENT, ARRANGEMENT.order, STRATEGIES["safety-first"])
+        list(sets.check())
+        alive = weakref.ref(sets)
+        del sets
+        assert alive() is None
+    finally:
+        gc.enable()
 
 
 def test_an_order_that_contradicts_the_tree_is_found_out():
@@ -333,5 +347,5 @@ def test_the_command_prints_a_table_the_states_and_the_traces(capsys):
     told = capsys.readouterr().out
     for words in ("127 active sets, ", "FAILS in 32", "90 of 127", "66 of 127",
                   "not explored: the start of a manager",
-                  "  2. RM3 never runs, so FTM4 stays active for ever"):
+                  "  2. RM3 never runs, so FTM4 stays active forever"):
         assert words in told
