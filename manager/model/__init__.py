@@ -1,1 +1,1 @@
-"""What a system is, to the arbiter: fault tree, gates, mechanisms, orders."""
+"""The arbiter's model of a system: fault tree, gates, mechanisms, orders."""

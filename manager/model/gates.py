@@ -1,4 +1,4 @@
-"""Logical gates over names: what a mechanism detects by, and what it recovers with.
+"""Logical gates over the names of detection and recovery modules.
 
 A mechanism joins detection modules to recovery modules by two gates (paper, section V, "logical
 gates"): `detect = "DM1 and DM3"`, `recover = "RM2 and RM4"`. The language is
@@ -6,12 +6,12 @@ gates"): `detect = "DM1 and DM3"`, `recover = "RM2 and RM4"`. The language is
     DM1                      DM1 and DM3               DM1 or (DM2 and not DM3)
     2 of (DM1, DM2, DM3)     RM2 and RM4               RM4 or RM3
 
-`and` binds tighter than `or`, `not` tighter than both. On the recovery side `and` means both
-together, and `or` means the first that can be had: the next one is taken when it has failed or
-when what it needs is not there. `not` and `k of` make no sense there.
+`and` binds tighter than `or`, `not` tighter than both. In a recovery gate `and` runs both
+together. `or` runs the first alternative, and the next one if that has failed or lacks what it
+needs. `not` and `k of` are not allowed there.
 
-*Silence is no alibi.* A detection module that is silent counts as active, so `DM1` holds; it must
-not count as an assurance that all is well either, so `not DM1` holds too.
+A silent detection module counts as active, so `DM1` holds. Its silence does not prove that all is
+well either, so `not DM1` holds too.
 """
 
 from __future__ import annotations
@@ -29,25 +29,20 @@ import msgspec
 from rampart.files.plain_text import one_line
 
 MAX_NAMES = 16
-"""A gate over more modules than these is a fault tree; it belongs there."""
-
-MAX_DEPTH = 50
+"""Of a gate; a gate over more modules belongs in the fault tree."""
 
 MAX_TOKENS = 400
-"""Names, words and parentheses of a gate."""
-
-MAX_INPUTS = 64
-"""Of `k of`: each input is counted with each number of those before it."""
+"""Names, words, commas and parentheses of a gate; this bounds its depth and its inputs as well."""
 
 WORDS = frozenset({"and", "or", "not", "of"})
-"""Of the language; no module can be called so."""
+"""Reserved words of the language."""
 
 MAX_WAYS = 64
-"""Alternatives of a recovery gate: `(A or B) and (C or D)` has four. Each is tried in turn."""
+"""Alternatives of a recovery gate: `(A or B) and (C or D)` has four."""
 
 
 class GateError(ValueError):
-    """A gate that cannot be read, or that makes no sense. The message is one line."""
+    """A gate cannot be read, or is useless. The message is one line."""
 
     def __init__(self, problem: str) -> None:
         super().__init__(one_line(problem))
@@ -57,10 +52,10 @@ class Gate(msgspec.Struct, frozen=True):
     """A gate: a name, its negation, or at least `required` of some inputs.
 
     Attributes:
-        name: Of a module; "" for a gate over inputs.
-        negated: The name must not be active.
+        name: Name of a module; "" for a gate over inputs.
+        negated: The module must not be active.
         required: How many inputs must hold.
-        inputs: Of the gate.
+        inputs: Inputs of the gate.
     """
 
     name: str = ""
@@ -70,13 +65,13 @@ class Gate(msgspec.Struct, frozen=True):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names in the gate, each once, as written."""
+        """Names in the gate, each once, in the sequence of the text."""
         if self.name:
             return (self.name,)
         return tuple(dict.fromkeys(chain.from_iterable(i.names for i in self.inputs)))
 
     def holds(self, active: Collection[str], silent: Collection[str] = ()) -> bool:
-        """Tell whether the gate holds when these modules are active (`silent` ones included)."""
+        """Return whether the gate holds if these modules are active (`silent` ones included)."""
         if self.name:
             if self.negated:
                 return self.name not in active or self.name in silent
@@ -84,12 +79,12 @@ class Gate(msgspec.Struct, frozen=True):
         return sum(gate.holds(active, silent) for gate in self.inputs) >= self.required
 
     def renamed(self, words: Mapping[str, str]) -> Gate:
-        """Return the gate with names replaced by words for those that have some."""
+        """Return the gate with names replaced by the given words, if there are any."""
         return Gate(words.get(self.name) or self.name, self.negated, self.required,
                     tuple(gate.renamed(words) for gate in self.inputs))
 
     def alternatives(self) -> Iterator[tuple[str, ...]]:
-        """Yield the sets of names that satisfy a gate without negation, preferred ones first."""
+        """Yield the sets of names that satisfy a gate without negation, the preferred one first."""
         if self.name:
             yield (self.name,)
             return
@@ -119,12 +114,12 @@ def detection_gate(text: str) -> Gate:
     gate = _read(text)
     names = gate.names
     if len(names) > MAX_NAMES:
-        raise GateError(f"a gate over {len(names)} modules; at most {MAX_NAMES} are right, more "
-                        "belong into the fault tree")
+        raise GateError(f"{len(names)} detection modules; expected at most {MAX_NAMES}, more "
+                        "belong in the fault tree")
     if gate.holds(()):
-        raise GateError("it is active while all its detection modules are idle")
+        raise GateError("active while all its detection modules are idle; expected idle then")
     if not _truth_table(gate, names):
-        raise GateError("it can never be active")
+        raise GateError("can never be active")
     return gate
 
 
@@ -138,16 +133,15 @@ def recovery_gate(text: str) -> Gate:
     gate = _read(text)
     names = gate.names
     if len(names) > MAX_NAMES:
-        raise GateError(f"{len(names)} recovery modules; at most {MAX_NAMES} are right")
-
+        raise GateError(f"{len(names)} recovery modules; expected at most {MAX_NAMES}")
     ways = _count_ways(gate)
     if ways > MAX_WAYS:
-        raise GateError(f"{ways} alternatives; at most {MAX_WAYS} are right")
+        raise GateError(f"{ways} alternatives; expected at most {MAX_WAYS}")
     return gate
 
 
 def _truth_table(gate: Gate, names: tuple[str, ...]) -> int:
-    """Return for which sets of active names a gate holds: one bit for each of the 2^n sets."""
+    """Return the sets of active names for which a gate holds: one bit for each of the 2^n sets."""
     sets = 1 << len(names)
     every = (1 << sets) - 1
     # Of name k: 2^k sets without it, 2^k sets with it, and so on.
@@ -160,7 +154,7 @@ def _truth_table(gate: Gate, names: tuple[str, ...]) -> int:
         tables = [table(inner) for inner in part.inputs]
         if part.required in {1, len(tables)}:
             return reduce(or_ if part.required == 1 else and_, tables)
-        at_least = [every] + [0] * part.required  # of the inputs met so far
+        at_least = [every] + [0] * part.required  # of the inputs so far
         for holds in tables:
             for count in range(part.required, 0, -1):
                 at_least[count] |= at_least[count - 1] & holds
@@ -170,17 +164,13 @@ def _truth_table(gate: Gate, names: tuple[str, ...]) -> int:
 
 
 def _count_ways(gate: Gate) -> int:
-    """Return how many alternatives there are, without making them: there may be millions.
-
-    Raises:
-        GateError: There is more in it than names, `and` and `or`.
-    """
+    """Return the number of alternatives without making them: there may be millions."""
     if gate.negated:
-        raise GateError(f"'not {gate.name}' cannot be run; names, 'and' and 'or' are right")
+        raise GateError(f"'not {gate.name}' cannot be run; expected names, 'and' and 'or'")
     if gate.name:
         return 1
     if 1 < gate.required < len(gate.inputs):
-        raise GateError(f"'{gate.required} of' does not say which; names, 'and' and 'or' are right")
+        raise GateError(f"'{gate.required} of' is ambiguous here; expected names, 'and' and 'or'")
     counts = [_count_ways(i) for i in gate.inputs]
     return sum(counts) if gate.required == 1 else math.prod(counts)
 
@@ -195,41 +185,35 @@ _LANGUAGE = ("expected names, 'and', 'or', 'not', 'k of (...)' and parentheses, 
 
 
 def _read(text: str) -> Gate:
-    """Read a gate: Python does, of a text in which names begin with n, and `2 of (` is `k2(`."""
+    """Parse a gate as Python, with `n` before each name, and `2 of (` as `k2(`."""
     tokens = len(_TOKEN.findall(text))
     if tokens > MAX_TOKENS:
-        raise GateError(f"{tokens} names, words and parentheses; at most {MAX_TOKENS} are right, "
-                        "more belong into the fault tree")
+        raise GateError(f"{tokens} names, words and parentheses; expected at most {MAX_TOKENS}, "
+                        "more belong in the fault tree")
     spelt = _NAME.sub(lambda found: found[0] if found[0] in WORDS else f"n{found[0]}",
                       " ".join(text.split()))
     try:
         if _STRANGE.search(text):
             raise SyntaxError
-        return _gate(ast.parse(_AT_LEAST.sub(r"k\1(", spelt), mode="eval").body, 0)
-    except (SyntaxError, MemoryError):  # the latter of what is nested too deeply for Python
+        return _gate(ast.parse(_AT_LEAST.sub(r"k\1(", spelt), mode="eval").body)
+    except (SyntaxError, MemoryError):  # too many nested parentheses for Python
         raise GateError(_LANGUAGE) from None
 
 
-def _gate(part: ast.expr, depth: int) -> Gate:
-    if depth > MAX_DEPTH:
-        raise GateError(f"nested more than {MAX_DEPTH} deep")
-
-    def each(parts: list[ast.expr]) -> tuple[Gate, ...]:
-        return tuple(_gate(inner, depth + 1) for inner in parts)
-
+def _gate(part: ast.expr) -> Gate:
     match part:
         case ast.Name(id=name) if name.startswith("n"):
             return Gate(name=name[1:])
         case ast.UnaryOp(op=ast.Not(), operand=inner):
-            return _negate(_gate(inner, depth + 1))
+            return _negate(_gate(inner))
         case ast.BoolOp(op=op, values=parts):
-            return Gate(required=1 if isinstance(op, ast.Or) else len(parts), inputs=each(parts))
+            return Gate(required=1 if isinstance(op, ast.Or) else len(parts),
+                        inputs=tuple(map(_gate, parts)))
         case ast.Call(func=ast.Name(id=name), args=parts) if name.startswith("k"):
             required, count = int(name[1:1 + _MAX_DIGITS]), len(parts)
-            if not 1 <= required <= count or count > MAX_INPUTS:
-                raise GateError(f"{required} of {count} inputs; expected 1 to {count}, of at most "
-                                f"{MAX_INPUTS}")
-            return Gate(required=required, inputs=each(parts))
+            if not 1 <= required <= count:
+                raise GateError(f"{required} of {count} inputs; expected 1 to {count}")
+            return Gate(required=required, inputs=tuple(map(_gate, parts)))
     raise SyntaxError
 
 

@@ -1,9 +1,8 @@
-"""The fault-tolerance mechanisms: FTMx(DMy, RMz), and what a recovery promises.
+"""The fault-tolerance mechanisms, FTMx(DMy, RMz), and the contracts of recoveries.
 
 A mechanism joins a detection module to a recovery module, or gates over several of them. It is
-*active* when its detection module is (or its gate holds), and *activated* when its recovery
-module is (paper, section III-B). Two mechanisms may share a recovery: FTM2 and FTM3 both stop the
-robot with RM2.
+*active* if its detection module is (or its gate holds), and *activated* if its recovery module is
+(paper, section III-B). Two mechanisms may share a recovery: FTM2 and FTM3 both run RM2.
 """
 
 from __future__ import annotations
@@ -20,23 +19,23 @@ from rampart.manager.model.order import UnknownElementError
 
 
 class RecoveryKind(StrEnum):
-    """How a recovery gets rid of an error (Avizienis, Laprie, Randell, Landwehr 2004)."""
+    """How a recovery handles an error (Avizienis, Laprie, Randell, Landwehr 2004)."""
 
     FORWARD = "forward"
-    """A new, safe state, possibly degraded: stopped, or driven by hand."""
+    """Brings the robot to a new, safe state, possibly degraded: stopped, or driven by hand."""
     BACKWARD = "backward"
-    """Back to a checkpoint from before the error."""
+    """Returns to a checkpoint from before the error."""
     MASKING = "masking"
-    """Service goes on as if nothing had happened."""
+    """Continues the service, as the paper's RM4 does."""
 
     @property
     def repairs(self) -> bool:
-        """Whether the cause is to be gone afterwards, so that its detection must fall silent."""
+        """Whether the recovery removes the cause, so that its detection must become idle."""
         return self is not RecoveryKind.FORWARD
 
 
 class RecoveryPhase(StrEnum):
-    """How far an activated recovery is: only `ACTING` must not be cut off."""
+    """Progress of an activated recovery; only `ACTING` must not be cut off."""
 
     IDLE = "idle"
     ACTING = "acting"
@@ -49,18 +48,18 @@ class Contract(msgspec.Struct, frozen=True):
     """What a recovery module promises the arbiter.
 
     Attributes:
-        name: Of the recovery module.
+        name: Name of the recovery module.
         kind: How it recovers.
         claims: Resources that it needs for itself; two recoveries that share one never act at
             the same time.
-        interruptible: May be released while it is acting. False: it is left to finish.
-        latched: Stays in force until an operator resets it, even when the cause is gone.
-        excused_by: Detection modules of what explains its causes for a while, as an overload of
-            the machine does: taken up meanwhile it is not latched.
-        deadline_s: From command to done (and, for a repair, to the cause being gone).
-        escalate_to: Recovery to take when this one fails; "" for that of the mechanism above.
-        needs: Preconditions: nodes or resources without which it is of no use. While a node
-            among them is reported failed, the recovery counts as failed too.
+        interruptible: It may be released while it is acting; otherwise it finishes first.
+        latched: It stays in force until an operator resets it, even when the cause is gone.
+        excused_by: Detection modules of conditions that explain its causes, such as an overload of
+            the machine. An activation meanwhile does not latch.
+        deadline_s: Longest time from command to done, and for a repair until the cause is gone.
+        escalate_to: Recovery to run if this one fails; "" for that of the mechanism above.
+        needs: Nodes or resources that it needs. While a detection module reports a node among
+            them failed, the recovery counts as failed too.
         disables: Nodes or resources that cannot be used while it is in force.
     """
 
@@ -80,9 +79,9 @@ class Mechanism(msgspec.Struct, frozen=True):
     """FTMx(DMy, RMz); `detect` and `recover` are gates in text (`rampart.manager.model.gates`).
 
     Attributes:
-        patience_s: How long its recovery may take before the error has gone too far.
-        explains: Mechanisms whose detections are its consequences: while it is detected they do not
-            count. Not while its detection modules are merely silent.
+        patience_s: How long its recovery may take before the next barrier has to act.
+        explains: Mechanisms whose detections are its consequences. They do not count while its
+            detection modules report, not while these are merely silent.
     """
 
     name: str
@@ -93,22 +92,22 @@ class Mechanism(msgspec.Struct, frozen=True):
 
 
 class Mechanisms:
-    """All mechanisms of a system, looked up by their name or by that of one of their modules.
+    """All mechanisms of a system, by their names and by those of their modules.
 
     Args:
-        mechanisms: In the sequence in which they are shown.
-        contracts: Of all recoveries, those included that are only escalated to.
+        mechanisms: The mechanisms, in declared sequence.
+        contracts: Contracts of all recoveries, also of those that only escalation runs.
 
     Attributes:
-        recover: The recoveries that each mechanism runs, where all can be had.
-        detect: The detection modules that each mechanism listens to.
-        users: The mechanisms that may run each recovery.
-        causes: The detection modules that each recovery answers to.
-        repairs: What is run for a detection module, where all of it repairs.
+        recover: Mechanism → recoveries of its first alternative.
+        detect: Mechanism → detection modules in its gate.
+        users: Recovery → mechanisms that may run it.
+        causes: Recovery → detection modules that it answers to.
+        repairs: Detection module → recoveries that answer to it, if all of them repair.
         explaining: The mechanisms that explain others.
 
     Raises:
-        GateError: A gate that cannot be read.
+        GateError: A gate cannot be read.
     """
 
     def __init__(self, mechanisms: Sequence[Mechanism], contracts: Sequence[Contract]) -> None:
@@ -140,7 +139,7 @@ class Mechanisms:
         """Return mechanism names once each, in the declared sequence.
 
         Raises:
-            UnknownElementError: One of them is no mechanism.
+            UnknownElementError: A name is unknown.
         """
         try:
             return tuple(sorted(set(names), key=self._number.__getitem__))
@@ -150,11 +149,11 @@ class Mechanisms:
 
     def detected_by(self, active_detections: Iterable[str], silent: Iterable[str] = ()
                     ) -> tuple[str, ...]:
-        """Return the mechanisms that are active when these detection modules are.
+        """Return the mechanisms that are active if these detection modules are.
 
         Args:
             active_detections: Active modules, silent ones included.
-            silent: Those of them that are active only because they are silent.
+            silent: The modules that are silent.
         """
         active, mute = set(active_detections), set(silent)
         if not active:
@@ -162,11 +161,11 @@ class Mechanisms:
         return tuple(name for name, gate in self._gates.items() if gate.holds(active, mute))
 
     def unexplained(self, active: tuple[str, ...], reported: Set[str]) -> tuple[str, ...]:
-        """Return the active mechanisms that no other one explains.
+        """Return the active mechanisms that no other mechanism explains.
 
         Args:
-            active: Mechanisms.
-            reported: Detection modules that are active, and not only because they are silent.
+            active: Active mechanisms.
+            reported: Modules that are active by their report, not only by their silence.
         """
         if not self.explaining:
             return active
@@ -176,11 +175,11 @@ class Mechanisms:
         return tuple(name for name in active if name not in explained) if explained else active
 
     def alternatives(self, mechanism: str) -> tuple[tuple[str, ...], ...]:
-        """Return the sets of recoveries that would do for a mechanism, preferred ones first."""
+        """Return the alternative sets of recoveries of a mechanism, the preferred one first."""
         return self._alternatives[mechanism]
 
     def overlap(self, one: str, other: str) -> bool:
-        """Tell whether two recoveries claim a common resource."""
+        """Return whether two recoveries claim a common resource."""
         return not self.contracts[one].claims.isdisjoint(self.contracts[other].claims)
 
     def harms(self, one: str, other: str) -> frozenset[str]:

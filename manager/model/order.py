@@ -2,13 +2,13 @@
 
 The strategy asks two questions of the FTMTree and of the RMGraph: *which member of this set is
 above all the others?* and *which element is the closest one above all of them?* (paper, section
-IV-A, `dom` and `low_com_dom`). Both are answered here with a handful of integer operations.
+IV-A, `dom` and `low_com_dom`). A few integer operations answer both.
 
-The trick is the numbering. Elements are numbered along a linear extension of the order, the
-greater first, so whatever is above an element has a lower bit than the element itself. Then
+Elements are numbered along a linear extension of the order, greater ones first. So whatever is
+above an element has a lower bit than the element itself, and
 
-* the greatest element of a set, if there is one, can only be the set's lowest bit, and it is the
-  greatest iff no other bit of the set lies outside its down-set;
+* the greatest element of a set, if it exists, is the set's lowest bit; it is the greatest iff
+  all other bits of the set lie in its down-set;
 * in a tree the common ancestors of a set form a chain, so the closest is the highest bit in the
   intersection of the members' up-sets.
 
@@ -29,11 +29,7 @@ from operator import or_
 
 
 class CycleError(ValueError):
-    """A relation that should be an order has a cycle.
-
-    Attributes:
-        cycle: The names along it; the first is repeated at the end.
-    """
+    """A relation has a cycle; `cycle` has the names along it, the first one again at the end."""
 
     def __init__(self, cycle: Sequence[str]) -> None:
         self.cycle = tuple(cycle)
@@ -41,11 +37,11 @@ class CycleError(ValueError):
 
 
 class UnknownElementError(ValueError):
-    """A name that is no element of the order."""
+    """A name is not an element of the order."""
 
 
 def find_cycle(above: Mapping[str, Iterable[str]]) -> tuple[str, ...] | None:
-    """Return one cycle of a directed graph, first name repeated at the end, or None."""
+    """Return a cycle of a directed graph, the first name again at the end, or None."""
     try:
         TopologicalSorter(above).prepare()
     except graphlib.CycleError as error:
@@ -58,7 +54,7 @@ class PartialOrder:
 
     Args:
         names: All elements. Their sequence breaks ties in the numbering, so output is stable.
-        above: For an element, those it is above. Need not be transitively closed or reduced.
+        above: Element → elements below it, neither transitively closed nor reduced.
 
     Raises:
         CycleError: The relation has a cycle.
@@ -74,7 +70,7 @@ class PartialOrder:
         self.bit = {name: 1 << bit for name, bit in self.number.items()}
         below = [0] * len(self.names)
         up_set = [1 << bit for bit in range(len(self.names))]
-        for bit, name in enumerate(self.names):  # an upper one is complete before its lowers
+        for bit, name in enumerate(self.names):  # an element is complete before those below it
             for lower in relation[name]:
                 up_set[self.number[lower]] |= up_set[bit]
         for bit, name in reversed(tuple(enumerate(self.names))):
@@ -98,7 +94,7 @@ class PartialOrder:
         return tuple(name for bit, name in enumerate(self.names) if mask >> bit & 1)
 
     def is_above(self, upper: str, lower: str) -> bool:
-        """Tell whether `upper` is strictly above `lower`."""
+        """Return whether `upper` is strictly above `lower`."""
         return bool(self.below[self.number[upper]] & self.bit[lower])
 
     def greatest(self, names: Iterable[str]) -> str | None:
@@ -111,19 +107,18 @@ class PartialOrder:
         return self.names[bit]
 
     def maximal(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Return the members that no other member is above, greater ones first."""
+        """Return the maximal members, greater ones first."""
         mask, found = self.mask(names), []
-        while mask:  # the lowest bit is maximal, and whatever is below it is not
+        while mask:  # the lowest bit is maximal, and elements below it are not
             bit = (mask & -mask).bit_length() - 1
             found.append(self.names[bit])
             mask &= ~(self.below[bit] | 1 << bit)
         return tuple(found)
 
     def chain(self, upper: str, lower: str) -> tuple[str, ...]:
-        """Return a longest-to-read chain from `upper` down to `lower`, both included.
+        """Return a maximal chain from `upper` down to `lower`, both included.
 
-        Each step goes to the nearest element below that still leads to `lower`, so nothing that
-        lies between two neighbours of the chain is skipped.
+        No element lies between two neighbours of the chain.
 
         Raises:
             ValueError: `upper` is neither `lower` nor above it.
@@ -139,14 +134,14 @@ class PartialOrder:
 
 
 def refine(criteria: Sequence[PartialOrder]) -> PartialOrder:
-    """Return the order in which each criterion decides what those before it leave open.
+    """Return the order in which each criterion decides pairs that those before it leave open.
 
     Args:
         criteria: Orders over the same elements, the most important first; at least one.
 
     Raises:
-        CycleError: The criteria contradict each other: of three elements the first criterion puts
-            a above b, the second b above c and c above a.
+        CycleError: The criteria contradict each other: the first puts a above b, the second puts
+            b above c and c above a.
     """
     first = criteria[0]
     above = {name: list(first.members(first.below[first.number[name]])) for name in first.names}
@@ -163,7 +158,7 @@ class Tree(PartialOrder):
     """A tree in which a parent is above its children.
 
     Args:
-        parents: The parent of each element; exactly one, the root, has None.
+        parents: Element → parent; exactly one element, the root, has None.
     """
 
     def __init__(self, parents: Mapping[str, str | None]) -> None:
@@ -186,8 +181,8 @@ class Tree(PartialOrder):
             raise ValueError("the empty set has no lowest common dominant")
         bit = (mask & -mask).bit_length() - 1
         common = self.up_set[bit]
-        # Climb from the first member; whatever it is not above yet takes it further up, never
-        # down, so this ends after no more steps than the tree is deep.
+        # Climb from the first member until all others are below. Each step goes up, so there are
+        # at most as many steps as the tree is deep.
         while rest := mask & ~(self.below[bit] | 1 << bit):
             common &= self.up_set[rest.bit_length() - 1]
             bit = common.bit_length() - 1
@@ -196,18 +191,19 @@ class Tree(PartialOrder):
 
 def contradictions(tree: Tree, order: PartialOrder, of: Mapping[str, Sequence[str]]
                    ) -> Iterator[tuple[str, str, str, str]]:
-    """Yield where elements of an order contradict the tree of those that they belong to.
+    """Yield where the order of recoveries contradicts the tree of mechanisms.
 
     Args:
-        tree: Of the owners.
-        order: Of what they own.
-        of: By owner.
+        tree: The FTMTree.
+        order: The order of the recoveries.
+        of: Mechanism → its recoveries.
 
     Yields:
-        An upper owner, a lower one, what of the lower one is above what of the upper one.
+        An upper mechanism, a lower one, and a recovery of the lower one that is above a recovery
+        of the upper one.
     """
     own = {name: order.mask(owned) for name, owned in of.items()}
-    under = {name: reduce(or_, (order.below[order.number[one]] for one in owned))
+    under = {name: reduce(or_, (order.below[order.number[r]] for r in owned))
              for name, owned in of.items()}
     for upper in tree.names:
         for lower in tree.members(tree.below[tree.number[upper]]):
@@ -217,7 +213,7 @@ def contradictions(tree: Tree, order: PartialOrder, of: Mapping[str, Sequence[st
 
 
 def _linear_extension(relation: Mapping[str, Iterable[str]]) -> tuple[str, ...]:
-    """Number an acyclic relation so that the upper comes first; ties keep declaration order."""
+    """Return the names of an acyclic relation, upper ones first; ties keep the sequence."""
     sorter = TopologicalSorter[str](dict.fromkeys(relation, ()))
     for upper, lowers in relation.items():
         for lower in lowers:

@@ -1,1 +1,1 @@
-"""How a set of active mechanisms becomes a set of recoveries; one file for each strategy."""
+"""Strategies: from active mechanisms to recoveries. One file for each strategy."""

@@ -1,7 +1,4 @@
-"""How the mechanisms of a system are arranged: the FTMTree over them, an order of their recoveries.
-
-A strategy sees nothing else of the system.
-"""
+"""Mechanisms with their FTMTree and an order of their recoveries: all that a strategy sees."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ class Arrangement:
     Args:
         mechanisms: Registry of mechanisms and recovery contracts.
         tree: The FTMTree.
-        order: The RM order; what is above is preferred when in doubt.
+        order: The RM order; in doubt the upper recovery is preferred.
 
     Attributes:
         compound: Whether a mechanism runs more than one recovery.
@@ -34,22 +31,22 @@ class Arrangement:
                 or mechanisms.harms(other, name))) for name in order.names}
 
     def demanded(self, active: Iterable[str]) -> tuple[str, ...]:
-        """Return the recoveries that mechanisms ask for, each once, in the mechanisms' sequence."""
+        """Return the recoveries that mechanisms ask for, each once, in their sequence."""
         return tuple(dict.fromkeys(
             recovery for name in active for recovery in self.mechanisms.recover[name]))
 
     def asking(self, names: Iterable[str], recoveries: Iterable[str]) -> tuple[str, ...]:
-        """Return those of some mechanisms that ask for one of some recoveries."""
+        """Return the mechanisms among `names` that ask for one of the recoveries."""
         wanted = frozenset(recoveries)
         return tuple(name for name in names
                      if not wanted.isdisjoint(self.mechanisms.recover[name]))
 
     def can_join(self, recovery: str, others: Iterable[str]) -> bool:
-        """Tell whether a recovery can run beside others: no common claim, no need disabled."""
+        """Return whether a recovery can run beside others: no common claim, no need disabled."""
         return self._conflicts[recovery].isdisjoint(others)
 
     def compatible(self, recoveries: Iterable[str], beside: Iterable[str] = ()) -> tuple[str, ...]:
-        """Return recoveries that run anyway, and those of others that can join those before."""
+        """Return `beside` and each further recovery that can join those before it."""
         taken = list(beside)
         for name in recoveries:
             if name not in taken and self.can_join(name, taken):

@@ -1,9 +1,8 @@
-"""What follows a recovery that fails.
+"""Escalation: the successor of a recovery that fails.
 
-An alternative that its mechanism names, all of it; else the recovery that its contract names; else
-that of the mechanism above, which is the next barrier on the way to the top event. At the root
-there is nothing above: a last resort that fails stays in force, for releasing it could only make
-things worse.
+It is the next alternative of its mechanism; else the recovery that its contract names; else that of
+the mechanism above, the next barrier on the path to the top event. A last resort that fails stays
+in force, since its release could only make things worse.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ def escalate(decision: Decision, failures: Mapping[str, str], arrangement: Arran
     """Replace failed recoveries in a decision.
 
     Args:
-        decision: As the strategy took it.
-        failures: Why a recovery counts as failed, by its name.
+        decision: Decision of the strategy.
+        failures: Failed recovery → reason.
         arrangement: Mechanisms with their contracts, and the FTMTree.
 
     Returns:
-        The decision with other recoveries; each failed one is among the rejected, with the reason
-        and what it escalated to.
+        The decision with the successors; each failed recovery is rejected, with the reason and its
+        successor.
     """
     recover = arrangement.mechanisms.recover
     recoveries: dict[str, None] = {}
@@ -40,7 +39,7 @@ def escalate(decision: Decision, failures: Mapping[str, str], arrangement: Arran
             recoveries.update(dict.fromkeys(_companions(tried[-1], sakes, failures, arrangement)))
         rejected.extend((failed, f"failed: {failures[failed]}; escalated to {following}")
                         for failed, following in pairwise(tried))
-    # What was escalated to may claim what another recovery of the decision claims.
+    # A successor may claim a resource of another recovery of the decision.
     compatible = arrangement.compatible(
         sorted(recoveries, key=arrangement.order.number.__getitem__))
     taken = tuple(name for name in recoveries if name in compatible)
@@ -56,9 +55,8 @@ def succession(recovery: str, sakes: Iterable[str], failures: Container[str],
     tree, mechanisms = arrangement.tree, arrangement.mechanisms
     tried = [recovery]
     wanting = tuple(sakes)
-    # Above a mechanism that wants its own recovery is its parent; above several of them, none of
-    # which is above the others, is their lowest common dominant itself. So it is above a guard
-    # that is taken for the dominant's sake but is not the dominant's own.
+    # Above a mechanism with its own recovery is its parent. Above several mechanisms, or above a
+    # guard that is not the dominant's own recovery, is the lowest common dominant itself.
     closest = tree.lowest_common_dominant(wanting)
     above = list(reversed(tree.chain(tree.root, closest)))
     if closest in wanting and recovery in mechanisms.recover[closest]:
@@ -77,7 +75,7 @@ def succession(recovery: str, sakes: Iterable[str], failures: Container[str],
 
 def _companions(recovery: str, sakes: Iterable[str], failures: Container[str],
                 arrangement: Arrangement) -> tuple[str, ...]:
-    """Return what an alternative runs together with a recovery, itself included; () for none."""
+    """Return the alternative that a recovery is part of, () if there is none."""
     return next((way for way in _ways_left(sakes, failures, arrangement) if recovery in way), ())
 
 
@@ -85,4 +83,4 @@ def _ways_left(sakes: Iterable[str], failures: Container[str], arrangement: Arra
                ) -> list[tuple[str, ...]]:
     """Return the alternatives of some mechanisms in which no recovery has failed."""
     return [way for mechanism in sakes for way in arrangement.mechanisms.alternatives(mechanism)
-            if not any(one in failures for one in way)]
+            if not any(recovery in failures for recovery in way)]

@@ -1,17 +1,16 @@
-"""Repair under guard: as safe as every active mechanism asks for, and no stop without end.
+"""Guarded repair: as safe as every active mechanism asks for, and never stuck.
 
-Our own strategy. The paper's safety-first has two costs, both found by `rampart verify`:
+Rampart's own strategy. `rampart verify` found two costs of the paper's safety-first:
 
-* It runs one recovery. With a dead control node and its consequence, a stale command, FTM2
-  dominates FTM4, RM2 stops the robot, RM3 is never started, and the robot stands there permanently.
+* It runs one recovery. If a control node dies and its command goes stale, FTM2 dominates FTM4. RM2
+  stops the robot, RM3 never starts, and the robot stands permanently.
 * Where neither tree nor order decides (block 4) it climbs the tree, often to the emergency stop,
-  although a less drastic recovery would be safer than all that are asked for. Two node crashes at
-  once, FTM4 and FTM7, end in RM1. And it is not monotone: with FTM6 active *as well*, it is RM5.
+  although a milder recovery would suffice. FTM4 and FTM7, two crashes at once, end in RM1. And it
+  is not monotone: with FTM6 active *as well* it runs RM5.
 
-Repair under guard separates the two things that recoveries do. One recovery, the *guard*, takes
-the robot to a state that is safe enough for all of them: the mildest one that is at least as
-safe as each recovery asked for. Beneath it all repairs that are asked for run at once, so that the
-causes go away and the guard can be released.
+Guarded repair separates two tasks. One recovery, the *guard*, brings the robot to a state that is
+safe enough: the mildest recovery at least as safe as each one asked for. Beneath it all repairs
+asked for run at once, so that the causes disappear and the guard can be released.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ class GuardedRepair:
     """A guard that is at least as safe as every recovery asked for, and repairs beneath it.
 
     1. Only one mechanism is active: its recovery.
-    2. Else the guard is the recovery asked for that dominates all the others asked for.
-    3. Else it is the least of all recoveries that dominate those asked for: one that has no other
-       such below it; of several that of the lowest common dominant, or else the first declared.
-    4. There is none: the recoveries of the lowest common dominant, as in safety-first.
+    2. Else the guard is the recovery asked for that dominates all others asked for.
+    3. Else it is a least recovery that dominates all those asked for; of several, that of the
+       lowest common dominant, or else the first declared.
+    4. Else the guards are the recoveries of the lowest common dominant, as in safety-first.
 
-    Every repair that is asked for runs beneath the guard, unless it claims what another one
-    claims; then it waits until that one is done.
+    Every repair asked for runs beneath the guard. One that conflicts with a running recovery waits
+    until that is done.
     """
 
     name = "guarded-repair"
@@ -64,22 +63,22 @@ class GuardedRepair:
 
     def _guard(self, active: tuple[str, ...], demanded: tuple[str, ...], arrangement: Arrangement
                ) -> tuple[int, tuple[str, ...], tuple[str, ...]]:
-        """Return rule, guard, and the mechanism for whose sake it is, if it need not ask for it."""
+        """Return rule, guards, and the mechanism they act for if it may not ask for them."""
         order, recover = arrangement.order, arrangement.mechanisms.recover
         guard = order.greatest(demanded)
         if guard is not None:
-            return 2, (guard,), ()  # for the sake of those that ask for it, and they are active
+            return 2, (guard,), ()
         dominant = arrangement.tree.lowest_common_dominant(active)
         above = [name for name in order.names
-                 if all(name == one or order.is_above(name, one) for one in demanded)]
-        least = {name for name in above if not any(order.is_above(name, one) for one in above)}
+                 if all(name == asked or order.is_above(name, asked) for asked in demanded)]
+        least = {name for name in above if not any(order.is_above(name, o) for o in above)}
         if not least:
             return 4, recover[dominant], (dominant,)
         preferred = chain(recover[dominant], arrangement.mechanisms.recoveries)
         return 3, (next(name for name in preferred if name in least),), (dominant,)
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
-        """Give what the guard dominates, and why the others were rejected."""
+        """Add what the guard dominates, and why other recoveries were rejected."""
         if decision.rule == 1:
             return msgspec.structs.replace(decision, path=decision.active)
         order, taken = arrangement.order, decision.recoveries

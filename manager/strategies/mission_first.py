@@ -1,12 +1,11 @@
 """Mission first: the deepest barrier first, as long as there is time.
 
-A fault low in the fault tree is met by the mechanism that stands there, which interferes least
-with the mission: a respawn rather than a stop. Only when the detection persists after that
-mechanism's *patience*, the time that may pass before the consequence is out of hand
-(`rampart.manager.spec.budget`), does the next barrier up the FTMTree take over.
+The deepest mechanism interferes least with the mission: a respawn rather than a stop. The next
+barrier up the FTMTree takes over only if the detection persists longer than the mechanism's
+*patience*, the time that its budget leaves (`rampart.manager.spec.budget`).
 
-It is not as safe as safety-first and does not claim to be: where a consequence is detected as
-well, its own recovery waits until the cause's had its chance.
+This is less safe than safety-first: if a consequence is detected as well, its recovery waits for
+that of the cause.
 """
 
 from __future__ import annotations
@@ -20,10 +19,9 @@ from rampart.manager.strategies.decision import Decision, Late
 class MissionFirst:
     """The deepest barriers first, one step up the FTMTree for each that is late.
 
-    Each active mechanism that no active one in time is below asks for its recovery; one that is
-    late asks for that of its parent, and so on up. All that are asked for run together; of two in
-    conflict the one above in the order, else the one of the deeper mechanism, else the one
-    declared first.
+    Each active mechanism with no active one in time below it asks for its recovery. A late one asks
+    for that of its parent, and so on up. All recoveries asked for run together. Of two in conflict
+    the upper one in the order runs, else that of the deeper mechanism, else the first declared.
 
     1. No active mechanism is late.
     2. At least one is late, so a barrier further up was taken.
@@ -49,11 +47,11 @@ class MissionFirst:
         asking: dict[str, None] = {}
         for name in active:
             if tree.below[tree.number[name]] & in_time:
-                continue  # the cause is being dealt with
+                continue  # its cause is being recovered
             while name in late and tree.parents[name]:
                 name = str(tree.parents[name])  # noqa: PLW2901 climbing
             asking[name] = None
-        # Of barriers in time none is above another already.
+        # Of barriers in time none is above another.
         highest = tree.maximal(asking) if climbed else asking
         deepest_first = sorted(
             highest, key=lambda name: tree.up_set[tree.number[name]].bit_count(), reverse=True)
@@ -65,7 +63,7 @@ class MissionFirst:
         return Decision(active, 2 if climbed else 1, taken, sakes)
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
-        """Say which barriers were taken, and why the others wait."""
+        """Add which barriers were taken, and why the others wait."""
         tree, recover = arrangement.tree, arrangement.mechanisms.recover
         path, rejected = [], []
         for name in decision.active:

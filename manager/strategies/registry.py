@@ -1,7 +1,6 @@
-"""Strategies by name: from the active mechanisms to the recoveries to run.
+"""The strategies by name, decisions by them, and a decision in words.
 
-A system spec names the strategy it wants. It can be replaced without touching any detection or
-recovery module, which know nothing of each other. Each has a file of its own:
+A system spec names its strategy. Each has its own file:
 
 * `safety-first`: the paper's, block by block;
 * `mission-first`: the deepest barrier first, climbing the FTMTree when it takes too long;
@@ -27,30 +26,19 @@ from rampart.manager.strategies.simultaneous import Simultaneous
 STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in (
     SafetyFirst(), MissionFirst(), Simultaneous(), GuardedRepair())}
 
-MEMORY = 4096
-"""Decisions to remember; seven mechanisms have 128 active sets."""
+CACHED = 4096
+"""Decisions in the cache; seven mechanisms have 128 active sets."""
 
 
 class UnknownStrategyError(ValueError):
     """No strategy has this name."""
 
 
-def register(strategy: Strategy) -> None:
-    """Make a strategy known under its name.
-
-    Raises:
-        ValueError: The name is taken.
-    """
-    if strategy.name in STRATEGIES:
-        raise ValueError(f"strategy {strategy.name!r} is registered twice")
-    STRATEGIES[strategy.name] = strategy
-
-
 def find_strategy(name: str) -> Strategy:
     """Return the strategy of that name.
 
     Raises:
-        UnknownStrategyError: There is none; the message lists those there are.
+        UnknownStrategyError: The name is unknown; the message lists the known ones.
     """
     if name not in STRATEGIES:
         raise UnknownStrategyError(
@@ -59,12 +47,12 @@ def find_strategy(name: str) -> Strategy:
 
 
 class Decider:
-    """A strategy applied to an arrangement, which remembers what it chose."""
+    """A strategy applied to an arrangement, with a cache of its decisions."""
 
     def __init__(self, strategy: Strategy, arrangement: Arrangement) -> None:
         self.strategy = strategy
         self.arrangement = arrangement
-        self._choose = lru_cache(MEMORY)(
+        self._choose = lru_cache(CACHED)(
             lambda active, late: strategy.choose(active, arrangement, late))
 
     def choose(self, active: tuple[str, ...], late: Late = frozenset()) -> Decision:
@@ -85,8 +73,8 @@ def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,
     """Decide by the strategy of that name, with the certificate.
 
     Raises:
-        UnknownElementError: `active` names an unknown mechanism.
-        UnknownStrategyError: No such strategy.
+        UnknownElementError: A name in `active` is not a mechanism.
+        UnknownStrategyError: The strategy is unknown.
     """
     decider = _decider(strategy, mechanisms, tree, order)
     return decider.explain(decider.choose(mechanisms.sort(active)))
@@ -98,7 +86,7 @@ def _decider(strategy: str, mechanisms: Mechanisms, tree: Tree, order: PartialOr
 
 
 def named(name: str, titles: Mapping[str, str]) -> str:
-    """Return what a mechanism, module or recovery is called: title first, code in brackets."""
+    """Return a name with its title: "title (name)"."""
     title = titles.get(name, "")
     return f"{title} ({name})" if title and title != name else name
 
@@ -106,17 +94,15 @@ def named(name: str, titles: Mapping[str, str]) -> str:
 def decision_in_words(active: Sequence[str], rule: int, recoveries: Sequence[str],
                       strategy: str = "safety-first",
                       titles: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return one sentence: what is done, about what, and by which rule.
-
-    Of a strategy that is not known here (a recording may name one) the rule has a number only.
+    """Return a decision as one sentence.
 
     Args:
-        active: Mechanisms.
-        rule: Of the strategy.
-        recoveries: That are run.
-        strategy: Name of the strategy.
-        titles: Of mechanisms and recoveries, see `SystemSpec.titles`; without one its code stands
-            alone.
+        active: Active mechanisms.
+        rule: Number of the rule.
+        recoveries: The recoveries that run.
+        strategy: Name of the strategy; if it is unknown, as in an old recording, the rule is shown
+            as a number only.
+        titles: Titles of mechanisms and recoveries, see `SystemSpec.titles`.
     """
     active, recoveries = ([named(name, titles) for name in names] for names in (active, recoveries))
     if not active and recoveries:

@@ -16,12 +16,12 @@ from rampart.manager.strategies.decision import (
 
 
 class SafetyFirst:
-    """The safest reading of what is active.
+    """The paper's four blocks.
 
     1. Only one mechanism is active: its recovery.
-    2. Else one active mechanism dominates all the others in the FTMTree: its recovery.
-    3. Else one of the active mechanisms' recoveries dominates all the others in the RM order:
-       that recovery.
+    2. Else one active mechanism dominates all others in the FTMTree: its recovery.
+    3. Else one of the active mechanisms' recoveries dominates all others in the RM order: that
+       recovery.
     4. Else the recovery of the lowest common dominant of the active mechanisms in the FTMTree,
        which need not be active itself.
     """
@@ -43,11 +43,9 @@ class SafetyFirst:
         dominant = tree.greatest(active)
         if dominant is not None:
             return Decision(active, 1 if len(active) == 1 else 2, recover[dominant], (dominant,))
-        # Block 3 asks for a recovery that dominates all *others*, and mechanisms may share one:
-        # FTM5 and FTM7 active is {RM4}, a set with no others, which RM4 therefore dominates.
-        # Counting recoveries per mechanism instead (RM4 against RM4) would find no strict
-        # dominance and fall through to block 4: an emergency stop for two crashes that one
-        # respawn cures.
+        # Mechanisms may share a recovery. For FTM5 and FTM7 the set is {RM4}, and RM4 dominates
+        # all others, since there are none. Compared per mechanism, RM4 would not dominate RM4,
+        # and block 4 would answer two crashes that one respawn repairs with an emergency stop.
         taken = _dominating(active, arrangement)
         if taken:
             return Decision(active, 3, taken,
@@ -56,7 +54,7 @@ class SafetyFirst:
         return Decision(active, 4, recover[chosen], (chosen,))
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
-        """Give the path of dominance, and why the others were rejected."""
+        """Add the path of dominance, and why other recoveries were rejected."""
         tree, order = arrangement.tree, arrangement.order
         recover = arrangement.mechanisms.recover
         names, taken, chosen = decision.active, decision.recoveries, decision.mechanisms[0]
@@ -84,7 +82,7 @@ def _dominating(active: tuple[str, ...], arrangement: Arrangement) -> tuple[str,
         return (greatest,)
     for name in active if arrangement.compound else ():
         way = arrangement.mechanisms.recover[name]
-        if all(other in way or any(order.is_above(one, other) for one in way)
+        if all(other in way or any(order.is_above(upper, other) for upper in way)
                for other in demanded):
             return way
     return ()

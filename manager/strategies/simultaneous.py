@@ -1,4 +1,4 @@
-"""All that is needed at once: the paper's outlook, "simultaneous recoveries", made precise."""
+"""Simultaneous recoveries, which the paper suggests as future work."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from rampart.manager.strategies.decision import Decision, Late, dominance, turne
 
 
 class Simultaneous:
-    """Run every maximal recovery, as far as they can run together.
+    """All maximal recoveries at once, as far as they can run together.
 
     1. Only one mechanism is active: its recovery.
-    2. Else all recoveries of the active mechanisms that no other of them dominates, if no two of
-       them claim the same resource and none disables what another needs.
-    3. Else the mechanisms whose recoveries are in conflict give way to their lowest common
-       dominant in the FTMTree (block 4 of safety-first, but for them alone), and again rule 2.
+    2. Else all recoveries of the active mechanisms that no other dominates, if no two claim the
+       same resource and none disables what another needs.
+    3. Else the mechanisms whose recoveries are in conflict are replaced by their lowest common
+       dominant in the FTMTree, and rule 2 applies again.
     """
 
     name = "simultaneous"
@@ -46,7 +46,7 @@ class Simultaneous:
                 (upper, *(n for n in sakes if n != upper and not tree.is_above(upper, n))))
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
-        """Give what dominates what, and why the others were rejected."""
+        """Add the chains of dominance, and why other recoveries were rejected."""
         tree, order = arrangement.tree, arrangement.order
         taken = decision.recoveries
         candidates = arrangement.demanded(decision.active)

@@ -48,7 +48,7 @@ def test_a_shared_event_is_fine_while_its_mechanism_has_one_parent():
     ({"F2": "x", "F4": "a"}, "F4", "several parents .*: F2, none"),
     ({"F2": "x", "F3": "y"}, "F3", "2 roots: F2, F3"),
     ({}, "", "0 roots: none"),
-    ({"F1": "top", "F2": "top"}, "F2", "event 'top' already holds F1"),
+    ({"F1": "top", "F2": "top"}, "F2", "event 'top' already has F1"),
 ])
 def test_a_placement_that_makes_no_tree_is_refused(placement, subject, message):
     events = tree(top=(1, "x y"), x=(1, "a"), y=(1, "a b"))
