@@ -1,1 +1,1 @@
-"""System specifications: their tables, what is checked before anything runs, time budgets."""
+"""System specifications: their tables, the checks before a run, time budgets."""

@@ -1,8 +1,7 @@
-"""Changing the mechanisms of a system while it runs.
+"""Changes the mechanisms of a running system.
 
-A change is applied to the document that the system was read from, and the result is checked like
-a fresh spec, whole: so nothing can be changed into a system that would have been refused at load.
-Document in, document out: a change is never seen half-applied.
+A change is applied to a copy of the system's document, and the result is checked as at load. So no
+change leads to a system that would have been refused at its start, and none is half applied.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ Document = dict[str, Any]
 
 
 class Action(StrEnum):
-    """What a change does."""
+    """Kind of a change."""
 
     ENABLE = "enable"
     DISABLE = "disable"
@@ -38,7 +37,7 @@ CHANGEABLE: dict[str, type[Table]] = {
 """Tables whose rows can be enabled, disabled, retuned and replaced, by name."""
 
 SETTINGS = ("strategy", "shadow", "order")
-"""Values that can be set."""
+"""Fields of the system that can be set."""
 
 
 class Change(msgspec.Struct, frozen=True):
@@ -46,11 +45,11 @@ class Change(msgspec.Struct, frozen=True):
 
     Attributes:
         action: See `Action`.
-        name: Of a detection module, a recovery module or a mechanism; with `set` one of
+        name: Name of a detection module, a recovery module or a mechanism; with `set` one of
             `SETTINGS`.
-        values: With `retune` the fields to change, where a name that is no field of the table is
-            one of its parameters; with `replace` the whole new table but for its name; with `set`
-            the new value under the key `value`.
+        values: With `retune`, the fields to change; a name that is not a field of the table is a
+            parameter. With `replace`, the whole new table without its name. With `set`, the new
+            value under the key `value`.
     """
 
     action: Action
@@ -59,23 +58,23 @@ class Change(msgspec.Struct, frozen=True):
 
 
 class ChangeError(ValueError):
-    """A change that cannot be made. The message is one line."""
+    """A change that cannot be applied. The message is one line."""
 
 
 def adapt(document: Document, change: Change, file: str) -> tuple[Document, SystemSpec]:
     """Apply a change.
 
     Args:
-        document: Of the running system, as TOML reads it; it is not touched.
-        change: What to change.
+        document: The running system as TOML reads it; it stays as it is.
+        change: The change.
         file: Name of the system's file, for messages.
 
     Returns:
         The new document, and the system it describes.
 
     Raises:
-        ChangeError: There is no such thing to change.
-        SpecificationError: The changed system would make no sense.
+        ChangeError: The name or a value of the change is unknown or missing.
+        SpecificationError: The changed system would be refused at load.
     """
     after = copy.deepcopy(document)
     match change.action:
@@ -96,7 +95,7 @@ def adapt(document: Document, change: Change, file: str) -> tuple[Document, Syst
 
 
 def describe(change: Change) -> str:
-    """Say in a few words what a change does."""
+    """Return a change in a few words."""
     values = ", ".join(f"{key} = {value!r}" for key, value in change.values.items())
     if change.action is Action.SET:
         return f"set {change.name} to {change.values.get('value')!r}"
@@ -104,10 +103,10 @@ def describe(change: Change) -> str:
 
 
 def parse_value(text: str) -> Any:
-    """Read a value as TOML writes it; a bare word is taken for a string.
+    """Read a TOML value; a bare word counts as a string.
 
     Raises:
-        ChangeError: It is neither.
+        ChangeError: The text is neither.
     """
     try:
         return toml.parse(f"value = {text}")["value"]
@@ -119,16 +118,15 @@ def parse_value(text: str) -> Any:
 
 
 def changed_actors(before: SystemSpec, after: SystemSpec) -> tuple[str, ...]:
-    """Return the detection and recovery modules whose processes have to be started anew."""
-    was = {node.name: node for node in before.actors()}
+    """Return the modules whose processes have to be restarted."""
+    old = {node.name: (node.actor, node.parameters) for node in before.actors()}
     return tuple(node.name for node in after.actors()
-                 if node.name in was and (node.actor, node.parameters) != (
-                     was[node.name].actor, was[node.name].parameters))
+                 if (node.actor, node.parameters) != old.get(node.name))
 
 
 def _find(document: Document, name: str) -> tuple[str, dict[str, Any]]:
     rows = [(table, row) for table in CHANGEABLE for row in document.get(table, ())]
-    found = next((one for one in rows if one[1].get("name") == name), None)
+    found = next((found for found in rows if found[1].get("name") == name), None)
     if found is None:
         known = ", ".join(str(row.get("name")) for _, row in rows)
         raise ChangeError(f"unknown detection module, recovery module or mechanism {name!r}; "
@@ -138,13 +136,13 @@ def _find(document: Document, name: str) -> tuple[str, dict[str, Any]]:
 
 def _retune(table: str, row: dict[str, Any], change: Change) -> None:
     if not change.values:
-        raise ChangeError(f"retune {change.name}: nothing to change; name fields and values")
+        raise ChangeError(f"retune {change.name}: expected fields and their new values")
     known = [field.encode_name for field in msgspec.structs.fields(CHANGEABLE[table])]
     for key, value in change.values.items():
         if key == "name":
             raise ChangeError(f"name = {value!r}: a name cannot be changed")
         if key == "parameters" and key in known and not isinstance(value, dict):
-            raise ChangeError(f"parameters = {value!r}: must be a table of names and values")
+            raise ChangeError(f"parameters = {value!r}: expected a table")
         if key in known:
             row[key] = value
         elif "parameters" in known:
@@ -158,6 +156,6 @@ def _set(document: Document, change: Change) -> None:
     if change.name not in SETTINGS:
         raise ChangeError(f"unknown setting {change.name!r}; known: {', '.join(SETTINGS)}")
     if "value" not in change.values:
-        raise ChangeError(f"set {change.name}: the value is missing")
+        raise ChangeError(f"set {change.name}: expected a value")
     document[change.name] = change.values["value"]
 

@@ -1,17 +1,16 @@
-"""The times of a spec: the time budget from above, false alarms from below.
+"""The times of a spec: the time budget bounds timeouts from above, false alarms from below.
 
-Recovery must start before a collision can. For every mechanism, and for every guard beside the
-mechanisms, this inequality must hold:
+Recovery must start before a collision can. For every mechanism, and every protection layer beside
+the mechanisms, this inequality must hold:
 
     detection + arbitration + actuation (+ respawn)  <=  time left
 
-The right-hand side is what distances and speeds leave (`rampart.manager.spec.mobile_robot`), what
-the spec says (`within_s`), or, against the *parent*, the time in which the mechanism above detects
-the consequence. A respawn that takes longer than that is still safe, the mechanism above stops the
-robot, but it has masked nothing.
+The time left follows from distances and speeds (`rampart.manager.spec.mobile_robot`), or the spec
+states it (`within_s`). Against the *parent* it is the time in which the mechanism above detects the
+consequence: a slower respawn is still safe, since the mechanism above stops the robot.
 
-The respawn counts where the recovery brings a node back (backward, masking), for then only the
-node's first message ends the error.
+The respawn counts if the recovery restarts a node, since only the first message of the new process
+ends the error.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ from rampart.manager.spec.schema import Kind, SystemSpec, Within
 from rampart.manager.spec.tables import FAILOVER_S, GUARDED, PERIODS, Finding, Timing, numbered
 
 PERIODS_TO_MISS = 3
-"""A timeout shorter than so many periods would take a late message for a lost one."""
+"""A timeout of fewer periods would take a late message for a lost one."""
 
 
 class Budget(msgspec.Struct, frozen=True):
-    """The two sides of the inequality, for one mechanism or guard; all times in seconds."""
+    """The two sides of the inequality, for one mechanism or layer; all times in seconds."""
 
     name: str
     hazard: str
@@ -52,7 +51,7 @@ class Budget(msgspec.Struct, frozen=True):
 
     @property
     def margin_s(self) -> float:
-        """What is left over; negative if the recovery comes too late."""
+        """Time left over; negative if the recovery comes too late."""
         return self.time_left_s - self.needed_s
 
     @property
@@ -68,16 +67,16 @@ class Budget(msgspec.Struct, frozen=True):
 
 
 def check(spec: SystemSpec) -> list[Budget]:
-    """Draw up the budget of every mechanism and guard that is switched on, mechanisms first."""
+    """Return the budgets of all mechanisms and of the layers that are switched on."""
     return [*(_of_mechanisms(spec) if spec.layers.ftm else ()),
-            *(_of_guards(spec) if spec.mobile else ())]
+            *(_of_layers(spec) if spec.mobile else ())]
 
 
 def patience_s(spec: SystemSpec) -> dict[str, float]:
     """Return how long the recovery of each mechanism may take, in seconds from its detection.
 
-    What is left of the time before the hazard when detection has taken its longest, and when the
-    next recovery still has to be decided on and to take effect.
+    This assumes the longest detection, and leaves the next recovery time to be decided on and to
+    take effect.
     """
     return {budget.name: max(0.0, budget.margin_s + budget.respawn_s)
             for budget in _of_mechanisms(spec)}
@@ -101,7 +100,7 @@ def _of_mechanisms(spec: SystemSpec) -> Iterator[Budget]:
             parent = mechanisms[str(parents[mechanism.name])]
             left_s = min(detections[name].soonest_s for name in parent.detections)
             hazard = f"{parent.detect} of {parent.name} detects the consequence"
-        # Which input of a gate opens it is not known: count on the slowest.
+        # Any input may be the one that opens the gate: count the slowest.
         detection_s = max(detection.latency_s for detection in listens_to) + (
             spec.link_s(manager, mechanism.detections))
         arbitration_s = timing.arbitration_s + spec.link_s(manager, mechanism.recoveries)
@@ -109,13 +108,13 @@ def _of_mechanisms(spec: SystemSpec) -> Iterator[Budget]:
                      0.0 if repairs.isdisjoint(mechanism.recoveries) else timing.respawn_s)
 
 
-def _of_guards(spec: SystemSpec) -> Iterator[Budget]:
-    """Draw up the budgets of the guards that a mobile robot's pilot is, beside the mechanisms."""
+def _of_layers(spec: SystemSpec) -> Iterator[Budget]:
+    """Yield the budgets of a mobile robot's protection layers beside the mechanisms."""
     timing, layers = spec.timing, spec.layers
     pilot = next((node.name for node in spec.nodes if node.kind is Kind.PILOT), "")
     hits = time_to_obstacle_s(spec.robot), "the robot hits an obstacle"
     drifts = time_left(spec.robot, Hazard.DRIFT, math.inf)
-    cycle_s = timing.control_period_s  # of the pilot: one to see, one to command
+    cycle_s = timing.control_period_s  # the pilot needs one to see and one to command
     for name, switched_on, (left_s, hazard), detection_s, decision_s in (
             (pilot, bool(pilot), hits, cycle_s, cycle_s),
             ("blind_pilot", pilot and layers.safety_pilot_checks, hits, timing.scan_timeout_s,
@@ -130,12 +129,12 @@ def _of_guards(spec: SystemSpec) -> Iterator[Budget]:
 
 
 def find_wrong_times(spec: SystemSpec) -> Iterator[Finding]:
-    """Times that are missing, contradictory, or raise false alarms."""
+    """Find times that contradict each other, or raise false alarms."""
     timing = spec.timing
     if spec.mobile is not None:
         yield from find_too_little_room(spec.mobile)
     if timing.release_hold_max_s < timing.release_hold_s:
-        yield Finding("$.timing.release_hold_max_s", "must be no less than release_hold_s = "
+        yield Finding("$.timing.release_hold_max_s", "expected at least release_hold_s = "
                       f"{timing.release_hold_s}", (timing.release_hold_max_s,))
     yield from find_false_alarms(timing)
     for first in ("backoff", "attempt"):
@@ -143,7 +142,7 @@ def find_wrong_times(spec: SystemSpec) -> Iterator[Finding]:
         most_s = getattr(spec.supervision, f"{first}_max_s")
         if most_s < first_s:
             yield Finding(f"$.supervision.{first}_max_s",
-                          f"must be no less than {first}_s = {first_s:g}", (most_s,))
+                          f"expected at least {first}_s = {first_s:g}", (most_s,))
 
 
 def find_false_alarms(timing: Timing) -> Iterator[Finding]:
@@ -152,16 +151,16 @@ def find_false_alarms(timing: Timing) -> Iterator[Finding]:
         value = getattr(timing, field)
         problem = find_false_alarm(timing, value, period_field)
         if not problem and field not in GUARDED and value < FAILOVER_S - 1e-9:
-            problem = (f"would stop the robot whenever a router of the bus dies; at least "
-                       f"{FAILOVER_S:.3f} s, for which nothing may be heard then, is right")
+            problem = ("would stop the robot whenever a router dies; expected at least "
+                       f"{FAILOVER_S:.3f} s, the longest gap in messages then")
         if problem:
             yield Finding(f"$.timing.{field}", problem, (value,))
 
 
 def allowed_late_s(timing: Timing) -> float:
-    """Return how late a loop may be, s: half the shortest slack of a timeout.
+    """Return how late a loop may be, in seconds: half the shortest slack of a timeout.
 
-    A message may be late twice, at its sender and at its reader.
+    A message may be late at its sender and again at its reader.
     """
     slacks_s: list[float] = [getattr(timing, field) - getattr(timing, period)
                              for field, period in PERIODS.items()]
@@ -169,17 +168,17 @@ def allowed_late_s(timing: Timing) -> float:
 
 
 def find_false_alarm(timing: Timing, timeout_s: float, period_field: str) -> str:
-    """Say what is wrong with a timeout on what comes with a period of `[timing]`; "" if nothing."""
+    """Return why a timeout on messages with a period of `[timing]` is too short, or ""."""
     period_s = getattr(timing, period_field)
     least_s = PERIODS_TO_MISS * period_s
     if timeout_s >= least_s - 1e-9:
         return ""
-    return (f"would raise false alarms; at least {least_s:.3f} s, {PERIODS_TO_MISS} periods of "
-            f"{period_field} = {period_s:.3f} s, is right")
+    return (f"would raise false alarms; expected at least {least_s:.3f} s, {PERIODS_TO_MISS} "
+            f"periods of {period_field} = {period_s:.3f} s")
 
 
 def find_wrong_budget(spec: SystemSpec) -> Iterator[Finding]:
-    """Mechanisms that come too late, or race what there is not."""
+    """Find mechanisms that come too late, or whose hazard does not apply."""
     root = spec.build_ftm_tree().root if spec.mechanisms else ""
     detections = {detection.name: detection for detection in spec.detections}
     for row, mechanism in numbered("mechanism", spec.mechanisms):
@@ -187,8 +186,8 @@ def find_wrong_budget(spec: SystemSpec) -> Iterator[Finding]:
         if isinstance(hazard, Within):
             continue
         if spec.mobile is None and hazard is not Hazard.PARENT:
-            needs = "needs a [robot]; 'parent' or { within_s = ..., hazard = '...' } is right"
-            yield (Finding(path, f"'drift', which it is if left out, {needs}")
+            needs = "needs a [robot]; expected 'parent' or { within_s = ..., hazard = '...' }"
+            yield (Finding(path, f"the default 'drift' {needs}")
                    if hazard is Hazard.DRIFT else Finding(path, needs, (hazard.value,)))
         if hazard is Hazard.PARENT and mechanism.name == root:
             yield Finding(path, f"{root} is the root of the FTMTree and has no parent to be "
@@ -200,8 +199,8 @@ def find_wrong_budget(spec: SystemSpec) -> Iterator[Finding]:
     for path, detection in numbered("detection", spec.detections):
         margin_m = detection.parameters.get("margin_m", 0.0)
         if spec.mobile is not None and margin_m >= spec.robot.corridor_clearance_m:
-            yield Finding(f"{path}.parameters.margin_m", "would raise false alarms; it must be "
-                          f"below corridor_clearance_m = {spec.robot.corridor_clearance_m:g}",
+            yield Finding(f"{path}.parameters.margin_m", "would raise false alarms; expected less "
+                          f"than corridor_clearance_m = {spec.robot.corridor_clearance_m:g}",
                           (margin_m,))
     for budget in check(spec):
         if not budget.fits:

@@ -1,7 +1,7 @@
-"""Whether a system spec makes sense: names, nodes, modules, trees, orders, and what others check.
+"""Checks of a system spec: names, nodes, modules, hosts, trees, orders.
 
-One small validator per concern; each yields what it finds wrong as a `Finding`. They run in
-sequence and the first finding is the one reported, so a validator may rely on those before it.
+Each validator yields what it finds wrong. They run in sequence and only the first finding is
+reported, so a validator may rely on those before it.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ def find_nonsense(spec: SystemSpec) -> Finding | None:
 
 
 def find_nonsense_of_rest(spec: SystemSpec) -> Finding | None:
-    """Return the first thing wrong with what is left of a sound spec when some is disabled."""
+    """Return the first thing wrong with the enabled rest of a sound spec, or None."""
     if not spec.mechanisms:
-        return Finding("$.mechanism", "no mechanism is left enabled; at least one must be")
+        return Finding("$.mechanism", "all are disabled; expected at least one enabled mechanism")
     off = {recovery.name for recovery in spec.recoveries if not recovery.enabled}
     for path, recovery in numbered("recovery", spec.recoveries):
         if recovery.enabled and recovery.escalate_to in off:
-            return Finding(f"{path}.escalate_to", f"{recovery.name} escalates to it, and it is "
-                           "disabled", (recovery.escalate_to,))
+            return Finding(f"{path}.escalate_to", "expected an enabled recovery module",
+                           (recovery.escalate_to,))
     return _first(spec, (_wrong_tree, _contradictions, _wrong_precedence, find_wrong_budget))
 
 
@@ -62,13 +62,13 @@ def _names(spec: SystemSpec) -> Iterator[Finding]:
     named += [(path, m.name, "") for path, m in numbered("mechanism", spec.mechanisms)]
     for path, name, process in named:
         if name in WORDS:
-            yield Finding(f"{path}.name", "a word of gates, no name", (name,))
+            yield Finding(f"{path}.name", "expected a name that is not a word of gates", (name,))
         if name in taken:
             yield Finding(f"{path}.name", f"duplicate name, {taken[name]}; nodes, detection and "
                           "recovery modules and mechanisms share one namespace", (name,))
         taken[name] = f"already at {path}.name"
         if process in RESERVED:
-            yield Finding(f"{path}.process", "reserved; nothing else can live in it", (process,))
+            yield Finding(f"{path}.process", "reserved; expected another name", (process,))
     events: dict[str, str] = {}
     for path, event in numbered("event", spec.events):
         first = events.setdefault(event.name, path)
@@ -82,46 +82,46 @@ def _nodes(spec: SystemSpec) -> Iterator[Finding]:
     for path, node in numbered("node", spec.nodes):
         kind = node.kind.value
         if node.kind in {Kind.DETECTION, Kind.RECOVERY}:
-            yield Finding(f"{path}.kind", f"belongs into [[{kind}]]", (kind,))
+            yield Finding(f"{path}.kind", f"expected in a table [[{kind}]]", (kind,))
         if node.kind not in NODE_KINDS:
             yield unknown(f"{path}.kind", kind, "kind", NODE_KINDS)
         if node.actor == MANAGER_CLASS and node.kind is not Kind.MANAGER:
-            yield Finding(f"{path}.kind", f"{node.actor} has to be of kind 'manager'", (kind,))
+            yield Finding(f"{path}.kind", f"expected 'manager', the kind of {node.actor}", (kind,))
         if node.respawn not in respawners:
             yield unknown(f"{path}.respawn", node.respawn, "recovery module", respawners)
         if node.kind is Kind.MANAGER and node.respawn != SUPERVISOR:
-            yield Finding(f"{path}.respawn", "the manager cannot command its own recovery; only "
-                                             f"{SUPERVISOR!r} is right", (node.respawn,))
+            yield Finding(f"{path}.respawn", f"expected {SUPERVISOR!r}: the manager cannot command "
+                          "its own recovery", (node.respawn,))
     for sole in (Kind.MANAGER, Kind.PILOT):
         found = [(path, n.name) for path, n in numbered("node", spec.nodes) if n.kind is sole]
         if len(found) > 1:
-            yield Finding(f"{found[1][0]}.kind", f"{found[0][1]} is of this kind already; a "
-                          f"system has one {sole.value} at most", (sole.value,))
+            yield Finding(f"{found[1][0]}.kind", f"expected at most one {sole.value}, and "
+                          f"{found[0][1]} is one", (sole.value,))
         if sole is Kind.MANAGER and not found and spec.mechanisms and spec.layers.ftm:
             yield Finding("$.node", "no node is of kind 'manager', so no mechanism would act; add "
-                          f"one with actor = {MANAGER_CLASS!r}, or say ftm = false in [layers]")
+                          f"one with actor = {MANAGER_CLASS!r}, or set ftm = false in [layers]")
 
 
 def _processes(spec: SystemSpec) -> Iterator[Finding]:
-    """Actors of one process come back together: all by the same hand, and none by its own."""
-    lives_in = {name: process or name for _, name, process, _ in modules(spec)}
+    """Actors of one process restart together: one restarter for all, and it is not among them."""
+    process_of = {name: process or name for _, name, process, _ in modules(spec)}
     first: dict[str, tuple[str, str]] = {}
     for path, name, _, respawn in modules(spec):
-        other, by = first.setdefault(lives_in[name], (name, respawn))
+        other, by = first.setdefault(process_of[name], (name, respawn))
         if respawn != by:
-            yield Finding(f"{path}.process", f"{other} lives there too and is brought back by {by},"
-                          f" {name} by {respawn}; who shares a process is brought back by the same",
-                          (lives_in[name],))
-    managers = {lives_in[node.name] for node in spec.nodes if node.kind is Kind.MANAGER}
+            yield Finding(f"{path}.process", f"{by} restarts {other}, which shares it, but "
+                          f"{respawn} restarts {name}; expected one restarter for a process",
+                          (process_of[name],))
+    managers = {process_of[node.name] for node in spec.nodes if node.kind is Kind.MANAGER}
     for path, recovery in numbered("recovery", spec.recoveries):
         for place, name in enumerate(recovery.parameters.get("nodes", ())):
             at = f"{path}.parameters.nodes[{place}]"
-            if lives_in[name] in managers:
-                yield Finding(at, "the manager lives in its process, and cannot command its own "
-                              "recovery", (name,))
-            if lives_in[name] == lives_in[recovery.name]:
-                yield Finding(at, f"{recovery.name} lives in its process, and would end itself",
-                              (name,))
+            if process_of[name] in managers:
+                yield Finding(at, "it shares the process of the manager, which cannot command its "
+                              "own recovery", (name,))
+            if process_of[name] == process_of[recovery.name]:
+                yield Finding(at, f"it shares the process of {recovery.name}, which would end "
+                              "itself", (name,))
 
 
 def _detections(spec: SystemSpec) -> Iterator[Finding]:
@@ -136,7 +136,7 @@ def _detections(spec: SystemSpec) -> Iterator[Finding]:
                 yield Finding(f"{path}.parameters.{key}", "expected a number > 0", (value,))
                 return
         if not detection.latency_s > 0:
-            yield Finding(f"{path}.within_s", "missing; say within how many seconds the module "
+            yield Finding(f"{path}.within_s", "missing; expected the seconds in which the module "
                                               "detects, here or as parameters.timeout_s")
 
 
@@ -166,39 +166,39 @@ def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
             yield unknown(f"{path}.event", mechanism.event, "event", events)
         yield from _explanations(spec, path, mechanism)
     if not spec.mechanisms and (spec.detections or spec.recoveries):
-        yield Finding("$.mechanism", "missing; no mechanism joins detection to recovery")
+        yield Finding("$.mechanism", "missing; expected one that joins detection to recovery")
 
 
 def _explanations(spec: SystemSpec, path: str, mechanism: MechanismSpec) -> Iterator[Finding]:
-    """What a mechanism explains is another one, that itself explains nothing."""
+    """A mechanism may explain others that explain nothing themselves."""
     others = {other.name: other.explains for other in spec.mechanisms}
     explains = sorted(mechanism.explains)
     yield from find_wrong_names(f"{path}.explains", explains, "mechanism", others, "listed twice")
     for name in explains:
         if name == mechanism.name or others.get(name):
-            yield Finding(f"{path}.explains", f"{name} itself explains others; leave it out of one "
+            yield Finding(f"{path}.explains", f"{name} itself explains others; remove it from one "
                           "of the two", (explains,))
 
 
 def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
     names = [recovery.name for recovery in spec.recoveries]
     nodes = dict.fromkeys(node.name for node in spec.nodes)
-    there = nodes.keys() | set().union(*(r.claims | r.disables for r in spec.recoveries))
+    needable = nodes.keys() | set().union(*(r.claims | r.disables for r in spec.recoveries))
     detections = [detection.name for detection in spec.detections]
     for path, recovery in numbered("recovery", spec.recoveries):
         for need in sorted(recovery.needs):
-            if need not in there:
+            if need not in needable:
                 yield Finding(f"{path}.needs", f"{need!r} is neither a node nor a resource that a "
-                              f"recovery claims or disables; known: {', '.join(sorted(there))}",
+                              f"recovery claims or disables; known: {', '.join(sorted(needable))}",
                               (sorted(recovery.needs),))
             if need in recovery.disables:
-                yield Finding(f"{path}.disables", f"{recovery.name} itself needs {need!r}; leave "
-                              "it out of one of the two", (sorted(recovery.disables),))
+                yield Finding(f"{path}.disables", f"{recovery.name} itself needs {need!r}; remove "
+                              "it from one of the two", (sorted(recovery.disables),))
         yield from find_wrong_names(f"{path}.excused_by", sorted(recovery.excused_by),
                                     "detection module", detections, "listed twice")
         if recovery.excused_by and not recovery.latched:
-            yield Finding(f"{path}.excused_by", "only what is latched is excused; leave it out, or "
-                          "say latched = true", (sorted(recovery.excused_by),))
+            yield Finding(f"{path}.excused_by", "expected only with latched = true",
+                          (sorted(recovery.excused_by),))
         if recovery.escalate_to and recovery.escalate_to not in names:
             yield unknown(f"{path}.escalate_to", recovery.escalate_to, "recovery module", names)
         if "nodes" in recovery.parameters:
@@ -206,7 +206,7 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
     cycle = find_cycle({r.name: [r.escalate_to] if r.escalate_to else [] for r in spec.recoveries})
     if cycle:
         yield Finding(f"$.recovery[{names.index(cycle[0])}].escalate_to",
-                      f"cycle {' > '.join(cycle)}; escalation must come to an end", (cycle[1],))
+                      f"cycle {' > '.join(cycle)}; escalation must end", (cycle[1],))
     used = nodes.keys() | set().union(*(r.claims | r.needs for r in spec.recoveries))
     for path, recovery in numbered("recovery", spec.recoveries):
         for name in sorted(recovery.disables - used):
@@ -216,7 +216,7 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
 
 
 def _reachability(spec: SystemSpec) -> Iterator[Finding]:
-    answers: dict[str, set[str]] = {}  # to a detection module: recoveries
+    answers: dict[str, set[str]] = {}  # detection module → recoveries
     recovering = {recovery.escalate_to for recovery in spec.recoveries}
     for mechanism in spec.mechanisms:
         recovering.update(mechanism.recoveries)
@@ -252,44 +252,43 @@ def _faults(spec: SystemSpec) -> Iterator[Finding]:
 
 
 def _hosts(spec: SystemSpec) -> Iterator[Finding]:
-    """Hosts that make no sense, and nodes that cannot be where they are."""
+    """Check the hosts, and where nodes run."""
     yield from _wrong_table(spec)
     known = [host.name for host in spec.hosts]
-    for path, one in spec.placed():
-        if one.host and not known:
-            yield Finding(f"{path}.host", "there is no [[host]]", (one.host,))
-        elif one.host and one.host not in known:
-            yield unknown(f"{path}.host", one.host, "host", known)
+    for path, row in spec.placed():
+        if row.host and row.host not in known:
+            yield unknown(f"{path}.host", row.host, "host", known)
     if not known:
         return
     at: dict[str, tuple[str, str]] = {}
-    for path, one in spec.placed():
-        host = one.host or known[0]
-        first, other = at.setdefault(one.process or one.name, (host, one.name))
+    for path, row in spec.placed():
+        host = row.host or known[0]
+        first, other = at.setdefault(row.process or row.name, (host, row.name))
         if host != first:
-            yield Finding(f"{path}.host", f"{other} lives in the same process, on {first}", (host,))
+            yield Finding(f"{path}.host", f"expected {first!r}, the host of {other}, which shares "
+                          "the process", (host,))
     for path, node in numbered("node", spec.nodes):
         if node.kind is Kind.PILOT and node.host not in ("", known[0]):
-            yield Finding(f"{path}.host", f"{node.name} moves the robot, so no link may be between "
-                          f"them; {known[0]!r}, the first host, is right", (node.host,))
+            yield Finding(f"{path}.host", f"expected {known[0]!r}, the first host, so that no link "
+                          f"is between {node.name} and the robot that it moves", (node.host,))
     yield from _too_short(spec)
 
 
 def _wrong_table(spec: SystemSpec) -> Iterator[Finding]:
     if len(spec.hosts) == 1:
-        yield Finding("$.host", "one machine needs no [[host]]; leave it out, or name another one")
+        yield Finding("$.host", "one machine needs no [[host]]; remove it, or add another one")
     for path, host in numbered("host", spec.hosts):
         try:
             ipaddress.ip_address(host.address)
         except ValueError:
             yield Finding(f"{path}.address", "expected an IP address such as '192.168.7.1'",
                           (host.address,))
-    for (_, one), (path, other) in combinations(numbered("host", spec.hosts), 2):
-        if one.name == other.name:
-            yield Finding(f"{path}.name", "duplicate name", (other.name,))
-        if one.address == other.address and abs(one.port - other.port) < PORTS:
-            yield Finding(f"{path}.port", f"each host uses {PORTS} ports, and {one.name} has the "
-                          f"same address and those from {one.port}", (other.port,))
+    for (_, first), (path, host) in combinations(numbered("host", spec.hosts), 2):
+        if first.name == host.name:
+            yield Finding(f"{path}.name", "duplicate name", (host.name,))
+        if first.address == host.address and abs(first.port - host.port) < PORTS:
+            yield Finding(f"{path}.port", f"each host uses {PORTS} ports, and {first.name} has the "
+                          f"same address and uses those from {first.port}", (host.port,))
 
 
 def _too_short(spec: SystemSpec) -> Iterator[Finding]:
@@ -300,16 +299,16 @@ def _too_short(spec: SystemSpec) -> Iterator[Finding]:
         far = [name for name in detection.watch if host_of[name] != host_of[detection.name]]
         timeout_s = detection.parameters.get("timeout_s", needed_s)
         if far and isinstance(timeout_s, int | float) and timeout_s < needed_s:
-            yield Finding(f"{path}.parameters.timeout_s", f"{detection.name} watches {far[0]} over "
-                          f"the link: two heartbeats and [link] delay_s, {needed_s:.2f} s, is the "
-                          "least", (timeout_s,))
+            yield Finding(f"{path}.parameters.timeout_s", f"expected at least {needed_s:.2f} s, "
+                          f"two heartbeats and [link] delay_s: {detection.name} watches {far[0]} "
+                          "over the link", (timeout_s,))
 
 
-# -- what is arbitrated -------------------------------------------------------------------------
+# -- arbitration --------------------------------------------------------------------------------
 
 
 def _wrong_tree(spec: SystemSpec) -> Iterator[Finding]:
-    """Events, gates, and where the mechanisms sit."""
+    """Check events, gates, and the places of mechanisms in the tree."""
     paths = {event.name: path for path, event in numbered("event", spec.events)}
     for path, event in numbered("event", spec.events):
         if event.of and event.gate is None:
@@ -330,20 +329,20 @@ def _wrong_tree(spec: SystemSpec) -> Iterator[Finding]:
         tree.derive_ftm_tree({name: event for name, (_, event) in mechanisms.items()})
     except FaultTreeError as error:
         if error.subject:
-            path, sits_on = mechanisms[error.subject]
-            yield Finding(f"{path}.event", f"{error.subject}: {error}", (sits_on,))
+            path, event_name = mechanisms[error.subject]
+            yield Finding(f"{path}.event", f"{error.subject}: {error}", (event_name,))
         else:
             yield Finding("$.mechanism", str(error))
 
 
 def _wrong_policy(spec: SystemSpec) -> Iterator[Finding]:
-    """Names of strategies and of orders."""
+    """Check the names of strategies and of orders."""
     for field in ("strategy", "shadow"):
         name = getattr(spec, field)
         if name not in STRATEGIES and (name or field == "strategy"):
             yield unknown(f"$.{field}", name, "strategy", sorted(STRATEGIES))
     if not spec.criteria:
-        yield Finding("$.order", "expected the name of an order, or a list of such", ([],))
+        yield Finding("$.order", "expected the name of an order, or a list of names", ([],))
     for name in spec.criteria:
         if name not in spec.orders:
             yield unknown("$.order", name, "order", list(spec.orders))
@@ -352,7 +351,7 @@ def _wrong_policy(spec: SystemSpec) -> Iterator[Finding]:
 
 
 def _wrong_orders(spec: SystemSpec) -> Iterator[Finding]:
-    """What each order relates, and that it is one."""
+    """Check that each order relates recoveries and has no cycle."""
     recoveries = dict.fromkeys(recovery.name for recovery in spec.recoveries)
     for name, relation in spec.orders.items():
         for upper, lowers in relation.items():
@@ -369,39 +368,40 @@ def _wrong_orders(spec: SystemSpec) -> Iterator[Finding]:
 
 
 def _contradictions(spec: SystemSpec) -> Iterator[Finding]:
-    """Orders that contradict each other."""
+    """Check that the selected orders do not contradict each other."""
     try:
         spec.build_order()
     except CycleError as error:
-        yield Finding("$.order", f"the criteria contradict each other, {error}; leave one out or "
-                                 "let them agree", (list(spec.criteria),))
+        yield Finding("$.order", f"the criteria contradict each other, {error}; expected orders "
+                                 "that agree", (list(spec.criteria),))
 
 
 def _wrong_compounds(spec: SystemSpec) -> Iterator[Finding]:
-    """Recoveries that one mechanism runs together must be able to run together."""
+    """Check that recoveries that one mechanism runs together can run together."""
     recoveries = {recovery.name: recovery for recovery in spec.recoveries}
     for path, mechanism in numbered("mechanism", spec.mechanisms):
         ways = recovery_gate(mechanism.recover).alternatives()
         together = dict.fromkeys(chain.from_iterable(permutations(way, 2) for way in ways))
-        for one, other in together:
-            shared = recoveries[one].claims & recoveries[other].claims
-            harmed = recoveries[one].disables & recoveries[other].needs
+        for name, other in together:
+            shared = recoveries[name].claims & recoveries[other].claims
+            harmed = recoveries[name].disables & recoveries[other].needs
             if shared or harmed:
                 yield Finding(f"{path}.recover", (
-                    f"{one} and {other} both claim {', '.join(sorted(shared))}" if shared else
-                    f"{one} disables {', '.join(sorted(harmed))}, which {other} needs"
+                    f"{name} and {other} both claim {', '.join(sorted(shared))}" if shared else
+                    f"{name} disables {', '.join(sorted(harmed))}, which {other} needs"
                     ) + "; they cannot run together", (mechanism.recover,))
 
 
 def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
-    """Recoveries that are safer than what is above them, or keep the last resort waiting."""
+    """Check that recoveries get safer towards the root, and that the last resort never waits."""
     if not spec.mechanisms:
         return
     order, tree = spec.build_safety_order(), spec.build_ftm_tree()
     for path, mechanism in numbered("mechanism", spec.mechanisms):
         if tree.root in mechanism.explains:
             yield Finding(f"{path}.explains", f"{tree.root} is the root of the FTMTree; the last "
-                          "barrier acts whatever explains it", (sorted(mechanism.explains),))
+                          "barrier acts even if its cause is explained",
+                          (sorted(mechanism.explains),))
     recover = {mechanism.name: mechanism.recoveries for mechanism in spec.mechanisms}
     safer = spec.criteria[0]
     for upper, lower, high, low in contradictions(tree, order, recover):
@@ -411,22 +411,16 @@ def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
     for path, recovery in numbered("recovery", spec.recoveries):
         if recovery.escalate_to and order.is_above(recovery.name, recovery.escalate_to):
             yield Finding(f"{path}.escalate_to", f"{recovery.name} is above it in the order "
-                          f"{spec.criteria[0]!r}; escalation must not lead to less",
+                          f"{safer!r}; expected a recovery that is not less safe",
                           (recovery.escalate_to,))
-    yield from _delayed_last_resort(spec, tree.root)
-
-
-def _delayed_last_resort(spec: SystemSpec, root: str) -> Iterator[Finding]:
-    """A recovery of the FTMTree's root is a last resort: nothing may make it wait."""
-    last_resorts = next(m.recoveries for m in spec.mechanisms if m.name == root)
-    rows = {recovery.name: (path, recovery)
-            for path, recovery in numbered("recovery", spec.recoveries)}
-    for last_resort, (path, recovery) in product(last_resorts, rows.values()):
-        shared = recovery.claims & rows[last_resort][1].claims
-        if recovery.name != last_resort and shared:
-            yield Finding(f"{path}.claims", f"{last_resort}, the last resort, would have to wait "
-                          f"for {recovery.name}, which claims {', '.join(sorted(shared))} as well",
-                          (sorted(recovery.claims),))
+    last_resorts = [r for r in spec.recoveries if r.name in recover[tree.root]]
+    for last_resort, (path, recovery) in product(
+            last_resorts, numbered("recovery", spec.recoveries)):
+        shared = recovery.claims & last_resort.claims
+        if recovery is not last_resort and shared:
+            yield Finding(f"{path}.claims", f"{last_resort.name}, the last resort, would have to "
+                          f"wait for {recovery.name}, which also claims "
+                          f"{', '.join(sorted(shared))}", (sorted(recovery.claims),))
 
 
 VALIDATORS: tuple[Validator, ...] = (

@@ -1,8 +1,8 @@
-"""The machines of a system, and what is assumed of the network between them.
+"""The tables `[[host]]` and `[link]`: machines of a system, and the network between them.
 
-A system without a `[[host]]` runs on one machine. Of several the first is the robot's: it decides
-who is to run what, gives the others their time, and takes over what a machine ran that cannot be
-reached any more (`rampart.actors.hosts.placement`).
+A system without a `[[host]]` runs on one machine. Of several hosts the first is on the robot. It
+decides what each host runs, gives the others their time, and takes over the nodes of a lost host
+(`rampart.actors.hosts.placement`).
 """
 
 from __future__ import annotations
@@ -14,20 +14,19 @@ import msgspec
 from rampart.manager.spec.tables import Name, Positive, Table
 
 PORTS = 3
-"""Of a host: its two routers, and where the robot's launcher is asked by the others'."""
-
+"""Of a host: two for its routers, one on which the first host's launcher answers the others."""
 
 MOST_CLOCK_S = 0.1
-"""The most that the clocks of two hosts may differ: messages stamped further ahead are refused."""
+"""Largest difference of two hosts' clocks: readers refuse messages stamped further ahead."""
 
 
 class HostSpec(Table, frozen=True):
     """A machine.
 
     Attributes:
-        name: By which nodes say that they run there.
-        address: IP address of it, as the others reach it.
-        port: The first of the three TCP ports that it uses.
+        name: Name, which nodes give in `host`.
+        address: IP address by which the other hosts reach it.
+        port: First of the three TCP ports that it uses.
     """
 
     name: Name
@@ -36,17 +35,14 @@ class HostSpec(Table, frozen=True):
 
 
 class Link(Table, frozen=True):
-    """What is assumed of the network between hosts, and when it counts as lost; real seconds.
+    """Assumptions about the network between hosts; real seconds.
 
     Attributes:
-        delay_s: Longest time that a message takes while the link is up, what is lost and sent
-            again included.
-        clock_s: How far the clocks of two hosts may be apart; one that is not known as well as
-            that is told of. Every reader refuses what is stamped more than `MOST_CLOCK_S` ahead.
-        lost_after_s: Nothing was heard of a host for so long: it is lost, and what it ran is
-            started on the first host.
-        return_after_s: A host has been heard for so long without a break: what was started in its
-            place is its own again.
+        delay_s: Longest delay of a message while the link is up, retransmissions included.
+        clock_s: Largest difference of two hosts' clocks; a larger uncertainty is reported.
+        lost_after_s: A host that is silent for this long is lost. The first host starts its nodes.
+        return_after_s: A lost host that is received for this long without a break gets its nodes
+            back.
     """
 
     delay_s: Positive = 0.3

@@ -1,21 +1,20 @@
-"""A mobile robot: the room it has, and the time that leaves.
+"""The table `[robot]`: the room that a mobile robot has, and the time which that leaves.
 
 With v the top speed, b the braking and v^2 / 2b the braking distance, the robot may wait at most
 
-* *drift*: `(clearance - v^2/2b) / v`. The error makes it go on as before, e.g. with the last
-  command it got, straight at the edge of the corridor. Obstacles do not enter here: the Safety
-  Pilot sees them by laser, whatever becomes of commands and of localization.
+* *drift*: `(clearance - v^2/2b) / v`. The robot goes on as before, e.g. by its last command,
+  straight towards the edge of the corridor. Obstacles do not count here, since the Safety Pilot
+  sees them by laser.
 * *runaway*: t with `v t + a t^2/2 + (v + a t)^2/2b = clearance`. A wrong command makes it
-  accelerate, until the drive can go no faster.
+  accelerate up to the speed limit of the drive.
 * *intrusion*: `(margin - gps accuracy - v^2/2b) / v`. It comes within the margin at which the
   redundant device warns.
-* an *obstacle*, for the Safety Pilot and for the base's own dead man: `(stop distance - v^2/2b)
-  / v`; when the Safety Pilot dies, or its last sweep of the laser was made, an obstacle may be
-  just beyond the stop distance.
+* *obstacle*: `(stop distance - v^2/2b) / v`, for the Safety Pilot and the base's dead man. When
+  the last laser scan was made, an obstacle may have been just beyond the stop distance.
 
-Watchdog values need not be guessed (`rampart.manager.spec.budget` bounds them). `derive_timeouts`
-takes nine tenths of the upper bound; the heartbeat timeout is what is left of the command's after a
-respawn, because a crash is better masked by RM3 than noticed by DM2, but no more than five periods.
+`derive_timeouts` takes nine tenths of each bound (`rampart.manager.spec.budget`). The heartbeat
+timeout is the command timeout without the time of a respawn, so that a restarted node prevents the
+stale command; it is at most five periods.
 """
 
 from __future__ import annotations
@@ -38,28 +37,28 @@ from rampart.manager.spec.tables import (
 )
 
 SHARE = 0.9
-"""Of the time that is left, a derived timeout takes this much."""
+"""Part of the time left that a derived timeout takes."""
 
 
 class Robot(Table, frozen=True):
-    """The robot and the room it has, as far as time budgets depend on them.
+    """The robot and its room, as far as time budgets depend on them.
 
     Attributes:
-        length_m: Of the footprint, along x of `base_link`.
-        width_m: Of the footprint, along y.
-        top_speed_mps: Fastest command that the controller gives.
-        top_turn_rate_radps: Fastest turn that the controller commands.
-        hardware_speed_mps: Fastest the drive goes when it is commanded nonsense.
-        acceleration_mps2: With which it gets there.
+        length_m: Length of the footprint, along x of `base_link`.
+        width_m: Width of the footprint, along y.
+        top_speed_mps: Highest speed that the controller commands.
+        top_turn_rate_radps: Highest turn rate that the controller commands.
+        hardware_speed_mps: Highest speed of the drive, whatever the command.
+        acceleration_mps2: Highest acceleration of the drive.
         braking_mps2: Deceleration that is certain on wet concrete.
-        stop_distance_m: The Safety Pilot stops for an obstacle this far ahead of the footprint.
-        lateral_distance_m: And for one this far beside it.
-        sensing_range_m: The laser shows everything up to this distance ...
-        sensing_field_rad: ... in this angle, half of it on either side of straight ahead ...
-        sensing_gap_rad: ... with rays no farther apart. A sweep that covers less is not believed.
+        stop_distance_m: The Safety Pilot stops for an obstacle this close ahead of the footprint.
+        lateral_distance_m: The same beside the footprint.
+        sensing_range_m: Range of the laser.
+        sensing_field_rad: Field of view, half of it on either side of straight ahead.
+        sensing_gap_rad: Largest angle between rays. A scan that covers less is refused.
         gps_accuracy_m: Error bound of the redundant positioning device.
-        corridor_clearance_m: From the footprint to the nearest prohibited area, when the robot
-            is where it should be.
+        corridor_clearance_m: Distance from the footprint to the nearest prohibited area while the
+            robot follows its path.
     """
 
     length_m: Positive
@@ -79,16 +78,16 @@ class Robot(Table, frozen=True):
 
 
 class Hazard(StrEnum):
-    """What a mechanism races against; all but `PARENT` are a robot's."""
+    """The event that a mechanism must forestall; all but `PARENT` need a robot."""
 
     DRIFT = "drift"
-    """The robot goes on as before, at top speed, until the corridor ends."""
+    """The robot goes on at top speed until the corridor ends."""
     RUNAWAY = "runaway"
     """It accelerates as hard as it can."""
     INTRUSION = "intrusion"
-    """It has come within the detection module's `margin_m` of the prohibited area."""
+    """It is within the detection module's `margin_m` of the prohibited area."""
     PARENT = "parent"
-    """Nothing yet, but the mechanism above is about to detect the consequence."""
+    """The mechanism above detects the consequence."""
 
 
 _WORDS = {
@@ -99,18 +98,18 @@ _WORDS = {
 
 
 def braking_distance_m(robot: Robot, speed_mps: float) -> float:
-    """Distance in which the robot comes to a stop."""
+    """Return the distance in which the robot stops."""
     return speed_mps ** 2 / (2 * robot.braking_mps2)
 
 
 def time_to_drift_s(robot: Robot) -> float:
-    """Time after which braking comes too late for the corridor's edge, at constant speed."""
+    """Return the time after which braking is too late for the corridor's edge, at top speed."""
     v = robot.top_speed_mps
     return (robot.corridor_clearance_m - braking_distance_m(robot, v)) / v
 
 
 def time_to_runaway_s(robot: Robot) -> float:
-    """Time after which braking comes too late for the corridor's edge, at full acceleration."""
+    """Return the time after which braking is too late for the edge, at full acceleration."""
     v, a, b = robot.top_speed_mps, robot.acceleration_mps2, robot.braking_mps2
     fastest = max(v, robot.hardware_speed_mps)
     ramp = (fastest - v) / a
@@ -125,13 +124,13 @@ def time_to_runaway_s(robot: Robot) -> float:
 
 
 def time_to_intrusion_s(robot: Robot, margin_m: float) -> float:
-    """Time after which braking comes too late, from the margin of the redundant device on."""
+    """Return the time after which braking is too late, from the margin of the device on."""
     v = robot.top_speed_mps
     return (margin_m - robot.gps_accuracy_m - braking_distance_m(robot, v)) / v
 
 
 def time_to_obstacle_s(robot: Robot) -> float:
-    """Time after which braking comes too late for an obstacle at the stop distance."""
+    """Return the time after which braking is too late for an obstacle at the stop distance."""
     v = robot.top_speed_mps
     return (robot.stop_distance_m - braking_distance_m(robot, v)) / v
 
@@ -139,7 +138,7 @@ def time_to_obstacle_s(robot: Robot) -> float:
 def time_left(robot: Robot, hazard: Hazard, margin_m: float) -> tuple[float, str]:
     """Return the time before a hazard in seconds, and the hazard in words.
 
-    `margin_m` is the distance at which the redundant device warns; it counts for an intrusion.
+    `margin_m`, at which the redundant device warns, counts for an intrusion only.
     """
     left_s = (time_to_drift_s(robot) if hazard is Hazard.DRIFT else
               time_to_runaway_s(robot) if hazard is Hazard.RUNAWAY else
@@ -148,21 +147,20 @@ def time_left(robot: Robot, hazard: Hazard, margin_m: float) -> tuple[float, str
 
 
 PERIODS_WAITED = 5
-"""Of what a timeout waits for, in a system that has no [robot] to derive it from."""
+"""Periods of the awaited message that a timeout takes in a system without a [robot]."""
 
 
 def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
     """Fill in the timeouts that a spec leaves out.
 
     Args:
-        robot: Speeds and distances; without one a timeout is `PERIODS_WAITED` periods of what it
-            waits for, and what stops the robot outlasts the death of a router (`FAILOVER_S`).
-        timing: With NaN where a value is to be derived; values that are given are kept, and
-            those derived follow from them.
+        robot: Speeds and distances; without them a timeout is `PERIODS_WAITED` periods of what it
+            waits for, and a timeout that stops the robot at least `FAILOVER_S`.
+        timing: Times, NaN where a value is to be derived.
 
     Returns:
-        Timing without NaN. A robot that leaves no time gets values that are too short, zero or
-        even negative; `check` and `find_false_alarms` then refuse it.
+        Timing without NaN. If the robot leaves no time, values are too short or even negative;
+        `check` and `find_false_alarms` then refuse them.
     """
     if robot is None:
         return msgspec.structs.replace(timing, **{
@@ -187,7 +185,7 @@ def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
         before_consequence_s = min(timing.command_timeout_s, timing.localization_timeout_s) - (
             timing.arbitration_s + timing.actuation_s + timing.respawn_s)
         timing = msgspec.structs.replace(timing, heartbeat_timeout_s=_to_millisecond(
-            min(5 * timing.heartbeat_period_s, before_consequence_s)))
+            min(PERIODS_WAITED * timing.heartbeat_period_s, before_consequence_s)))
     return timing
 
 
@@ -197,16 +195,16 @@ def find_too_little_room(robot: Robot) -> Iterator[Finding]:
     for field in ("corridor_clearance_m", "stop_distance_m"):
         room_m = getattr(robot, field)
         if room_m <= braking_m:
-            yield Finding(f"$.robot.{field}", f"too little to brake in; from top_speed_mps the "
-                          f"robot takes {braking_m:.3f} m", (room_m,))
+            yield Finding(f"$.robot.{field}", f"expected more than {braking_m:.3f} m, the braking "
+                          "distance from top_speed_mps", (room_m,))
     if robot.hardware_speed_mps < robot.top_speed_mps:
-        yield Finding("$.robot.hardware_speed_mps", "the drive cannot be slower than top_speed_mps "
-                      f"= {robot.top_speed_mps}", (robot.hardware_speed_mps,))
+        yield Finding("$.robot.hardware_speed_mps", "expected at least top_speed_mps = "
+                      f"{robot.top_speed_mps}", (robot.hardware_speed_mps,))
     if robot.sensing_range_m <= robot.stop_distance_m:
-        yield Finding("$.robot.sensing_range_m", "obstacles must be seen before they are nearer "
-                      f"than stop_distance_m = {robot.stop_distance_m}", (robot.sensing_range_m,))
+        yield Finding("$.robot.sensing_range_m", "expected more than stop_distance_m = "
+                      f"{robot.stop_distance_m}", (robot.sensing_range_m,))
 
 
 def _to_millisecond(value_s: float) -> float:
-    """Round down, for a timeout may be shorter but not longer than derived."""
+    """Round down, since a timeout may be shorter than derived but not longer."""
     return math.floor(value_s * 1000 + 1e-6) / 1000

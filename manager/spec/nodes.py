@@ -1,4 +1,4 @@
-"""The table of nodes: actors, and commands that are nodes; and whether a command makes sense."""
+"""The table `[[node]]`: actors, and commands that run as nodes; and the checks of commands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OptionalClassPath = Annotated[str, msgspec.Meta(
 
 
 class Kind(StrEnum):
-    """What a node is, which decides who guards it and who brings it back."""
+    """Kind of a node; it decides which checks apply and what may restart it."""
 
     CONTROL = "control"
     NON_CONTROL = "non-control"
@@ -33,17 +33,17 @@ class Kind(StrEnum):
 
 
 NODE_KINDS = (Kind.CONTROL, Kind.NON_CONTROL, Kind.PILOT, Kind.MANAGER, Kind.WORLD)
-"""What a `[[node]]` can be; the others are the supervisor, and what has a table of its own."""
+"""Kinds of a `[[node]]`; the others are the supervisor, and modules with their own tables."""
 
 
 class ChildHeartbeat(Table, frozen=True):
-    """By what a command shows that it turns: one of the three, and how long it may be silent.
+    """How a command shows that it runs: by a key, by datagrams, or by a topic.
 
     Attributes:
-        timeout_s: Simulated seconds.
-        key: Zenoh key below `rampart/` on which anything counts.
-        notify: Datagrams `WATCHDOG=1` to `$NOTIFY_SOCKET`, as of sd_notify(3).
-        topic: One of those that it publishes.
+        timeout_s: Longest silence, simulated seconds.
+        key: Zenoh key below `rampart/`; any message on it counts.
+        notify: Datagrams `WATCHDOG=1` to `$NOTIFY_SOCKET` count, see sd_notify(3).
+        topic: A topic that the command publishes.
     """
 
     timeout_s: Positive
@@ -53,11 +53,11 @@ class ChildHeartbeat(Table, frozen=True):
 
 
 class ChildLimits(Table, frozen=True):
-    """What a command may use at most, each of its processes for itself; see setrlimit(2).
+    """Limits of each process of a command; see setrlimit(2).
 
     Attributes:
         memory_mb: Address space, in millions of bytes.
-        processor_s: Processor time; what exceeds it is killed.
+        processor_s: Processor time, after which the process is killed.
         open_files: Descriptors.
         file_mb: Size of a file that it writes, in millions of bytes.
     """
@@ -71,7 +71,7 @@ class ChildLimits(Table, frozen=True):
 _KEY = re.compile(r"([^\s/*$?#]+(/[^\s/*$?#]+)*)?")
 
 RESERVED_VARIABLES = ("RAMPART_", "NOTIFY_SOCKET", "WATCHDOG_")
-"""Of the environment of a command; what begins so is set for it."""
+"""Beginnings of environment variables that Rampart sets for a command."""
 
 
 class NodeSpec(Table, frozen=True):
@@ -79,24 +79,23 @@ class NodeSpec(Table, frozen=True):
 
     Attributes:
         name: Unique among nodes, detection and recovery modules.
-        kind: What it is.
-        actor: Its class, `module:Class`; "" of one that has a command.
-        process: Name of the OS process it runs in; "" for one of its own name.
-        host: Name of the machine on which it runs; "" for the first.
-        respawn: Who brings it back: a recovery module, or "supervisor".
-        spare: What its next process is made of. "pool": one that is connected to the bus and may
-            become any node. "none": a new one. "" is "pool", but for the world. "warm", "own" and
-            "hot" are of version 0.7, and mean "pool".
-        parameters: For the actor, or for that which stands in for the command. A value of a key
-            in `_s` may name a `[timing]` value.
+        kind: Kind of the node.
+        actor: Its class, `module:Class`; "" if the node has a command.
+        process: Name of its OS process; "" for the name of the node.
+        host: Name of the host on which it runs; "" for the first.
+        respawn: What restarts it: a recovery module, or "supervisor".
+        spare: Source of its next process. "pool": a process of the pool. "none": a new process.
+            "" means "none" for the world, else "pool", as do "warm", "own" and "hot".
+        parameters: Of the actor, or of the command's stand-in. If a key ends in `_s`, its value
+            may name a `[timing]` value.
         command: Executable and arguments, in place of an actor.
-        env: What is added to the environment of the command.
-        folder: In which it is run, relative to the file of the system.
-        limits: What it may use at most.
-        heartbeat: By what it shows that it turns; None for nothing but its existence.
-        publishes: Keys of topics that it publishes by its socket.
-        hears: Keys of topics that it hears there.
-        stand_in: Class of the actor that plays it in virtual time.
+        env: Variables to add to the environment of the command.
+        folder: Working folder of the command, relative to the system's file.
+        limits: Limits of the command.
+        heartbeat: How the command shows that it runs; None if only its end counts.
+        publishes: Keys of topics that it publishes on its socket.
+        hears: Keys of topics that it receives there.
+        stand_in: Class of the actor that replaces it in virtual time.
     """
 
     name: Name
@@ -118,11 +117,11 @@ class NodeSpec(Table, frozen=True):
 
     @property
     def command_parameters(self) -> dict[str, Any]:
-        """What the actor that runs its command is told."""
+        """Parameters of the actor that runs the command."""
         return {field: getattr(self, field) for field in COMMAND_FIELDS if field != "stand_in"}
 
     def in_virtual_time(self) -> NodeSpec:
-        """Return what plays the node where there are no processes, if anything does."""
+        """Return the node with its stand-in as the actor, if it has one."""
         if not self.command or not self.stand_in:
             return self
         return msgspec.structs.replace(self, actor=self.stand_in, **dict(_NO_COMMAND))
@@ -130,16 +129,13 @@ class NodeSpec(Table, frozen=True):
 
 COMMAND_FIELDS = ("command", "env", "folder", "limits", "heartbeat", "publishes", "hears",
                   "stand_in")
-"""What can be said of a node that has a command only."""
+"""Fields that only a node with a command may have."""
 
 _NO_COMMAND = {field: getattr(NodeSpec("none", Kind.WORLD), field) for field in COMMAND_FIELDS}
 
 
 def find_wrong_commands(nodes: Iterable[NodeSpec]) -> Iterator[Finding]:
-    """Find nodes that have neither or both of actor and command, and commands that make no sense.
-
-    The finding's path names the node.
-    """
+    """Check that each node has either an actor or a command, and check the commands."""
     for node in nodes:
         found = chain(_wrong_command(node), _wrong_heartbeat(node), _wrong_keys(node)
                       ) if node.command else _wrong_actor(node)
@@ -151,27 +147,27 @@ def _wrong_actor(node: NodeSpec) -> Iterator[tuple[Any, ...]]:
     """Yield field, problem, and the value if one is to blame."""
     for field in COMMAND_FIELDS:
         if (value := getattr(node, field)) != _NO_COMMAND[field]:
-            yield field, "of use with a command only, and the node has none", _plain(value)
+            yield field, "expected only with a command; the node has none", _plain(value)
     if not node.actor:
-        yield "actor", "missing; say actor = 'module:Class' or command = ['./program', ...]"
+        yield "actor", "missing; expected actor = 'module:Class' or command = ['./program', ...]"
 
 
 def _wrong_command(node: NodeSpec) -> Iterator[tuple[Any, ...]]:
     command = list(node.command)
     if node.actor:
-        yield "command", f"either actor or command is right; it has actor = {node.actor!r}", command
+        yield "command", f"expected only one of actor and command; actor = {node.actor!r}", command
     if node.kind is Kind.MANAGER:
-        yield "command", "the manager has to be an actor", command
+        yield "command", "expected an actor, as the node is the manager", command
     if not node.command[0]:
-        yield "command", "the first is the program, and it has no name", command
+        yield "command", "expected the name of a program first", command
     if any("\0" in text for text in (*command, *node.env, *node.env.values(), node.folder)):
-        yield "command", "no text of it or its env or folder may have a character 0", command
+        yield "command", "a null character in command, env or folder", command
     for name, value in node.env.items():
         if not name or "=" in name or name.startswith(RESERVED_VARIABLES):
-            yield f"env.{name}", "no variable that can be set here; RAMPART_*, NOTIFY_SOCKET and " \
-                "WATCHDOG_* are set for it", value
+            yield f"env.{name}", "expected a name without '=' that does not begin with " \
+                f"{', '.join(RESERVED_VARIABLES)}, which Rampart sets", value
     if node.parameters and not node.stand_in:
-        yield "parameters", "a command takes none; they are for the actor that stand_in names"
+        yield "parameters", "expected only with stand_in: a command takes no parameters"
 
 
 def _wrong_heartbeat(node: NodeSpec) -> Iterator[tuple[Any, ...]]:
@@ -179,10 +175,10 @@ def _wrong_heartbeat(node: NodeSpec) -> Iterator[tuple[Any, ...]]:
     if beat is None:
         return
     if sum(map(bool, (beat.key, beat.notify, beat.topic))) != 1:
-        yield ("heartbeat", "one of key = '...', notify = true, topic = '...' is right",
+        yield ("heartbeat", "expected one of key = '...', notify = true, topic = '...'",
                _plain(beat))
     if beat.topic and beat.topic not in node.publishes:
-        yield ("heartbeat.topic", "not one of the topics that it publishes; these are: "
+        yield ("heartbeat.topic", "expected a topic that the node publishes: "
                f"{', '.join(node.publishes) or 'none'}", beat.topic)
     if not _KEY.fullmatch(beat.key):
         yield "heartbeat.key", "expected a Zenoh key such as 'est/alive'", beat.key
@@ -193,7 +189,7 @@ def _wrong_keys(node: NodeSpec) -> Iterator[tuple[Any, ...]]:
         listed = getattr(node, field)
         for place, key in enumerate(listed):
             if "{" in key:
-                yield field, "name one member of the family", key
+                yield field, "expected a name in place of {name}", key
             if key in listed[:place]:
                 yield field, "listed twice", key
 

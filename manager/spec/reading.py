@@ -1,7 +1,7 @@
-"""What a file says, read as the type that declares it, or refused with what is expected there.
+"""Converts a value of a file to a declared type, or reports which part does not fit.
 
-`msgspec` converts. Which part of a value does not fit, and what would, is read off the type: its
-bounds, or the description in its `msgspec.Meta`.
+`msgspec` converts. The report says what was expected: the type in words, its bounds, or the
+description in its `msgspec.Meta`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,7 @@ _BOUNDS = {"ge": ", {:.10g} or more", "gt": " > {:.10g}", "le": ", at most {:.10
 
 
 class MisfitError(ValueError):
-    """A value that its type does not allow.
-
-    Attributes:
-        finding: Where, and what is expected.
-    """
+    """A value does not fit its type; `finding` has its path and what was expected."""
 
     def __init__(self, finding: Finding) -> None:
         self.finding = finding
@@ -39,7 +35,7 @@ class MisfitError(ValueError):
 
 
 def read(value: Any, kind: type[T], path: str = "$") -> T:
-    """Return a value of a file, at a path in it, as a type.
+    """Convert a value to a type; `path` is its place in the file.
 
     Raises:
         MisfitError: A field is missing, unknown or of the wrong type.
@@ -51,7 +47,7 @@ def read(value: Any, kind: type[T], path: str = "$") -> T:
 
 
 def _find_misfit(value: Any, kind: Any, path: str, problem: str) -> Finding:
-    """Return which part of a refused value is to blame."""
+    """Return the innermost part of a refused value that does not fit."""
     for step, part, wanted in _parts(value, kind):
         try:
             msgspec.convert(part, wanted)
@@ -88,7 +84,7 @@ def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _options(kind: Any) -> Iterator[Any]:
-    """Yield the classes of which a value of a type may be, with their parameters."""
+    """Yield the classes that a type allows, with their parameters."""
     if get_origin(kind) is Annotated:
         kind = kind.__origin__
     if get_origin(kind) in {Union, UnionType}:
@@ -107,7 +103,7 @@ def _fields(table: type[msgspec.Struct]) -> dict[str, Any]:
 
 
 def expected(kind: inspect.Type) -> str:
-    """Return in words which values a type has, "" if there are no simple words for it."""
+    """Return in words which values a type allows, "" if there are no simple words."""
     words = ""
     match kind:
         case inspect.Metadata(extra={"names": what}):

@@ -1,9 +1,7 @@
-"""The tables of a system specification: nodes, modules, mechanisms, fault tree, orders.
+"""The tables of a system specification: modules, mechanisms, fault tree, faults, orders.
 
-One TOML file says everything that the arbiter, the launcher and the supervisor need to know;
-`systems/osmosis.toml` shows every field. These classes are its shape, and what
-is checked by type alone: unknown fields, wrong types, names that are no names, negative times.
-`rampart.manager.spec.specification` reads a file into them.
+These types define field names, types, names and ranges; `rampart.manager.spec.specification`
+reads a file into them. `systems/osmosis.toml` shows every field.
 """
 
 from __future__ import annotations
@@ -39,28 +37,27 @@ from rampart.manager.spec.tables import (
 T = TypeVar("T")
 Few = Annotated[T, msgspec.Meta(max_length=16)]
 Rows = Annotated[tuple[T, ...], msgspec.Meta(max_length=1000)]
-"""Of a table; the shipped systems have 31 actors, and checks compare many with many."""
+"""Rows of a table, bounded because some checks take quadratic time."""
 
 Relation = Annotated[dict[str, Annotated[tuple[str, ...], msgspec.Meta(
     description="a list of recovery names")]], msgspec.Meta(
-    description="a table, recovery = [recoveries that it is above]")]
+    description="a table, recovery = [less safe recoveries]")]
 
 
 class DetectionSpec(Table, frozen=True):
     """A detection module.
 
     Attributes:
-        within_s: Longest time from the error to the report; a number or the name of a `[timing]`
-            value. May be left out if `parameters.timeout_s` says it; if both do, the longer one
-            counts.
-        parameters: For the actor, as for a node. Keys that mean something here too: `watch`, a
-            list of node names; `timeout_s`; `margin_m`, the distance at which it warns.
-        name: Of the module, e.g. "DM1".
-        title: For people.
+        name: Name of the module, e.g. "DM1".
+        title: Title for people.
         actor: Its class, `module:Class`.
-        process: OS process it runs in; "" for one of its own name.
-        host: On which it runs; "" for the first.
-        enabled: False leaves out every mechanism that listens to it.
+        within_s: Longest time from the error to the report; a number or the name of a `[timing]`
+            value. Default: `parameters.timeout_s`.
+        process: Name of its OS process; "" for the name of the module.
+        host: Host on which it runs; "" for the first.
+        parameters: Of the actor, as for a node. The manager uses three: `watch`, a list of node
+            names; `timeout_s`; `margin_m`, the distance at which the module warns.
+        enabled: False leaves out every mechanism that uses the module.
     """
 
     name: Name
@@ -79,15 +76,15 @@ class DetectionSpec(Table, frozen=True):
 
     @property
     def latency_s(self) -> float:
-        """Longest time from the error to the report; NaN if the spec does not say.
+        """Longest time from the error to the report; NaN if the spec has none.
 
-        Where both `within_s` and `parameters.timeout_s` say it, the longer one counts.
+        Of `within_s` and `parameters.timeout_s` the longer one counts.
         """
         return max(self._times_s)
 
     @property
     def soonest_s(self) -> float:
-        """The shorter of the two, for what has to be faster than this module."""
+        """The shorter of the two, for mechanisms that must be faster than this module."""
         return min(self._times_s)
 
     @property
@@ -97,10 +94,9 @@ class DetectionSpec(Table, frozen=True):
 
 
 class RecoverySpec(Table, frozen=True):
-    """A recovery module; the contract fields are those of `mechanisms.Contract`.
+    """A recovery module; see `rampart.manager.model.mechanisms.Contract`.
 
-    A key of `parameters` that means something here too: `nodes`, a list of names of those that it
-    may respawn.
+    Its parameter `nodes` lists the names of the nodes that it may respawn.
     """
 
     name: Name
@@ -122,25 +118,24 @@ class RecoverySpec(Table, frozen=True):
 
 
 class Within(Table, frozen=True):
-    """A hazard in the user's own words, and the time that is left before it, in seconds."""
+    """A hazard in words, and the time that is left before it, in seconds."""
 
     within_s: Positive
     hazard: str
 
 
 class MechanismSpec(Table, frozen=True):
-    """FTMx(DMy, RMz), on an event of the fault tree, in time before a hazard.
+    """FTMx(DMy, RMz), a barrier on an event of the fault tree.
 
     Attributes:
-        name: Of the mechanism, e.g. "FTM1".
-        detect: A detection module, or a gate over several; `rampart.manager.model.gates` has the
-            language.
+        name: Name of the mechanism, e.g. "FTM1".
+        detect: A detection module, or a gate over several (`rampart.manager.model.gates`).
         recover: A recovery module, or a gate over several.
-        event: Of the fault tree, on which it is a barrier.
-        against: What it races.
-        explains: Mechanisms whose detections are its consequences, as many are of an overload of
-            the machine: while it is detected they do not act.
-        enabled: False leaves it out. One with a disabled module is left out as well.
+        event: The event of the fault tree on which it is a barrier.
+        against: The hazard that it must forestall.
+        explains: Mechanisms whose detections are its consequences, as many are of an overloaded
+            machine; they do not act while it is detected.
+        enabled: False leaves the mechanism out, as does a disabled module.
     """
 
     name: Name
@@ -155,7 +150,7 @@ class MechanismSpec(Table, frozen=True):
 
     @property
     def detections(self) -> tuple[str, ...]:
-        """Names of the detection modules that it listens to."""
+        """Names of the detection modules in its gate."""
         return detection_gate(self.detect).names
 
     @property
@@ -181,7 +176,7 @@ class EventSpec(Table, frozen=True):
 
     @property
     def required(self) -> int:
-        """How many of its inputs make it occur; 0 for a basic event."""
+        """How many inputs must occur for the event to occur; 0 for a basic event."""
         if self.gate is None:
             return 0
         if isinstance(self.gate, AtLeast):
@@ -190,23 +185,23 @@ class EventSpec(Table, frozen=True):
 
 
 class FaultSpec(Table, frozen=True):
-    """A fault of the system that has a name: what happens to one topic; see `Injection`.
+    """A named fault that changes the messages of one topic; see `Injection`.
 
     Attributes:
-        name: As it is typed, e.g. "gauge-stuck".
-        title: For people.
-        topic: Key below `rampart/`, where it is published.
+        name: Name to type, e.g. "gauge-stuck".
+        title: Title for people.
+        topic: Key of the topic below `rampart/`.
         mode: What happens to its messages: "drop", "corrupt" and so on.
-        kind: By which faults are listed and drawn: "sensor", "actuator" and so on.
-        duration_s: How long it lasts unless told otherwise, simulated seconds.
-        set: For corrupt: field → value that takes the place of the true one.
-        add: For corrupt: field → what is added.
-        ramp: For corrupt: field → what is added per simulated second.
+        kind: Group in lists and pictures: "sensor", "actuator" and so on.
+        duration_s: Default duration, simulated seconds.
+        set: For corrupt: field → value in place of the true one.
+        add: For corrupt: field → value to add.
+        ramp: For corrupt: field → value to add per simulated second.
         noise: For corrupt: field → standard deviation.
-        keep_ends: For corrupt: lists of which the first and last element stay.
+        keep_ends: For corrupt: lists whose first and last elements stay.
         delay_s: For delay.
-        stamp_s: For restamp: ahead, or behind if below 0.
-        detected_by: Detection modules that should see it.
+        stamp_s: For restamp: seconds ahead; negative for behind.
+        detected_by: Detection modules that should detect it.
     """
 
     name: Annotated[str, msgspec.Meta(
@@ -228,22 +223,22 @@ class FaultSpec(Table, frozen=True):
 
 
 class SystemSpec(Table, frozen=True):
-    """A whole system. In the file the arrays of tables are called by the singular.
+    """A whole system. In the file, arrays of tables have singular names.
 
     Attributes:
-        application: What the system adds to the engine: `class`, and that class's options.
-        judge: Who says what a run was worth: `class`, and that class's parameters.
-        end: When a run is over.
-        hosts: Its machines, the robot's first; none for a system of one machine.
-        link: What is assumed of the network between them.
+        application: What the system adds to the engine: `class`, and its options.
+        judge: The test oracle of a run: `class`, and its parameters.
+        end: When a run ends.
+        hosts: Its machines, the robot's first; empty for a system of one machine.
+        link: Assumptions about the network between them.
         mobile: Speeds and distances of a mobile robot, `[robot]` in the file.
-        strategy: By which the arbiter decides; `rampart.manager.strategies.registry` has them.
-        shadow: A strategy that is asked as well, and whose differing decisions are recorded;
-            "" for none.
-        order: Name of an order of the recoveries, or several: what the first leaves open the
-            next decides. The first is the one that says what is safer.
-        panels: Of the operator's page, besides those of its class; see `rampart.actors.operator`.
-        ros2: What is passed on between ROS 2 and the system, likewise.
+        strategy: Strategy of the arbiter (`rampart.manager.strategies.registry`).
+        shadow: A strategy that decides without effect; differing decisions are recorded. "" for
+            none.
+        order: Name of an order of the recoveries, or several; each decides what those before it
+            leave open. The first defines which recovery is safer.
+        panels: Additional panels of the operator's page (`rampart.actors.operator`).
+        ros2: Links to ROS 2 (`rampart.actors.ros2`).
     """
 
     name: Name
@@ -256,7 +251,7 @@ class SystemSpec(Table, frozen=True):
     mobile: Robot | None = msgspec.field(name="robot", default=None)
     strategy: str = "safety-first"
     shadow: str = ""
-    order: str | tuple[str, ...] = "safer"  # a pattern beside a list has msgspec 0.22 crash
+    order: str | tuple[str, ...] = "safer"  # with a pattern beside a list msgspec 0.22 crashes
     timing: Timing = Timing()
     layers: Layers = Layers()
     supervision: Supervision = Supervision()
@@ -273,16 +268,16 @@ class SystemSpec(Table, frozen=True):
 
     @property
     def titles(self) -> dict[str, str]:
-        """Titles of modules and mechanisms by name; a mechanism's are those of its detections."""
-        found = {one.name: one.title for one in self.detections}
-        found |= {one.name: one.title for one in self.recoveries}
-        return found | {one.name: " / ".join(found[name] for name in one.detections
-                                             if name in found) for one in self.mechanisms}
+        """Titles of modules and mechanisms by name; a mechanism has those of its detections."""
+        titles = {d.name: d.title for d in self.detections}
+        titles |= {r.name: r.title for r in self.recoveries}
+        return titles | {m.name: " / ".join(titles[name] for name in m.detections)
+                         for m in self.mechanisms}
 
     def without_disabled(self) -> SystemSpec:
-        """Return the spec without the mechanisms that are disabled; itself if none is.
+        """Return the spec without disabled mechanisms; itself if none is disabled.
 
-        Modules that are disabled stay: their processes run, but what they say has no effect.
+        Disabled modules stay: their processes run, but their reports have no effect.
         """
         off = {d.name for d in self.detections if not d.enabled}
         off |= {r.name for r in self.recoveries if not r.enabled}
@@ -291,10 +286,10 @@ class SystemSpec(Table, frozen=True):
         return self if left == self.mechanisms else msgspec.structs.replace(self, mechanisms=left)
 
     def actors(self) -> tuple[NodeSpec, ...]:
-        """Return everything that runs as an actor, detection and recovery modules as nodes too.
+        """Return all nodes and modules as nodes, with `process` filled in.
 
-        `process` is filled in. With the layer `ftm` off, those that make up fault tolerance (the
-        detection modules, the recovery modules, the FTM Manager) are left out.
+        With the layer `ftm` off, detection modules, recovery modules and the FTM Manager are left
+        out.
         """
         actors = list(self.nodes)
         actors += [NodeSpec(m.name, Kind.DETECTION, m.actor, m.process, m.host,
@@ -313,12 +308,12 @@ class SystemSpec(Table, frozen=True):
 
     @property
     def host_of(self) -> dict[str, str]:
-        """Names of all nodes, detection and recovery modules with that of their host."""
+        """The name of the host of each node, detection and recovery module."""
         first = self.hosts[0].name if self.hosts else ""
-        return {one.name: one.host if first and one.host else first for _, one in self.placed()}
+        return {row.name: row.host if first and row.host else first for _, row in self.placed()}
 
     def link_s(self, node: str, others: Iterable[str]) -> float:
-        """Return how long a message between a node and any of others is under way on a network."""
+        """Return the link's delay if any of the others is on another host, else 0."""
         host_of = self.host_of if self.hosts else {}
         return self.link.delay_s if any(
             host_of.get(other) != host_of.get(node) for other in others) else 0.0
@@ -335,8 +330,8 @@ class SystemSpec(Table, frozen=True):
         """Build the registry of mechanisms and recovery contracts.
 
         Args:
-            patience_s: How long each mechanism's recovery may take
-                (`rampart.manager.spec.budget.patience_s`).
+            patience_s: For each mechanism, how long its recovery may take; see
+                `rampart.manager.spec.budget.patience_s`.
         """
         return Mechanisms(
             [Mechanism(m.name, m.detect, m.recover, patience_s.get(m.name, math.inf), m.explains)
@@ -357,7 +352,7 @@ class SystemSpec(Table, frozen=True):
         """The mobile robot.
 
         Raises:
-            ValueError: The system is none.
+            ValueError: The system has no [robot].
         """
         if self.mobile is None:
             raise ValueError(f"system {self.name!r} has no [robot]")
@@ -365,18 +360,18 @@ class SystemSpec(Table, frozen=True):
 
     @property
     def criteria(self) -> tuple[str, ...]:
-        """Names of the selected orders; the first says what is safer."""
+        """Names of the selected orders; the first defines which recovery is safer."""
         return (self.order,) if isinstance(self.order, str) else self.order
 
     def build_order(self, *criteria: str) -> PartialOrder:
-        """Build the RM order of these criteria; of those that the spec selects if none is given.
+        """Build the RM order of these criteria; by default of those that the spec selects.
 
         Raises:
-            CycleError: One of them has a cycle, or together they have one.
+            CycleError: A criterion has a cycle, or they contradict each other.
         """
         names = [r.name for r in self.recoveries]
         return refine([PartialOrder(names, self.orders[c]) for c in criteria or self.criteria])
 
     def build_safety_order(self) -> PartialOrder:
-        """Build the order that says which recovery is safer: the first criterion alone."""
+        """Build the order that defines which recovery is safer: the first criterion."""
         return self.build_order(self.criteria[0])

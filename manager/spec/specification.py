@@ -1,14 +1,12 @@
-"""Reads the specification of a system; what a spec can say is in `rampart.manager.spec.schema`.
+"""Reads the specification of a system (its tables: `rampart.manager.spec.schema`).
 
-Reading happens in three steps, each with its own kind of error, and every error is one line that
-names file, path, value, and what would be right (`SpecificationError`):
+1. `rampart.files.toml` and `msgspec` check syntax, sizes, types and field names.
+2. Missing timeouts are derived from the robot (`rampart.manager.spec.mobile_robot`). Parameters
+   that name a timing value get that value.
+3. `rampart.manager.spec.checks` checks names, cycles, the tree, the order and the time budget.
 
-1. syntax, sizes and types: `rampart.files.toml`, then `msgspec`, strict, unknown fields forbidden;
-2. timing values left out are derived from the robot (`rampart.manager.spec.mobile_robot`), and
-   parameters that name a timing value are replaced by it;
-3. sense: names, cycles, the tree, the order, the time budget (`rampart.manager.spec.checks`).
-
-There is no file I/O here: the caller hands over the text, and the name to use in messages.
+Every error is one line: file, path, value, and what was expected (`SpecificationError`). The
+caller passes the text and a name for messages; no file is opened here.
 """
 
 from __future__ import annotations
@@ -33,15 +31,13 @@ from rampart.manager.spec.tables import Finding, SpecificationError, Table, by_n
 Row = TypeVar("Row", bound=Table)
 
 LARGEST, SMALLEST = 1e9, 1e-9
-"""Of numbers that the analyses calculate with: squares and quotients of these are far from the
-limits of a float, and a thousand million seconds are thirty years.
-"""
+"""Of numbers outside parameters; their squares and quotients are far from a float's limits."""
 
 LARGEST_INTEGER = 2 ** 63 - 1
-"""In parameters, which go to an actor as they are, by way of MessagePack."""
+"""Of MessagePack, by which parameters reach an actor."""
 
 INTERFACES = "interfaces"
-"""Parameter of a node in a system with `[[ros2]]`: folders, relative to the file of the system."""
+"""Parameter of a node in a system with `[[ros2]]`: folders, relative to the system's file."""
 
 
 def parse_specification(text: str, file: str) -> SystemSpec:
@@ -55,17 +51,17 @@ def parse_specification(text: str, file: str) -> SystemSpec:
         The spec, with every timing value a number.
 
     Raises:
-        SpecificationError: The text is no TOML, a field is missing, unknown or of the wrong type,
-            or the spec makes no sense.
+        SpecificationError: The text is not TOML, a field is missing, unknown or of the wrong type,
+            or a check fails.
     """
     return check_document(read_document(text, file), file)
 
 
 def read_document(text: str, file: str) -> dict[str, Any]:
-    """Read TOML, unchecked; a byte order mark at its beginning is no part of it.
+    """Read TOML without checks; a byte order mark at the start is ignored.
 
     Raises:
-        SpecificationError: The text is no TOML.
+        SpecificationError: The text is not TOML.
     """
     try:
         return toml.parse(text)
@@ -74,27 +70,26 @@ def read_document(text: str, file: str) -> dict[str, Any]:
 
 
 def check_change(before: SystemSpec, after: SystemSpec) -> None:
-    """Make sure that a running system can be changed into another one.
+    """Check that a running system can be changed into another one.
 
-    The actors, their processes, hosts and commands stay. No module is named that the system it came
-    from does not name: a class is imported when it is named, and its module is executed. Only the
-    file that the operator started the system with decides which ones may be.
+    Actors, processes, hosts and commands stay. An actor's class may change only within the Python
+    modules that the system names already: to import a module is to execute it, and only the file
+    that the operator started decides which.
 
     Raises:
         ValueError: It cannot; the message names node, field and value.
     """
-    was, becomes = ({node.name: node for node in spec.actors()} for spec in (before, after))
-    if was.keys() != becomes.keys():
-        names = ", ".join(sorted(was.keys() ^ becomes.keys()))
+    old, new = ({node.name: node for node in spec.actors()} for spec in (before, after))
+    if old.keys() != new.keys():
+        names = ", ".join(sorted(old.keys() ^ new.keys()))
         raise ValueError(f"{names}: a running system keeps the actors that it was started with")
-    known = {node.actor.partition(":")[0] for node in was.values()}
-    for name, node in becomes.items():
+    known = {node.actor.partition(":")[0] for node in old.values()}
+    for name, node in new.items():
         if node.actor.partition(":")[0] not in known:
-            raise ValueError(f"{name}: actor = {node.actor!r}: no actor of the system that was "
-                             "started is in that module; known modules: "
-                             f"{', '.join(sorted(known))}")
+            raise ValueError(f"{name}: actor = {node.actor!r}: expected a class in a module that "
+                             f"the running system uses: {', '.join(sorted(known))}")
         for field in ("process", "host", *COMMAND_FIELDS):
-            value, kept = getattr(node, field), getattr(was[name], field)
+            value, kept = getattr(node, field), getattr(old[name], field)
             if value != kept:
                 raise ValueError(f"{name}: {field} = {value!r}: expected {kept!r}, which stays "
                                  "while a system runs")
@@ -103,12 +98,11 @@ def check_change(before: SystemSpec, after: SystemSpec) -> None:
 def check_document(document: dict[str, Any], file: str) -> SystemSpec:
     """Make a spec of a document, and check it.
 
-    Mechanisms that are disabled, or of which a module is, are checked like all others and then
-    left out; what remains has to make sense as well.
+    Disabled mechanisms, and those with a disabled module, are checked like all others. They are
+    then left out, and the rest is checked again.
 
     Raises:
-        SpecificationError: A field is missing, unknown or of the wrong type, or the spec makes no
-            sense.
+        SpecificationError: A field is missing, unknown or of the wrong type, or a check fails.
     """
     for finding in _find_unwritable(document):
         raise _refusal(file, finding, document)
@@ -130,12 +124,12 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
 
 def read_rows(rows: Sequence[dict[str, Any]], kind: type[Row], table: str, file: str
               ) -> tuple[Row, ...]:
-    """Read rows of a table that is an actor's, and not known here.
+    """Read the rows of a table that belongs to an actor.
 
     Args:
-        rows: As the spec has them.
-        kind: What one says.
-        table: Its name in the file.
+        rows: The rows as in the spec.
+        kind: Type of a row.
+        table: Name of the table in the file.
         file: Name to use in messages.
 
     Raises:
@@ -153,7 +147,7 @@ def _refusal(file: str, finding: Finding, document: Mapping[str, Any]) -> Specif
 
 
 def _find_unwritable(document: dict[str, Any]) -> Iterator[Finding]:
-    """Find nesting without end, and numbers that no time, distance or count is."""
+    """Find too deep nesting, and numbers that cannot be a time, a distance or a count."""
     left: list[tuple[object, str, int, bool]] = [(document, "$", 0, False)]
     while left:
         value, path, depth, free = left.pop()
@@ -171,20 +165,19 @@ def _find_unwritable(document: dict[str, Any]) -> Iterator[Finding]:
             yield Finding(path, f"expected an integer of at most {LARGEST_INTEGER}", (value,))
         elif isinstance(value, int | float) and not free and value and not (
                 SMALLEST <= abs(value) <= LARGEST):
-            yield Finding(path, f"out of all proportion; expected {SMALLEST:g} to {LARGEST:g}",
-                          (value,))
+            yield Finding(path, f"expected 0, or {SMALLEST:g} to {LARGEST:g} in size", (value,))
 
 
 def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
-    """Replace names of timing values by the values, in `within_s` and in parameters `*_s`."""
+    """Replace names of timing values by their values, in `within_s` and in parameters `*_s`."""
     times = msgspec.structs.asdict(spec.timing)
 
     def resolve(value: Any, path: str) -> Any:
         if not isinstance(value, str):
             return value
         if value not in times:
-            raise SpecificationError(file, path, "unknown timing value; a number or one of: "
-                                                 f"{', '.join(times)}", value)
+            raise SpecificationError(file, path, "unknown timing value; expected a number or one "
+                                                 f"of: {', '.join(times)}", value)
         return times[value]
 
     def resolved(table: str, row: NodeSpec | DetectionSpec | RecoverySpec) -> dict[str, Any]:
@@ -206,14 +199,14 @@ def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
 
 
 def _resolve_folders(spec: SystemSpec, file: str) -> SystemSpec:
-    """Put the folder of the file before those that a gateway to ROS 2 names."""
+    """Make the folders of a ROS 2 gateway relative to the folder of the system's file."""
 
     def resolved(node: NodeSpec) -> NodeSpec:
-        named = node.parameters.get(INTERFACES)
-        if not isinstance(named, list):
+        folders = node.parameters.get(INTERFACES)
+        if not isinstance(folders, list):
             return node
-        above = PurePath(file).parent
+        parent = PurePath(file).parent
         return replace(node, parameters={**node.parameters, INTERFACES: [
-            str(above / one) if isinstance(one, str) else one for one in named]})
+            str(parent / folder) if isinstance(folder, str) else folder for folder in folders]})
 
     return replace(spec, nodes=tuple(map(resolved, spec.nodes))) if spec.ros2 else spec

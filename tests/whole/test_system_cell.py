@@ -38,7 +38,7 @@ WITHIN = 'against = { within_s = 0.45, hazard = "a hand is within the arm\'s rea
 
 @pytest.mark.parametrize(("old", "new", "message"), [
     ("heartbeat_timeout_s = 0.3\n", "heartbeat_timeout_s = 0.1\n", "would raise false alarms"),
-    (WITHIN, "", "mechanism M_CURTAIN: against: 'drift', which it is if left out, needs a [robot]"),
+    (WITHIN, "", "mechanism M_CURTAIN: against: the default 'drift' needs a [robot]"),
     (WITHIN, 'against = "runaway"', "mechanism M_CURTAIN: against = 'runaway': needs a [robot]"),
     ("within_s = 0.45", "within_s = 0.1", "M_CURTAIN needs 0.180 s (detection 0.030 + arbitration "
      "0.050 + actuation 0.100) of 0.100 s before a hand is within the arm's reach"),

@@ -77,15 +77,15 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
 
 @pytest.mark.parametrize(("action", "name", "values", "message"), [
     ("disable", "FTM9", {}, "unknown detection module, recovery module or mechanism 'FTM9'"),
-    ("retune", "FTM3", {}, "retune FTM3: nothing to change; name fields and values"),
+    ("retune", "FTM3", {}, "retune FTM3: expected fields and their new values"),
     ("retune", "FTM3", {"name": "X"}, "name = 'X': a name cannot be changed"),
     ("retune", "FTM3", {"margin_m": 1}, "margin_m = 1: unknown field of a mechanism; known: "),
     ("replace", "FTM3", {"name": "X"}, "name = 'X': a replacement keeps the name, 'FTM3'"),
     ("set", "airport", {"value": "x"}, "unknown setting 'airport'; known: strategy, shadow, order"),
-    ("set", "strategy", {}, "set strategy: the value is missing"),
+    ("set", "strategy", {}, "set strategy: expected a value"),
     ("set", "strategy", {"value": "bold"}, "$.strategy = 'bold': unknown strategy; known: "),
     ("set", "order", {"value": "comfort"}, "$.order = 'comfort': unknown order; known: safer"),
-    ("disable", "RM1", {}, "recovery RM2: escalate_to = 'RM1': RM2 escalates to it"),
+    ("disable", "RM1", {}, "recovery RM2: escalate_to = 'RM1': expected an enabled"),
     ("disable", "FTM1", {}, "the FTMTree has 3 roots: FTM2, FTM3, FTM6"),
     ("disable", "DM2", {}, "FTM4 needs 0.990 s"),  # it would have to be faster than DM1
     ("retune", "DM2", {"timeout_s": 5.0}, "the time budget does not fit: FTM2 needs 5.150 s"),
@@ -244,7 +244,7 @@ async def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_no
     ("retune", "DM3", '{"actor": "rampart.actors.osmosis.recovery.emergency_stop:EmergencyStop"}',
      "it does not publish detection/{name}"),
     ("retune", "DM3", '{"actor": "rampart.actors.detection.stub:StubDetection"}',
-     "no actor of the system that was started is in that module"),
+     "expected a class in a module that the running system uses"),
     ("retune", "DM4", '{"timeout_s": 0.01}', "parameters.timeout_s = 0.01: would raise false"),
     ("retune", "DM5", '{"process": "DM1"}', "DM5: process = 'DM1': expected 'DM5', which stays"),
     ("retune", "DM3", '{"hold": 1}', "detection DM3: parameters.hold = 1: unknown field; known"),

@@ -111,7 +111,7 @@ REFUSED = {
         ('detect = "DM3"', f'''detect = "{'9' * 5000} of (DM3)"''')],
     "detection DM2: parameters.timeout_s = 1000": [
         ('timeout_s = "command_timeout_s"', "timeout_s = 1" + "0" * 400)],
-    "$.robot.top_speed_mps = 1e+200: out of all proportion;": [
+    "$.robot.top_speed_mps = 1e+200: expected 0, or 1e-09 to": [
         ("top_speed_mps = 1.0", "top_speed_mps = 1e200")],
     "$: nested more than 32 deep": [("[layers]", f"[{'.'.join('a' * 50)}]")],
     "$.node[5].name = 'teleoperation': duplicate name,": [
@@ -123,7 +123,7 @@ REFUSED = {
     "$.event[2].name = 'erroneous_graph': duplicate name,": [
         ('name = "actuator_failure"', 'name = "erroneous_graph"'),
         (PROHIBITED, PROHIBITED.replace(', "actuator_failure"', ""))],
-    "$.mechanism[1].name = 'and': a word of gates, no name": [('name = "FTM2"', 'name = "and"')],
+    "$.mechanism[1].name = 'and': expected a name that is": [('name = "FTM2"', 'name = "and"')],
     "mechanism FTM3: detect = 'DM9': unknown detection": [('detect = "DM3"', 'detect = "DM9"')],
     "mechanism FTM6: recover = 'RM9': unknown recovery": [('recover = "RM5"', 'recover = "RM9"')],
     "mechanism FTM4: event = 'meteorite': unknown event;": [
@@ -146,22 +146,22 @@ REFUSED = {
     "detection DM3: within_s: missing": [('within_s = "control_period_s"', "")],
     "detection DM1: parameters.margin_m = True: expected a": [
         ("margin_m = 0.6", "margin_m = true")],
-    "node simulator: kind = 'detection': belongs into": [('kind = "world"', 'kind = "detection"')],
-    "node ftm_manager: respawn = 'RM4': the manager cannot": [
+    "node simulator: kind = 'detection': expected in": [('kind = "world"', 'kind = "detection"')],
+    "node ftm_manager: respawn = 'RM4': expected 'supervis": [
         ('kind = "manager"\nrespawn = "supervisor"', 'kind = "manager"\nrespawn = "RM4"')],
-    "node ftm_manager: process = 'hmi': hmi lives there too": [
+    "node ftm_manager: process = 'hmi': RM4 restarts hmi": [
         ('kind = "manager"', 'kind = "manager"\nprocess = "hmi"')],
-    "node hmi: process = 'graph_planner': graph_planner": [
+    "node hmi: process = 'graph_planner': RM3 restarts": [
         ('name = "hmi"', 'name = "hmi"\nprocess = "graph_planner"')],
-    "recovery RM4: process = 'hmi': hmi lives there too and": [(RM4, RM4 + '\nprocess = "hmi"')],
-    "recovery RM4: parameters.nodes[1] = 'safety_pilot': the": [
+    "recovery RM4: process = 'hmi': RM4 restarts hmi, which": [(RM4, RM4 + '\nprocess = "hmi"')],
+    "nodes[1] = 'safety_pilot': it shares the process of the": [
         ('name = "safety_pilot"', 'name = "safety_pilot"\nprocess = "ftm_manager"'),
         (RM4, RM4 + '\nparameters = { nodes = ["hmi", "safety_pilot"] }')],
-    "recovery RM4: parameters.nodes[0] = 'safety_pilot': RM4": [
+    "nodes[0] = 'safety_pilot': it shares the process of RM4": [
         ('name = "safety_pilot"', 'name = "safety_pilot"\nprocess = "RM4"'),
         (RM4, RM4 + '\nparameters = { nodes = ["safety_pilot"] }')],
     "$.node: no node is of kind 'manager', so no mechanism": [(MANAGER, "")],
-    "node another: kind = 'manager': ftm_manager is of this": [
+    "node another: kind = 'manager': expected at most one": [
         (MANAGER, MANAGER + MANAGER.replace("ftm_manager", "another"))],
     "node ftm_manager: kind = 'control':": [('kind = "manager"', 'kind = "control"')],
     "node hmi: respawn = 'RM4': node 'hmi' is unreachable": [
@@ -203,7 +203,7 @@ REFUSED = {
         ('escalate_to = "RM1"            # a robot', 'escalate_to = "RM4" # a robot')],
     "RM1, the last resort, would have to wait for RM3": [
         ('claims = ["brakes"]', 'claims = ["brakes", "control_nodes"]')],
-    "recovery RM1: excused_by = ['DM5']: only what is": [
+    "recovery RM1: excused_by = ['DM5']: expected only with": [
         ("latched = true ", 'excused_by = ["DM5"]\n# ')],
     "mechanism FTM2: explains = ['FTM2']: FTM2 itself": [
         ('detect = "DM2"', 'detect = "DM2"\nexplains = ["FTM2"]')],
@@ -218,20 +218,20 @@ REFUSED = {
     "detection DM1: parameters.margin_m = 1.5: would raise": [("margin_m = 0.6", "margin_m = 1.5")],
     "$.timing.heartbeat_timeout_s = 0.2: would raise false": [
         ("arbitration_s = 0.05 ", "heartbeat_timeout_s = 0.2\narbitration_s = 0.05 ")],
-    "$.robot.hardware_speed_mps = 0.3: the drive cannot be": [
+    "$.robot.hardware_speed_mps = 0.3: expected at least": [
         ("hardware_speed_mps = 3.0", "hardware_speed_mps = 0.3")],
-    "$.robot.corridor_clearance_m = 1.5: too little to brake": [
+    "$.robot.corridor_clearance_m = 1.5: expected more than": [
         ("top_speed_mps = 1.0", "top_speed_mps = 2.5")],
     "mechanism FTM1: against = 'intrusion': DM1 needs": [("margin_m = 0.6, ", "")],
     "mechanism FTM1: against = 'parent': FTM1 is the root": [
         ('against = "intrusion"', 'against = "parent"')],
-    "$.robot.stop_distance_m = 0.2: too little to brake": [
+    "$.robot.stop_distance_m = 0.2: expected more than": [
         ("stop_distance_m = 0.8", "stop_distance_m = 0.2")],
-    "$.robot.sensing_range_m = 0.7: obstacles must be seen": [
+    "$.robot.sensing_range_m = 0.7: expected more than": [
         ("sensing_range_m = 5.0", "sensing_range_m = 0.7")],
-    "$.timing.release_hold_max_s = 10.0: must be no less": [
+    "$.timing.release_hold_max_s = 10.0: expected at least": [
         ("release_hold_s = 0.5 ", "release_hold_s = 20.0 ")],
-    "$.supervision.backoff_max_s = 2.0: must be no less than": [
+    "$.supervision.backoff_max_s = 2.0: expected at least": [
         ("[layers]", "[supervision]\nbackoff_s = 3.0\n[layers]")],
     "$.supervision.intensity = 0:": [("[layers]", "[supervision]\nintensity = 0\n[layers]")],
 }
