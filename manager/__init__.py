@@ -1,4 +1,4 @@
-"""The FTM Manager, and what it is made of; only its actor has a clock and sends anything."""
+"""The FTM Manager and its parts; only the actor has a clock and sends messages."""
 
 if __name__ != "rampart.manager":
     raise ImportError("import it as rampart.manager: everything of Rampart has this one name")

@@ -1,15 +1,13 @@
 """The FTM Manager: the arbiter as an actor.
 
-All decisions are the arbiter's. The actor hands it what detection and recovery modules report,
-in the handler of that very message, and sends the commands that come out before the handler
-returns: between a detection and its recovery no timer is waited for. Timers only repeat what is
-in force, show that the manager runs, and let the arbiter notice silence.
+The arbiter decides. The actor passes it each report, and sends the resulting commands before the
+handler of that message returns, so no recovery waits for a timer. Timers repeat commands, publish
+the status, and let the arbiter detect silence.
 
-One that was killed finds out what is in force from the recovery modules themselves, and adopts it;
-until it knows, it releases nothing. What they do not know it has from its checkpoint
-(`rampart.manager.arbitration.arbiter_memory`). That is kept *after* the commands are on their way,
-unlike elsewhere: an emergency stop does not wait for a disk, and its module knows the command
-as well.
+After its death the manager adopts what the recovery modules report as activated, and releases
+nothing before all have reported. The rest comes from its checkpoint
+(`rampart.manager.arbitration.arbiter_memory`). Unlike other actors it writes the checkpoint *after*
+sending the commands: an emergency stop does not wait for a disk.
 """
 
 from __future__ import annotations
@@ -83,7 +81,7 @@ class FtmManager(Actor):
 
     @classmethod
     def output_names(cls, topic: Topic[Any], name: str, parameters: Any) -> tuple[str, ...] | None:
-        """Command any recovery module."""
+        """Allow any recovery module as the receiver of a command."""
         return None if topic is topics.RECOVERY_COMMAND else super().output_names(
             topic, name, parameters)
 
@@ -93,7 +91,7 @@ class FtmManager(Actor):
         return tuple(topic.at(module.name) for module in modules)
 
     def on_start(self) -> None:
-        """Publish at once that the manager runs, and what it has latched."""
+        """Publish the status and the latched recoveries at once."""
         memory = self.kept(MANAGER_STATE)
         if memory is not None:
             self.arbiter_state = recall(
@@ -103,53 +101,53 @@ class FtmManager(Actor):
 
     @every(1.0)
     def remember(self) -> None:
-        """Keep what a successor cannot find out."""
+        """Write what a successor cannot find out to the checkpoint."""
         self._remembered = self.arbiter_state.number, self.arbiter_state.latched
         self.keep(MANAGER_STATE, remember(self.arbiter_state, self._arbiter))
 
-    # -- what it receives -----------------------------------------------------------------------
+    # -- inputs ---------------------------------------------------------------------------------
 
     @on(topics.DETECTION)
     def detection(self, message: m.DetectionReport, header: Header) -> None:
-        """Take in the report of a detection module."""
+        """Pass the report of a detection module to the arbiter."""
         self._step(DetectionHeard(
             header.source, message.state is m.DetectionState.ACTIVE, message.reason,
             message.nodes, message.since_s, header.stamp, header.incarnation))
 
     @on(topics.RECOVERY)
     def recovery(self, message: m.RecoveryReport, header: Header) -> None:
-        """Take in the report of a recovery module."""
+        """Pass the report of a recovery module to the arbiter."""
         self._step(RecoveryHeard(
             header.source, message.state is m.RecoveryState.ACTIVATED, message.phase,
             message.decision, message.reason))
 
     @on(topics.RESET)
     def reset(self, message: m.Reset, _header: Header) -> None:
-        """Reset a latched recovery for the operator; who obeys unknown holders resets those."""
+        """Reset a latched recovery for the operator; names of other latches are ignored."""
         if any(recovery.name == message.recovery for recovery in self._system.recoveries):
             self._step(ResetAsked(message.recovery, message.by))
 
     @on(topics.ADAPT)
     def adapt(self, message: m.AdaptationRequest, _header: Header) -> None:
-        """Change the system, if the changed one is sound and no recovery is under way."""
+        """Change the system, if the result is sound and no recovery is under way."""
         try:
             change = Change(Action(message.action), message.name,
                             msgspec.json.decode(message.values, type=dict[str, Any]))
             reason = self._change(change, message.by)
-        except Exception as error:  # whatever was typed, this manager guards a robot
+        except Exception as error:  # no input of an operator may end the manager
             reason = " ".join(str(error).split()) or type(error).__name__
         self.publish(topics.ADAPTATION, m.AdaptationAnswer(
             message.request, not reason, clip(reason), self._version))
 
     @every(1.0)
     def repeat_system(self) -> None:
-        """Repeat the changed system for those that joined late."""
+        """Repeat the changed system for late subscribers."""
         if self._adapted is not None:
             self.publish(topics.ADAPTED_SYSTEM, self._adapted)
 
     @every(0.1)
     def tick(self) -> None:
-        """Let time pass, and show that the manager runs."""
+        """Let time pass, and publish the status."""
         self.read_postings()
         self._step(Tick())
         self._show()
@@ -158,10 +156,10 @@ class FtmManager(Actor):
 
     @every(0.2)
     def repeat(self) -> None:
-        """Repeat what is wanted, in case it was lost."""
+        """Repeat the commands, in case one was lost."""
         state = self.arbiter_state
         for command in state.desired.values():
-            # One that has just started does not know yet what is in force: it releases nothing.
+            # Until all modules have reported, a running recovery must not be released.
             if command.activate or state.oriented:
                 self._command(command)
 
@@ -172,7 +170,7 @@ class FtmManager(Actor):
         return self._adapted.version if self._adapted else 0
 
     def _change(self, change: Change, by: str) -> str:
-        """Make a change at once and whole; return why not, or ""."""
+        """Apply a change, whole or not at all; return why not, or ""."""
         if not self._document:
             return "this manager was started without a system file"
         file = f"{self._system.name}.toml"
@@ -188,8 +186,7 @@ class FtmManager(Actor):
             return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
         text = msgspec.json.encode(document).decode()
         if len(text) > DOCUMENT_CHARS:
-            return (f"the system would have {len(text)} characters, at most {DOCUMENT_CHARS} are "
-                    "right")
+            return f"the system has {len(text)} characters; expected at most {DOCUMENT_CHARS}"
         arbiter = build_arbiter(system)
         self.arbiter_state = take_over(arbiter, self.arbiter_state, self.clock.now())
         self._arbiter, self._document, self._system = arbiter, document, system
@@ -198,12 +195,12 @@ class FtmManager(Actor):
         self._step(Tick())
         return ""
 
-    # -- what it does ---------------------------------------------------------------------------
+    # -- outputs --------------------------------------------------------------------------------
 
     def _step(self, event: Input) -> None:
         now_s = self.clock.now()
         self._absence.note(now_s)
-        # Before the run begins the system is starting: silence means nothing yet.
+        # Before the run begins, silence is start-up.
         is_excused = now_s <= self.context.run.plan.begins_s or self._absence.excuses(now_s)
         missed_s = now_s - self._ran_s - (0.0 if is_excused else ABSENT_S)
         self._ran_s = now_s
@@ -229,9 +226,9 @@ class FtmManager(Actor):
             self.remember()
 
     def _replace_the_overdue(self) -> None:
-        """Ask for a restart of a detection module that is not heard, once for each incarnation.
+        """Request a restart of an overdue detection module, once for each incarnation.
 
-        Not while something explains why it is late, nor soon after the manager itself was stopped.
+        Not while another detection explains the delay, nor soon after the manager was stopped.
         """
         explaining = set(self._arbiter.mechanisms.explaining)
         if self._absence.excuses(self.clock.now()) or not explaining.isdisjoint(
@@ -250,7 +247,7 @@ class FtmManager(Actor):
             name=command.recovery)
 
     def _publish_decision(self, made: DecisionMade) -> None:
-        decision = self._arbiter.explain(made)  # the commands are on their way already
+        decision = self._arbiter.explain(made)  # after the commands were sent
         self.publish(topics.DECISION, m.DecisionRecord(
             made.number, self._system.strategy, decision.active, decision.rule,
             decision.recoveries, tuple(map(clip, decision.path)),
@@ -269,16 +266,16 @@ class FtmManager(Actor):
 
 
 def _with_other_topics(before: Layout, after: Layout) -> list[str]:
-    """Return the actors that would receive or publish other topics than now."""
+    """Return the actors that would receive or publish other topics than before."""
     return [name for name, new in after.members.items() for old in [before.members[name]]
             if (heard(new), published(new)) != (heard(old), published(old))]
 
 
 def forgive_absence(state: State, missed_s: float, now_s: float) -> State:
-    """Return the state of an arbiter for which the last `missed_s` of its time did not pass.
+    """Return a state in which the last `missed_s` did not pass.
 
-    A manager that was stopped and goes on has heard no module meanwhile, and that is not their
-    fault: their reports wait unread. Taken for silence, it would be an emergency stop.
+    While a manager is stopped, the reports of all modules wait unread. Taken for silence, this
+    would be an emergency stop.
     """
     def later(at_s: float) -> float:
         return min(at_s + missed_s, now_s)

@@ -1,7 +1,4 @@
-"""The systems that ship with Rampart, as data: one TOML file each, and their airports.
-
-`rampart.manager.spec.specification` reads them.
-"""
+"""The shipped systems as data: one TOML file each, and their airports."""
 
 from __future__ import annotations
 
@@ -16,15 +13,15 @@ DEFAULT = SHIPPED / "osmosis.toml"
 
 
 def names() -> str:
-    """Return the names of the systems that ship, as words for a message."""
+    """Return the names of the shipped systems, for a message."""
     return ", ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
 
 
 def find(text: str) -> Path:
-    """Return the file that is meant by a path or by the name of a system that ships.
+    """Return the file for a path, or else for the name of a shipped system.
 
-    A file that is there comes first; nobody has looked whether what is returned is one.
+    The file may not exist.
     """
     shipped = SHIPPED / f"{text}.toml"
-    there = os.path.isfile(text)  # noqa: PTH113 a name that no file can have is no error here
-    return shipped if not there and os.path.isfile(shipped) else Path(text)  # noqa: PTH113
+    exists = os.path.isfile(text)  # noqa: PTH113 also for text that cannot be a name of a file
+    return shipped if not exists and os.path.isfile(shipped) else Path(text)  # noqa: PTH113

@@ -1,1 +1,1 @@
-"""From reports to commands: the arbiter, step by step, and what it remembers."""
+"""The arbiter, from reports to commands, and its memory."""

@@ -1,29 +1,27 @@
-"""The arbiter: from what detection and recovery modules report to what recovery modules do.
+"""The arbiter: from reports of detection and recovery modules to commands.
 
-A pure state machine, `step(state, input, now) -> (state, outputs)`: it reads no clock, sends
-nothing, and its state is immutable, so a timeline can be tested as one and all its reachable
-states can be explored. The strategy decides *which* recovery; the arbiter sees to *how*:
+It is a pure state machine, `step(state, input, now) -> (state, outputs)`, with an immutable state.
+So tests are timelines, and all reachable states can be explored. The strategy decides *which*
+recoveries run; the arbiter decides *how*:
 
-* Exactly one recovery runs under a strategy that is exclusive, as the paper's is; before one is
-  activated, every other is released. Under others those run together that the strategy chose.
-* No two hold the same resource. One that claims what a released one claimed waits for that one's
-  word that it has let go, or for its deadline, whichever comes first: a release is a message, and
-  a message takes time. Nothing claims what the last resort claims, so that never waits.
-* None is cut off. One that is not interruptible and is acting, or may be because the order is
-  still on its way, is not released but *drains*: it stays under orders until it reports that it
-  is done, degraded or idle. What comes next waits for it, with one exception: a safer recovery
-  that shares no claim with it starts at once. So an emergency stop never waits for a respawn.
-* A recovery whose cause has cleared is released, and hands control back. A latched one stays
-  until it is reset; only a safer one takes its place meanwhile. A reset is refused while the
-  cause persists. What a detection explains for a while, as an overload of the machine does many,
-  neither counts meanwhile nor latches (`Mechanism.explains`, `Contract.excused_by`); what outlasts
-  it does both.
-* A recovery that fails, is not done by its deadline, or needs a node that is reported failed is
-  followed by the one it escalates to, else by that of the mechanism above. A repair also fails if
-  it is done but its cause persists. One that is late but still acting is let be as long as no
-  other one has to wait for it: late is better than never.
-* An arbiter that starts while recoveries are activated, because the one before it was killed,
-  adopts them, and releases none before it has heard every module (or has waited long enough).
+* Under an exclusive strategy, such as the paper's, one recovery runs: every other is released
+  first. Under others, the recoveries that the strategy chose run together.
+* No two recoveries hold the same resource. The successor of a released recovery with a common claim
+  waits until that one reports that it has let go, or until its deadline. No other recovery claims
+  what the last resort claims, so the last resort never waits.
+* None is cut off. A recovery that is not interruptible, and acts or may have begun to, *drains*: it
+  stays under orders until it reports done, degraded or idle. Its successor waits, except for a
+  safer recovery without a common claim. So an emergency stop never waits for a respawn.
+* A recovery whose cause has cleared is released. A latched one stays until it is reset; only a
+  safer one takes its place meanwhile. A reset is refused while the cause persists. A cause that
+  another detection explains, such as an overload of the machine, neither counts nor latches
+  (`Mechanism.explains`, `Contract.excused_by`) unless it outlasts the explanation.
+* A recovery fails by its own report, by its deadline, or if it needs a node that is reported
+  failed. It escalates to the one that its contract names, else to that of the mechanism above. A
+  repair also fails if it is done but its cause persists. A failed recovery that is still acting may
+  finish as long as no other waits for it.
+* An arbiter that starts while recoveries are activated, because its predecessor was killed, adopts
+  them. It releases none before every module has reported or the grace time has passed.
 """
 
 from __future__ import annotations
@@ -49,7 +47,7 @@ from rampart.manager.arbitration.detection_track import (
     DetectionHeard,
     DetectionRules,
     DetectionTrack,
-    said,
+    reporting,
 )
 from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.budget import patience_s
@@ -60,23 +58,22 @@ from rampart.manager.strategies.escalation import escalate
 from rampart.manager.strategies.registry import Decider, find_strategy
 
 LARGEST_NUMBER = 1 << 52
-"""A decision number beyond it was never given, although it be reported or remembered. What may
-follow still fits into a message (`rampart.actors.bus.bounds.Count`)."""
+"""A reported or remembered decision number above it is false; its successors still fit into a
+message (`rampart.actors.bus.bounds.Count`)."""
 
 EXCUSE_S = 5.0
-"""So long before what excuses it was detected may a latch have come: an overload begins before it
-is noticed."""
-
+"""A latch up to this long before its excuse was detected is excused too: an overload begins before
+it is detected."""
 
 
 class Arbiter:
-    """The rules; all that changes is in `State`.
+    """The rules; everything that changes is in `State`.
 
     Args:
         arrangement: Mechanisms with their contracts, FTMTree, RM order.
-        strategy: The policy.
-        rules: For belief in detection modules.
-        shadow: A policy that is asked as well, and whose differing decisions are told.
+        strategy: The strategy that decides.
+        rules: Times for belief in detection modules.
+        shadow: A strategy without effect, whose differing decisions are reported.
     """
 
     def __init__(self, arrangement: Arrangement, strategy: Strategy, rules: DetectionRules,
@@ -94,16 +91,15 @@ class Arbiter:
         self._needy = {name for name, c in mechanisms.contracts.items() if c.needs}
 
     def explain(self, made: DecisionMade) -> Decision:
-        """Return a decision with its certificate, what the arbiter itself rejected included."""
+        """Return a decision with its certificate and the arbiter's own rejections."""
         reasons = self.decider.explain(made.chosen)
         return replace(
             made.decision, path=reasons.path, rejected=reasons.rejected + made.decision.rejected)
 
     def _rules_of(self, state: State, detection: str) -> DetectionRules:
-        # The hold keeps a forward recovery (a stop) from being taken up and let go with every
-        # flap. A repair that has been done has ended by itself. Held, its mechanism would still
-        # count when another becomes active, and two unrelated crashes a second apart would end
-        # in an emergency stop (block 4).
+        # The hold prevents a stop from starting and ending with every flap. A finished repair
+        # has ended by itself. If its mechanism were held active, two unrelated crashes a second
+        # apart would end in an emergency stop (block 4).
         repairs = self.mechanisms.repairs.get(detection, ())
         if repairs and all(
                 track.phase is RecoveryPhase.DONE and track.acknowledged
@@ -116,8 +112,8 @@ class Arbiter:
 
         Args:
             now: Time, seconds.
-            number: Decisions are numbered from here on. Give each incarnation of the manager a
-                higher range, so that no two decisions of a run have the same number.
+            number: Number before that of the first decision. Each incarnation of the manager needs
+                a higher range, so that no two decisions of a run have the same number.
         """
         detections = (DetectionTrack(name, heard_s=now) for name in self.mechanisms.detections)
         recoveries = (RecoveryTrack(Command(name, False, number))
@@ -128,14 +124,13 @@ class Arbiter:
         """Take one input.
 
         Args:
-            state: As returned by `initial` or by the last step.
-            event: What happened; a detection or recovery module that is not of this system is
-                ignored.
+            state: State from `initial` or from the last step.
+            event: The input; reports of unknown modules are ignored.
             now: Time, seconds; never less than before.
 
         Returns:
-            The new state, and what came of it: first commands, releases before activations, then
-            the decision and answers.
+            The new state, and the outputs: commands, releases before activations, then the
+            decision and answers.
         """
         answers: tuple[Output, ...] = ()
         match event:
@@ -157,14 +152,14 @@ class Arbiter:
                 and event.recovery in self._recovery:
             track = self._track(state, event.recovery)
             if (track.wanted or track.letting_go) and track.command not in outputs:
-                # It was respawned, or has not got the order yet.
+                # It was respawned, or has not received the order yet.
                 outputs = (track.command, *outputs)
         return state, outputs + answers
 
     def _is_quiet(self, state: State, now: float) -> bool:
-        """Tell whether nothing is active, under orders or awaited, so that time changes nothing.
+        """Return whether nothing is active, under orders or awaited, so that time changes nothing.
 
-        Nearly always it is so, and a module of some kind is heard seventy times a second.
+        This is nearly always so, while seventy reports arrive a second.
         """
         if not state.oriented or state.decision is not NOTHING_ACTIVE or state.since or state.late:
             return False
@@ -185,7 +180,7 @@ class Arbiter:
         track = self._track(state, event.recovery)
         number = state.number
         if event.activated and not state.oriented and not track.wanted and not track.heard:
-            if event.decision <= LARGEST_NUMBER:  # a larger one was never given
+            if event.decision <= LARGEST_NUMBER:
                 number = max(number, event.decision)
             command = Command(event.recovery, True, event.decision,
                               reason="adopted, it was found activated")
@@ -200,11 +195,11 @@ class Arbiter:
         unlatched = self._choose(state)[1]
         refusal = ""
         if event.recovery not in self._recovery:
-            refusal = "there is no such recovery module"
+            refusal = "the recovery module is unknown"
         elif not self._track(state, event.recovery).latched:
             refusal = "it is not latched"
         elif not state.oriented:
-            refusal = "not all modules have been heard yet"
+            refusal = "not all modules have reported yet"
         elif event.recovery in unlatched.recoveries:
             refusal = f"the cause persists: {', '.join(unlatched.active)} active"
         else:
@@ -217,7 +212,7 @@ class Arbiter:
         detections = tuple(detection_track.pass_time(t, self._rules_of(state, t.name), now)
                            for t in state.detections)
         believed = {track.name: track for track in detections}
-        active, reported = self._active(detections), said(detections)
+        active, reported = self._active(detections), reporting(detections)
         recoveries = tuple(
             self._excuse(self._judge(t, believed, active, now), believed, reported)
             for t in state.recoveries)
@@ -231,31 +226,31 @@ class Arbiter:
         return self._with_late(state, active, now) if self._patient else state
 
     def _sakes(self, recovery: str, active: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the active mechanisms for whose sake a recovery acts.
+        """Return the active mechanisms that a recovery acts for: its own, else all.
 
-        One that was chosen for another's sake, by block 4 or by escalation, acts for all.
+        Block 4 or escalation may run a recovery of a mechanism that is not active.
         """
         users = self.mechanisms.users[recovery]
         return tuple(name for name in active if name in users) or active
 
     def _judge(self, track: RecoveryTrack, believed: Mapping[str, DetectionTrack],
                active: tuple[str, ...], now: float) -> RecoveryTrack:
-        """Find a recovery to have failed, or forgive it."""
+        """Mark a recovery as failed, or clear its failure."""
         if track.failure:
             forgiven = set(track.failed_for).isdisjoint(active)
             return replace(track, failure="", failed_for=()) if forgiven else track
         contract = self.mechanisms.contracts[track.name]
         if now - track.ordered_s <= contract.deadline_s:
             return track
-        if track.letting_go:  # one that does not answer for so long is dead, and holds nothing
+        if track.letting_go:  # without an answer until the deadline it is dead, and holds nothing
             return replace(track, letting_go=False)
         if not track.wanted or not (active or track.draining):
-            return track  # latched or adopted: there is nothing to escalate for
+            return track  # latched or adopted, without a cause to escalate for
         failure = ""
         if track.unfinished:
             failure = f"not done within {contract.deadline_s:g} s"
         elif contract.kind.repairs and not track.draining:
-            # What it was not told of yet, it cannot have repaired.
+            # Only what it was ordered to repair can have outlasted the repair.
             lasting = sorted(
                 name for name, rises in track.cause
                 if believed[name].asserted and believed[name].rises == rises
@@ -269,7 +264,7 @@ class Arbiter:
 
     def _excuse(self, track: RecoveryTrack, believed: Mapping[str, DetectionTrack],
                 reported: frozenset[str]) -> RecoveryTrack:
-        """Undo a latch that is excused, unless it came long before what excuses it."""
+        """Undo a latch that is excused, unless it is much older than the excuse."""
         excusing = self.mechanisms.contracts[track.name].excused_by & reported
         if track.latched and any(
                 track.latched_s >= believed[name].since_s - EXCUSE_S for name in excusing):
@@ -279,9 +274,8 @@ class Arbiter:
     def _with_late(self, state: State, active: tuple[str, ...], now: float) -> State:
         """Note since when mechanisms have had their turn, and which of them are late.
 
-        One that has to wait for a deeper one does not lose its patience meanwhile, or it would be
-        late, and the next above in force, the moment the deeper one has succeeded. One whose
-        recovery is in force is not late; but a repair ends the error or it does not.
+        A mechanism that waits for a deeper one keeps its patience; else it would be late as soon as
+        the deeper one has succeeded. A mechanism whose forward recovery is in force is not late.
         """
         tree, mechanisms = self.arrangement.tree, self.mechanisms
         before = dict(state.since)
@@ -298,10 +292,10 @@ class Arbiter:
     def _active(self, detections: tuple[DetectionTrack, ...]) -> tuple[str, ...]:
         active = self.mechanisms.detected_by(
             (t.name for t in detections if t.active), (t.name for t in detections if t.silent))
-        return self.mechanisms.unexplained(active, said(detections))
+        return self.mechanisms.unexplained(active, reporting(detections))
 
     def _choose(self, state: State) -> tuple[Decision, Decision, Decision]:
-        """Return the strategy's decision, that after escalation, and that after latching too."""
+        """Return the strategy's decision, the one after escalation, and the one after latching."""
         chosen = decision = self.decider.choose(self._active(state.detections), state.late)
         failures = self._unmet(state) if self._needy and chosen.active else {}
         failures |= {t.name: t.failure for t in state.recoveries if t.failure}
@@ -312,9 +306,8 @@ class Arbiter:
     def _keep_latched(self, state: State, decision: Decision) -> Decision:
         """Return a decision in which the safest of the kept recoveries stays, or a safer one runs.
 
-        A latched recovery stays until an operator resets it. An adopted one was found activated by
-        an arbiter that had just started, and stays until all modules have been heard. Several stay
-        only if one drains under another.
+        A latched recovery stays until an operator resets it, an adopted one until all modules have
+        reported. Several stay only if one drains under another.
         """
         kept = [t for t in state.recoveries if t.latched or t.adopted]
         if not kept:
@@ -332,7 +325,7 @@ class Arbiter:
             (name, f"{safest.name} {why}") for name in others if name not in beneath))
 
     def _unmet(self, state: State) -> dict[str, str]:
-        """Return why recoveries are of no use now: a node that they need is reported failed."""
+        """Return the recoveries that need a node which is reported failed, and why they fail."""
         failed = {node: t.name for t in state.detections if t.active for node in t.nodes}
         return {name: f"needs {node}, which {failed[node]} reports failed"
                 for name in sorted(self._needy)
@@ -340,8 +333,8 @@ class Arbiter:
 
     def _settle(self, state: State, now: float, late_before: frozenset[str]
                 ) -> tuple[State, tuple[Output, ...]]:
-        """Decide, then command: release what is not chosen, activate what is."""
-        strategys, _, decision = self._choose(state)
+        """Decide, then release what is not chosen, and activate what is."""
+        by_strategy, _, decision = self._choose(state)
         chosen = decision.recoveries
         fresh = decision != state.decision or any(
             self._has_new_cause(state, self._track(state, name)) for name in chosen)
@@ -362,9 +355,9 @@ class Arbiter:
                 outputs.append(after.command)
         if fresh:
             detected_s = max((t.since_s for t in state.detections if t.active), default=now)
-            outputs.append(DecisionMade(state.number, decision, detected_s, strategys))
+            outputs.append(DecisionMade(state.number, decision, detected_s, by_strategy))
         if fresh or state.late != late_before:  # a patient shadow may have climbed alone
-            outputs.extend(self._ask_shadow(state, strategys))
+            outputs.extend(self._ask_shadow(state, by_strategy))
         return state, tuple(outputs)
 
     def _ask_shadow(self, state: State, chosen: Decision) -> tuple[ShadowDiffered, ...]:
@@ -376,29 +369,26 @@ class Arbiter:
         return ()
 
     def _causes(self, state: State, recovery: str) -> list[DetectionTrack]:
-        """Return the active detection modules that a recovery answers to.
-
-        One that was chosen for another's sake, by block 4 or by escalation, answers to all.
-        """
+        """Return the active detection modules that a recovery answers to: its own, else all."""
         active = [track for track in state.detections if track.active]
         own = [track for track in active if track.name in self.mechanisms.causes[recovery]]
         return own or active
 
     def _has_new_cause(self, state: State, track: RecoveryTrack) -> bool:
-        """Tell whether a recovery under orders has to be ordered again.
+        """Return whether a recovery under orders has to be ordered again.
 
-        Only a repair has to: it is an action, and there is more to repair. A forward recovery is
-        a state, which is in force already.
+        Only a repair has to, since it is an action. A forward recovery is a state that is in force
+        already.
         """
         return (track.wanted and self.mechanisms.contracts[track.name].kind.repairs
                 and self._is_news(state, track))
 
     def _is_news(self, state: State, track: RecoveryTrack, named: Callable[[str], str] = str
                  ) -> bool:
-        """Tell whether its causes, with nodes named like this, are more than it was told of."""
-        told = {named(node) for node in track.command.nodes}
+        """Return whether its causes or their nodes, as `named`, are more than in its command."""
+        ordered = {named(node) for node in track.command.nodes}
         return any((cause.name, cause.rises) not in track.cause
-                   or not {named(node) for node in cause.nodes} <= told
+                   or not {named(node) for node in cause.nodes} <= ordered
                    for cause in self._causes(state, track.name))
 
     def _release(self, track: RecoveryTrack, chosen: tuple[str, ...], number: int, now: float
@@ -412,10 +402,10 @@ class Arbiter:
         return replace(
             track, command=Command(track.name, False, number, reason=reason), cause=frozenset(),
             ordered_s=now, acknowledged=False, draining=False, adopted=False,
-            letting_go=not track.failure)  # the word of one that failed is not waited for
+            letting_go=not track.failure)  # nothing waits for a failed one to let go
 
     def _activate(self, state: State, track: RecoveryTrack, now: float) -> RecoveryTrack:
-        """Activate a recovery, order it again if need be, or let it wait for another to drain."""
+        """Activate a recovery, order it again if necessary, or let it wait for another."""
         ordered_s = now
         activated = track
         if not track.latched and self._latches(state, track):
@@ -424,8 +414,8 @@ class Arbiter:
             if not self._has_new_cause(state, track):
                 return replace(activated, draining=False)
             if not track.acknowledged or not self._is_news(state, track, _without_incarnation):
-                # It has been deaf since then; or its detection has not cleared and blames one
-                # incarnation of a node after the other: it has not ended the error.
+                # The deadline goes on: it has not acknowledged, or its detection names further
+                # incarnations of the same nodes, so that it has not ended the error.
                 ordered_s = track.ordered_s
         elif any(self._blocks(other, track.name, state.decision.recoveries)
                  for other in state.recoveries):
@@ -440,16 +430,14 @@ class Arbiter:
             acknowledged=False, draining=False, letting_go=False, adopted=False)
 
     def _latches(self, state: State, track: RecoveryTrack) -> bool:
-        """Tell whether a recovery that is chosen stays until it is reset.
-
-        One that was excused when it was taken up does if its cause outlasts the excuse.
-        """
+        """Return whether a chosen recovery latches, also later if its cause outlasts the excuse."""
         contract = self.mechanisms.contracts[track.name]
-        return contract.latched and contract.excused_by.isdisjoint(said(state.detections)) and (
-            not track.wanted or any(c.asserted for c in self._causes(state, track.name)))
+        if not contract.latched or contract.excused_by & reporting(state.detections):
+            return False
+        return not track.wanted or any(c.asserted for c in self._causes(state, track.name))
 
     def _blocks(self, other: RecoveryTrack, name: str, chosen: tuple[str, ...]) -> bool:
-        """Tell whether a recovery has to wait for another to drain, or to let go."""
+        """Return whether a recovery has to wait for another to drain, or to let go."""
         if other.name == name:
             return False
         busy = other.unfinished and not other.failure
@@ -461,7 +449,7 @@ class Arbiter:
 
 
 def _without_incarnation(node: str) -> str:
-    """Return the name of a node that is blamed as NODE#INCARNATION, or as it is."""
+    """Return the name of a node from NODE#INCARNATION or NODE."""
     return node.partition("#")[0]
 
 
@@ -470,11 +458,11 @@ def build_arbiter(spec: SystemSpec, *, first_start: bool = True) -> Arbiter:
 
     Args:
         spec: The system.
-        first_start: Whether modules may be starting as well, and are waited for accordingly; those
-            of an arbiter that was respawned run already.
+        first_start: Whether modules may still be starting and get the grace time; those of a
+            respawned arbiter run already.
 
     Raises:
-        UnknownStrategyError: No such strategy.
+        UnknownStrategyError: The strategy is unknown.
     """
     timing = spec.timing
     silence_s = timing.detection_silence_timeout_s

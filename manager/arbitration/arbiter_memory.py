@@ -1,17 +1,15 @@
-"""What of the arbiter's state must survive the FTM Manager's death, and how it is taken up again.
+"""The part of the arbiter's state that survives the FTM Manager's death.
 
-Little: an arbiter that starts learns from the modules what is detected and what is in force, adopts
-it, and releases nothing before it has heard them all. Four things only the arbiter knows:
+An arbiter that starts learns from the modules what is detected and in force, and adopts it. Four
+facts are known only to the arbiter:
 
-* *Latches.* Whether an operator has reset an emergency stop is the arbiter's knowledge. If it dies
-  together with a recovery module that cannot find out from the world what it has done (RM1 can, by
-  the brakes), no process is left that knows, and the plant would go on.
-* *That one of these does not latch*, because what it is for is explained for a while.
-* *How much a detection module has flapped*, by which its all-clear is believed sooner or later.
-* *The number of the last decision*, so that none is given twice.
+* *Latches.* If the manager dies together with a recovery module that cannot read its state from
+  the world, as RM1 can from the brakes, no other process knows that the robot must stay stopped.
+* *That a recovery does not latch*, because its cause is explained for a while.
+* *How much a detection module has flapped*, which delays the release of its mechanisms.
+* *The number of the last decision*, so that no number is used twice.
 
-A wrong memory can only stop the robot: it can latch, and release nothing whose
-cause is still there.
+A wrong memory can only stop the robot. It may latch, but releases nothing whose cause persists.
 """
 
 from __future__ import annotations
@@ -28,11 +26,10 @@ from rampart.manager.arbitration.detection_track import DetectionTrack
 
 
 class Latch(msgspec.Struct, frozen=True):
-    """A recovery that stays until it is reset: what it was told last, and for which detections.
+    """A recovery that stays until it is reset: its last command, its causes, and since when.
 
-    A safer one may have taken its place for a while. `latched_s` is since when it stays; a latch of
-    unknown age is excused by nothing. Not `latched` is one in force that would be latched, but for
-    what explains its cause.
+    Nothing excuses a latch of unknown age. `latched` is false for a recovery in force that does not
+    latch because its cause is explained.
     """
 
     command: Command
@@ -45,9 +42,9 @@ class Memory(msgspec.Struct, frozen=True):
     """What the arbiter must not forget.
 
     Attributes:
-        number: of the last decision.
-        latches: the latched recoveries, and those that what explains their causes excuses.
-        buckets: of detection modules that have flapped: name, content, and when that was true;
+        number: Number of the last decision.
+        latches: Latched recoveries, and recoveries in force that are excused from latching.
+        buckets: Name, content in s and time in s of the bucket of each module that has flapped;
             see `rampart.manager.arbitration.detection_track`.
     """
 
@@ -57,7 +54,7 @@ class Memory(msgspec.Struct, frozen=True):
 
 
 def remember(state: State, arbiter: Arbiter) -> Memory:
-    """Return what of a state must not be forgotten."""
+    """Return the memory of a state."""
     contracts = arbiter.mechanisms.contracts
     latches = (Latch(t.command, tuple(sorted(t.cause)), t.latched_s, t.latched)
                for t in state.recoveries
@@ -67,13 +64,13 @@ def remember(state: State, arbiter: Arbiter) -> Memory:
 
 
 def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
-    """Return the state in which an arbiter starts that has a memory.
+    """Return the state in which an arbiter with a memory starts.
 
     Args:
-        arbiter: the rules; modules that it does not know are left out.
-        memory: of the arbiter before.
-        now: time, seconds.
-        number: decisions are numbered from here on, or from the memory's number if that is higher.
+        arbiter: The rules; modules that they do not name are left out.
+        memory: Memory of the previous arbiter.
+        now: Time, seconds.
+        number: Number before that of the first decision, unless the memory's is higher.
     """
     state = arbiter.initial(now, max(number, memory.number))
     detections = {t.name: t for t in state.detections}
@@ -86,9 +83,9 @@ def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
 
 
 def take_over(arbiter: Arbiter, state: State, now: float) -> State:
-    """Return the state of another arbiter, one of the same system before a change, as this one's.
+    """Return the state of the arbiter before an adaptation as a state of this one.
 
-    What is known of modules that there still are is kept; new ones are waited for.
+    Tracks of modules that stay are kept; new modules are awaited.
     """
     fresh = _with_tracks(
         arbiter.initial(now, state.number), state.detections, state.recoveries)
@@ -97,16 +94,16 @@ def take_over(arbiter: Arbiter, state: State, now: float) -> State:
 
 def _with_tracks(state: State, detections: Iterable[DetectionTrack],
                  recoveries: Iterable[RecoveryTrack]) -> State:
-    """Return a state with other tracks for those of its modules that these are of."""
-    known = {track.name: track for track in detections}
+    """Return a state in which these tracks replace those of the same modules."""
+    detected = {track.name: track for track in detections}
     commanded = {track.name: track for track in recoveries}
     return replace(
-        state, detections=tuple(known.get(t.name, t) for t in state.detections),
+        state, detections=tuple(detected.get(t.name, t) for t in state.detections),
         recoveries=tuple(commanded.get(t.name, t) for t in state.recoveries))
 
 
 def objection(memory: Memory) -> str:
-    """Say why a memory makes no sense; "" if it does."""
+    """Return what is implausible in a memory, or ""."""
     if not 0 <= memory.number <= LARGEST_NUMBER:
         return f"decision number {memory.number}"
     for name, bucket_s, at_s in memory.buckets:

@@ -1,4 +1,4 @@
-"""What goes into the arbiter, what comes out of it, and what it knows in between."""
+"""Inputs, outputs and state of the arbiter."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.strategies.decision import Decision
 
 LONG_AGO_S = -1e12
-"""A time before all others; finite, for it is kept."""
+"""A time before all others; finite, because it is stored."""
 
 
 class Command(msgspec.Struct, frozen=True):
-    """What a recovery module is to do, until told otherwise.
+    """A command to a recovery module, valid until the next one.
 
     Attributes:
-        recovery: Its name.
+        recovery: Name of the module.
         activate: Activate, or release.
-        decision: Number of the decision that wants it. A new number is a new order, even if all
-            else is the same: the cause has come back and the action is to be taken again.
-        nodes: Failed nodes that it is for, as far as detection named them.
-        reason: In words.
+        decision: Number of its decision. A new number is a new order to act, even if all else is
+            equal: the cause has come back.
+        nodes: Failed nodes that detection modules named.
+        reason: Reason in words.
     """
 
     recovery: str
@@ -33,7 +33,7 @@ class Command(msgspec.Struct, frozen=True):
 
 
 class RecoveryHeard(msgspec.Struct, frozen=True, tag=True):
-    """Input: a report of a recovery module, for the decision it last obeyed."""
+    """Input: a report of a recovery module, on the decision that it last obeyed."""
 
     recovery: str
     activated: bool
@@ -46,21 +46,21 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
     """One recovery module.
 
     Attributes:
-        command: What it was last told; to be repeated until it is obeyed.
-        ordered_s: Since when its deadline runs; once it is released, since when it is.
-        cause: Detection modules for which it acts, each with the count of its rises: a cause not
-            among these is a new one.
-        heard: It was heard since the arbiter started.
-        activated: What it last reported.
-        phase: What it last reported.
-        acknowledged: It has reported to act on `command`. Until then it may be about to.
-        draining: It is superseded, and left to finish.
-        letting_go: It was released and has not confirmed it; it may hold what it claims.
-        adopted: It was found activated by an arbiter that had just started.
-        latched: It stays until reset.
-        latched_s: Since when; long ago if that is not known. Nothing else changes it.
+        command: The last command, repeated until it is obeyed.
+        ordered_s: Start of its deadline, or the time of its release.
+        cause: Detection modules for which it acts, each with its count of rises, by which a new
+            cause is recognized.
+        heard: It has reported since the arbiter started.
+        activated: Whether it is activated, by its last report.
+        phase: Phase in its last report.
+        acknowledged: It has reported to act on `command`; before, it may be about to.
+        draining: It is superseded, and finishes first.
+        letting_go: It was released and has not confirmed it, so it may still hold its claims.
+        adopted: It was activated when the arbiter started.
+        latched: It stays until it is reset.
+        latched_s: Time of latching; long ago if unknown.
         failure: Why it counts as failed; "" if it does not.
-        failed_for: Mechanisms for whose sake it failed; when none is active, all is forgiven.
+        failed_for: Mechanisms for which it failed; when none is active, the failure is cleared.
     """
 
     command: Command
@@ -90,23 +90,22 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
 
     @property
     def unfinished(self) -> bool:
-        """Whether it is, or may be for all the arbiter knows, in the middle of its action.
+        """Whether it acts, or may act because an order that it has not acknowledged is on its way.
 
-        An order that is not acknowledged is on its way: to release the module now could reach it
-        half-way.
+        A release now could reach it in the middle of its action.
         """
         return self.wanted and (not self.acknowledged or self.phase is RecoveryPhase.ACTING)
 
     @property
     def in_force(self) -> bool:
-        """Whether it has done what was ordered; the error may last after a repair."""
+        """Whether it has done what was ordered; the error may outlast a repair."""
         return (self.wanted and self.acknowledged and not self.failure
                 and self.phase in {RecoveryPhase.DONE, RecoveryPhase.DEGRADED})
 
     def heard_from(self, report: RecoveryHeard, now: float) -> RecoveryTrack:
         """Return the track after a report that arrives at `now`."""
         after = replace(self, heard=True, activated=report.activated, phase=report.phase)
-        # A report on an earlier decision does not count for this one.
+        # A report on an earlier decision says nothing about this one.
         current = report.decision == self.command.decision
         if not self.wanted:
             return replace(after, letting_go=False) if current and not report.activated else after
@@ -115,8 +114,8 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
             return replace(after, acknowledged=current, failure=(
                 report.reason or "it reports failure") if failed else self.failure)
         if self.acknowledged and not self.draining:
-            # It was at work and is idle now: it was respawned. Being done earlier earns it the
-            # whole deadline; dying half-way does not, or a crash loop would never be found out.
+            # It was respawned. If it had finished, its deadline starts again. If it died while
+            # acting, the deadline goes on, or a crash loop would never count as a failure.
             finished = self.phase is not RecoveryPhase.ACTING
             return replace(
                 after, acknowledged=False, ordered_s=now if finished else self.ordered_s)
@@ -138,14 +137,14 @@ Input = DetectionHeard | RecoveryHeard | ResetAsked | Tick
 
 
 class DecisionMade(msgspec.Struct, frozen=True, tag=True):
-    """Output: a decision, as it is carried out. `Arbiter.explain` adds the certificate.
+    """Output: a decision as it is executed. `Arbiter.explain` adds the certificate.
 
     Attributes:
         number: Counts up; commands refer to it.
-        decision: The strategy's, but `recoveries` are those that the arbiter takes after
-            escalation and latching, and `rejected` names the others.
+        decision: The strategy's decision after escalation and latching; `rejected` names the
+            recoveries that these removed.
         detected_s: When the youngest of its causes was detected.
-        chosen: The strategy's, before escalation and latching.
+        chosen: The strategy's decision.
     """
 
     number: int
@@ -155,13 +154,13 @@ class DecisionMade(msgspec.Struct, frozen=True, tag=True):
 
 
 class ShadowDiffered(msgspec.Struct, frozen=True, tag=True):
-    """Output: the strategy that runs in shadow would have run other recoveries.
+    """Output: the shadow strategy would have run other recoveries.
 
     Attributes:
-        number: Of the decision that was taken instead.
+        number: Number of the actual decision.
         strategy: Name of the shadow strategy.
-        decision: What it would have decided.
-        taken: Recoveries that the active strategy chose.
+        decision: Its decision.
+        taken: Recoveries of the active strategy.
     """
 
     number: int
@@ -182,17 +181,17 @@ Output = Command | DecisionMade | ShadowDiffered | ResetAnswered
 
 
 class State(msgspec.Struct, frozen=True):
-    """Everything the arbiter knows.
+    """The whole state of the arbiter.
 
     Attributes:
-        detections: One track for each detection module, in the sequence of the registry.
-        recoveries: One track for each recovery module, in the same way.
-        number: Of the last decision.
-        decision: The last decision, as carried out.
+        detections: One track for each detection module, in declared sequence.
+        recoveries: One track for each recovery module, likewise.
+        number: Number of the last decision.
+        decision: The last decision, as executed.
         started_s: When the arbiter started.
-        oriented: It has heard every module, or has waited long enough; adoption is over.
-        since: Active mechanisms, each with the time since when it is active.
-        late: Those whose recovery has not ended the error within its patience.
+        oriented: Every module has reported, or the grace time has passed; adoption is over.
+        since: Active mechanisms, each with the time since when it has its turn.
+        late: Mechanisms whose recovery has not ended the error within its patience.
     """
 
     detections: tuple[DetectionTrack, ...]
@@ -206,7 +205,7 @@ class State(msgspec.Struct, frozen=True):
 
     @property
     def desired(self) -> dict[str, Command]:
-        """What every recovery module is to do; repeat it until it is obeyed, and after."""
+        """The command of each recovery module, which the manager keeps repeating."""
         return {track.name: track.command for track in self.recoveries}
 
     @property
@@ -226,11 +225,11 @@ class State(msgspec.Struct, frozen=True):
 
     @property
     def busy(self) -> tuple[str, ...]:
-        """Names of the recovery modules that are in the middle of something."""
+        """Names of the recovery modules that are under orders, letting go or latched."""
         return tuple(track.name for track in self.recoveries
                      if track.wanted or track.letting_go or track.latched)
 
     @property
     def latched(self) -> tuple[str, ...]:
-        """Names of the recovery modules that stay until they are reset."""
+        """Names of the latched recovery modules."""
         return tuple(track.name for track in self.recoveries if track.latched)

@@ -1,29 +1,27 @@
 """What the arbiter believes about one detection module.
 
-Belief differs from the last report in two ways.
+Belief differs from the last report in three ways.
 
-*Silence counts as active.* A dead module cannot report its death, hence one of which there is no
-report younger than `silence_timeout_s` is taken for active, whatever the reason: also while it is
-being respawned, which takes a fraction of the timeout, and one that crashes again and again is not
-excused for good. Age is that of the report, not of its arrival: a repeated old report is silence.
+*Silence counts as active*, since a dead module cannot report its death. A module is silent if its
+last report is older than `silence_timeout_s`, for whatever reason. The age is that of the report,
+not of its arrival: a repeated old report is silence.
 
-*One that runs and is not heard is replaced* once, well before its silence counts (`overdue`): its
-way out may be broken where its heartbeat's is not. Not while others are late as well: then it is
-the machine, or who listens, and a module that is killed for being late comes later still.
+*A module whose reports do not arrive is replaced* once, well before its silence counts (`overdue`):
+its reports may be lost while its heartbeats are not. If others are late as well, the cause is the
+machine or the reader, and none is replaced.
 
-*Active at once, idle after a while.* A flapping module must not thrash the arbiter: a recovery
-started and released with every flap. So it has to stay idle for a hold before it is believed. The
-hold is a bucket: every rise pours in `release_hold_s`, and it leaks so slowly that a full one
-takes `release_hold_max_s` per portion. Therefore
+*Active at once, idle after a hold.* A flapping module must not start and release a recovery with
+every flap. The hold is a leaky bucket: each rise adds `release_hold_s`, and such a portion leaks
+out in `release_hold_max_s`. Therefore
 
-* flaps closer together than `release_hold_max_s` pour in faster than leaks out; the hold grows
-  past the gaps between them, and the flapping is seen as one long activity: no thrashing;
-* flaps further apart do not build up, and a release per `release_hold_max_s` is not thrashing;
-* the bucket is no larger than `release_hold_max_s`, so that long after the last flap the recovery
-  is released for certain: no starvation either.
+* flaps closer together than `release_hold_max_s` fill the bucket; the hold outgrows the gaps
+  between them, and the flapping counts as one long activity;
+* flaps further apart do not add up, and one release per `release_hold_max_s` is harmless;
+* the bucket holds at most `release_hold_max_s`, so the recovery is released for certain that long
+  after the last flap.
 
-A single fault finds the bucket empty and is held for `release_hold_s`. With both times 0 there is
-no hold: so it is once a repair has been done (see `Arbiter`).
+A single fault finds the bucket empty and is held for `release_hold_s`. After a finished repair
+there is no hold (see `Arbiter`).
 """
 
 from __future__ import annotations
@@ -38,13 +36,13 @@ class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
     """Input: a report of a detection module.
 
     Attributes:
-        detection: Its name.
+        detection: Name of the module.
         active: Its state.
-        reason: Why.
-        nodes: Failed nodes that it names.
+        reason: Reason in words.
+        nodes: Failed nodes.
         since_s: When it took that state.
-        stamp_s: When the report was true; infinite for now.
-        incarnation: Its own.
+        stamp_s: Time stamp of the report; infinite for now.
+        incarnation: Incarnation of the module.
     """
 
     detection: str
@@ -69,20 +67,20 @@ class DetectionTrack(msgspec.Struct, frozen=True):
     """Belief about one detection module.
 
     Attributes:
-        name: Of the module.
-        heard_s: When its newest report was true, or else when its time to report began to run.
-        incarnation: Its own, as last heard; 0 before.
-        ever_heard: Whether it was heard at all since the arbiter started.
-        reported: What it last said: active or not.
-        silent: Not heard for too long.
-        active: What the arbiter acts on.
+        name: Name of the module.
+        heard_s: Time stamp of its newest report; before the first, when its time began to run.
+        ever_heard: It has reported since the arbiter started.
+        reported: It is active by its last report.
+        silent: Its last report is too old.
+        active: The arbiter takes it for active.
         rises: How often it became active.
         since_s: Since when it is active, by its own report.
-        clear_s: When it was last seen to become idle.
-        bucket_s: Content of the bucket, at the time `bucket_at_s`.
+        clear_s: When it last became idle.
+        bucket_s: Content of the bucket at the time `bucket_at_s`.
         bucket_at_s: See `bucket_s`.
         nodes: Failed nodes that it names.
         reason: Why it is active.
+        incarnation: Incarnation of its newest report; 0 before the first.
     """
 
     name: str
@@ -102,19 +100,18 @@ class DetectionTrack(msgspec.Struct, frozen=True):
 
     @property
     def asserted(self) -> bool:
-        """Whether it is active by its own word or by its silence, rather than only held."""
+        """Whether it is active by its report or by its silence, rather than only held."""
         return self.reported or self.silent
 
 
 MANY_SHARE = 1 / 3
-"""Of the detection modules: so many are not silent by chance, each for a reason of its own."""
+"""Share of the detection modules that are not silent at once by chance."""
 
 
-def said(tracks: tuple[DetectionTrack, ...]) -> frozenset[str]:
-    """Return the modules that are active by what they reported, not only because they are silent.
+def reporting(tracks: tuple[DetectionTrack, ...]) -> frozenset[str]:
+    """Return the modules that are active by their report, not only by their silence.
 
-    Where many are silent at once it is what they have in common, and the silence of each means
-    what it would report if it could.
+    If many are silent at once, they have a common cause, and their silence counts as a report.
     """
     many_are_silent = sum(track.silent for track in tracks) >= MANY_SHARE * len(tracks)
     return frozenset(track.name for track in tracks if track.active and (
@@ -122,13 +119,13 @@ def said(tracks: tuple[DetectionTrack, ...]) -> frozenset[str]:
 
 
 OVERDUE_SHARE = 0.6
-"""Of the silence timeout: older news of a module, and it is overdue; half of that is late. Three
-reports fit in before, and its successor has time to be heard after."""
+"""Share of the silence timeout after which a module is overdue; at half of it the module is late.
+Three reports fit in before, and its successor has time to report after."""
 
 
 def overdue(tracks: tuple[DetectionTrack, ...], rules: DetectionRules, now: float
             ) -> DetectionTrack | None:
-    """Return the one module that is overdue while no other one is late, if there is one."""
+    """Return the module that is overdue while no other is late, if there is one."""
     limit_s = OVERDUE_SHARE * rules.silence_timeout_s
     late = [track for track in tracks if now - track.heard_s > limit_s / 2]
     return next((track for track in late if len(late) == 1 and now - track.heard_s > limit_s
@@ -137,7 +134,7 @@ def overdue(tracks: tuple[DetectionTrack, ...], rules: DetectionRules, now: floa
 
 def hear(track: DetectionTrack, report: DetectionHeard, rules: DetectionRules, now: float
          ) -> DetectionTrack:
-    """Take in a report that arrives at `now`; it was true then at the latest."""
+    """Return the track after a report that arrives at `now`."""
     heard_s = max(track.heard_s, min(report.stamp_s, now))
     heard = replace(track, heard_s=heard_s, ever_heard=True, reported=report.active,
                     incarnation=report.incarnation,
@@ -148,7 +145,7 @@ def hear(track: DetectionTrack, report: DetectionHeard, rules: DetectionRules, n
 
 
 def pass_time(track: DetectionTrack, rules: DetectionRules, now: float) -> DetectionTrack:
-    """Let time pass: find out silence, and let go what has been idle for long enough."""
+    """Return the track as of `now`: silent after the timeout, idle after the hold."""
     patience_s = rules.silence_timeout_s
     if not track.ever_heard:
         patience_s = max(patience_s, rules.startup_grace_s)
@@ -162,14 +159,14 @@ def pass_time(track: DetectionTrack, rules: DetectionRules, now: float) -> Detec
 
 
 def release_hold_s(track: DetectionTrack, rules: DetectionRules) -> float:
-    """How long the module must stay idle, from `clear_s` on, before that is believed."""
+    """Return how long the module must stay idle after `clear_s` to count as idle."""
     bucket_s = _bucket_s(track, rules, track.clear_s)
     return min(max(bucket_s, rules.release_hold_s), rules.release_hold_max_s)
 
 
 def _follow(before: DetectionTrack, after: DetectionTrack, rules: DetectionRules, now: float,
             since_s: float) -> DetectionTrack:
-    """Note a rise or a fall."""
+    """Return the track `after` with a rise or a fall noted."""
     if after.asserted and not before.asserted:
         bucket_s = _bucket_s(before, rules, now) + rules.release_hold_s
         return replace(
@@ -181,7 +178,7 @@ def _follow(before: DetectionTrack, after: DetectionTrack, rules: DetectionRules
 
 
 def _bucket_s(track: DetectionTrack, rules: DetectionRules, now: float) -> float:
-    """Content of the bucket now: it loses one portion in `release_hold_max_s`."""
+    """Return the content of the bucket now: it loses one portion in `release_hold_max_s`."""
     if rules.release_hold_max_s == 0:
         return 0.0
     leak = rules.release_hold_s / rules.release_hold_max_s

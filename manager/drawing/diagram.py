@@ -1,7 +1,6 @@
-"""What there is to draw of a system: its fault tree, its FTMTree, its order of the recoveries.
+"""Diagrams of a system: its fault tree, its FTMTree, its order of the recoveries.
 
-Each is a directed graph of boxes, ready for any renderer (`tree_text`, `tree_dot`, `tree_svg`).
-The boxes carry what is active and what was decided, so that a picture shows a situation.
+Each is a directed graph of boxes for any renderer. The boxes show what is active and decided.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from rampart.manager.spec.schema import MechanismSpec, SystemSpec
 from rampart.manager.strategies.registry import decision_in_words
 
 WHATS = ("fault-tree", "ftm-tree", "order")
-"""What can be drawn."""
+"""Names of the diagrams."""
 
 
 class Box(msgspec.Struct, frozen=True):
@@ -25,16 +24,16 @@ class Box(msgspec.Struct, frozen=True):
 
     Attributes:
         name: Unique in the diagram.
-        title: For people; may be "".
-        gate: Of an event: "or", "and", "at-least"; "" for a basic event and for what is none.
+        title: Title for people; may be "".
+        gate: Gate of an event: "or", "and", "at-least"; "" for all other boxes.
         required: How many inputs the gate needs.
-        inputs: How many it has.
-        mechanism: The one that is a barrier on this event, or the box itself is.
+        inputs: How many inputs the gate has.
+        mechanism: The mechanism of the box, or the barrier on the event.
         detect: Its detection gate.
         recover: Its recovery gate.
-        active: The mechanism is active; a recovery is that of an active mechanism.
-        decided: The recovery is to run, or the mechanism is one of those that ask for it; where
-            no active mechanism does, one of those that have it.
+        active: The mechanism is active; of a recovery: an active mechanism has it.
+        decided: The recovery runs, or the mechanism asks for one that runs; if no active mechanism
+            does, each mechanism with that recovery.
     """
 
     name: str
@@ -50,30 +49,30 @@ class Box(msgspec.Struct, frozen=True):
 
     @property
     def subtitle(self) -> str:
-        """The title, or "" if it says no more than the name."""
+        """The title, or "" if it only repeats the name."""
         words = "".join(c if c.isalnum() else " " for c in self.title.casefold()).split()
         return "" if words == self.name.casefold().split("_") else self.title
 
     @property
     def gate_words(self) -> str:
-        """The gate as people say it: "or", "and", "2 of 3"; "" if there is none."""
+        """The gate in words: "or", "and", "2 of 3"; "" if there is none."""
         return f"{self.required} of {self.inputs}" if self.gate == "at-least" else self.gate
 
     @property
     def barrier_words(self) -> str:
-        """The mechanism as the paper writes it, FTMx(DMy, RMz); "" if there is none."""
+        """The mechanism as in the paper, FTMx(DMy, RMz); "" if there is none."""
         return f"{self.mechanism}({self.detect}, {self.recover})" if self.mechanism else ""
 
 
 class Diagram(msgspec.Struct, frozen=True):
-    """A graph to draw; an edge goes from the upper box to the lower.
+    """A graph to draw.
 
     Attributes:
         what: One of `WHATS`.
         title: One line.
-        note: The situation, one line; "" if nothing is active.
-        boxes: All, uppers in no particular place.
-        edges: (upper, lower).
+        note: The situation in one line; "" if nothing is active.
+        boxes: All boxes, in any sequence.
+        edges: Names of (upper box, lower box).
     """
 
     what: str
@@ -84,12 +83,12 @@ class Diagram(msgspec.Struct, frozen=True):
 
     @property
     def active_words(self) -> str:
-        """What it means for a box of this diagram to be active."""
+        """The word for an active box of this diagram."""
         return "asked for" if self.what == "order" else "active"
 
 
 class Situation(msgspec.Struct, frozen=True):
-    """What is active, and what is done about it."""
+    """Active mechanisms, and the decision on them."""
 
     active: frozenset[str] = frozenset()
     recoveries: tuple[str, ...] = ()
@@ -97,7 +96,7 @@ class Situation(msgspec.Struct, frozen=True):
     strategy: str = ""
 
     def note(self, spec: SystemSpec) -> str:
-        """Return it in one line."""
+        """Return the situation in one line."""
         if not self.active:
             return ""
         active = [m.name for m in spec.mechanisms if m.name in self.active]
@@ -112,9 +111,9 @@ def draw(spec: SystemSpec, what: str, order: PartialOrder, criteria: Sequence[st
     Args:
         spec: The system.
         what: One of `WHATS`.
-        order: Of the recoveries.
-        criteria: Names of the orders that it is made of.
-        situation: To show in it.
+        order: Order of the recoveries.
+        criteria: Names of the orders of which it consists.
+        situation: The situation to show.
     """
     if what == "fault-tree":
         subject, parts = "Fault tree", _fault_tree(spec, situation)
@@ -127,7 +126,7 @@ def draw(spec: SystemSpec, what: str, order: PartialOrder, criteria: Sequence[st
 
 
 def covers(order: PartialOrder) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of neighbours of an order (its transitive reduction, the Hasse diagram)."""
+    """Return the pairs of neighbours of an order: its transitive reduction (Hasse diagram)."""
     return tuple((upper, lower) for upper in order.names
                  for lower in order.maximal(order.members(order.below[order.number[upper]])))
 
@@ -167,9 +166,10 @@ def _order(spec: SystemSpec, order: PartialOrder, situation: Situation) -> _Part
 
 
 def _bar(box: Box, mechanism: MechanismSpec, spec: SystemSpec, situation: Situation) -> Box:
-    """Return a box with a mechanism on it.
+    """Return a box with a mechanism.
 
-    It is lit if its recovery was decided on and it is active; or where no active one is, block 4.
+    It counts as decided if its recovery runs and it is active. After block 4 no active mechanism
+    has the recovery; then activity does not matter.
     """
     decided = [m.name for m in spec.mechanisms
                if not set(m.recoveries).isdisjoint(situation.recoveries)]

@@ -1,14 +1,12 @@
-"""Gives the boxes of a graph their coordinates, and the lines between them theirs.
+"""Places the boxes of a graph, and the lines between them.
 
-A tidy tree (Reingold and Tilford 1981): a box stands one layer below the lowest of those above it,
-subtrees stand side by side as near as their outlines allow, in the declared sequence, and what is
-above stands centred over what is below. So nothing of a tree crosses, and lines go down, across
-and down without touching those of others.
+The layout is a tidy tree (Reingold and Tilford 1981). A box is one layer below its lowest parent.
+Subtrees are side by side in declared sequence, as close as their outlines allow, and a parent is
+centred above its children. So no lines of a tree cross or touch.
 
-A box that several lead to belongs to the nearest box that all ways to it lead through, and stands
-centred below that, on its own layer; the lines to it slant. One that passes layers on its way gets
-a place of its own there, so that no line crosses a box. The same graph always gives the same
-picture.
+A box with several parents is centred below the nearest box that all paths to it pass; the lines to
+it slant. A line that passes layers gets its own place in each, so that it crosses no box. The same
+graph always gives the same picture.
 """
 
 from __future__ import annotations
@@ -22,17 +20,17 @@ from math import inf
 import msgspec
 
 GAP = 22.0
-"""Between two boxes of a layer."""
+"""Distance between two boxes of a layer."""
 LAYER_GAP = 34.0
-"""Between two layers."""
+"""Distance between two layers."""
 TOP = ""
-"""What all boxes belong to; it is not drawn."""
+"""Root of all boxes, which is not drawn."""
 
 Point = tuple[float, float]
 
 
 class Place(msgspec.Struct, frozen=True):
-    """Where a box is: its corner at the upper left and its size; y grows downwards."""
+    """Upper left corner and size of a box; y grows downwards."""
 
     left: float
     top: float
@@ -41,7 +39,7 @@ class Place(msgspec.Struct, frozen=True):
 
     @property
     def x(self) -> float:
-        """Of the centre line."""
+        """The x of the centre line."""
         return self.left + self.width / 2
 
     @property
@@ -54,10 +52,10 @@ class Placing(msgspec.Struct, frozen=True):
     """Coordinates of a graph, from 0 to `width` and `height`.
 
     Attributes:
-        places: Of each name.
+        places: Place of each box by its name.
         lines: For each edge, in the given sequence, the points of its line.
-        width: Of all.
-        height: Of all.
+        width: Width of the picture.
+        height: Height of the picture.
     """
 
     places: dict[str, Place]
@@ -75,7 +73,7 @@ class _Block:
         self.right = dict.fromkeys(layers, width / 2)
 
     def take(self, other: _Block, wanted: float = -inf) -> None:
-        """Take in another block, moved by `wanted`, or as much further right as it must be."""
+        """Add another block, moved right by `wanted` or as much more as it needs."""
         shift = max(wanted, *(self.right[layer] + GAP - left for layer, left in other.left.items()
                               if layer in self.right), -inf)
         self.x |= {member: x + shift for member, x in other.x.items()}
@@ -91,7 +89,7 @@ def place(sizes: Mapping[str, tuple[float, float]], edges: Sequence[tuple[str, s
     Args:
         sizes: Width and height of each box.
         edges: (upper, lower), each once; their sequence is that of the boxes of a layer.
-        square: Draw the lines of a tree across and down, else straight.
+        square: Draw the lines of a tree rectangular, else straight.
 
     Raises:
         graphlib.CycleError: The graph is not acyclic.
@@ -127,12 +125,12 @@ def place(sizes: Mapping[str, tuple[float, float]], edges: Sequence[tuple[str, s
 
 def _arrange(sizes: Mapping[str, tuple[float, float]], edges: Sequence[tuple[str, str]],
              uppers: Mapping[str, Sequence[str]]) -> tuple[dict[str, int], _Block]:
-    """Return the layer of each box, and all of them side by side."""
+    """Return the layer of each box, and the block of all boxes."""
     layer, owner = {TOP: -1}, {TOP: TOP}
     owned: dict[str, dict[str | int, None]] = {name: {} for name in (TOP, *sizes)}
 
     def meet(one: str, other: str) -> str:
-        """Return the nearest box that all ways to both lead through."""
+        """Return the nearest box that all paths to both boxes pass."""
         while one != other:
             one, other = sorted((one, other), key=layer.__getitem__)
             other = owner[other]

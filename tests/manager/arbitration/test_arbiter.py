@@ -162,7 +162,7 @@ def test_an_emergency_stop_never_waits_whatever_runs(dm, phase):
 
 @pytest.mark.parametrize(("rm", "why"), [
     ("RM1", "the cause persists: FTM1 active"), ("RM2", "it is not latched"),
-    ("RM9", "there is no such recovery module")])
+    ("RM9", "the recovery module is unknown")])
 def test_a_reset_that_is_refused_is_told_why(rm, why):
     assert Bench().play("DM1; RM1 done").reset(rm).reason == why
 
