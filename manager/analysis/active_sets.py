@@ -26,12 +26,10 @@ KEPT = 3
 
 
 class Property(msgspec.Struct, frozen=True):
-    """The verdict on one property of one strategy.
+    """The verdict on one property, see `docs/explanation/arbitration.md`.
 
     Attributes:
-        name: See `docs/explanation/arbitration.md`.
         strategy: Name of the strategy; "" if the property does not depend on one.
-        holds: No counterexample exists.
         cases: How many cases were checked.
         count: In how many of them it fails.
         counterexamples: The first few, shortest first; each is a trace, one line a step.
@@ -65,10 +63,7 @@ class Case(msgspec.Struct, frozen=True):
 class ActiveSets:
     """All active sets of an arrangement under one strategy.
 
-    Args:
-        arrangement: Mechanisms, tree, and the order that the strategy uses.
-        safety: The order that defines which recovery is safer.
-        strategy: The strategy to check.
+    `safety` is the order that defines which recovery is safer.
     """
 
     def __init__(self, arrangement: Arrangement, safety: PartialOrder, strategy: Strategy) -> None:

@@ -52,12 +52,7 @@ def _guarded(tree: FaultTree, events: Sequence[str], occurred: Sequence[str],
 
 
 def outlook(spec: SystemSpec, active: Iterable[str]) -> Outlook:
-    """Return what is left before the top event.
-
-    Args:
-        spec: The system.
-        active: Active mechanisms; the event of each counts as occurred.
-    """
+    """Return what is left before the top event if the events of active mechanisms have occurred."""
     tree = spec.build_fault_tree()
     ftms = spec.build_ftm_tree()
     event_of = {m.name: m.event for m in spec.mechanisms}

@@ -111,10 +111,7 @@ class CutSets:
         return sum(self.sizes)
 
     def sets(self, limit: int | None = None) -> Iterator[tuple[str, ...]]:
-        """Yield minimal cut sets, smaller ones first.
-
-        Args:
-            limit: At most this many; None for all.
+        """Yield minimal cut sets, smaller ones first, at most `limit` of them.
 
         Raises:
             TooLargeError: The tree is nested too deeply to list its sets; they can be counted.
@@ -133,7 +130,6 @@ class CutSets:
             yield tuple(sorted(events))
 
     def _weight(self, name: str) -> Mapping[int, int]:
-        """Return how many sets of each size a name stands for."""
         module = self._modules.get(name)
         if module is not None:
             return module.sizes[module.family]

@@ -57,7 +57,6 @@ class Report(msgspec.Struct, frozen=True):
     """What verification found.
 
     Attributes:
-        system: Name of the system.
         strategy: The strategy that the system uses.
         active_sets: How many sets of active mechanisms were checked for each strategy.
         states: How many states of the arbiter were visited, over all strategies.
@@ -198,7 +197,7 @@ def _askable(sets: ActiveSets) -> frozenset[frozenset[str]]:
 
 
 def _reachable(decision: Decision, arrangement: Arrangement) -> set[str]:
-    """Return all recoveries that escalation from a decision can lead to."""
+    """Return all recoveries that a decision and its escalations can lead to."""
     tree, contracts = arrangement.tree, arrangement.mechanisms.contracts
     found = set(decision.recoveries)
     for mechanism in decision.mechanisms:

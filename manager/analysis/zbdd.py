@@ -48,11 +48,7 @@ class Diagram:
 
 
 class Families:
-    """A store of families; equal families have equal numbers.
-
-    Args:
-        limit: Largest number of nodes.
-    """
+    """A store of families, with at most `limit` nodes; equal families have equal numbers."""
 
     def __init__(self, limit: int) -> None:
         self.variable = [1 << 60, 1 << 60]
@@ -135,10 +131,8 @@ class Families:
               ) -> dict[int, Mapping[int, int]]:
         """Return for each node of a family the number of sets of each size below it.
 
-        Args:
-            family: The family.
-            weights: For each variable, the number of sets of each size that it stands for: one of
-                size 1 if it stands for itself.
+        `weights` has, for each variable, the number of sets of each size that it stands for: one
+        of size 1 if it stands for itself.
         """
         found: dict[int, Mapping[int, int]] = {EMPTY: {}, UNIT: {0: 1}}
         nodes, _ = search(family, lambda node: (

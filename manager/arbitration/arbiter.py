@@ -449,20 +449,13 @@ class Arbiter:
 
 
 def _without_incarnation(node: str) -> str:
-    """Return the name of a node from NODE#INCARNATION or NODE."""
     return node.partition("#")[0]
 
 
 def build_arbiter(spec: SystemSpec, *, first_start: bool = True) -> Arbiter:
     """Build the arbiter of a system.
 
-    Args:
-        spec: The system.
-        first_start: Whether modules may still be starting and get the grace time; those of a
-            respawned arbiter run already.
-
-    Raises:
-        UnknownStrategyError: The strategy is unknown.
+    Modules get the grace time only at the `first_start`: those of a respawned arbiter run already.
     """
     timing = spec.timing
     silence_s = timing.detection_silence_timeout_s

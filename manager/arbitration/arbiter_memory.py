@@ -39,10 +39,9 @@ class Latch(msgspec.Struct, frozen=True):
 
 
 class Memory(msgspec.Struct, frozen=True):
-    """What the arbiter must not forget.
+    """The number of the last decision, and what else the arbiter must not forget.
 
     Attributes:
-        number: Number of the last decision.
         latches: Latched recoveries, and recoveries in force that are excused from latching.
         buckets: Name, content in s and time in s of the bucket of each module that has flapped;
             see `rampart.manager.arbitration.detection_track`.
@@ -64,13 +63,10 @@ def remember(state: State, arbiter: Arbiter) -> Memory:
 
 
 def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
-    """Return the state in which an arbiter with a memory starts.
+    """Return the state in which an arbiter with a memory starts at time `now`, seconds.
 
-    Args:
-        arbiter: The rules; modules that they do not name are left out.
-        memory: Memory of the previous arbiter.
-        now: Time, seconds.
-        number: Number before that of the first decision, unless the memory's is higher.
+    Modules that the arbiter does not know are left out. `number` is the number before that of the
+    first decision, unless the memory's is higher.
     """
     state = arbiter.initial(now, max(number, memory.number))
     detections = {t.name: t for t in state.detections}

@@ -16,13 +16,8 @@ LONG_AGO_S = -1e12
 class Command(msgspec.Struct, frozen=True):
     """A command to a recovery module, valid until the next one.
 
-    Attributes:
-        recovery: Name of the module.
-        activate: Activate, or release.
-        decision: Number of its decision. A new number is a new order to act, even if all else is
-            equal: the cause has come back.
-        nodes: Failed nodes that detection modules named.
-        reason: Reason in words.
+    `nodes` are the failed nodes that detection modules named. A new number of the `decision` is a
+    new order to act, even if all else is equal: the cause has come back.
     """
 
     recovery: str
@@ -154,13 +149,9 @@ class DecisionMade(msgspec.Struct, frozen=True, tag=True):
 
 
 class ShadowDiffered(msgspec.Struct, frozen=True, tag=True):
-    """Output: the shadow strategy would have run other recoveries.
+    """Output: the shadow `strategy` would have decided otherwise than decision `number`.
 
-    Attributes:
-        number: Number of the actual decision.
-        strategy: Name of the shadow strategy.
-        decision: Its decision.
-        taken: Recoveries of the active strategy.
+    `taken` are the recoveries of the active strategy.
     """
 
     number: int

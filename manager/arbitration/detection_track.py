@@ -33,16 +33,9 @@ from msgspec.structs import replace
 
 
 class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
-    """Input: a report of a detection module.
+    """Input: a report of a detection module, active or idle since `since_s`.
 
-    Attributes:
-        detection: Name of the module.
-        active: Its state.
-        reason: Reason in words.
-        nodes: Failed nodes.
-        since_s: When it took that state.
-        stamp_s: Time stamp of the report; infinite for now.
-        incarnation: Incarnation of the module.
+    `nodes` are failed nodes. `stamp_s` is the time stamp of the report, infinite for now.
     """
 
     detection: str
@@ -67,7 +60,6 @@ class DetectionTrack(msgspec.Struct, frozen=True):
     """Belief about one detection module.
 
     Attributes:
-        name: Name of the module.
         heard_s: Time stamp of its newest report; before the first, when its time began to run.
         ever_heard: It has reported since the arbiter started.
         reported: It is active by its last report.
@@ -79,8 +71,7 @@ class DetectionTrack(msgspec.Struct, frozen=True):
         bucket_s: Content of the bucket at the time `bucket_at_s`.
         bucket_at_s: See `bucket_s`.
         nodes: Failed nodes that it names.
-        reason: Why it is active.
-        incarnation: Incarnation of its newest report; 0 before the first.
+        incarnation: Of its newest report; 0 before the first.
     """
 
     name: str

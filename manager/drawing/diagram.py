@@ -23,14 +23,10 @@ class Box(msgspec.Struct, frozen=True):
     """An event, a mechanism or a recovery.
 
     Attributes:
-        name: Unique in the diagram.
-        title: Title for people; may be "".
         gate: Gate of an event: "or", "and", "at-least"; "" for all other boxes.
         required: How many inputs the gate needs.
         inputs: How many inputs the gate has.
         mechanism: The mechanism of the box, or the barrier on the event.
-        detect: Its detection gate.
-        recover: Its recovery gate.
         active: The mechanism is active; of a recovery: an active mechanism has it.
         decided: The recovery runs, or the mechanism asks for one that runs; if no active mechanism
             does, each mechanism with that recovery.
@@ -65,14 +61,9 @@ class Box(msgspec.Struct, frozen=True):
 
 
 class Diagram(msgspec.Struct, frozen=True):
-    """A graph to draw.
+    """A graph to draw: one of `WHATS`, with edges (upper box, lower box).
 
-    Attributes:
-        what: One of `WHATS`.
-        title: One line.
-        note: The situation in one line; "" if nothing is active.
-        boxes: All boxes, in any sequence.
-        edges: Names of (upper box, lower box).
+    `note` is the situation in one line, "" if nothing is active.
     """
 
     what: str
@@ -106,14 +97,9 @@ class Situation(msgspec.Struct, frozen=True):
 
 def draw(spec: SystemSpec, what: str, order: PartialOrder, criteria: Sequence[str],
          situation: Situation) -> Diagram:
-    """Return one of the diagrams of a system.
+    """Return a diagram of a system, one of `WHATS`.
 
-    Args:
-        spec: The system.
-        what: One of `WHATS`.
-        order: Order of the recoveries.
-        criteria: Names of the orders of which it consists.
-        situation: The situation to show.
+    `criteria` are the names of the orders of which `order` consists.
     """
     if what == "fault-tree":
         subject, parts = "Fault tree", _fault_tree(spec, situation)

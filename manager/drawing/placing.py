@@ -51,11 +51,7 @@ class Place(msgspec.Struct, frozen=True):
 class Placing(msgspec.Struct, frozen=True):
     """Coordinates of a graph, from 0 to `width` and `height`.
 
-    Attributes:
-        places: Place of each box by its name.
-        lines: For each edge, in the given sequence, the points of its line.
-        width: Width of the picture.
-        height: Height of the picture.
+    `places` has each box by its name, `lines` the points of the line of each edge.
     """
 
     places: dict[str, Place]

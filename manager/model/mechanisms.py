@@ -149,12 +149,7 @@ class Mechanisms:
 
     def detected_by(self, active_detections: Iterable[str], silent: Iterable[str] = ()
                     ) -> tuple[str, ...]:
-        """Return the mechanisms that are active if these detection modules are.
-
-        Args:
-            active_detections: Active modules, silent ones included.
-            silent: The modules that are silent.
-        """
+        """Return the mechanisms that are active if these modules are (`silent` ones included)."""
         active, mute = set(active_detections), set(silent)
         if not active:
             return ()
@@ -163,9 +158,7 @@ class Mechanisms:
     def unexplained(self, active: tuple[str, ...], reported: Set[str]) -> tuple[str, ...]:
         """Return the active mechanisms that no other mechanism explains.
 
-        Args:
-            active: Active mechanisms.
-            reported: Modules that are active by their report, not only by their silence.
+        `reported` are the modules that are active by their report, not only by their silence.
         """
         if not self.explaining:
             return active

@@ -191,12 +191,7 @@ class Tree(PartialOrder):
 
 def contradictions(tree: Tree, order: PartialOrder, of: Mapping[str, Sequence[str]]
                    ) -> Iterator[tuple[str, str, str, str]]:
-    """Yield where the order of recoveries contradicts the tree of mechanisms.
-
-    Args:
-        tree: The FTMTree.
-        order: The order of the recoveries.
-        of: Mechanism → its recoveries.
+    """Yield where the order of recoveries contradicts the FTMTree; `of`: mechanism → recoveries.
 
     Yields:
         An upper mechanism, a lower one, and a recovery of the lower one that is above a recovery

@@ -62,15 +62,7 @@ class ChangeError(ValueError):
 
 
 def adapt(document: Document, change: Change, file: str) -> tuple[Document, SystemSpec]:
-    """Apply a change.
-
-    Args:
-        document: The running system as TOML reads it; it stays as it is.
-        change: The change.
-        file: Name of the system's file, for messages.
-
-    Returns:
-        The new document, and the system it describes.
+    """Return a changed copy of a document, and the system that it describes.
 
     Raises:
         ChangeError: The name or a value of the change is unknown or missing.

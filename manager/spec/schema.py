@@ -48,9 +48,6 @@ class DetectionSpec(Table, frozen=True):
     """A detection module.
 
     Attributes:
-        name: Name of the module, e.g. "DM1".
-        title: Title for people.
-        actor: Its class, `module:Class`.
         within_s: Longest time from the error to the report; a number or the name of a `[timing]`
             value. Default: `parameters.timeout_s`.
         process: Name of its OS process; "" for the name of the module.
@@ -128,7 +125,6 @@ class MechanismSpec(Table, frozen=True):
     """FTMx(DMy, RMz), a barrier on an event of the fault tree.
 
     Attributes:
-        name: Name of the mechanism, e.g. "FTM1".
         detect: A detection module, or a gate over several (`rampart.manager.model.gates`).
         recover: A recovery module, or a gate over several.
         event: The event of the fault tree on which it is a barrier.
@@ -188,8 +184,6 @@ class FaultSpec(Table, frozen=True):
     """A named fault that changes the messages of one topic; see `Injection`.
 
     Attributes:
-        name: Name to type, e.g. "gauge-stuck".
-        title: Title for people.
         topic: Key of the topic below `rampart/`.
         mode: What happens to its messages: "drop", "corrupt" and so on.
         kind: Group in lists and pictures: "sensor", "actuator" and so on.
@@ -327,12 +321,7 @@ class SystemSpec(Table, frozen=True):
 
     def build_mechanisms(self, patience_s: Mapping[str, float] = MappingProxyType({})
                          ) -> Mechanisms:
-        """Build the registry of mechanisms and recovery contracts.
-
-        Args:
-            patience_s: For each mechanism, how long its recovery may take; see
-                `rampart.manager.spec.budget.patience_s`.
-        """
+        """Build the registry of mechanisms and contracts; see `budget.patience_s` for patience."""
         return Mechanisms(
             [Mechanism(m.name, m.detect, m.recover, patience_s.get(m.name, math.inf), m.explains)
              for m in self.mechanisms],

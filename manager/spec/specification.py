@@ -41,14 +41,9 @@ INTERFACES = "interfaces"
 
 
 def parse_specification(text: str, file: str) -> SystemSpec:
-    """Read a system spec and check it.
+    """Read a system spec from TOML and check it; messages name `file`.
 
-    Args:
-        text: TOML.
-        file: Name to use in messages.
-
-    Returns:
-        The spec, with every timing value a number.
+    Every timing value of the result is a number.
 
     Raises:
         SpecificationError: The text is not TOML, a field is missing, unknown or of the wrong type,
@@ -124,13 +119,7 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
 
 def read_rows(rows: Sequence[dict[str, Any]], kind: type[Row], table: str, file: str
               ) -> tuple[Row, ...]:
-    """Read the rows of a table that belongs to an actor.
-
-    Args:
-        rows: The rows as in the spec.
-        kind: Type of a row.
-        table: Name of the table in the file.
-        file: Name to use in messages.
+    """Read the rows of a table that belongs to an actor; messages name `table` and `file`.
 
     Raises:
         SpecificationError: A field is missing, unknown or of the wrong type.

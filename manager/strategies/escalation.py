@@ -17,16 +17,9 @@ from rampart.manager.strategies.decision import Decision
 
 
 def escalate(decision: Decision, failures: Mapping[str, str], arrangement: Arrangement) -> Decision:
-    """Replace failed recoveries in a decision.
+    """Replace failed recoveries in a decision; `failures`: failed recovery → reason.
 
-    Args:
-        decision: Decision of the strategy.
-        failures: Failed recovery → reason.
-        arrangement: Mechanisms with their contracts, and the FTMTree.
-
-    Returns:
-        The decision with the successors; each failed recovery is rejected, with the reason and its
-        successor.
+    Each failed recovery is among the rejected ones, with the reason and its successor.
     """
     recover = arrangement.mechanisms.recover
     recoveries: dict[str, None] = {}

@@ -94,15 +94,9 @@ def named(name: str, titles: Mapping[str, str]) -> str:
 def decision_in_words(active: Sequence[str], rule: int, recoveries: Sequence[str],
                       strategy: str = "safety-first",
                       titles: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return a decision as one sentence.
+    """Return a decision as one sentence, with `SystemSpec.titles` if given.
 
-    Args:
-        active: Active mechanisms.
-        rule: Number of the rule.
-        recoveries: The recoveries that run.
-        strategy: Name of the strategy; if it is unknown, as in an old recording, the rule is shown
-            as a number only.
-        titles: Titles of mechanisms and recoveries, see `SystemSpec.titles`.
+    If the strategy is unknown, as in an old recording, the rule is shown as a number only.
     """
     active, recoveries = ([named(name, titles) for name in names] for names in (active, recoveries))
     if not active and recoveries:

@@ -47,7 +47,7 @@ WRONG = [
     ('hears = ["tug/command"]', 'hears = ["tug/command", "tug/command"]', "wheels: hears = .*twi"),
     ('hears = ["tug/command"]', 'hears = ["detection/{name}"]', "wheels: hears = .*: exp"),
     ('stand_in = "cart:VirtualWheels"', "parameters = { radius_m = 0.1 }", "wheels: parameters: "),
-    (f'{COMMAND}\nkind = "control"', f'{COMMAND}\nkind = "manager"', "wheels: comm.*: an actor"),
+    (f'{COMMAND}\nkind = "control"', f'{COMMAND}\nkind = "manager"', "wheels: comm.*: exp.* actor"),
     (BEAT, f"{BEAT}\nlimits = {{ memory = 1 }}", "node wheels: limits.memory = 1: unknown field"),
     (BEAT, f"{BEAT}\nlimits = {{ open_files = 1 }}", "node wheels: limits.open_files = 1: exp"),
     ("cart:VirtualWheels", "cart.VirtualWheels", "node wheels: stand_in = .*: expected"),
