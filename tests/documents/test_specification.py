@@ -196,5 +196,5 @@ def test_the_gates_it_shows_are_gates(text):
 def test_nesting_without_end_is_one_line_and_no_traceback():
     with pytest.raises(SpecificationError, match=r"^x.toml: \$: nested more than 32 deep"):
         read_document("a = " + "[" * 100_000 + "]" * 100_000, "x.toml")
-    with pytest.raises(GateError, match="200001 names, .*; expected at most 400"):
+    with pytest.raises(GateError, match="200001 names, words and parentheses; expected"):
         detection_gate("(" * 100_000 + "DM1" + ")" * 100_000)
