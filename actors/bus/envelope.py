@@ -22,7 +22,7 @@ from rampart.actors.bus.topic import Qos, Topic
 B = TypeVar("B")
 
 UNREADABLE = (ValueError, RecursionError)
-"""Errors of decoding foreign bytes: those of msgspec and of invalid UTF-8, and of deep nesting."""
+"""Errors of decoding foreign bytes: msgspec, invalid UTF-8, deep nesting."""
 
 AHEAD_S = 0.1
 """Largest clock jitter, simulated seconds; a stamp further in the future is wrong."""
@@ -107,7 +107,7 @@ def decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
 
 
 @dataclass(slots=True)
-class _Heard:
+class _Source:
     """Messages received from the present incarnation of a source.
 
     Attributes:
@@ -146,7 +146,7 @@ class ArrivalGuard:
         self._crowded = crowded
         self._register = register
         self._command_age_s = command_age_s
-        self._heard: dict[str, _Heard] = {}
+        self._sources: dict[str, _Source] = {}
         self._strangers: deque[str] = deque()
 
     def receiver(self, topic: Topic[Any], take: Callable[[str, Envelope[Any]], None],
@@ -160,7 +160,7 @@ class ArrivalGuard:
                 future, is an old command, or comes from a superseded incarnation.
         """
         unpack, kind = decoder(topic.type), topic.type.__name__
-        heard_of, meet, is_command = self._heard, self._meet, topic.qos is Qos.COMMAND
+        sources, meet, is_command = self._sources, self._meet, topic.qos is Qos.COMMAND
         now, object_to, age_s = self._now, self._object_to, self._command_age_s
 
         def receive(key: str, payload: bytes) -> None:  # called for every message
@@ -178,26 +178,26 @@ class ArrivalGuard:
                 refuse(key, f"stamped {ahead_s:.2f} s ahead of now" if not ahead_s <= AHEAD_S
                        else f"a command, given {-ahead_s:.2f} s ago")
                 return
-            heard = heard_of.get(message.source)
-            if heard is None or heard.incarnation != message.incarnation or (
-                    now_s - heard.at_s > _PAUSE_S):
-                if objection := object_to(heard, message):
+            source = sources.get(message.source)
+            if source is None or source.incarnation != message.incarnation or (
+                    now_s - source.at_s > _PAUSE_S):
+                if objection := object_to(source, message):
                     refuse(key, objection)
                     return
-                if heard is None or heard.incarnation != message.incarnation:
-                    heard = meet(message.source, message.incarnation)
-            heard.at_s = now_s
+                if source is None or source.incarnation != message.incarnation:
+                    source = meet(message.source, message.incarnation)
+            source.at_s = now_s
             sequence = message.sequence
             if is_command:
-                recent = heard.recent.get(key)
+                recent = source.recent.get(key)
                 if recent is None:
-                    _make_room(heard.recent)
-                    recent = heard.recent[key] = deque(maxlen=_REMEMBERED_COMMANDS)
+                    _make_room(source.recent)
+                    recent = source.recent[key] = deque(maxlen=_REMEMBERED_COMMANDS)
                 if sequence in recent:
                     return
                 recent.append(sequence)
             else:
-                newest = heard.newest
+                newest = source.newest
                 before = newest.get(key)
                 if before is None:
                     _make_room(newest)
@@ -208,25 +208,24 @@ class ArrivalGuard:
 
         return receive
 
-    def _object_to(self, heard: _Heard | None, message: Header) -> str:
+    def _object_to(self, source: _Source | None, message: Header) -> str:
         """Return why an incarnation is not a node's present one; "" if it may be."""
         which = f"incarnation {message.incarnation} of {message.source}"
-        if heard is not None and message.incarnation < heard.incarnation:
-            return f"{which} was superseded by {heard.incarnation}"
+        if source is not None and message.incarnation < source.incarnation:
+            return f"{which} was superseded by {source.incarnation}"
         issued = self._register(message.source)
         if issued is not None and message.incarnation != issued:
             return f"{which}, of which {issued} was issued last"
         return ""
 
-    def _meet(self, source: str, incarnation: int) -> _Heard:
-        heard = _Heard(incarnation)
-        if source not in self._members and source not in self._heard:
-            self._strangers.append(source)
+    def _meet(self, name: str, incarnation: int) -> _Source:
+        if name not in self._members and name not in self._sources:
+            self._strangers.append(name)
             if len(self._strangers) > STRANGERS:
-                self._heard.pop(self._strangers.popleft(), None)
+                self._sources.pop(self._strangers.popleft(), None)
                 self._crowded()
-        self._heard[source] = heard
-        return heard
+        source = self._sources[name] = _Source(incarnation)
+        return source
 
 
 def _make_room(by_key: dict[str, Any]) -> None:

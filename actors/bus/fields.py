@@ -1,7 +1,7 @@
 """Fields of messages by name: `pose.x_m`, `cells[2].voltage_v`, `ranges_m[min]`.
 
-A path is names separated by dots. Of a list, brackets choose one item by its number (from 0; -1
-is the last), the least or greatest (`[min]`, `[max]`), or how many there are (`[len]`).
+A path is names separated by dots. Brackets choose an item of a list by its number (from 0; -1 is
+the last), its least or greatest item (`[min]`, `[max]`), or its length (`[len]`).
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class Field:
     """A field of the messages of a type.
 
     Args:
-        message: type of the messages.
-        path: of the field.
+        message: Type of the messages.
+        path: Path of the field.
 
     Attributes:
         kind: "number", "text" or "truth".
 
     Raises:
-        ValueError: there is no such field, or it is none of these; one line.
+        ValueError: The field does not exist or has another kind.
     """
 
     def __init__(self, message: type[msgspec.Struct], path: str) -> None:
@@ -49,15 +49,15 @@ class Field:
             info = _follow(_plain(info), step, path)
         kind = _SIMPLE.get(type(_plain(info)))
         if kind is None:
-            raise ValueError(f"{path}: not a number, a text or a truth value")
+            raise ValueError(f"{path}: expected a number, a text or a truth value")
         self.kind = kind
 
     def beyond(self, message: Any) -> str:
-        """Return which item a list of a message is too short for, "" if none is."""
+        """Return which item a list of the message is too short for; "" if all exist."""
         value = message
         for step in self._steps:
             if isinstance(step, int) and value is not None and not -len(value) <= step < len(value):
-                return f"{self.path}: [{step}] of a list of {len(value)} items"
+                return f"{self.path}: no item [{step}], the list has {len(value)}"
             value = _taken(value, step)
         return ""
 
@@ -85,17 +85,17 @@ def _steps(path: str) -> list[str | int]:
     while at < len(path):
         found = _STEP.match(path, at)
         if found is None or (at == 0 and path[0] == "."):
-            raise ValueError(f"{path}: no path of a field, e.g. pose.x_m or ranges_m[0]")
+            raise ValueError(f"{path}: not a path of a field, such as pose.x_m or ranges_m[0]")
         name, index = found.groups()
         steps.append(name or (index if index in _FOLDS else int(index)))
         at = found.end()
     if not steps:
-        raise ValueError("a field has to be named")
+        raise ValueError("expected the name of a field")
     return steps
 
 
 def _plain(info: inspect.Type) -> inspect.Type:
-    """Return a type without what is said of it and without None."""
+    """Return a type without its metadata and without None."""
     if isinstance(info, inspect.Metadata):
         return _plain(info.type)
     if isinstance(info, inspect.UnionType):
@@ -107,7 +107,7 @@ def _plain(info: inspect.Type) -> inspect.Type:
 def _follow(info: inspect.Type, step: str | int, path: str) -> inspect.Type:
     if isinstance(step, int) or (step in _FOLDS and isinstance(info, _LISTS)):
         if not isinstance(info, _LISTS):
-            raise ValueError(f"{path}: [{step}] of what is no list")
+            raise ValueError(f"{path}: cannot take [{step}]: the value is not a list")
         if step == "len":
             return inspect.IntType()
         fixed = info.item_types if isinstance(info, inspect.TupleType) else ()
@@ -119,7 +119,7 @@ def _follow(info: inspect.Type, step: str | int, path: str) -> inspect.Type:
             return fixed[step if isinstance(step, int) else 0]
         return info.item_type
     if not isinstance(info, inspect.StructType):
-        raise ValueError(f"{path}: {step} of what has no fields")
+        raise ValueError(f"{path}: cannot take {step}: the value has no fields")
     known = {field.name: field.type for field in info.fields}
     if step not in known:
         near = difflib.get_close_matches(step, known, 1)
@@ -128,20 +128,20 @@ def _follow(info: inspect.Type, step: str | int, path: str) -> inspect.Type:
     return known[step]
 
 
-class Steered:
-    """Messages that say where a stick is: one or two numbers, and whether it is held.
+class StickMessages:
+    """Makes the messages of a joystick: one or two numbers, and whether the stick is held.
 
-    A number is at its greatest where the stick is at 1, at its least where that is at -1: at the
-    bounds of its type, which are 1 and -1 where it has none, or at plus and minus its `scale`.
+    Full deflection gives a number's greatest or least value: the bounds of its type (1 and -1
+    without bounds), or plus and minus its `scale`.
 
     Args:
-        message: type of the messages.
-        fields: those of the numbers.
-        held: that of the truth value, "" for none.
-        scale: for each number what it is at 1; () for the bounds of its type.
+        message: Type of the messages.
+        fields: Fields of the numbers.
+        held: Field of the truth value; "" for none.
+        scale: Value of each number at full deflection; () for the bounds of its type.
 
     Raises:
-        ValueError: no such message can be made; one line.
+        ValueError: No such message can be made.
     """
 
     def __init__(self, message: type[msgspec.Struct], fields: Sequence[str], held: str = "",
@@ -150,12 +150,12 @@ class Steered:
         steered = (*fields, held) if held else tuple(fields)
         for name in steered:
             if name not in known:
-                raise ValueError(f"{name}: a whole field of {message.__name__} is right: "
+                raise ValueError(f"{name}: not a field of {message.__name__}; expected one of "
                                  f"{', '.join(known)}")
         if left := [name for name, field in known.items()
                     if field.required and name not in steered]:
-            raise ValueError(f"nothing says what {', '.join(left)} of {message.__name__} is; a "
-                             "default in its class is right")
+            raise ValueError(f"{message.__name__} has no value for {', '.join(left)}; expected a "
+                             "default in its class")
         self._message = message
         self._held = held
         self._ends = {name: _ends(known[name].type, scale[i] if scale else None)
@@ -165,24 +165,24 @@ class Steered:
                 try:
                     msgspec.convert(value, known[name].type)
                 except ValueError as error:
-                    when = "at rest" if value == 0 else "at full stick"
-                    raise ValueError(f"{name} = {value:g} {when}: {error}; a scale within its "
-                                     "bounds is right") from None
+                    when = "at rest" if value == 0 else "at full deflection"
+                    raise ValueError(f"{name} = {value:g} {when}: {error}; expected a scale within "
+                                     "its bounds") from None
 
     def __call__(self, position: Sequence[float] | None) -> msgspec.Struct:
-        """Return the message of a stick that is held at a position in [-1, 1], None: at rest."""
-        said: dict[str, Any] = {self._held: position is not None} if self._held else {}
+        """Return the message of a stick held at a position in [-1, 1], or at rest (None)."""
+        values: dict[str, Any] = {self._held: position is not None} if self._held else {}
         for (name, (low, high)), at in zip(self._ends.items(), position or (0, 0), strict=False):
             value = (at * high if at >= 0 else -at * low) + 0.0  # no -0
-            said[name] = round(value) if isinstance(high, int) else value
-        return self._message(**said)
+            values[name] = round(value) if isinstance(high, int) else value
+        return self._message(**values)
 
 
 def _ends(kind: Any, scale: float | None) -> tuple[float, float]:
-    """Return what a number is at -1 and at 1, as whole numbers if it is one."""
+    """Return the values of a number at -1 and at 1; integers for an integer field."""
     info = _plain(inspect.type_info(kind))
-    as_said = int if isinstance(info, inspect.IntType) else float
+    number = int if isinstance(info, inspect.IntType) else float
     low, high = getattr(info, "ge", None), getattr(info, "le", None)
     if scale is not None:
         low, high = -scale, scale
-    return as_said(-1 if low is None else low), as_said(1 if high is None else high)
+    return number(-1 if low is None else low), number(1 if high is None else high)

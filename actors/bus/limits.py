@@ -1,8 +1,7 @@
-"""What keeps a flood of messages from becoming a flood of memory or of lines.
+"""Limits that keep a flood of messages from filling memory or logs.
 
-Whatever a node remembers by a name that a message told it has room for so many names and no more,
-and whatever it repeats to others leaves so many times a second. What is over the bound is counted,
-and the owner of the bound reports the count: nothing disappears unseen.
+State that is kept by names from messages has a maximum size. Output that repeats messages has a
+maximum rate. Whatever exceeds a limit is counted, and the owner of the limit reports the count.
 """
 
 from __future__ import annotations
@@ -15,15 +14,13 @@ V = TypeVar("V")
 
 
 class Remembered(Generic[K, V], dict[K, V]):
-    """A dictionary with room for so many keys: with one more, the one put in first is forgotten.
-
-    Only `[key] = value` looks at the room.
+    """A dictionary that forgets its oldest key if `[key] = value` exceeds its size.
 
     Args:
-        room: keys at most.
+        room: Largest number of keys.
 
     Attributes:
-        forgotten: how many there were no room for.
+        forgotten: Number of keys forgotten so far.
     """
 
     def __init__(self, room: int) -> None:
@@ -32,7 +29,7 @@ class Remembered(Generic[K, V], dict[K, V]):
         self.forgotten = 0
 
     def __setitem__(self, key: K, value: V) -> None:
-        """Put a value in, in the place of the oldest if the key is new and there is no room."""
+        """Set a value; remove the oldest key if this one is new and there is no room."""
         if key not in self and len(self) >= self.room:
             del self[next(iter(self))]
             self.forgotten += 1
@@ -40,10 +37,10 @@ class Remembered(Generic[K, V], dict[K, V]):
 
 
 class RateLimit:
-    """So many a second pass; the others are counted. Pure.
+    """Lets a number of events per second pass and counts the others. Pure.
 
     Args:
-        per_s: that pass in a second of the clock whose time is told.
+        per_s: Events per second of the caller's clock.
     """
 
     def __init__(self, per_s: int) -> None:
@@ -52,7 +49,7 @@ class RateLimit:
         self._passed = self._left_out = 0
 
     def allows(self, now_s: float) -> bool:
-        """Whether one more may pass now; if not it is counted."""
+        """Whether an event may pass now; it is counted if not."""
         if not 0 <= now_s - self._begun_s < 1.0:
             self._begun_s, self._passed = now_s, 0
         if self._passed >= self._per_s:
@@ -62,7 +59,7 @@ class RateLimit:
         return True
 
     def left_out(self, now_s: float) -> int:
-        """Return how many did not pass since the last time, once their second is over; else 0."""
+        """Return how many events were stopped since the last call, once their second is over."""
         if not self._left_out or 0 <= now_s - self._begun_s < 1.0:
             return 0
         count, self._left_out = self._left_out, 0
@@ -70,7 +67,7 @@ class RateLimit:
 
 
 REPORTS_PER_S = 20
-"""Error reports of one node; a node with more to say says how many it left out."""
+"""Error reports of one node. A node with more reports how many it left out."""
 
 _OFFENDERS = 256
 _SLOT_CHARS = 512
@@ -78,14 +75,14 @@ _SAME_S = 1.0
 
 
 class ReportLimit:
-    """Which error reports leave a node: of one kind one a second, and not too many in all. Pure."""
+    """Limits the error reports of a node: one per kind and second, and a total rate. Pure."""
 
     def __init__(self) -> None:
         self._sent: Remembered[str, tuple[float, int]] = Remembered(_OFFENDERS)
         self._all = RateLimit(REPORTS_PER_S)
 
     def stands_for(self, slot: str, now_s: float) -> int:
-        """Return how many of its kind a report stands for that leaves now; 0 if it must not."""
+        """Return how many reports of its kind a report stands for; 0 if it must not leave now."""
         slot = slot[:_SLOT_CHARS]
         last_s, count = self._sent.get(slot, (-math.inf, 0))
         if now_s - last_s < _SAME_S:
@@ -97,5 +94,5 @@ class ReportLimit:
         return count + 1
 
     def left_out(self, now_s: float) -> int:
-        """Return how many reports did not leave since the last time because there were too many."""
+        """Return how many reports the total rate stopped since the last call."""
         return self._all.left_out(now_s)

@@ -1,4 +1,4 @@
-"""Messages that every actor knows: heartbeat, error report, fault injection. No robot here."""
+"""Messages of every actor: heartbeat, error report, fault injection."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _Changes = Annotated[dict[Name, float], msgspec.Meta(max_length=64)]
 _Values = Annotated[dict[Name, Any], msgspec.Meta(max_length=64)]
 
 _VALUES_BYTES = 300_000
-"""The longest value there is to set is a whole sweep of a laser."""
+"""The longest value to set is a whole sweep of a laser."""
 
 _VALUES_DEPTH = 6
 
 
 ON_TIME = 0.0
-"""Of what is never late in virtual time. A field of this very object is not encoded: msgspec
-compares a default by identity."""
+"""Lateness in virtual time. msgspec compares defaults by identity, so it leaves out a field that
+holds this object."""
 
 
 class Message(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True):

@@ -1,13 +1,13 @@
-"""A node's side of recording: what it sends on the bus it hands to a recorder too, if there is one.
+"""A node's side of recording: it copies each message that it publishes to a recorder.
 
-Why not a subscriber? One that hears everything over Zenoh takes an eleventh of a core for 900
-messages a second, all of it wake-ups, and every node pays for one more link. So the recorder is not
-on the bus at all: it listens on a unix socket, and a node that publishes puts a copy of each
-message there. The recorder comes by some twenty times a second and takes what has gathered. The
-price is one system call a message during a recording, and one a second without one.
+The recorder is not a subscriber. A subscriber of everything would take an eleventh of a core for
+900 messages a second, nearly all of it wake-ups, and each node would pay for one more link. Instead
+the recorder listens on a unix socket and empties it some twenty times a second. The price is one
+system call per message during a recording, and one a second without one.
 
-A node never waits for the recorder: what does not fit into the socket is lost to the recording,
-where the gap in the sequence numbers shows. What a node has handed over survives its SIGKILL.
+A node never waits for the recorder. A message that does not fit into the socket is lost to the
+recording, and the gap in the sequence numbers shows it. Messages handed over survive a SIGKILL of
+the node.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ RETRY_S = 1.0
 """Real seconds between two looks for a recorder."""
 
 BUFFER_BYTES = 1 << 22
-"""Asked of the kernel for what waits in one node's socket; it may grant less."""
+"""Requested size of a node's socket buffer; the kernel may grant less."""
 
 MAX_FRAME_BYTES = 1 << 20
-"""Longer messages are not recorded; the longest are those with a whole system in them."""
+"""Longer messages are not recorded. The longest contain a whole system specification."""
 
 _HEAD = struct.Struct("<dH")
 _FLAGS = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
@@ -40,7 +40,7 @@ def address(port: int) -> str:
 
 
 def frame(at_s: float, key: str, payload: bytes) -> bytes:
-    """Return what travels to the recorder: reading of the monotonic clock, full key, payload."""
+    """Return the frame for the recorder: reading of the monotonic clock, full key, payload."""
     name = key.encode()
     return _HEAD.pack(at_s, len(name)) + name + payload
 
@@ -49,26 +49,26 @@ def parse_frame(data: bytes | memoryview) -> tuple[float, str, bytes]:
     """Return time, key and payload of a frame.
 
     Raises:
-        ValueError: it is none.
+        ValueError: The data are not a frame.
     """
     try:
         at_s, length = _HEAD.unpack_from(data)
         key = bytes(data[_HEAD.size:_HEAD.size + length])
         if len(key) < length:
-            raise ValueError(f"a key of {len(key)} bytes where {length} were announced")
+            raise ValueError(f"key of {len(key)} bytes, expected {length}")
         if not math.isfinite(at_s):
-            raise ValueError(f"no frame: sent at {at_s}")
+            raise ValueError(f"not a frame: sent at {at_s}")
         return at_s, key.decode(), bytes(data[_HEAD.size + length:])
     except (struct.error, UnicodeDecodeError) as error:
-        raise ValueError(f"{len(data)} bytes that are no frame: {error}") from None
+        raise ValueError(f"not a frame: {len(data)} bytes: {error}") from None
 
 
 class RecorderConnection:
-    """One bus's way to the recorder of its run.
+    """Connection of one bus to the recorder of its run.
 
     Args:
-        port: base port of the run.
-        clock: monotonic, in real seconds; the same for all processes of the machine.
+        port: Base port of the run.
+        clock: Monotonic real seconds, the same for all processes of the machine.
     """
 
     def __init__(self, port: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -78,7 +78,7 @@ class RecorderConnection:
         self._next_look_s = 0.0
 
     def take(self, key: str, payload: bytes) -> None:
-        """Hand over a message that is being sent. Never waits and never raises."""
+        """Record a message that is being sent. Never waits and never raises."""
         now_s = self._clock()
         if self._socket is None and now_s >= self._next_look_s:
             self._next_look_s = now_s + RETRY_S
@@ -97,7 +97,7 @@ class RecorderConnection:
                 self.close()
 
     def close(self) -> None:
-        """Let go of the recorder; the next message looks for one again."""
+        """Close the connection; the next message looks for a recorder again."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -113,7 +113,7 @@ class RecorderConnection:
             if not is_same_user(connection):
                 raise PermissionError(self._address)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-        except OSError:  # no recorder is there, which is the rule
+        except OSError:  # usually there is no recorder
             connection.close()
             return
         self._socket = connection

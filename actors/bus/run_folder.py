@@ -1,24 +1,22 @@
-"""The folder of a run: its sockets, and which incarnation of each node was issued last.
+"""The folder of a run: its sockets, its postings, and the incarnation issued last for each node.
 
-Only the run's user can enter it, and the kernel sees to that at both ends: no other user can
-connect to a socket in it, or put one of his own in the place of a node that is down. So there is no
-secret that could leak, no port that could be taken, and no handshake that takes longer for it.
+Only the run's user can enter it. So no other user can connect to its sockets or replace one that is
+down, and no secret or port is needed.
 
-An incarnation is a number that a new process issues before it is heard (`issue`); a reader that
-meets a new one looks it up (`Register`). It is kept as the target of a symbolic link, which is
-written and read whole or not at all, in a system call or two and with no byte of a disk. Beside it
-stands which process that is, if it is one of this machine.
+A new process issues its incarnation before it publishes (`issue`). A reader that meets a new
+incarnation looks it up (`Register`). The number is the target of a symbolic link, which is written
+and read whole, in one or two system calls. The link also holds the pid if the process is on this
+machine.
 
-The folder lies in memory where it can: `$XDG_RUNTIME_DIR`, else `/dev/shm`, else the folder for
-temporary files. What ends a run removes it; what is left when all of a run dies at once goes
-when the same user starts the next one. A lock (flock(2)) shows that a run lives. A pid would not:
-the place may be shared with a container, which has pids of its own.
+The folder is in memory where possible: `$XDG_RUNTIME_DIR`, else `/dev/shm`, else the folder for
+temporary files. The end of a run removes it. If all of a run dies at once, the user's next run
+removes it. A lock (flock(2)) shows that a run lives. A pid would not, because a container that
+shares the folder has other pids.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import os
 import re
@@ -32,28 +30,27 @@ from rampart.actors.bus.board import FileBoard
 ROUTERS = ("router_a", "router_b")
 """Names of the sockets of the two routers."""
 
-MAX_SOCKET_BYTES = 107
-"""Longest path that the address of a unix socket can hold (unix(7))."""
+_MAX_SOCKET_BYTES = 107
+"""Longest path of a unix socket (unix(7))."""
 
-ROOM_FOR_NAMES = 64
-"""Bytes of such a path that are left for the name of a node."""
+_LONGEST = f"/rampart-32000-4194304-12345678/{ROUTERS[0]}"
 
 _NAME = re.compile(r"rampart-\d+-\d+-\w+\Z")
 _locks: dict[str, int] = {}
-"""By folder that was made here, the lock on it; processes that are forked hold it as well."""
+"""Lock on each folder that this process made. Forked processes hold it as well."""
 
 _ISSUED, _SYSTEM, _BOARD = "issued", "system", "board"
 
 
 def make(port: int, launcher: int) -> str:
-    """Make the folder of a run and return its path; remove what dead runs of this user left.
+    """Make the folder of a run and return its path. Remove what dead runs of this user left.
 
     Args:
-        port: base port of the run.
-        launcher: pid of its launcher.
+        port: Base port of the run.
+        launcher: Pid of its launcher.
 
     Raises:
-        OSError: there is no place for it.
+        OSError: No place can hold it.
     """
     failure: OSError = FileNotFoundError("no folder for temporary files")
     for place in _places():
@@ -64,7 +61,7 @@ def make(port: int, launcher: int) -> str:
                 (made / inner).mkdir(mode=0o700)
             lock = os.open(made, os.O_RDONLY | os.O_DIRECTORY)
             fcntl.flock(lock, fcntl.LOCK_EX)
-            folder = str(made).replace("~", "")  # only now others look whether it is locked
+            folder = str(made).replace("~", "")  # from now on others look whether it is locked
             made.rename(folder)
             _locks[folder] = lock
             return folder
@@ -81,34 +78,19 @@ def remove(folder: str) -> None:
             os.close(lock)
 
 
-def socket_path(folder: str, name: str) -> str:
-    """Return where the socket of that name is.
-
-    Raises:
-        ValueError: the name is too long for the address of a socket.
-    """
-    path = f"{folder}/{name}"
-    if len(path.encode()) > MAX_SOCKET_BYTES:
-        raise ValueError(f"name {name!r}: must be {ROOM_FOR_NAMES} characters long at most")
-    return path
-
-
-def issue(folder: str, names: Iterable[str], incarnation: int,
-          pid: int = 0) -> None:
-    """Make a number known as the incarnation of these nodes, before their process is heard.
+def issue(folder: str, names: Iterable[str], incarnation: int, pid: int = 0) -> None:
+    """Register the incarnation of nodes, before their process publishes.
 
     Args:
-        folder: of the run.
-        names: of the nodes.
-        incarnation: of their process.
-        pid: of their process; 0 if it is on another machine.
+        folder: Folder of the run.
+        names: Names of the nodes.
+        incarnation: Number of their process.
+        pid: Their process; 0 if it is on another machine.
 
     Raises:
-        OSError: the folder is gone, or full; or a name is none of a file.
+        OSError: The folder is gone or full.
     """
     for name in names:
-        if "/" in name or "\0" in name:
-            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL), name)
         fresh = Path(folder, _ISSUED, f"{name}~{os.getpid()}~")  # several may issue at once
         fresh.unlink(missing_ok=True)  # left by a process that died here
         fresh.symlink_to(f"{incarnation} {pid}" if pid else f"{incarnation}")
@@ -116,10 +98,10 @@ def issue(folder: str, names: Iterable[str], incarnation: int,
 
 
 def change_system(folder: str, system: bytes) -> None:
-    """Keep the system as it was changed last, for those that start processes of the run.
+    """Keep the changed system for those that start processes of the run.
 
     Raises:
-        OSError: the folder is gone, or full.
+        OSError: The folder is gone or full.
     """
     file = Path(folder, _SYSTEM)
     with contextlib.suppress(OSError):
@@ -131,14 +113,11 @@ def change_system(folder: str, system: bytes) -> None:
 
 
 def changed_system(folder: str, seen: tuple[int, ...]) -> tuple[tuple[int, ...], bytes] | None:
-    """Return the system as it was changed last, with a stamp.
+    """Return the stamp and content of the last change of the system; None if there is none newer.
 
     Args:
-        folder: of the run.
-        seen: the stamp of what was read before; () if nothing was.
-
-    Returns:
-        None if there is nothing newer.
+        folder: Folder of the run.
+        seen: Stamp of the change that was read before; () if none was.
     """
     try:
         with Path(folder, _SYSTEM).open("rb") as file:
@@ -150,7 +129,7 @@ def changed_system(folder: str, seen: tuple[int, ...]) -> tuple[tuple[int, ...],
 
 
 def issued(folder: str) -> dict[str, int]:
-    """Return the incarnation issued last of each node of a run."""
+    """Return the incarnation issued last for each node of a run."""
     register = register_of(folder)
     try:
         names = [entry.name for entry in Path(folder, _ISSUED).iterdir()]
@@ -161,12 +140,13 @@ def issued(folder: str) -> dict[str, int]:
 
 
 EPOCH = 1_000_000
-"""Beyond a multiple of it begin the incarnations of what is started in another host's place: more
-than the restarts of one process in any run, 50 in a minute being a thousand hours' worth."""
+"""Incarnations that replace those of a lost host begin beyond a multiple of this number. No process
+restarts as often in a run: at 50 restarts a minute it would take two weeks.
+"""
 
 
 def next_epoch(incarnation: int) -> int:
-    """Return what the incarnations of a node have to exceed that is started in another place."""
+    """Return the number that the incarnations of a node exceed when another host takes it over."""
     return (incarnation // EPOCH + 1) * EPOCH
 
 
@@ -176,7 +156,7 @@ def restarts_of(incarnation: int) -> int:
 
 
 Register = Callable[[str], int | None]
-"""Returns the incarnation of a node that was issued last; None if none ever was."""
+"""Returns the incarnation issued last for a node; None if there is none."""
 
 
 def register_of(folder: str) -> Register:
@@ -190,35 +170,34 @@ def register_of(folder: str) -> Register:
 
 
 def is_here(folder: str, name: str) -> bool:
-    """Whether the incarnation of a node that was issued last is a process of this machine."""
-    found = _look_up(folder, name)
-    return found is not None and len(found) > 1
+    """Whether the last incarnation of a node is a process of this machine."""
+    return len(_look_up(folder, name)) == 2
 
 
 def is_elsewhere(folder: str, name: str) -> bool:
-    """Whether the incarnation of a node that was issued last is on another machine."""
-    found = _look_up(folder, name)
-    return found is not None and len(found) == 1
+    """Whether the last incarnation of a node is on another machine."""
+    return len(_look_up(folder, name)) == 1
 
 
 def board_of(folder: str) -> FileBoard:
-    """Return this process's access to what the nodes of a run have posted."""
+    """Return this process's access to the postings of a run."""
     return FileBoard(f"{folder}/{_BOARD}")
 
 
-def _look_up(folder: str, name: str) -> tuple[int, ...] | None:
-    if "/" in name or "\0" in name:
-        return None
+def _look_up(folder: str, name: str) -> tuple[int, ...]:
+    """Return incarnation and pid of a node: (n, pid) on this machine, (n,) on another, or ()."""
+    if "/" in name or "\0" in name:  # names come from messages
+        return ()
     try:
-        target = os.readlink(f"{folder}/{_ISSUED}/{name}")  # noqa: PTH115 made of each newcomer
+        target = os.readlink(f"{folder}/{_ISSUED}/{name}")  # noqa: PTH115 pathlib is slower
     except (OSError, UnicodeError):
-        return None
+        return ()
     words = target.split(" ")
-    return tuple(map(int, words)) if all(map(str.isdecimal, words)) else None
+    return tuple(map(int, words)) if all(map(str.isdecimal, words)) else ()
 
 
 def _places() -> Iterator[str]:
-    room = MAX_SOCKET_BYTES - ROOM_FOR_NAMES - len("/rampart-32000-4194304-12345678/")
+    room = _MAX_SOCKET_BYTES - len(_LONGEST)
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     for place in (runtime, "/dev/shm", tempfile.gettempdir(), "/tmp"):  # noqa: S108 mkdtemp's
         if place.startswith("/") and len(place.encode()) <= room and Path(place).is_dir():

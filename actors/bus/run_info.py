@@ -1,7 +1,7 @@
-"""How a tool finds the runs on this machine: it asks the launchers.
+"""How a tool finds the runs on this machine: it asks their launchers.
 
-A launcher answers on an abstract unix socket, `rampart.PORT.launcher`, with one JSON object.
-The kernel lists such sockets in /proc/net/unix; nothing lies on a disk that could be stale.
+A launcher answers on an abstract unix socket, `rampart.PORT.launcher`, with one JSON object. The
+kernel lists these sockets in /proc/net/unix, so no file can be stale.
 """
 
 from __future__ import annotations
@@ -21,23 +21,27 @@ from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.machine.unix_peer import is_same_user, peer, process_state
 
 REPLAY = "replay"
-"""Name of the one socket in the folder of a replay: it plays all nodes."""
+"""Name of the only socket in the folder of a replay, which plays all nodes."""
 
 _NAME = re.compile(r"@rampart\.(\d+)\.launcher$", re.MULTILINE)
 _TIMEOUT_S = 1.0
 
 
 class RunInfo(msgspec.Struct, frozen=True):
-    """One run: where it is, what it runs, and when its simulated time began.
+    """What a launcher tells of its run.
 
-    `folder` holds the sockets of its nodes, `nodes`; `origin_s` is a reading of the machine's
-    monotonic clock. `page` is where the operator's page is, without its token. `plan` is
-    what a recording keeps of the run's plan. `replay_of` names the file of a replay. `host` is
-    which of the run's machines this is, "" the first, and the only one. `keys` is the folder of
-    keys of a run that has one, and `ports` are those of loopback on which its routers are spoken
-    with then. `hosts` are all machines of a run on several, the first one first, by name: each with
-    what its supervisor is called. `recording` is the file of `--record`, "" without one;
-    `recording_problem` is why nothing more is written to it, "" if all is well.
+    Attributes:
+        origin_s: Start of simulated time, by the machine's monotonic clock.
+        folder: Folder of the run.
+        page: Address of the operator's page, without its token.
+        plan: The part of the run's plan that a recording keeps.
+        replay_of: File of a replay; "" for a run.
+        host: Name of this machine; "" for the first or only one.
+        keys: Folder of credentials; "" without.
+        ports: Ports of the routers on loopback in a run with credentials.
+        hosts: Name of the supervisor by host, the first host first; empty for a single machine.
+        recording: File of `--record`; "" without one.
+        recording_problem: Why the recording ended; "" if it did not.
     """
 
     pid: int
@@ -61,28 +65,28 @@ class RunInfo(msgspec.Struct, frozen=True):
     recording_problem: str = ""
 
     def recording_data(self) -> dict[str, str] | None:
-        """Return file and problem of the recording as plain data, None without a recording."""
+        """Return file and problem of the recording; None without a recording."""
         return {"file": self.recording, "problem": self.recording_problem
                 } if self.recording else None
 
     @property
     def recording_in_words(self) -> str:
-        """What becomes of the recording; "" without one."""
+        """State of the recording; "" without one."""
         return f"ENDED: {self.recording_problem}" if self.recording_problem else self.recording
 
     @property
     def own_host(self) -> str:
-        """Name of this machine in a run on several, "" in one on a single machine."""
+        """Name of this machine; "" in a run on a single machine."""
         return self.host or next(iter(self.hosts), "")
 
     @property
     def endpoints(self) -> list[str]:
-        """Where a tool that hears everything connects to."""
+        """Endpoints for tools."""
         return [endpoint(self.folder, REPLAY)] if self.replay_of else endpoints(self.folder)
 
 
 class NoRunError(Exception):
-    """There is no run, or several and none was chosen; the text is one line for the user."""
+    """There is no run, or several without a choice. The text is one line for the user."""
 
 
 def address(port: int) -> str:
@@ -104,12 +108,10 @@ def _ports() -> list[int]:
 
 
 def find_run(port: int | None = None) -> RunInfo:
-    """Return the one run there is, or the one on a base port.
-
-    A replay counts only where there is no run: without a port the robot is meant.
+    """Return the only run, or the one on a base port. Without a port, runs go before replays.
 
     Raises:
-        NoRunError: there is none, or there are several and no port was given.
+        NoRunError: There is none, or there are several and no port was given.
     """
     found = find_runs()
     if port is not None:
@@ -141,7 +143,7 @@ def _stopped(ports: Iterable[int]) -> Iterator[str]:
 
 
 def ask(port: int) -> RunInfo | None:
-    """Return what the launcher of the run on a base port tells; None if there is none."""
+    """Return the run on a base port; None if no launcher of this user answers."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(_TIMEOUT_S)
         try:
@@ -154,7 +156,7 @@ def ask(port: int) -> RunInfo | None:
 
 
 def answer(listener: socket.socket, info: RunInfo) -> None:
-    """Tell one tool of this user, which is waiting on the socket of a launcher, of a run."""
+    """Send the run to one tool of this user that waits on the launcher's socket."""
     with contextlib.suppress(OSError):
         connection, _ = listener.accept()
         with connection:
@@ -163,9 +165,9 @@ def answer(listener: socket.socket, info: RunInfo) -> None:
 
 
 def read_info(data: bytes) -> RunInfo:
-    """Return what a launcher told.
+    """Decode the answer of a launcher.
 
     Raises:
-        ValueError, RecursionError: it is no such thing.
+        ValueError, RecursionError: The data are not a `RunInfo`.
     """
     return msgspec.json.decode(data, type=RunInfo)

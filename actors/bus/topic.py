@@ -1,7 +1,7 @@
-"""What a topic is: a Zenoh key, the type that travels on it, and how it is treated.
+"""A topic: a Zenoh key, the type of its messages, and how they are delivered.
 
-A topic family has one `{name}` in its key (`heartbeat/{name}`): `at("DM1")` gives the
-concrete key of one member, `pattern` the key expression that covers all of them.
+The key of a topic family has one `{name}` (`heartbeat/{name}`). `at("DM1")` returns the key of one
+member, `pattern` the key expression of all.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ ROOT = "rampart"
 """First chunk of every key."""
 
 ROS_SIDE = "ros2-side"
-"""First chunk of keys of what passes among nodes of ROS 2: in virtual time, and in recordings."""
+"""First chunk of the keys of ROS 2 traffic, in virtual time and in recordings."""
 
 T = TypeVar("T", bound=msgspec.Struct)
 
 Members = tuple[str, ...] | None
-"""Names of members of a topic family; None for all of them, or where there is no family."""
+"""Names of members of a topic family; None for all of them, or for a plain topic."""
 
 
 class Qos(Enum):
     """How a topic's messages travel and wait.
 
-    `SENSOR`: best sample is the newest; the mailbox keeps one per key, latest wins.
-    `STATE`: like a sensor, and repeated at `rate_hz` even without change, so that who joins
-    late (a respawned node) knows it within one period.
-    `COMMAND`: each message counts; the mailbox queues it, bounded, and reports an overflow.
+    `SENSOR`: The mailbox keeps the latest message of each key.
+    `STATE`: Like a sensor, and repeated at `rate_hz` without change, so that a restarted node knows
+    it within one period.
+    `COMMAND`: Each message counts. The mailbox queues it, bounded, and reports an overflow.
     """
 
     SENSOR = "sensor"
@@ -43,20 +43,20 @@ class Topic(Generic[T]):
     """The contract of one key: shown in `topics.md`, enforced by the bus.
 
     Args:
-        key: key below `rampart/`, with at most one `{name}` chunk.
-        type: the message struct; units are in its field names (SI).
-        qos: see `Qos`.
-        rate_hz: nominal publication rate in simulated time; 0 means on event.
+        key: Key below `rampart/`, with at most one `{name}` chunk.
+        type: The message struct; units are in its field names (SI).
+        qos: See `Qos`.
+        rate_hz: Nominal publication rate in simulated time; 0 means on event.
         frame: `map`, `odom`, `base_link` (REP-105) or `""`.
-        doc: one sentence for `topics.md`.
-        outside: tools, or the driver of a device, publish it: no node of the system has to.
-        several: more than one node may publish it. Commands always may be given by several; of
-            what is measured, or is the case, the latest message wins, so that is one node's to say.
-        resend_s: above 0 the newest message is posted where the nodes of the host look
-            (`rampart.actors.bus.board`), and sent only if it differs from the one sent last, or so
-            many simulated seconds have passed since; in a system of several hosts, always.
-        compared: a message that differs from the one sent last is news. If not, it only shows that
-            its publisher works.
+        doc: One sentence for `topics.md`.
+        outside: Tools or device drivers publish it, so no node of the system has to.
+        several: More than one node may publish it. Commands may always have several publishers. Of
+            sensors and states the latest message wins, so one node publishes them.
+        resend_s: Above 0, each message is posted for the nodes of the host
+            (`rampart.actors.bus.board`). It is sent only if it differs from the last one sent, or
+            this many simulated seconds after it. With several hosts every message is sent.
+        compared: Whether a different message is sent at once. If not, the messages only show that
+            their publisher works.
     """
 
     key: str
@@ -81,9 +81,9 @@ class Topic(Generic[T]):
         return f"{ROOT}/{self.key.replace('{name}', '*')}"
 
     def member(self, key: str) -> str | None:
-        """Return which member of this family a key below the root is, "" of a plain topic.
+        """Return the family member of a key below the root; "" for a plain topic.
 
-        None if the key is not one of this topic's.
+        None if the key does not belong to this topic.
         """
         head, family, tail = self.key.partition("{name}")
         name = key[len(head):len(key) - len(tail)]
@@ -94,7 +94,7 @@ class Topic(Generic[T]):
         """Return the full concrete key.
 
         Raises:
-            ValueError: a family was asked without a name, or a plain topic with one.
+            ValueError: A family needs a name, a plain topic takes none.
         """
         if self.is_family != (name is not None):
             need = "needs a name" if self.is_family else "takes no name"

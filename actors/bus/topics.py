@@ -1,4 +1,4 @@
-"""Topics that every actor publishes or hears."""
+"""Topics that every actor publishes or subscribes to."""
 
 from __future__ import annotations
 

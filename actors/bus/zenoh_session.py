@@ -14,7 +14,7 @@ from typing import Any
 
 import zenoh
 
-from rampart.actors.bus.run_folder import ROUTERS, socket_path
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.machine.unix_peer import peer, process_state
 
 AUTHORITY = "ca.crt"
@@ -76,7 +76,7 @@ _PROTOCOL = "unixsock-stream"
 
 def endpoint(folder: str, name: str) -> str:
     """Return the Zenoh endpoint of a socket in the folder of a run."""
-    return f"{_PROTOCOL}/{socket_path(folder, name)}"
+    return f"{_PROTOCOL}/{folder}/{name}"
 
 
 def endpoints(folder: str) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 
 import msgspec
 
-from rampart.actors.bus.fields import ANYTHING, NUMBER, TEXT, TRUTH, Field, Steered
+from rampart.actors.bus.fields import ANYTHING, NUMBER, TEXT, TRUTH, Field, StickMessages
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.runtime.actor import BASE_OUTPUTS
@@ -220,7 +220,7 @@ def _kind(topic: Topic[Any], path: str) -> str:
         return ""  # a list, or what has fields itself
 
 
-def steered(panel: Panel, topic: Topic[Any]) -> Steered:
+def steered(panel: Panel, topic: Topic[Any]) -> StickMessages:
     """Return what makes the messages of a panel's stick.
 
     Raises:
@@ -228,7 +228,7 @@ def steered(panel: Panel, topic: Topic[Any]) -> Steered:
     """
     names = [shown.field.partition(":")[2] for shown in panel.fields()]
     count = len(panel.stick or ())
-    return Steered(topic.type, names[:count], "".join(names[count:]), panel.scale)
+    return StickMessages(topic.type, names[:count], "".join(names[count:]), panel.scale)
 
 
 def problem_of(panels: Sequence[Panel]) -> str:

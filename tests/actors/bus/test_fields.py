@@ -80,19 +80,19 @@ def test_an_index_beyond_a_list_of_known_length_is_refused(kind, path):
 
 def test_an_item_that_a_list_lacks_is_named():
     field = Field(Level, "cells[7]")
-    assert field.beyond(Level(1.5, (1.0, 2.0))) == "cells[7]: [7] of a list of 2 items"
+    assert field.beyond(Level(1.5, (1.0, 2.0))) == "cells[7]: no item [7], the list has 2"
     assert field.beyond(Level(1.5, (1.0,) * 8)) == ""
 
 
 @pytest.mark.parametrize(("kind", "path", "words"), [
     (Level, "hieght_m", "hieght_m: Level has no field 'hieght_m'; did you mean height_m?"),
     (Level, "zzz", "zzz: Level has no field 'zzz'; known: height_m, cells, heading_rad"),
-    (Level, "cells", "cells: not a number, a text or a truth value"),
-    (Level, "height_m[0]", "height_m[0]: [0] of what is no list"),
-    (Level, "height_m.x", "height_m.x: x of what has no fields"),
-    (Level, "", "a field has to be named"),
-    (Level, ".height_m", ".height_m: no path of a field, e.g. pose.x_m or ranges_m[0]"),
-    (Level, "cells[one]", "cells[one]: no path of a field, e.g. pose.x_m or ranges_m[0]"),
+    (Level, "cells", "cells: expected a number, a text or a truth value"),
+    (Level, "height_m[0]", "height_m[0]: cannot take [0]: the value is not a list"),
+    (Level, "height_m.x", "height_m.x: cannot take x: the value has no fields"),
+    (Level, "", "expected the name of a field"),
+    (Level, ".height_m", ".height_m: not a path of a field, such as pose.x_m or ranges_m[0]"),
+    (Level, "cells[one]", "cells[one]: not a path of a field, such as pose.x_m or ranges_m[0]"),
 ])
 def test_what_is_no_field_is_refused_in_one_line(kind, path, words):
     with pytest.raises(ValueError, match=r".") as caught:

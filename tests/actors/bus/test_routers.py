@@ -19,7 +19,7 @@ import pytest
 from rampart.actors.bus import zenoh_bus
 from rampart.actors.bus.board import FileBoard
 from rampart.actors.bus.bus import Bus, BusError, shared
-from rampart.actors.bus.run_folder import ROUTERS, socket_path
+from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
 from rampart.actors.osmosis import topics
@@ -136,7 +136,7 @@ async def test_who_connects_and_says_nothing_holds_no_place_for_long(routers, so
     with contextlib.ExitStack() as stack:
         for _ in range(120):  # Zenoh has a hundred places for handshakes
             idle = stack.enter_context(socket.socket(socket.AF_UNIX))
-            idle.connect(socket_path(sockets, "router_a"))
+            idle.connect(f"{sockets}/router_a")
         async with client(sockets) as one, client(sockets) as other:
             heard = hear(one)
             await send_until(other, lambda: heard)
@@ -193,7 +193,7 @@ async def test_a_process_without_a_router_posts_nothing(routers, sockets, tmp_pa
             routers.send(name, signal.SIGKILL)
         await eventually(lambda: not bus.post("a", b"2"))
         for name in ROUTERS:
-            Path(socket_path(sockets, name)).unlink()
+            Path(sockets, name).unlink()
         await routers.start(ROUTERS[0])
         await eventually(lambda: bus.post("a", b"3"))
         assert bus.posted("a") == b"3"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import stat
 import subprocess
 import sys
@@ -36,11 +37,17 @@ def test_only_its_user_can_enter_it(sockets):
     assert found.st_uid == os.getuid()
 
 
-def test_it_leaves_room_for_the_names_of_nodes(sockets):
-    name = "n" * run_folder.ROOM_FOR_NAMES
-    assert run_folder.socket_path(sockets, name).endswith(name)
-    with pytest.raises(ValueError, match="must be 64 characters long at most"):
-        run_folder.socket_path(sockets, "n" * 108)
+def test_a_place_too_deep_for_a_socket_is_not_chosen(tmp_path, monkeypatch):
+    deep = tmp_path / ("n" * 100)
+    deep.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
+    folder = run_folder.make(1, os.getpid())
+    try:
+        assert not folder.startswith(str(tmp_path))
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(f"{folder}/{run_folder.ROUTERS[0]}")
+    finally:
+        run_folder.remove(folder)
 
 
 def test_what_was_issued_last_is_known_and_to_which_process():

@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 import pytest
 
-from rampart.actors.bus.fields import Steered
+from rampart.actors.bus.fields import StickMessages
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.operator.hmi import Hmi
@@ -171,14 +171,14 @@ def test_a_member_of_a_family_has_a_stick_and_the_others_are_somebody_else_s():
     ('stick = ["tank/hand"]', "tank.toml: $.panel[0].stick[0] = 'tank/hand': expected "
      "'topic:field'"),
     ('stick = ["tank/steps:steps"]',
-     "tank.toml: page: panel 'Drive': stick: topic tank/steps: nothing says what name of Steps "
-     "is; a default in its class is right"),
+     "tank.toml: page: panel 'Drive': stick: topic tank/steps: Steps has no value for name; "
+     "expected a default in its class"),
     ('stick = ["tank/place/a:at.forward"]',
-     "tank.toml: page: panel 'Drive': stick: topic tank/place/a: at.forward: a whole field of "
-     "Place is right: at, count"),
+     "tank.toml: page: panel 'Drive': stick: topic tank/place/a: at.forward: not a field of "
+     "Place; expected one of at, count"),
     (f"{FIELDS}\nscale = [1.0, 1.0]",
-     "tank.toml: page: panel 'Drive': stick: topic tank/hand: forward = -1 at full stick: Expected "
-     "`float` >= -0.5; a scale within its bounds is right"),
+     "tank.toml: page: panel 'Drive': stick: topic tank/hand: forward = -1 at full deflection: "
+     "Expected `float` >= -0.5; expected a scale within its bounds"),
 ])
 def test_a_stick_that_cannot_be_is_refused_in_one_line(rest, line):
     said = refused(rest, "Driven")
@@ -206,19 +206,19 @@ def test_two_publishers_of_a_stick():
 
 
 def test_a_number_goes_from_bound_to_bound_and_is_0_at_rest():
-    said = Steered(Hand, ("forward", "left"), "held")
+    said = StickMessages(Hand, ("forward", "left"), "held")
     assert said((1.0, 1.0)) == Hand(2.0, 1.0, True)
     assert said((-1.0, -1.0)) == Hand(-0.5, -1.0, True)
     assert said((0.5, 0.0)) == Hand(1.0, 0.0, True)
     assert said(None) == Hand(0.0, 0.0, False)
-    turned = Steered(Hand, ("left", "forward"), "", (-4.0, 0.5))
+    turned = StickMessages(Hand, ("left", "forward"), "", (-4.0, 0.5))
     assert turned((0.5, 1.0)) == Hand(0.5, -2.0)
     assert math.copysign(1.0, turned(None).left) == 1.0
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("fast", "fast = 0 at rest: Expected `float` >= 1.0; a scale within its bounds is right"),
-    ("open_end", "open_end = -1 at full stick: Expected `float` > -1.0; a scale within its bounds"),
+    ("fast", "fast = 0 at rest: Expected `float` >= 1.0; expected a scale within its bounds"),
+    ("open_end", "open_end = -1 at full deflection: Expected `float` > -1.0; expected a scale"),
 ])
 def test_a_number_that_cannot_be_0_or_not_at_its_end_is_refused(name, words):
     class Named(Steps):
@@ -226,7 +226,7 @@ def test_a_number_that_cannot_be_0_or_not_at_its_end_is_refused(name, words):
         name: str = ""
 
     with pytest.raises(ValueError, match=r".") as caught:
-        Steered(Named, (name,))
+        StickMessages(Named, (name,))
     assert words in str(caught.value)
 
 
