@@ -1,8 +1,8 @@
-"""Certificates: of an authority, and of those to whom it issues them. Pure; needs `cryptography`.
+"""Certificates of an authority and of the identities it certifies. Pure; needs `cryptography`.
 
-Keys are of the curve P-256, which TLS libraries and browsers take alike. A file holds a private key
-and its certificate together, so that one cannot be exchanged without the other. Only a router's
-certificate is good for the listening side of a link: with a node's key nobody can pose as a router.
+Keys are on the curve P-256, which TLS libraries and browsers accept. A file holds a private key and
+its certificate, so that neither is exchanged without the other. Only a router's certificate is
+valid for the listening side of a link, so a node cannot pose as a router.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
-"""Where a router of the same machine is spoken with."""
+"""Addresses of every router on its own machine."""
 
 _BACK = dt.timedelta(minutes=5)
-"""A certificate is valid from so long ago, for hosts whose clocks are behind."""
+"""A certificate is valid from this long before its issue, for hosts whose clocks are behind."""
 
 _AUTHORITY = "Rampart authority"
 _RSA_BITS = 2048
@@ -32,17 +32,17 @@ _CURVES = (ec.SECP256R1, ec.SECP384R1)
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What a certificate says.
+    """Contents of a certificate.
 
     Attributes:
-        common_name: of whom.
-        kind: what the owner is: router, node, operator, viewer.
-        not_before, not_after: between which it is valid, UTC.
+        common_name: Name of the owner.
+        kind: router, node, operator or viewer.
+        not_before, not_after: Validity, UTC.
         fingerprint: SHA-256, in hexadecimal.
-        addresses: alternative names.
-        is_ours: whether the authority has signed it.
-        has_key: whether the private key with it is its own.
-        refused_key: what its key is, if no router takes such a one; else "".
+        addresses: Alternative names.
+        is_ours: Whether the authority signed it.
+        has_key: Whether the file also holds its private key.
+        refused_key: Kind of its key if routers refuse it; else "".
     """
 
     common_name: str
@@ -76,20 +76,20 @@ def new_certificate(authority: bytes, common_name: str, kind: str, *,
     """Return a new key and the certificate for it, PEM.
 
     Args:
-        authority: key and certificate, PEM.
-        common_name: of whom.
-        kind: what that is; a router can be listened to.
-        addresses: of a router, at which it is spoken with: IP addresses and names.
+        authority: Key and certificate, PEM.
+        common_name: Name of the owner.
+        kind: Kind of the owner. Only a router's certificate is valid for listening.
+        addresses: IP addresses and names of a router.
         now: UTC.
-        days: how long it is valid.
+        days: Validity.
 
     Raises:
-        ValueError: the authority's file is none.
+        ValueError: The authority's data are invalid.
     """
     issuer = x509.load_pem_x509_certificate(authority)
     signing = serialization.load_pem_private_key(authority, None)
     if not isinstance(signing, ec.EllipticCurvePrivateKey):
-        raise ValueError("not a key that rampart has made")
+        raise ValueError("not an elliptic-curve key, expected one made by rampart")
     key = ec.generate_private_key(ec.SECP256R1())
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
     certificate = _begun(_name(common_name, kind), issuer.subject, key, now, days)
@@ -105,14 +105,14 @@ def new_certificate(authority: bytes, common_name: str, kind: str, *,
 
 
 def read_certificate(pem: bytes, authority: bytes) -> Certificate:
-    """Return what the certificate in a file says.
+    """Return the contents of a certificate.
 
     Args:
-        pem: certificate, and its key or none.
-        authority: certificate of the authority.
+        pem: Certificate, with or without its key.
+        authority: Certificate of the authority.
 
     Raises:
-        ValueError: either is none.
+        ValueError: One of them is not a certificate.
     """
     found, issuer = x509.load_pem_x509_certificate(pem), x509.load_pem_x509_certificate(authority)
     try:
@@ -130,13 +130,13 @@ def read_certificate(pem: bytes, authority: bytes) -> Certificate:
     except x509.ExtensionNotFound:
         addresses = ()
     return Certificate(
-        _said(found, NameOID.COMMON_NAME), _said(found, NameOID.ORGANIZATIONAL_UNIT_NAME),
+        _subject(found, NameOID.COMMON_NAME), _subject(found, NameOID.ORGANIZATIONAL_UNIT_NAME),
         found.not_valid_before_utc, found.not_valid_after_utc,
         found.fingerprint(hashes.SHA256()).hex(), addresses, is_ours, has_key, _refused(found))
 
 
 def _refused(certificate: x509.Certificate) -> str:
-    """Return what a certificate's key is, if rustls takes no such key; else ""."""
+    """Return the kind of a certificate's key if rustls refuses it; else ""."""
     key = certificate.public_key()
     if isinstance(key, rsa.RSAPublicKey):
         return f"RSA of {key.key_size} bits" if key.key_size < _RSA_BITS else ""
@@ -146,10 +146,10 @@ def _refused(certificate: x509.Certificate) -> str:
 
 
 def check_address(text: str) -> None:
-    """Refuse what can be no alternative name.
+    """Check an alternative name.
 
     Raises:
-        ValueError: it is none.
+        ValueError: The text is neither an IP address nor a host name.
     """
     _alternative(text)
 
@@ -181,11 +181,11 @@ def _alternative(text: str) -> x509.GeneralName:
     labels = text.split(".")
     if not text.isascii() or len(text) > 253 or not all(
             0 < len(one) < 64 and one.replace("-", "a").isalnum() for one in labels):
-        raise ValueError(f"{text!r} is no IP address and no name of a host")
+        raise ValueError(f"{text!r}: expected an IP address or a host name")
     return x509.DNSName(text)
 
 
-def _said(found: x509.Certificate, what: x509.ObjectIdentifier) -> str:
+def _subject(found: x509.Certificate, what: x509.ObjectIdentifier) -> str:
     values = found.subject.get_attributes_for_oid(what)
     return str(values[0].value) if values else ""
 

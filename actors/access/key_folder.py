@@ -1,16 +1,16 @@
-"""A folder of keys: an authority, and what it has issued. Needs `cryptography`.
+"""A folder of credentials: an authority, and the certificates it issued. Needs `cryptography`.
 
 `keys/` has mode 0700 and holds
 
-* `authority.key`, the authority's private key and certificate: for `rampart keys` alone, no run
-  needs it;
-* `ca.crt`, its certificate; `register.json`, who has one and who no longer: no secrets, the same
-  on every host;
-* `NAME.pem` of each identity, private key and certificate, mode 0600: for the host on which it is.
+* `authority.key`: private key and certificate of the authority. Only `rampart keys` needs it.
+* `ca.crt`: its certificate, and `register.json`: valid and revoked identities. Both are public and
+  the same on every host.
+* `NAME.pem`: private key and certificate of an identity, mode 0600, for the host that runs it.
 
-Each file is written beside its place, synchronised, and renamed, so it is whole at every moment.
-The register comes first: who is killed between the two has an identity without a certificate, or a
-revoked one with a certificate that counts nowhere; either is shown, and mended by doing it again.
+Each file is written beside its place, synchronised, and renamed, so it is always complete. The
+register is written first. If the process is killed in between, an identity has no certificate, or a
+revoked one still has a file, which no router accepts. Both are shown, and a second attempt repairs
+them.
 """
 
 from __future__ import annotations
@@ -50,20 +50,20 @@ __all__ = ["check", "check_address", "days_left", "entries", "expired", "init", 
 
 AUTHORITY_DAYS = 1826.0
 DAYS: dict[str, float] = {"router": 30.0, "node": 30.0, "operator": 7.0, "viewer": 7.0}
-"""For how long certificates are valid unless told otherwise."""
+"""Default validity of certificates by kind."""
 
 _MOST_BYTES = 64 << 10
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What there is of one identity.
+    """One identity and its certificate.
 
     Attributes:
-        name: of it.
-        identity: as the register has it.
-        certificate: None if there is no file of it here.
-        trouble: why its file cannot be used; "" if nothing is wrong, or there is none.
+        name: Name of the identity.
+        identity: Its entry in the register.
+        certificate: None if its file is not here.
+        trouble: Why its file cannot be used; "" if it can, or if there is no file.
     """
 
     name: str
@@ -73,21 +73,20 @@ class Entry:
 
 
 def init(folder: Path, days: float = AUTHORITY_DAYS) -> None:
-    """Make a folder of keys with a new authority, or complete one whose making was interrupted.
+    """Make a folder with a new authority, or complete a folder whose making was interrupted.
 
     Raises:
-        KeysError: there is an authority already, or the folder is not this user's alone.
-        OSError: it cannot be written.
+        KeysError: The folder has an authority, or other users can access it.
+        OSError: It cannot be written.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with _held(folder):
+    with _locked(folder):
         own, public, register = (folder / name for name in (SIGNING, AUTHORITY, REGISTER))
         if own.exists() and public.exists() and register.exists():
-            raise KeysError(f"{folder}: has an authority already; a new one would make all that it "
-                            "has issued worthless")
+            raise KeysError(f"{folder}: has an authority already; a new one would invalidate all "
+                            "certificates")
         if public.exists() and not own.exists():
-            raise KeysError(f"{folder}: has keys that were issued elsewhere; another folder is "
-                            "right")
+            raise KeysError(f"{folder}: has keys that were issued elsewhere; expected a new folder")
         if not own.exists():
             _write(own, new_authority(_now(), days))
         _write(public, public_part(_read(own)), 0o644)
@@ -97,20 +96,20 @@ def init(folder: Path, days: float = AUTHORITY_DAYS) -> None:
 
 def issue(folder: Path, names: Sequence[str], kind: Kind, addresses: Sequence[str] = (),
           days: float | None = None) -> None:
-    """Issue certificates; who has one gets another, and the one before is good until it expires.
+    """Issue certificates. An earlier certificate of an identity stays valid until it expires.
 
     Args:
-        folder: of the keys.
-        names: of whom.
-        kind: what they are.
-        addresses: of routers, besides those of the loopback.
-        days: for how long; None for the default of the kind.
+        folder: Folder of credentials.
+        names: Names of the identities.
+        kind: Kind of the identities.
+        addresses: Addresses of routers, besides loopback.
+        days: Validity; None for the default of the kind.
 
     Raises:
-        KeysError: the authority is not here, or a name is another kind's.
-        OSError: a file cannot be written.
+        KeysError: The authority is not here, or a name has another kind.
+        OSError: A file cannot be written.
     """
-    with _held(folder):
+    with _locked(folder):
         authority = _authority(folder)
         register = read_register(folder).issued(names, kind)
         common_names = register.of_kind(kind)
@@ -122,19 +121,19 @@ def issue(folder: Path, names: Sequence[str], kind: Kind, addresses: Sequence[st
 
 
 def rotate(folder: Path, names: Sequence[str], days: float | None = None) -> list[str]:
-    """Issue new keys and certificates to who has some, with the addresses that these have.
+    """Reissue existing certificates with new keys and the same addresses.
 
     Args:
-        folder: of the keys.
-        names: of whom; empty for all.
-        days: for how long; None for the default of each kind.
+        folder: Folder of credentials.
+        names: Names of the identities; empty for all.
+        days: Validity; None for the default of each kind.
 
     Returns:
         The names.
 
     Raises:
-        KeysError: the authority is not here, or one of them has no certificate.
-        OSError: a file cannot be written.
+        KeysError: The authority is not here, or an identity has no certificate.
+        OSError: A file cannot be written.
     """
     here = {entry.name: entry for entry in entries(folder)}
     chosen = list(names) or [name for name, one in here.items()
@@ -149,40 +148,40 @@ def rotate(folder: Path, names: Sequence[str], days: float | None = None) -> lis
 
 
 def revoke(folder: Path, names: Sequence[str]) -> None:
-    """Have identities count no longer, and remove their files.
+    """Revoke identities and remove their files.
 
-    In force on a host when its routers have started with the register as it is then.
+    A host enforces it from the next start of its routers with this register.
 
     Raises:
-        KeysError: one of them has no certificate.
-        OSError: a file cannot be written.
+        KeysError: An identity has no certificate.
+        OSError: A file cannot be written.
     """
-    with _held(folder):
+    with _locked(folder):
         _keep(folder, read_register(folder).revoked(names))
         for name in names:
             _file(folder, name).unlink(missing_ok=True)
 
 
 def share(folder: Path, to: Path, names: Sequence[str]) -> None:
-    """Copy the keys of some identities, and what everybody needs, into a new folder.
+    """Copy the keys of some identities and the public files into a new folder.
 
     Raises:
-        KeysError: one of them has none that counts, or the new folder is there already.
-        OSError: a file cannot be read or written.
+        KeysError: An identity has no valid certificate, or the new folder exists.
+        OSError: A file cannot be read or written.
     """
     check(folder, names)
     if to.exists():
-        raise KeysError(f"{to}: is there already; a new folder is right")
+        raise KeysError(f"{to}: exists; expected a new folder")
     to.mkdir(mode=0o700)
     for file in (folder / AUTHORITY, folder / REGISTER, *(_file(folder, name) for name in names)):
         _write(to / file.name, _read(file))
 
 
 def entries(folder: Path) -> list[Entry]:
-    """Return what there is of each identity, by name.
+    """Return all identities, sorted by name.
 
     Raises:
-        KeysError: the folder is none, or has no certificate of an authority.
+        KeysError: The folder does not exist, or has no certificate of an authority.
     """
     register = read_register(folder)
     authority = _read(folder / AUTHORITY)
@@ -204,8 +203,8 @@ def _trouble(name: str, identity: Identity, certificate: Certificate) -> str:
     if not certificate.is_ours:
         return "of another authority"
     if certificate.refused_key:
-        return (f"its key is {certificate.refused_key}, which no router takes; one of the curve "
-                "P-256 or P-384, Ed25519, or RSA of 2048 bits is right")
+        return (f"its key is {certificate.refused_key}, which no router takes; expected P-256, "
+                "P-384, Ed25519, or RSA of at least 2048 bits")
     if not certificate.has_key:
         return "without its private key"
     if certificate.common_name != identity.common_name(name):
@@ -214,14 +213,14 @@ def _trouble(name: str, identity: Identity, certificate: Certificate) -> str:
 
 
 def check(folder: Path, names: Sequence[str]) -> dt.datetime:
-    """Check that a run can be started with the keys of a folder, and return until when.
+    """Check the credentials of a run, and return when the first of them expires.
 
     Args:
-        folder: of the keys.
-        names: of all processes of the run.
+        folder: Folder of credentials.
+        names: Names of all processes of the run.
 
     Raises:
-        KeysError: others can read the folder, or one of them has no certificate that is valid.
+        KeysError: Other users can read the folder, or a process has no valid certificate.
     """
     _check_private(folder)
     here = {entry.name: entry for entry in entries(folder)}
@@ -233,7 +232,7 @@ def check(folder: Path, names: Sequence[str]) -> dt.datetime:
             why = "is revoked" if entry and entry.identity.revoked else "has no certificate"
             raise KeysError(f"{file}: {name} {why}; `rampart keys issue` gives it one")
         if entry.trouble or entry.certificate is None:
-            raise KeysError(f"{file}: {entry.trouble}; `rampart keys issue {name}` mends it")
+            raise KeysError(f"{file}: {entry.trouble}; `rampart keys issue {name}` repairs it")
         if file.stat().st_mode & 0o077:
             raise KeysError(f"{file}: others can read it; chmod 600 it")
         if not entry.certificate.not_before <= now < entry.certificate.not_after:
@@ -245,10 +244,10 @@ def check(folder: Path, names: Sequence[str]) -> dt.datetime:
 
 
 def lifetimes(folder: Path, names: Iterable[str]) -> dict[str, dt.datetime]:
-    """Return until when the certificate of each is valid, of those that have one here.
+    """Return when the certificates of some identities expire. Those without a file are left out.
 
     Raises:
-        KeysError: the folder is none, or has no certificate of an authority.
+        KeysError: The folder does not exist, or has no certificate of an authority.
     """
     wanted = set(names)
     return {entry.name: entry.certificate.not_after for entry in entries(folder)
@@ -256,12 +255,12 @@ def lifetimes(folder: Path, names: Iterable[str]) -> dict[str, dt.datetime]:
 
 
 def days_left(until: dt.datetime) -> float:
-    """Return for how many days a certificate is still valid; negative if it has expired."""
+    """Return the days until a certificate expires; negative if it has expired."""
     return (until - _now()) / dt.timedelta(days=1)
 
 
 def expired(folder: Path, names: Iterable[str]) -> dict[str, str]:
-    """Return who has a certificate here that has expired → one line that names its file."""
+    """Return a line for each identity whose certificate has expired."""
     return {name: f"{_file(folder, name)}: the certificate of {name} expired at "
                   f"{until:%Y-%m-%d %H:%M:%S} UTC, and no router takes it; `rampart keys rotate "
                   f"{name}` renews it"
@@ -282,8 +281,8 @@ def _authority(folder: Path) -> bytes:
     try:
         return _read(folder / SIGNING)
     except FileNotFoundError:
-        raise KeysError(f"{folder / SIGNING}: there is none; certificates are issued where the "
-                        "authority is") from None
+        raise KeysError(f"{folder / SIGNING}: not found; issue certificates where the authority is"
+                        ) from None
 
 
 def _read(file: Path) -> bytes:
@@ -303,7 +302,7 @@ def _keep(folder: Path, register: Register) -> None:
 def _write(file: Path, content: bytes, mode: int = 0o600) -> None:
     """Write a file whole, or not at all."""
     fresh = file.with_name(f".{file.name}~")
-    fresh.unlink(missing_ok=True)  # left by one that was killed here
+    fresh.unlink(missing_ok=True)  # left by a process that was killed here
     made = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     with os.fdopen(made, "wb") as out:
         os.fchmod(out.fileno(), mode)
@@ -319,8 +318,8 @@ def _write(file: Path, content: bytes, mode: int = 0o600) -> None:
 
 
 @contextlib.contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """Have a folder for oneself: of two that change it at once the second one waits."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder, so that of two concurrent changes the second one waits."""
     try:
         place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:

@@ -1,9 +1,8 @@
-"""The register of a folder of keys: who has a certificate, of which kind, and who no longer.
+"""The register of a folder of credentials: identities, their kinds, and which are revoked.
 
-It holds no secret. Routers read it when they start, and let through nobody who is not in it, or is
-revoked there; so it has to be the same on every host. A name that was revoked and gets a new
-certificate is another identity, with a number behind its name: the old one stays out, though it
-has not expired yet.
+It holds no secret. Routers read it when they start and refuse every identity that is missing or
+revoked, so it must be the same on every host. A revoked name that gets a new certificate becomes a
+new identity with a number after its name. So the old certificate stays refused until it expires.
 """
 
 from __future__ import annotations
@@ -20,26 +19,26 @@ Kind = Literal["router", "node", "operator", "viewer"]
 KINDS: tuple[str, ...] = get_args(Kind)
 
 IdentityName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
-"""As nodes are called."""
+"""The same names as those of nodes."""
 
 REGISTER = "register.json"
 SIGNING = "authority.key"
-"""Key and certificate of the authority; to be kept where no robot is."""
+"""Key and certificate of the authority. It belongs on no robot."""
 
 _MOST_BYTES = 1 << 20
 
 
 class KeysError(ValueError):
-    """A folder of keys cannot be used; one line."""
+    """A folder of credentials cannot be used. The text is one line."""
 
 
 class Identity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Somebody who has, or had, certificates.
+    """A process or person that has, or had, certificates.
 
     Attributes:
-        kind: what it is.
-        number: of the identity; grows by 1 with each certificate that follows a revocation.
-        revoked: whether it has none that counts.
+        kind: Kind of the identity.
+        number: Grows by 1 with each certificate after a revocation.
+        revoked: Whether its certificates are refused.
     """
 
     kind: Kind
@@ -57,15 +56,15 @@ class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     identities: dict[IdentityName, Identity] = {}
 
     def of_kind(self, kind: Kind) -> dict[str, str]:
-        """Return the names of those who are not revoked → the names in their certificates."""
+        """Return name in the certificate by name, without revoked identities."""
         return {name: one.common_name(name) for name, one in self.identities.items()
                 if one.kind == kind and not one.revoked}
 
     def issued(self, names: Iterable[str], kind: Kind) -> Register:
-        """Return the register in which these have certificates.
+        """Return the register after certificates were issued.
 
         Raises:
-            KeysError: one of them is somebody else.
+            KeysError: A name has another kind.
         """
         found = dict(self.identities)
         for name in names:
@@ -73,31 +72,31 @@ class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if before is None:
                 found[name] = Identity(kind)
             elif before.kind != kind:
-                raise KeysError(f"{name}: is the name of a {before.kind}; another one is right")
+                raise KeysError(f"{name}: is the name of a {before.kind}; expected another name")
             elif before.revoked:
                 found[name] = Identity(kind, before.number + 1)
         return Register(found)
 
     def revoked(self, names: Iterable[str]) -> Register:
-        """Return the register in which these have none.
+        """Return the register after identities were revoked.
 
         Raises:
-            KeysError: one of them has none anyway.
+            KeysError: An identity has no certificate.
         """
         found = dict(self.identities)
         for name in names:
             before = found.get(name)
             if before is None or before.revoked:
-                raise KeysError(f"{name}: has no certificate that could be revoked")
+                raise KeysError(f"{name}: no certificate to revoke")
             found[name] = msgspec.structs.replace(before, revoked=True)
         return Register(found)
 
 
 def read_register(folder: Path) -> Register:
-    """Return the register of a folder of keys.
+    """Return the register of a folder of credentials.
 
     Raises:
-        KeysError: there is none, or it is unsound.
+        KeysError: It does not exist or is invalid.
     """
     file = folder / REGISTER
     try:

@@ -1,7 +1,7 @@
-"""What each identity of a system may do on the bus, computed from what the actor classes declare.
+"""The rights of each identity on the bus, computed from the declarations of the actor classes.
 
-A right is a key expression in full, such as `rampart/detection/DM4` or `rampart/heartbeat/*`. What
-is not named here nobody may do: that includes deleting, keys that are no topic's, and `**`.
+A right is a full key expression, such as `rampart/detection/DM4` or `rampart/heartbeat/*`. All else
+is refused, for example deleting, keys outside the topics, and `**`.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ from rampart.actors.system.topics import declared_topics
 
 OPERATOR: Final = "operator"
 VIEWER: Final = "viewer"
-"""Two kinds of people's certificates: what is done with a tool, and what is only looked at."""
+"""Two kinds of people's certificates: operators use all tools, viewers only look."""
 
 EVERYTHING = f"{ROOT}/**"
 
 
 @dataclass(frozen=True, slots=True)
 class Rights:
-    """What one identity may do, as key expressions.
+    """The rights of one identity, as key expressions.
 
     Attributes:
-        says: what it may publish.
-        hears: what it may subscribe to.
-        answers: of what it says, what it may be asked for, the newest message of each key.
-        asks: of what it hears, what it may ask for.
+        publishes: Keys it may publish.
+        subscribes: Keys it may subscribe to.
+        answers: Published keys whose latest message it may return to a query.
+        queries: Subscribed keys whose latest message it may query.
     """
 
-    says: frozenset[str] = frozenset()
-    hears: frozenset[str] = frozenset()
+    publishes: frozenset[str] = frozenset()
+    subscribes: frozenset[str] = frozenset()
     answers: frozenset[str] = frozenset()
-    asks: frozenset[str] = frozenset()
+    queries: frozenset[str] = frozenset()
 
     def __or__(self, other: Rights) -> Rights:
-        """Return what either may."""
+        """Return the union."""
         return Rights(*(getattr(self, one.name) | getattr(other, one.name)
                         for one in fields(self)))
 
 
 def together(several: Iterable[Rights]) -> Rights:
-    """Return what any of several may."""
+    """Return the union of several rights."""
     found = Rights()
     for one in several:
         found |= one
@@ -56,48 +56,40 @@ def together(several: Iterable[Rights]) -> Rights:
 
 
 def rights_of_all(layout: Layout) -> dict[str, Rights]:
-    """Return what each process of a system may, by the name in its certificate, and people by kind.
-
-    Args:
-        layout: of the system.
-    """
+    """Return the rights of all processes of a system by name, and of people by kind."""
     hosts = layout.hosts
     members = {**{name: router(name) for host in hosts.supervisors
                   for name in hosts.routers_of(host)}, **layout.members}
     topics = _topics(layout)
     found = {name: _rights_of(member, topics) for name, member in members.items()}
-    viewer = Rights(hears=frozenset({EVERYTHING}), asks=frozenset({EVERYTHING}))
-    operating = Rights(says=frozenset(_operated(layout, topics)))
-    if OBSERVER in found:  # the launcher's, which carries out what `--fault` asks for
+    viewer = Rights(subscribes=frozenset({EVERYTHING}), queries=frozenset({EVERYTHING}))
+    operating = Rights(publishes=frozenset(_operated(layout, topics)))
+    if OBSERVER in found:  # in the launcher, which injects the faults of `--fault`
         found[OBSERVER] |= operating
-        if hosts.several:  # its recorder hears what other hosts publish
-            found[OBSERVER] |= Rights(hears=viewer.hears)
+        if hosts.several:  # its recorder subscribes to what other hosts publish
+            found[OBSERVER] |= Rights(subscribes=viewer.subscribes)
     return {**found, OPERATOR: viewer | operating, VIEWER: viewer}
 
 
-def said_elsewhere(layout: Layout) -> frozenset[str]:
-    """Return what processes and people of the other hosts may publish, as key expressions.
-
-    Args:
-        layout: of the system, as one host has it.
-    """
+def published_elsewhere(layout: Layout) -> frozenset[str]:
+    """Return the keys that processes and people of the other hosts may publish."""
     hosts, rights = layout.hosts, rights_of_all(layout)
     there = {name for host in hosts.supervisors if host != layout.plan.host
              for name in (*hosts.routers_of(host), *hosts.may_run(host, layout.members))}
-    return together((*(rights[name] for name in there), rights[OPERATOR])).says
+    return together((*(rights[name] for name in there), rights[OPERATOR])).publishes
 
 
 def _rights_of(member: Member, topics: Mapping[str, Topic[Any]]) -> Rights:
     own = frozenset(f"{ROOT}/{key}" for key in member.actor.own_keys(member.parameters))
     outputs, inputs = published(member), heard(member) | {t.key: None for t in BASE_INPUTS}
     return Rights(
-        says=own | frozenset(_spelt(outputs)), hears=own | frozenset(_spelt(inputs)),
+        publishes=own | frozenset(_spelt(outputs)), subscribes=own | frozenset(_spelt(inputs)),
         answers=frozenset(_spelt(_kept(outputs, topics))),
-        asks=frozenset(_spelt(_kept(inputs, topics))))
+        queries=frozenset(_spelt(_kept(inputs, topics))))
 
 
 def _spelt(keys: Mapping[str, Members]) -> Iterator[str]:
-    """Yield the key expressions of topics: one for each member of a family, or for all of them."""
+    """Yield the key expressions of topics: one per named member of a family, or one for all."""
     for key, names in keys.items():
         if "{name}" in key:
             for name in ("*",) if names is None else names:
@@ -107,12 +99,12 @@ def _spelt(keys: Mapping[str, Members]) -> Iterator[str]:
 
 
 def _kept(keys: Mapping[str, Members], topics: Mapping[str, Topic[Any]]) -> dict[str, Members]:
-    """Return those whose newest message newcomers ask for: all but commands."""
+    """Return the topics whose latest message can be queried: all but commands."""
     return {key: names for key, names in keys.items() if topics[key].qos is not Qos.COMMAND}
 
 
 def _operated(layout: Layout, topics: Mapping[str, Topic[Any]]) -> Iterator[str]:
-    """Yield what operators say: what their page does, and commands that come from outside."""
+    """Yield the keys that operators publish: those of their page, and commands from outside."""
     own = {topic.key for topic in BASE_OUTPUTS}
     pages = [member for member in layout.members.values() if member.actor.is_page]
     by_page = {key: names for page in pages for key, names in published(page).items()

@@ -1,19 +1,16 @@
 """The access rules that a router enforces, as Zenoh's `access_control`.
 
-Nothing but what they allow is let through.
+A router passes only messages that a rule allows.
 
-A router knows who is at the other end of a link by the name in its certificate, and looks at each
-message that comes in by the link and each that goes out. Names are literal to Zenoh, so a rule is
-written for each identity.
+A router identifies the other end of a link by the name in its certificate. It checks each incoming
+and each outgoing message of the link. Zenoh takes names literally, so each identity has rules.
 
-* A client gets its own rights (`rampart.actors.access.rights`).
-* The other router of the same host gets everything: it has checked what it hands on.
-* A router of another host gets what the nodes there and people may do together. What it says
-  beyond that is refused, whoever it claims to hand it on for.
+* A client has its own rights (`rampart.actors.access.rights`).
+* The other router of the same host may pass everything, because it checks the same rules.
+* A router of another host has the rights of the nodes there and of people together.
 
-Going out, besides what somebody hears, is who else hears and asks: a publisher that did not know
-would not send. So of all subscriptions and questions of the system those go out that meet what the
-other end may say.
+Subscriptions and queries go out as well, because a publisher sends only to known subscribers. A
+link gets those of the whole system that match keys which the other end may publish.
 """
 
 from __future__ import annotations
@@ -43,20 +40,20 @@ INGRESS, EGRESS = "ingress", "egress"
 PUT, SUBSCRIBER, QUERY, QUERYABLE, REPLY = (
     "put", "declare_subscriber", "query", "declare_queryable", "reply")
 MESSAGES = (PUT, SUBSCRIBER, QUERY, QUERYABLE, REPLY)
-"""All that is ever let through; of what Zenoh can refuse, liveliness tokens and deleting never."""
+"""All messages that rules allow. Liveliness tokens and deleting are always refused."""
 
 Grant = tuple[str, tuple[str, ...], frozenset[str]]
-"""Flow, messages, and the key expressions for which they are let through."""
+"""Flow, messages, and the key expressions for which they may pass."""
 
 
 @dataclass(frozen=True, slots=True)
 class Host:
-    """One machine of a system, on which tools of operators and viewers may be used too.
+    """One machine of a system. Operators and viewers may use tools on every machine.
 
     Attributes:
-        name: of it; "" where there is one only.
-        routers: names of its routers.
-        nodes: names of the other processes there that have certificates.
+        name: Name of the machine; "" for the first or only one.
+        routers: Names of its routers.
+        nodes: Names of its other processes with certificates.
     """
 
     name: str = ""
@@ -67,30 +64,30 @@ class Host:
 _parsed = cache(zenoh.KeyExpr)
 
 
-def _meet(those: Iterable[str], these: Iterable[str]) -> frozenset[str]:
-    """Return those of the first that have a key in common with one of the second."""
-    wanted = [_parsed(key) for key in these]
-    return frozenset(key for key in those
-                     if any(_parsed(key).intersects(one) for one in wanted))
+def _overlapping(keys: Iterable[str], others: Iterable[str]) -> frozenset[str]:
+    """Return the key expressions that intersect one of the others."""
+    wanted = [_parsed(key) for key in others]
+    return frozenset(key for key in keys
+                     if any(_parsed(key).intersects(other) for other in wanted))
 
 
 def grants(own: Rights, everybody: Rights) -> list[Grant]:
-    """Return what a router lets through on a link to somebody.
+    """Return the messages that a router passes on a link to one identity.
 
     Args:
-        own: what that one may.
-        everybody: what all of the system may.
+        own: Rights of the identity.
+        everybody: Rights of the whole system.
     """
     found: list[Grant] = [
-        (INGRESS, (PUT,), own.says),
-        (INGRESS, (SUBSCRIBER,), own.hears),
-        (INGRESS, (QUERY,), own.asks),
+        (INGRESS, (PUT,), own.publishes),
+        (INGRESS, (SUBSCRIBER,), own.subscribes),
+        (INGRESS, (QUERY,), own.queries),
         (INGRESS, (QUERYABLE, REPLY), own.answers),
-        (EGRESS, (PUT,), own.hears),
-        (EGRESS, (SUBSCRIBER,), _meet(everybody.hears, own.says)),
-        (EGRESS, (QUERY,), _meet(everybody.asks, own.answers)),
-        (EGRESS, (QUERYABLE,), _meet(everybody.answers, own.asks)),
-        (EGRESS, (REPLY,), own.asks)]
+        (EGRESS, (PUT,), own.subscribes),
+        (EGRESS, (SUBSCRIBER,), _overlapping(everybody.subscribes, own.publishes)),
+        (EGRESS, (QUERY,), _overlapping(everybody.queries, own.answers)),
+        (EGRESS, (QUERYABLE,), _overlapping(everybody.answers, own.queries)),
+        (EGRESS, (REPLY,), own.queries)]
     return [grant for grant in found if grant[2]]
 
 
@@ -100,7 +97,7 @@ _BETWEEN_ROUTERS: list[Grant] = [
 
 
 def config_of(granted: Mapping[str, Iterable[Grant]]) -> dict[str, Any]:
-    """Return Zenoh's `access_control`, of what is let through by the names in certificates."""
+    """Return Zenoh's `access_control` for grants by the names in certificates."""
     rules = {name: [
         {"id": f"{name} {number}", "permission": "allow", "flows": [flow],
          "messages": list(messages), "key_exprs": sorted(keys)}
@@ -115,13 +112,13 @@ def config_of(granted: Mapping[str, Iterable[Grant]]) -> dict[str, Any]:
 
 def rules_of(host: Host, hosts: Sequence[Host], rights: Mapping[str, Rights],
              register: Register) -> dict[str, list[Grant]]:
-    """Return what the routers of a host let through, by the names in certificates.
+    """Return the grants of a host's routers, by the names in certificates.
 
     Args:
-        host: theirs.
-        hosts: all of the system, this one among them.
-        rights: of all, see `rights_of_all`.
-        register: who has which certificate; nobody else may anything.
+        host: The host.
+        hosts: All hosts of the system, this one included.
+        rights: See `rights_of_all`.
+        register: Valid identities; all others have no rights.
     """
     everybody = together(rights.values())
     routers, nodes = register.of_kind("router"), register.of_kind("node")
@@ -144,21 +141,21 @@ def rules_of(host: Host, hosts: Sequence[Host], rights: Mapping[str, Rights],
 
 
 def hosts_of(layout: Layout) -> dict[str, Host]:
-    """Return the hosts of a system by name; "" is the first, which may run what others do."""
+    """Return the hosts of a system by name; "" is the first, which may run all nodes."""
     hosts = layout.hosts
     return {name: Host(name, hosts.routers_of(name), hosts.may_run(name, layout.members))
             for name in hosts.supervisors}
 
 
 def access_of(layout: Layout, keys: str) -> dict[str, Any]:
-    """Return what the routers of a run on this host let through, as Zenoh's `access_control`.
+    """Return Zenoh's `access_control` for the routers of a run on this host.
 
     Args:
-        layout: of the run.
-        keys: folder of keys, with the register as it is now.
+        layout: Layout of the run.
+        keys: Folder of credentials with the current register.
 
     Raises:
-        KeysError: there is no sound register.
+        KeysError: The register is missing or invalid.
     """
     hosts = hosts_of(layout)
     return config_of(rules_of(hosts[layout.plan.host], list(hosts.values()), rights_of_all(layout),

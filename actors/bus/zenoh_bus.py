@@ -168,7 +168,7 @@ class ZenohBus:
                 pass
             if time.monotonic() > until_s:
                 shown = self._credentials
-                taking = f" that accepts the certificate in {shown.own}" if shown and dial else ""
+                taking = f" that takes the certificate in {shown.own}" if shown and dial else ""
                 raise BusError(f"no router at {' or '.join(self._dial)}{taking} "
                                f"({f'node {self._node}' if self._node else 'tool'})")
             await asyncio.sleep(_LOOK_S)

@@ -20,7 +20,7 @@ import msgspec
 import zenoh
 from zenoh.handlers import Callback
 
-from rampart.actors.access.rights import EVERYTHING, said_elsewhere
+from rampart.actors.access.rights import EVERYTHING, published_elsewhere
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.zenoh_session import Credentials, answering_first, open_session
 from rampart.actors.recording.message_form import header_of
@@ -62,7 +62,7 @@ def others_of(layout: Layout) -> OtherHosts | None:
     names = {supervisor: name for name, supervisor in hosts.called.items()}
     guards = {names[supervisor]: hosts.guards_of(host)
               for host, supervisor in hosts.supervisors.items() if supervisor != own}
-    return OtherHosts(distinct(said_elsewhere(layout)), guards, hosts.link.lost_after_s)
+    return OtherHosts(distinct(published_elsewhere(layout)), guards, hosts.link.lost_after_s)
 
 
 def distinct(expressions: Collection[str]) -> tuple[str, ...]:

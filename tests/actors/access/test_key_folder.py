@@ -126,7 +126,7 @@ def test_what_cannot_be_done_with_a_folder_is_refused_in_one_line(keys):
     for what, why in (
             (lambda: init(keys), "has an authority already"),
             (lambda: rotate(keys, ["DM5"]), "DM5: has no certificate"),
-            (lambda: revoke(keys, ["bob"]), "bob: has no certificate that could be revoked"),
+            (lambda: revoke(keys, ["bob"]), "bob: no certificate to revoke"),
             (lambda: issue(keys, ["DM4"], "operator"), "DM4: is the name of a node")):
         with pytest.raises(KeysError, match=why):
             what()
@@ -164,7 +164,7 @@ def test_a_run_is_started_with_certificates_that_are_valid(keys):
     (keys / "DM5.pem").chmod(0o640)
     assert why() == "DM5.pem: others can read it; chmod 600 it"
     (keys / "DM5.pem").write_bytes((keys / "DM4.pem").read_bytes())
-    assert why() == "DM5.pem: of DM4, and not of DM5; `rampart keys issue DM5` mends it"
+    assert why() == "DM5.pem: of DM4, and not of DM5; `rampart keys issue DM5` repairs it"
     (keys / "DM5.pem").write_text("nothing")
     assert why().startswith("DM5.pem: ")
     issue(keys, ["DM5"], "node", days=-1)
@@ -177,7 +177,7 @@ def test_a_run_is_started_with_certificates_that_are_valid(keys):
     init(other)
     issue(other, ["DM5"], "node")
     (keys / "DM5.pem").write_bytes((other / "DM5.pem").read_bytes())
-    assert why() == "DM5.pem: of another authority; `rampart keys issue DM5` mends it"
+    assert why() == "DM5.pem: of another authority; `rampart keys issue DM5` repairs it"
     (keys / "DM5.pem").unlink()
     assert why() == "DM5.pem: DM5 has no certificate; `rampart keys issue` gives it one"
 

@@ -20,7 +20,7 @@ RIGHTS = rights_of_all(LAYOUT)
 
 def who_says(key):
     return {name for name, rights in RIGHTS.items()
-            if any(zenoh.KeyExpr(one).includes(f"rampart/{key}") for one in rights.says)}
+            if any(zenoh.KeyExpr(one).includes(f"rampart/{key}") for one in rights.publishes)}
 
 
 @pytest.mark.parametrize(("key", "who"), [
