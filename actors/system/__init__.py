@@ -1,1 +1,1 @@
-"""Which actor runs in which process, who talks with whom, and the topics of a whole system."""
+"""Actors and processes of a whole system, their topics, and their connections."""

@@ -1,6 +1,6 @@
-"""Which machine runs what, and what the supervisors and routers of each are called.
+"""The hosts of a system: their nodes, and the names of their supervisors and routers.
 
-Hosts are known by name here, the first one, which is the only one as a rule, by "".
+Here the name of the first host, usually the only one, is "".
 """
 
 from __future__ import annotations
@@ -15,22 +15,23 @@ from rampart.manager.spec.schema import SystemSpec
 
 
 class Hosts:
-    """The machines of a system, as one of them sees it.
+    """The hosts of a system, as one of them sees it.
 
     Args:
-        spec: of the system.
-        own: name of the one; "" of the first.
+        spec: The system.
+        own: Name of this host.
 
     Attributes:
-        several: whether there is more than one.
-        supervisors: name of the supervisor of each host.
-        called: the same by what the hosts are called, the first one too; empty if there is one.
-        link: what is assumed of the network between them.
-        command_age_s: a command that was under way for longer is not obeyed.
-        home_of: name of each node with that of the host on which it runs, unless that is lost.
+        several: Whether there is more than one host.
+        supervisors: Name of the supervisor by host.
+        called: The same by the name in the specification, the first host's too; empty for a single
+            host.
+        link: Assumptions about the network between the hosts.
+        command_age_s: Commands older than this are refused.
+        home_of: Host of each node, on which it runs unless that host is lost.
 
     Raises:
-        ValueError: there is no such host.
+        ValueError: The host does not exist.
     """
 
     def __init__(self, spec: SystemSpec, own: str = "") -> None:
@@ -51,7 +52,7 @@ class Hosts:
         self._own = own
 
     def guards_of(self, host: str) -> tuple[str, ...]:
-        """Return the names of a host's supervisor and routers, by which it is known to be there."""
+        """Return the supervisor and routers of a host, whose heartbeats show that it works."""
         return (self.supervisors[host], *self.routers_of(host))
 
     def routers_of(self, host: str) -> tuple[str, ...]:
@@ -59,9 +60,9 @@ class Hosts:
         return tuple(on_host(name, host) for name in ROUTERS)
 
     def may_run(self, host: str, members: Iterable[str]) -> frozenset[str]:
-        """Return those of a system's actors that a host may run, its guards among them.
+        """Return the actors that a host may run, including its guards.
 
-        The first one may have to run what has its home elsewhere.
+        The first host may run the actors of all others.
         """
         guards = {on_host(name, other): other for other in self.supervisors
                   for name in (SUPERVISOR, OBSERVER)}
@@ -69,14 +70,14 @@ class Hosts:
             guards[name] == host if name in guards else host in {"", self.home_of[name]}))
 
     def address_of(self, host: str) -> str:
-        """Return the address of a host, "" if there is only one."""
+        """Return the address of a host; "" if there is only one."""
         return self._specs[host].address if self.several else ""
 
     def heard_by(self, host: str, nodes: Iterable[str]) -> tuple[str, ...]:
         """Return the nodes whose heartbeats the supervisor of a host receives.
 
-        Of its own routers and nodes, on the first host of all nodes, for it may have to run them,
-        and of the guards of the others.
+        These are its own routers and nodes, on the first host all nodes, because it may have to run
+        them, and the guards of the other hosts.
         """
         return (*(name for name in self.guards_of(host) if name != self.supervisors[host]),
                 *(node for node in nodes if host in {"", self.home_of[node]}),
@@ -87,22 +88,23 @@ class Hosts:
         """Return where a router of this host listens for those of the others.
 
         Args:
-            place: of the router, 0 or 1.
+            place: Number of the router, 0 or 1.
             protocol: "tcp" or "tls".
         """
         return [_endpoint(self._specs[self._own], place, protocol)] if self.several else []
 
     def dials(self, place: int, protocol: str) -> list[str]:
-        """Return where the routers are that one of this host dials: of the hosts before it.
+        """Return the routers that a router of this host dials: one on each host before it.
 
-        Each its like: with every router linked to both of another host, Zenoh (1.10) hands
-        nothing on between the two of a host any more when that host is lost.
+        Each router dials the one of its own number. If every router were linked to both of another
+        host, Zenoh (1.10) would no longer pass messages between the two routers of one host after
+        the other host is lost.
         """
         before = list(self._specs)[:list(self._specs).index(self._own)] if self.several else []
         return [_endpoint(self._specs[host], place, protocol) for host in before]
 
     def meeting_place(self) -> tuple[str, int]:
-        """Return address and port at which the first host's launcher is asked."""
+        """Return address and port of the first host's launcher."""
         first = self._specs[""]
         return first.address, first.port + len(ROUTERS)
 

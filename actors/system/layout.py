@@ -1,10 +1,10 @@
-"""Everything that follows from the plan of a run and its system: processes and their actors.
+"""The layout of a run, derived from its plan and system: processes, actors and connections.
 
-All that is checked of the actors together is checked here: whether what they receive can come, what
-they publish is theirs alone, and what they name is there.
+The checks of all actors together are here: every subscribed topic is published, every topic has the
+publishers it may have, and every name exists.
 
-A node that waits for a topic under a mistyped key, or for messages of another type, works as well
-as any: it is only silent. So it is refused before a run, in one line.
+A node that subscribes to a mistyped key, or expects messages of another type, would only be silent.
+So the check refuses it before a run, in one line.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Unit(msgspec.Struct, frozen=True):
 
     @property
     def respawn(self) -> str:
-        """Who brings it back: a recovery module or `supervisor`."""
+        """Its restarter: a recovery module or `supervisor`."""
         return self.nodes[0].respawn
 
 
@@ -69,14 +69,14 @@ class Layout:
     """Everything derived from plan and spec: units, members, topics.
 
     Args:
-        plan: of the run.
-        spec: the system, as the plan leaves it.
-        application: of the run; without one, its parameters of the world are missing.
+        plan: Plan of the run.
+        spec: The system, tailored to the plan.
+        application: Application of the run; it adds parameters of the world.
 
     Raises:
-        ValueError: an actor class named in the spec does not exist, cannot be imported, belongs
-            into another table, or does not take its parameters; an actor receives what no
-            node publishes, or publishes what another one does; the judge is not a judge.
+        ValueError: An actor class does not exist, cannot be imported, belongs in another table, or
+            does not take its parameters; a subscribed topic has no publisher, or a topic has two;
+            the judge is not a judge.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec,
@@ -104,8 +104,8 @@ class Layout:
         world = {"seed": plan.seed, **(application or Application()).world_parameters(),
                  "dead_man": spec.layers.dead_man,
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
-        # Without fault tolerance its actors are not started: what they publish is not missed, and
-        # what they receive is checked.
+        # Without fault tolerance its actors do not run. Their outputs are not required, and their
+        # inputs are checked.
         whole = msgspec.structs.replace(spec, layers=Layers()).actors()
         everyone = self._complete((
             *self._guards(observer, judged),
@@ -124,8 +124,8 @@ class Layout:
         if judge is None:
             return
         if kind.trial:
-            raise ValueError(f"{file}: $.judge: the application says by itself what a run was "
-                             "worth; leave it out")
+            raise ValueError(f"{file}: $.judge: the application judges its runs; expected "
+                             "no [judge]")
         given = {name: value for name, value in spec.judge.items() if name != "class"}
         read_parameters(judge.Parameters, given, file, "$.judge")
         for topic in judge.inputs():
@@ -133,7 +133,7 @@ class Layout:
                 connections.check_published(f"{file}: {judged_by}", topic.key, None)
 
     def _guards(self, observer: type[Actor], judged: Collection[Topic[Any]]) -> Iterator[Member]:
-        """Yield supervisors and observers of all hosts, the observer of the run among them."""
+        """Yield the supervisors and observers of all hosts, and the observer of the run."""
         several = self.hosts.several
         for host, name in self.hosts.supervisors.items():
             role = ("host supervisor" if host else "first supervisor") if several else "supervisor"
@@ -148,16 +148,16 @@ class Layout:
                              {"supervisor": name})
 
     def _complete(self, members: Iterable[Member], file: str) -> list[Member]:
-        """Return members with the parameters that they have in the whole system.
+        """Return the members with the parameters that depend on the whole system.
 
         Raises:
-            ValueError: the spec has rows of a table that no actor takes.
+            ValueError: No actor takes the rows of a table.
         """
         everyone = list(members)
         for table, rows in (("panel", self.spec.panels), ("ros2", self.spec.ros2)):
             if rows and not any(table in member.actor.tables for member in everyone):
-                raise ValueError(f"{file}: $.{table}: no node takes it; one of actor "
-                                 f"{TAKES[table]} does")
+                raise ValueError(f"{file}: $.{table}: no node takes it; expected a node with "
+                                 f"actor = {TAKES[table]!r}")
         nodes = {node.name for node in self.spec.nodes}
         topics = {topic.key: topic for member in everyone
                   if member.name in nodes and not member.actor.is_page
@@ -167,28 +167,28 @@ class Layout:
             member.parameters, topics.values(), ordered)) for member in everyone]
 
     def spare_of(self, names: Collection[str]) -> Spare:
-        """Return of what the next process of these actors is made."""
+        """Return whether the next process of these actors comes from the pool."""
         return "pool" if all(name in self.members and self.members[name].spare == "pool"
                              for name in names) else "none"
 
 
 class Connections:
-    """All topics of a system, and who publishes them.
+    """All topics of a system and their publishers.
 
     Args:
-        members: all actors of the system, also those that are not started now, and could be.
-        known: topics of engine and application, whose declarations count first.
-        judged: topics of the judge.
-        judge: what the judge is called in messages.
-        file: name of the spec, for messages.
+        members: All actors of the system, including those that do not run now.
+        known: Topics of engine and application; their declarations take precedence.
+        judged: Topics of the judge.
+        judge: Name of the judge in messages.
+        file: Name of the specification, for messages.
 
     Attributes:
-        members: the actors by name, with the topics that their parameters name.
-        named: those topics, by the keys in the parameters.
+        members: The actors by name, with the topics that their parameters name.
+        named: These topics, by the keys in the parameters.
 
     Raises:
-        ValueError: a topic makes no sense or is declared in two ways, or a parameter names a topic
-            or a field that there is not; the message names node, key or parameter, and value.
+        ValueError: A topic is invalid or declared in two ways, or a parameter names an unknown
+            topic or field. The message names node, key or parameter, and value.
     """
 
     def __init__(self, members: Collection[Member], known: Iterable[Topic[Any]],
@@ -214,15 +214,15 @@ class Connections:
                 self._publishers.setdefault(key, []).append((member, names))
 
     def check(self, started: Collection[Member], silent: Collection[str]) -> None:
-        """Check who receives and publishes what.
+        """Check the publishers of all topics.
 
         Args:
-            started: the actors that are started.
-            silent: keys on which no node has to publish now.
+            started: The actors that run.
+            silent: Keys that need no publisher now.
 
         Raises:
-            ValueError: a topic is received and never published, or has two publishers where one is
-                meant; the message names nodes and key.
+            ValueError: A subscribed topic has no publisher, or a topic has two where it may have
+                one. The message names nodes and key.
         """
         for member in started:
             optional = {topic.key for topic in member.actor.optional_inputs}
@@ -242,19 +242,19 @@ class Connections:
                     if other.name != member.name:
                         raise ValueError(
                             f"{self._file}: {member.where}: publishes {key!r}, as {other.where} "
-                            f"does; of a topic of qos {topic.qos.value} the latest message counts, "
-                            "so that one may (or several = True in the Topic)")
+                            f"does; a topic of qos {topic.qos.value} has one publisher, because "
+                            "its latest message counts (or several = True in the Topic)")
 
     def check_published(self, who: str, key: str, names: Members) -> None:
-        """Check that what is received is published.
+        """Check that a subscribed topic has a publisher.
 
         Args:
-            who: receives it, for the message.
-            key: of the topic.
-            names: of the members of a family, None for all.
+            who: The subscriber, for the message.
+            key: Key of the topic.
+            names: Members of a family; None for all.
 
         Raises:
-            ValueError: no node publishes it.
+            ValueError: No node publishes it.
         """
         topic, publishers = self._topics[key][0], self._publishers.get(key, [])
         if topic.outside or (publishers and not topic.is_family):
@@ -269,8 +269,8 @@ class Connections:
                  for _, there in those for name in there or ("{name}",)]
         near = difflib.get_close_matches(wanted, spelt, 1)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ValueError(f"{who} hears {wanted!r}, which nothing publishes; {hint}What a node can "
-                         "do without is named in optional_inputs of its class")
+        raise ValueError(f"{who} hears {wanted!r}, which nothing publishes; {hint}If the node can "
+                         "do without, name the topic in optional_inputs of its class")
 
     def _declare(self, topic: Topic[Any], who: str) -> None:
         first, other = self._topics.setdefault(topic.key, (topic, who))
@@ -315,9 +315,9 @@ class Connections:
         return topic
 
     def _check_alone(self, node: Member) -> None:
-        """Check that no other node publishes where one is to be alone, as an operator's joystick.
+        """Check that a node is the only publisher where it must be, as an operator's joystick.
 
-        Also of a command: the robot is told to stand still once, when he lets go.
+        This holds for commands, too: the order to stand still is sent once, at the release.
         """
         for alone_on, what in node.actor.alone_on(node.parameters).items():
             for key, publishers in self._publishers.items():
@@ -328,12 +328,11 @@ class Connections:
                         raise ValueError(
                             f"{self._file}: {node.name}: {what}: {other.where} "
                             f"publishes {alone_on!r} as well, and may move what an operator let go "
-                            "of; a topic of the stick's own is right (or several = True in the "
-                            "Topic)")
+                            "of; expected a topic of its own (or several = True in the Topic)")
 
     @contextlib.contextmanager
     def _checking(self, member: Member) -> Iterator[None]:
-        """Name file and node in what is wrong with its parameters."""
+        """Add file and node to an error in its parameters."""
         try:
             yield
         except ValueError as error:
@@ -341,28 +340,28 @@ class Connections:
 
 
 def check_repairs(members: Mapping[str, Member], spec: SystemSpec, file: str) -> None:
-    """Check that what a detection module names can be restarted by what answers to it.
+    """Check that the recoveries of a mechanism restart the nodes that its detections name.
 
     Args:
-        members: all actors of a system, by name.
-        spec: the system.
-        file: name of the spec, for messages.
+        members: All actors of a system, by name.
+        spec: The system.
+        file: Name of the specification, for messages.
 
     Raises:
-        ValueError: a module that restarts nodes answers to a detection module, and neither it nor
-            another one that answers has a node that this watches or suspects.
+        ValueError: A mechanism has recoveries that restart nodes, and none of them restarts a node
+            that one of its detections watches or suspects.
     """
     for mechanism in spec.mechanisms:
         repairs = {name: members[name].parameters for name in mechanism.recoveries
                    if name in members and issubclass(members[name].actor, Respawn)}
-        mendable = {node for said in repairs.values()
+        restartable = {node for said in repairs.values()
                     if isinstance(said, Respawn.Parameters) for node in said.nodes}
         for name in mechanism.detections if repairs else ():
             if name not in members:
                 continue
             for parameter in ("watch", "suspects"):
                 for node in getattr(members[name].parameters, parameter, ()):
-                    if node not in mendable:
+                    if node not in restartable:
                         by = " or ".join(repairs)
                         raise ValueError(
                             f"{file}: detection {name}: parameters.{parameter}: {by} answers to "
@@ -372,15 +371,14 @@ def check_repairs(members: Mapping[str, Member], spec: SystemSpec, file: str) ->
 
 
 def _check_field(topic: Topic[Any], named: Named, where: str) -> None:
-    """Check the field of a topic that a parameter names."""
     if named.field:
         try:
             kind = Field(topic.type, named.field).kind
         except ValueError as error:
             raise ValueError(f"{where}: topic {topic.key}: {error}") from None
         if kind not in named.kinds:
-            raise ValueError(f"{where}: topic {topic.key}: {named.field} is a {kind}; a "
-                             f"{' or a '.join(named.kinds)} is right")
+            raise ValueError(f"{where}: topic {topic.key}: {named.field} is a {kind}; expected a "
+                             f"{' or a '.join(named.kinds)}")
 
 
 def _form(topic: Topic[Any]) -> str:
@@ -392,7 +390,7 @@ def _guard(name: str, kind: type[Actor], given: Mapping[str, Any]) -> Member:
 
 
 def router(name: str) -> Member:
-    """Return a router of the bus, which real runs have."""
+    """Return a router of the bus; real runs have two."""
     return _guard(name, load_class(ROLES["router"]), {})
 
 
@@ -401,8 +399,8 @@ def adapted_system(layout: Layout, run: RunContext,
     """Return layout and context of the system as it was changed while running.
 
     Raises:
-        ValueError: the changed system is unsound, or the running one cannot be changed into it.
-            The manager lets neither happen; a message may.
+        ValueError: The changed system is invalid, or the running one cannot be changed into it.
+            The manager prevents both, but another sender may not.
     """
     try:
         document = msgspec.json.decode(adapted.document, type=dict[str, Any])
@@ -415,11 +413,11 @@ def adapted_system(layout: Layout, run: RunContext,
 
 
 def load_run(plan: RunPlan, spec: SystemSpec) -> RunContext:
-    """Load what all actors of a run have in common; done once, before the fork.
+    """Load the common context of all actors of a run; done once, before the fork.
 
     Raises:
-        ValueError: the application's options are unsound, or there is no such program as a node's
-            command names; the message names file and value.
+        ValueError: The application's options are invalid, or the program of a command does not
+            exist. The message names file and value.
     """
     check_programs(plan, spec)
     return RunContext(plan, spec, load_document(plan), load_application(plan, spec))
@@ -428,14 +426,14 @@ def load_run(plan: RunPlan, spec: SystemSpec) -> RunContext:
 def published_keys(spec: SystemSpec, layout: Layout | None = None) -> tuple[str, ...]:
     """Return the keys that the nodes of a system and its supervisor publish, families spelt out.
 
-    Those of the last system are remembered: a page asks for them when it starts, and starts again.
+    The keys of the last system are cached, because each restart of a page needs them.
 
     Args:
-        spec: the system.
-        layout: of it, if there is one; it takes 60 ms to make another.
+        spec: The system.
+        layout: Its layout if available; making one takes 60 ms.
 
     Raises:
-        ValueError: the spec names an actor class that does not exist.
+        ValueError: An actor class does not exist.
     """
     global _last  # noqa: PLW0603 one entry, by identity: a spec cannot be a key of a dictionary
     if _last[0] is not spec:

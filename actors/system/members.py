@@ -1,4 +1,4 @@
-"""The actors of a system: their classes, loaded by name, and what each publishes and receives."""
+"""The actors of a system: their classes, loaded by name, and the topics of each."""
 
 from __future__ import annotations
 
@@ -29,21 +29,23 @@ T = TypeVar("T")
 REPORTS_ON: Mapping[Kind, Topic[Any]] = {
     Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY,
     Kind.MANAGER: topics.MANAGER_STATUS}
-"""What an actor of such a kind publishes, and no other does."""
+"""The topic that every actor of a kind publishes, and no other actor."""
 
-_PLACE = {Kind.DETECTION: "it belongs into [[detection]]",
-          Kind.RECOVERY: "it belongs into [[recovery]]",
-          Kind.MANAGER: "kind = 'manager' is right"}
+_PLACE = {Kind.DETECTION: "it belongs in [[detection]]",
+          Kind.RECOVERY: "it belongs in [[recovery]]",
+          Kind.MANAGER: "expected kind = 'manager'"}
 
 Spare = Literal["none", "pool"]
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One actor of the system: its name, class and parameters, and where these are in its table.
+    """One actor of the system.
 
-    `hears` and `publishes` are the topics that its parameters name, as `heard` and `published` have
-    them.
+    Attributes:
+        table: Place of its parameters in its table, for messages.
+        hears: Subscribed topics that its parameters name, in the form of `heard`.
+        publishes: Published topics that its parameters name, in the form of `published`.
     """
 
     name: str
@@ -57,17 +59,17 @@ class Member:
 
     @property
     def where(self) -> str:
-        """What it is called in messages: by table and name."""
+        """Table and name, for messages."""
         return where(self.kind, self.name)
 
 
 def where(kind: Kind, name: str) -> str:
-    """Return what an actor is called in messages: by table and name."""
+    """Return table and name of an actor, for messages."""
     return f"{kind.value if kind in {Kind.DETECTION, Kind.RECOVERY} else 'node'} {name}"
 
 
 def published(member: Member) -> dict[str, Members]:
-    """Return topic key → names of the family members published (None: any, or not a family)."""
+    """Return the published family members by topic key (None: any, or not a family)."""
     actor = member.actor
     return _together({
         t.key: actor.output_names(t, member.name, member.parameters) if t.is_family else None
@@ -75,9 +77,9 @@ def published(member: Member) -> dict[str, Members]:
 
 
 def heard(member: Member) -> dict[str, Members]:
-    """Return topic key → names of the family members heard (None: all, or not a family).
+    """Return the subscribed family members by topic key (None: all, or not a family).
 
-    Without what every actor receives.
+    Topics of every actor are left out.
     """
     actor = member.actor
     return _together({
@@ -93,33 +95,33 @@ def _together(declared: dict[str, Members], chosen: Mapping[str, Members]) -> di
 
 
 def topics_of(actor: type[Actor]) -> tuple[Topic[Any], ...]:
-    """Return the inputs and outputs of an actor class without what every actor receives."""
+    """Return the topics of an actor class without the inputs of every actor."""
     return *(t for t in actor.inputs() if t not in BASE_INPUTS), *actor.outputs
 
 
 def load_member(node: NodeSpec, spec: SystemSpec, file: str,
                 derived: Mapping[str, Any] = MappingProxyType({})) -> Member:
-    """Load the class of an actor, and read its parameters as that declares them.
+    """Load the class of an actor and read its parameters.
 
     Args:
-        node: its row of the spec.
-        spec: the system; it names the nodes of a module that respawns.
-        file: name of the spec, for messages.
-        derived: parameters that it is given besides, if it takes them.
+        node: Its row of the specification.
+        spec: The system; it names the nodes that a recovery module restarts.
+        file: Name of the specification, for messages.
+        derived: Further parameters, used if the class declares them.
 
     Raises:
-        ValueError: there is no such class, or it does not take a parameter; the message is one
-            line and names file, path and value.
+        ValueError: The class does not exist or does not take a parameter. The message is one line
+            and names file, path and value.
     """
     path = where(node.kind, node.name)
     own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
     derived = {"nodes": own} if own else derived
     try:
-        if node.command and node.stand_in:  # what is wrong with it is told in real runs, too
+        if node.command and node.stand_in:  # checked in real runs, too
             load_class(node.stand_in, field="stand_in")
         actor = CommandNode if node.command else load_class(node.actor, node.kind)
         if actor is CommandNode and not node.command:
-            raise ValueError(f"actor = {node.actor!r}: say command = ['./program', ...] instead")
+            raise ValueError(f"actor = {node.actor!r}: expected command = ['./program', ...]")
         takes = {field.name for field in msgspec.structs.fields(actor.Parameters)}
     except ValueError as error:
         raise ValueError(f"{file}: {path}: {error}") from None
@@ -142,13 +144,13 @@ def load_class(path: str, kind: Kind | None = None, field: str = "actor") -> typ
     """Return the actor class named `module:Class`.
 
     Args:
-        path: name of the class.
-        kind: that it has to be of, which is known by what it publishes; None for any.
-        field: of the spec, for messages.
+        path: Name of the class.
+        kind: Required kind, recognised by its outputs; None for any.
+        field: Field of the specification, for messages.
 
     Raises:
-        ValueError: there is no such class, it is no actor, or one of another kind, or its module
-            cannot be imported.
+        ValueError: The class does not exist, is not an actor of this kind, or its module cannot be
+            imported.
     """
     found = import_class(path, Actor, field)
     own = None if kind is None else REPORTS_ON.get(kind)
@@ -159,17 +161,17 @@ def load_class(path: str, kind: Kind | None = None, field: str = "actor") -> typ
         if of is not kind and topic in found.outputs:
             raise ValueError(f"{field} = {path!r}: it publishes {topic.key}, so {_PLACE[of]}")
     if kind is not None and found.node_kind not in {"", kind.value}:
-        raise ValueError(f"{field} = {path!r}: it is no {kind.value} node; kind = "
-                         f"{found.node_kind!r} is right")
+        raise ValueError(f"{field} = {path!r}: not a {kind.value} node, expected kind = "
+                         f"{found.node_kind!r}")
     return found
 
 
 def import_class(path: str, base: type[T], field: str, what: str = "") -> type[T]:
-    """Return the class named `module:Class`, which has to be derived from `base`: `what` it is.
+    """Return the class named `module:Class`, derived from `base`; `what` names it in messages.
 
     Raises:
-        ValueError: there is no such class, or its module cannot be imported; `field` and `path`
-            are named.
+        ValueError: The class does not exist, or its module cannot be imported. The message names
+            `field` and `path`.
     """
     module, _, name = path.partition(":")
     try:
@@ -178,7 +180,7 @@ def import_class(path: str, base: type[T], field: str, what: str = "") -> type[T
         hidden = "; ".join(dict.fromkeys(working_folder.refused.values()))
         hint = f"; nothing is imported from there: {hidden}" if hidden else ""
         raise ValueError(f"{field} = {path!r}: {error}{hint}") from None
-    except Exception as error:  # a module of the user's own may raise anything
+    except Exception as error:  # a user's module may raise anything
         frames = traceback.extract_tb(error.__traceback__)
         at = next((frame for frame in reversed(frames) if not frame.filename.startswith(
             (str(Path(rampart.__file__).parent), "<frozen"))), frames[-1])
@@ -190,16 +192,15 @@ def import_class(path: str, base: type[T], field: str, what: str = "") -> type[T
         known = [key for key, value in vars(imported).items() if isinstance(value, type)
                  and issubclass(value, base) and value.__module__ == module]
         raise ValueError(f"{field} = {path!r}: no such {what or base.__name__.lower()} class; "
-                         "known: "
-                         f"{', '.join(known) or 'none'}")
+                         f"known: {', '.join(known) or 'none'}")
     return found
 
 
 def application_class(spec: SystemSpec) -> type[Application]:
-    """Return the class that a system names under `[application]`, `Application` if none.
+    """Return the class named under `[application]`; `Application` if there is none.
 
     Raises:
-        ValueError: there is no such class.
+        ValueError: The class does not exist.
     """
     path = spec.application.get("class")
     if path is None:
@@ -211,40 +212,39 @@ def load_application(plan: RunPlan, spec: SystemSpec) -> Application:
     """Return the application of a run: the options of the spec, replaced by those of the plan.
 
     Raises:
-        ValueError: an option is unknown or unsound; the message names file, field and value.
+        ValueError: An option is unknown or invalid; the message names file, field and value.
     """
     kind = application_class(spec)
-    said = {name: value for name, value in spec.application.items() if name != "class"}
+    given = {name: value for name, value in spec.application.items() if name != "class"}
     try:
-        options = msgspec.convert({**said, **plan.options}, kind.Options)
+        options = msgspec.convert({**given, **plan.options}, kind.Options)
     except msgspec.ValidationError as error:
         raise ValueError(f"{plan.system_file}: $.application: {error}") from None
     return kind(options)
 
 
 def judge_class(spec: SystemSpec) -> type[Handlers] | None:
-    """Return the class that a system names under `[judge]`, None if none.
+    """Return the class named under `[judge]`; None if there is none.
 
     Raises:
-        ValueError: there is no such class.
+        ValueError: The class does not exist.
     """
     path = spec.judge.get("class")
     if spec.judge and path is None:
-        raise ValueError("$.judge.class: missing; name a class derived from rampart.Judge")
+        raise ValueError("$.judge.class: missing; expected a class derived from rampart.Judge")
     if not spec.judge:
         return None
     found = import_class(str(path), Handlers, "$.judge.class", "judge")
     if not callable(getattr(found, "verdict", None)):
-        raise ValueError(f"$.judge.class = {path!r}: no judge; name a class derived from "
-                         "rampart.Judge")
+        raise ValueError(f"$.judge.class = {path!r}: expected a class derived from rampart.Judge")
     return found
 
 
 def judged_topics(spec: SystemSpec, observer: type[Handlers]) -> list[Topic[Any]]:
-    """Return the topics that the judge receives and the observer would not.
+    """Return the judge's topics that the observer does not subscribe to by itself.
 
     Raises:
-        ValueError: there is no such judge.
+        ValueError: The judge does not exist.
     """
     judge = judge_class(spec)
     return [] if judge is None else [t for t in judge.inputs() if t not in observer.inputs()]

@@ -1,4 +1,4 @@
-"""The topics of a system: the common ones, and what its actors declare besides."""
+"""The topics of a system: those of engine and application, and those of its actors."""
 
 from __future__ import annotations
 
@@ -16,30 +16,29 @@ from rampart.actors.system.members import application_class, load_class, load_me
 from rampart.manager.spec.specification import SystemSpec
 
 _SHIPPED = "rampart."
-"""Where the actors that ship are; that their topics are declared is a test's business."""
+"""Actors that ship; a test checks that their topics are declared."""
 
 
 def declared_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     """Return the topics of the engine and of the system's application.
 
     Raises:
-        ValueError: the application's class does not exist.
+        ValueError: The application's class does not exist.
     """
     return (*topics.ALL, *application_class(spec).topics)
 
 
 def system_topics(spec: SystemSpec, *, shipped: bool = True) -> tuple[Topic[Any], ...]:
-    """Return every topic of a system once: the declared ones, then what its actors have besides.
+    """Return every topic of a system once: the declared ones, then those of its actors in order.
 
-    The latter are in the order of the spec. A key that is declared keeps its contract.
+    A declared key keeps its declaration.
 
     Args:
-        spec: the system.
-        shipped: whether actors that ship are loaded, too.
+        spec: The system.
+        shipped: Whether actors that ship are loaded, too.
 
     Raises:
-        ValueError: the spec names an actor class that does not exist, or one of them declares a
-            topic that makes no sense.
+        ValueError: An actor class does not exist or declares an invalid topic.
     """
     found = {topic.key: topic for topic in declared_topics(spec)}
     paths = (*(node.actor for node in spec.nodes), *(row.actor for row in spec.detections),
@@ -60,36 +59,36 @@ def system_topics(spec: SystemSpec, *, shipped: bool = True) -> tuple[Topic[Any]
 
 
 def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return the topics that a system has beyond the declared ones.
+    """Return the topics of a system beyond the declared ones.
 
-    Only actors that do not ship are loaded, for those that do have declared topics only: a tool
-    that looks at a run need not wait for controller and simulator to be imported.
+    Actors that ship have only declared topics and are not loaded. So tools need not wait for
+    controller and simulator to be imported.
 
     Raises:
-        ValueError: as `system_topics`, of the actors that do not ship.
+        ValueError: As `system_topics`, for actors that do not ship.
     """
     return system_topics(spec, shipped=False)[len(declared_topics(spec)):]
 
 
 def stand_in_topics(spec: SystemSpec) -> list[Topic[Any]]:
-    """Return the topics that are declared by what plays commands in virtual time.
+    """Return the topics of the actors that replace commands in virtual time.
 
     Raises:
-        ValueError: there is no such class.
+        ValueError: A class does not exist.
     """
     return [topic for node in spec.nodes if node.stand_in
             for topic in topics_of(load_class(node.stand_in, field="stand_in"))]
 
 
 def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
-    """Return the topic of a key below the root, one member's if it is a family, or None."""
+    """Return the topic of a key below the root, or None."""
     return next((topic for topic in known if topic.member(key) is not None), None)
 
 
 def flaw(topic: Topic[Any]) -> str:
-    """Return what is wrong with a topic, or an empty text."""
+    """Return what is wrong with a topic; "" if nothing is."""
     if topic.key.count("{name}") > 1:
-        return "one {name} at most is right"
+        return "expected at most one {name}"
     if not (isinstance(topic.type, type) and issubclass(topic.type, msgspec.Struct)):
         return f"type = {topic.type!r}: must be derived from rampart.actors.bus.messages.Message"
     return _unsendable(topic.type)
@@ -97,7 +96,7 @@ def flaw(topic: Topic[Any]) -> str:
 
 @cache
 def _unsendable(message: type[msgspec.Struct]) -> str:
-    """Return which field of a message has a type that no message can have, "" if none has."""
+    """Return which field of a message has a type that cannot be sent; "" if none has."""
     try:
         waiting = [("", inspect.type_info(message))]
     except (TypeError, NameError) as error:

@@ -65,7 +65,7 @@ def test_the_topics_of_a_robot_s_own_actors_follow_the_common_ones(tmp_path):
 
 @pytest.mark.parametrize(("changes", "words"), [
     ({"type": dict}, "topic 'porter/load': type = <class 'dict'>: must be derived from "),
-    ({"key": "a/{name}/{name}"}, "topic 'a/{name}/{name}': one {name} at most is right"),
+    ({"key": "a/{name}/{name}"}, "topic 'a/{name}/{name}': expected at most one {name}"),
 ])
 def test_a_topic_that_makes_no_sense_is_refused_by_actor_and_key(tmp_path, monkeypatch, changes,
                                                                  words):

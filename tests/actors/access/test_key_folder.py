@@ -105,7 +105,7 @@ def test_a_certificate_says_who_where_and_for_how_long(keys):
     ("10.0.0.2", True), ("::1", True), ("rover-2.example.org", True), ("", False), ("a b", False),
     ("10.0.0.2:7450", False), ("x..y", False), ("*", False), ("rövér", False), ("a" * 64, False)])
 def test_an_address_is_one_of_ip_or_the_name_of_a_host(text, is_one):
-    with contextlib.nullcontext() if is_one else pytest.raises(ValueError, match="no IP address"):
+    with contextlib.nullcontext() if is_one else pytest.raises(ValueError, match="an IP address"):
         check_address(text)
 
 
@@ -132,7 +132,7 @@ def test_what_cannot_be_done_with_a_folder_is_refused_in_one_line(keys):
             what()
     assert (keys / "authority.key").read_bytes() == before
     (keys / "authority.key").unlink()
-    with pytest.raises(KeysError, match="issued where the authority is"):
+    with pytest.raises(KeysError, match="where the authority is"):
         issue(keys, ["DM5"], "node")
     assert check(keys, ["DM4"]) > NOW  # a run needs no authority
     keys.chmod(0o750)

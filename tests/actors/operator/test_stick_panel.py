@@ -149,11 +149,11 @@ def test_a_member_of_a_family_has_a_stick_and_the_others_are_somebody_else_s():
      "tank.toml: page: panel 'Drive': stick: topic tank/hand: forwards: Hand has no field "
      "'forwards'; did you mean forward?"),
     ('stick = ["tank/hand:held"]',
-     "tank.toml: page: panel 'Drive': stick: topic tank/hand: held is a truth; a number is right"),
+     "tank.toml: page: panel 'Drive': stick: topic tank/hand: held is a truth; expected a number"),
     (f'{FIELDS}\nheld = "tank/hand:left"', "'Drive': stick: tank/hand:forward, tank/hand:left, "
      "tank/hand:left: expected each field once"),
     ('stick = ["tank/hand:forward"]\nheld = "tank/hand:left"',
-     "tank.toml: page: panel 'Drive': held: topic tank/hand: left is a number; a truth is right"),
+     "tank.toml: page: panel 'Drive': held: topic tank/hand: left is a number; expected a truth"),
     ('stick = ["tank/hand:forward", "tank/level:height_m"]',
      "'Drive': stick: fields of tank/hand and tank/level; expected those of one topic"),
     (f'{FIELDS}\nheld = "tank/pump:running"',
@@ -198,7 +198,7 @@ def test_the_example_of_the_document_is_sound():
 def test_two_publishers_of_a_stick():
     assert refused(FIELDS, "Driven", "Rival") == (
         "tank.toml: page: panel 'Drive': stick: node rival publishes 'tank/hand' as well, and may "
-        "move what an operator let go of; a topic of the stick's own is right (or several = True "
+        "move what an operator let go of; expected a topic of its own (or several = True "
         "in the Topic)")
 
 

@@ -194,16 +194,16 @@ def test_an_actor_of_the_wrong_kind(tank):
               "class World(Gauge):\n    node_kind = 'world'\n")
     assert line_of(tank, module, "Detects") == (
         "node detects: actor = 'tank_here:Detects': it publishes detection/{name}, so it belongs "
-        "into [[detection]]")
+        "in [[detection]]")
     assert line_of(tank, module, "World", kind="pilot") == (
-        "node world: actor = 'tank_here:World': it is no pilot node; kind = 'world' is right")
+        "node world: actor = 'tank_here:World': not a pilot node, expected kind = 'world'")
     assert "world" in tank(module, "World", kind="world").members
 
 
 @pytest.mark.parametrize(("said", "line"), [
-    ("", "$.judge.class: missing; name a class derived from rampart.Judge"),
+    ("", "$.judge.class: missing; expected a class derived from rampart.Judge"),
     ('class = "tank_here:Fiar"\n', "$.judge.class = 'tank_here:Fiar': no such judge class"),
-    ('class = "tank_here:Pump"\n', "$.judge.class = 'tank_here:Pump': no judge; "),
+    ('class = "tank_here:Pump"\n', "$.judge.class = 'tank_here:Pump': expected a class derived"),
     ('class = "tank_here:Fair"\nlitres = 3\n', "$.judge.litres = 3: unknown field; known: none"),
     ('class = "tank_here:Fair"\n', "$.judge: Fair hears 'tank/levle', which nothing publishes; "),
 ])

@@ -78,8 +78,8 @@ def tug(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("old", "new", "line"), [
     ("cart:VirtualWheels", "cart:Nobody", "node wheels: stand_in = 'cart:Nobody': no such actor "
      "class; known: Driver, VirtualWheels"),
-    ("cart:Driver", COMMAND_NODE, f"node driver: actor = '{COMMAND_NODE}': say command = "
-     "['./program', ...] instead"),
+    ("cart:Driver", COMMAND_NODE, f"node driver: actor = '{COMMAND_NODE}': expected "
+     "command = ['./program', ...]"),
     ("stand_in", "parameters = { radius_m = 1 }\nstand_in", "node wheels: parameters.radius_m = 1: "
      "unknown field; known: none")])
 def test_a_stand_in_is_held_to_what_the_file_says_of_it_in_real_runs_too(tug, old, new, line):
