@@ -1,1 +1,1 @@
-"""Runs, real and virtual, from the start to the verdict, and what is said meanwhile."""
+"""Real and virtual runs, from start to verdict, with their console output and reports."""

@@ -1,4 +1,4 @@
-"""What a run tells on the terminal: one line per event, and a live line where there is a tty."""
+"""Terminal output of a run: one line per event, and a live line on a tty."""
 
 from __future__ import annotations
 
@@ -19,30 +19,29 @@ from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.runs.record import RunRecord
 
 REPORTS_PER_S = 10
-"""Error reports shown in a real second."""
+"""Error reports shown per real second."""
 
 LINES_PER_S = 50
-"""Other lines shown in a real second."""
+"""Other lines shown per real second."""
 
 LINE_CHARS = 400
-"""Longest line that is shown."""
+"""Longest shown line."""
 
 
 class Console:
-    """Writes the story of a run to a stream as it happens.
+    """Writes the events of a run to a stream as they happen.
 
-    What it is told comes from the bus, and from any sender: each line is made printable and
-    clipped, and of more lines than can be read the number is told instead. In virtual time there
-    are no other senders, and a second may be a whole mission: there all lines are shown. A robot
-    derives its own for what it has to tell.
+    The text comes from the bus and from any sender. So each line is made printable and clipped, and
+    above a rate only the number of lines is shown. In virtual time there are no foreign senders and
+    a second may be a whole mission, so all lines are shown. A robot derives a class for its events.
 
     Class attributes:
-        example: of a node to kill; a system that has it not offers its first that a recovery
-            brings back.
+        example: Node to kill in the hint at the start; by default, the first node that a recovery
+            module restarts.
 
     Args:
-        stream: where to.
-        clock: real seconds.
+        stream: Output.
+        clock: Real seconds.
     """
 
     example: ClassVar[str] = ""
@@ -59,7 +58,7 @@ class Console:
         self._last_live_s = 0.0
 
     def banner(self, what: str, plan: RunPlan, spec: SystemSpec, *, virtual: bool = False) -> None:
-        """Say what is about to run, and in real time how to disturb it."""
+        """Print the system of the run and, in real time, how to disturb it."""
         self._is_limited = not virtual
         self._narrator.titles = spec.titles
         mode = spec.strategy if plan.ftm else "no fault tolerance"
@@ -72,11 +71,11 @@ class Console:
             self.say(f"Try from another shell: kill-node {example}")
 
     def speed(self, times: float, messages: int, trace: str) -> None:
-        """Say how fast virtual time went, and by what the run can be recognised."""
+        """Print the speed of virtual time and the hash of the run."""
         self.say(f"{times:.0f} times real time, {messages} messages, trace {trace[:16]}")
 
     def take(self, _topic: Topic[Any], message: Any, header: Header) -> None:
-        """Take one message of the run."""
+        """Print the lines of one message."""
         at = header.stamp
         now_s = self._clock()
         if count := self._reports.left_out(now_s) + self._others.left_out(now_s):
@@ -86,12 +85,12 @@ class Console:
             self.line(at, line.text, limit)
 
     def line(self, at_s: float, text: str, limit: RateLimit | None = None) -> None:
-        """Write one line with its simulated time, unless there are too many of its kind."""
+        """Print a line with its simulated time, unless its rate is too high."""
         if not self._is_limited or (limit or self._others).allows(self._clock()):
             self.say(f"[{at_s:7.2f} s] {one_line(text, LINE_CHARS)}")
 
     def conclusion(self, record: RunRecord, report: Path | None) -> None:
-        """Say how it ended, and where the report is, if there is one."""
+        """Print the result, and the path of the report if there is one."""
         for line in self.verdict(record):
             self.say(line)
         for reason in record.reasons:
@@ -102,14 +101,14 @@ class Console:
             self.say(f"Report: {report}")
 
     def verdict(self, record: RunRecord) -> list[str]:
-        """Return the verdict of a run that was judged, in lines."""
+        """Return the lines of the verdict; none without a judge."""
         if record.mission is None:
             return []
         safety = "safety not known" if record.safety == "not known" else record.safety
         return [f"{record.mission}, {safety}, {record.duration_s:.1f} s simulated."]
 
     def show_live(self, text: str, at_s: float) -> None:
-        """Show a line in place of the last one, four times a simulated second, on a terminal."""
+        """Replace the live line of a terminal, at most four times per simulated second."""
         if not self._live or at_s - self._last_live_s < 0.25:
             return
         self._last_live_s = at_s
@@ -119,13 +118,13 @@ class Console:
         self._stream.flush()
 
     def close(self) -> None:
-        """Take the live line away."""
+        """Remove the live line."""
         if self._live_text:
             self._stream.write("\r\x1b[K")
             self._live_text = ""
 
     def say(self, text: str) -> None:
-        """Write a line."""
+        """Print a line."""
         self.close()
         self._stream.write(printable(text) + "\n")
         self._stream.flush()

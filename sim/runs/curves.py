@@ -14,7 +14,7 @@ from rampart.actors.operator.panels import plots_of
 from rampart.actors.runtime.actor import Header
 
 MOST = 600
-"""Points of a curve: at one more every second one goes."""
+"""Most points of a curve; beyond, every second one is dropped."""
 
 
 class Curve(msgspec.Struct, frozen=True):
@@ -26,13 +26,13 @@ class Curve(msgspec.Struct, frozen=True):
 
 
 class CurveRecorder:
-    """Keeps the numbers that a page without panels plots as well.
+    """Records the numbers that a page without panels plots.
 
     Args:
-        topics: of the robot.
+        topics: Topics of the robot.
 
     Attributes:
-        topics: of these, by key, what it has to receive.
+        topics: The topics that it needs, by key.
     """
 
     def __init__(self, topics: Iterable[Topic[Any]]) -> None:
@@ -61,6 +61,6 @@ class CurveRecorder:
                 del points[1::2]
 
     def curves(self) -> tuple[Curve, ...]:
-        """Return what was kept, in the order of the plots."""
+        """Return the curves in the order of the plots."""
         return tuple(Curve(plot, field, tuple(points)) for plot, field, points in self._curves
                      if points)

@@ -1,13 +1,12 @@
-"""The judge of a system: hears a run, says when it is over and what it was worth.
+"""The judge of a system: it observes a run, decides when it is over, and gives a verdict.
 
-A specification names one under `[judge]`; the other keys there are its parameters:
+A specification names it under `[judge]`; the other keys there are its parameters:
 
     [judge]
     class = "tug.judge:Deliveries"
     deliveries = 3
 
-A system without a judge can be run and disturbed as well; of its runs no success, safety or margin
-is known.
+A system without a judge can be run and disturbed as well. Its runs have no verdict and no margins.
 """
 
 from __future__ import annotations
@@ -20,21 +19,21 @@ import msgspec
 from rampart.actors.runtime.declaration import Handlers
 
 UNSTABLE = "physics unstable"
-"""Context of the diagnostic by which a world ends a run that nobody can judge."""
+"""Context of the diagnostic with which a world ends a run that cannot be judged."""
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run was worth.
+    """Verdict on a run.
 
     Args:
-        success: whether its task was done.
-        safe: whether it was safe all the time; None if nothing was heard to know it by.
-        reasons: why not, in words; empty if all is well.
-        margins: how far from harm it was at its worst, by the names in `Judge.margins`; None where
-            there was nothing to measure.
-        severity: how bad an unsafe run was: the larger, the worse; 0 for a safe one.
-        unsafe_s: when it first became unsafe, simulated seconds.
-        narrowest_s: when the smallest margin was measured.
+        success: Whether the task was done.
+        safe: Whether the run was always safe; None if no message shows it.
+        reasons: Why the run failed or was unsafe; empty if neither.
+        margins: Smallest distance from harm, by the names in `Judge.margins`; None where nothing
+            was measured.
+        severity: Severity of an unsafe run, larger is worse; 0 for a safe run.
+        unsafe_s: Time of the first unsafe state, simulated seconds.
+        narrowest_s: Time of the smallest margin, simulated seconds.
     """
 
     success: bool
@@ -47,20 +46,20 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Judge(Handlers):
-    """Base of every judge. Methods marked with `on(TOPIC)` hear messages: `heard(message, header)`.
+    """Base of every judge. Methods marked with `on(TOPIC)` take `(message, header)`.
 
-    A judge is outside of the system: no fault is injected into what it hears, and nothing in the
-    system hears it. It hears the truth where a world publishes it.
+    A judge is outside of the system: no fault is injected into its inputs, and it publishes
+    nothing. It may subscribe to the ground truth of a world.
 
     Class attributes:
-        Parameters: what the specification may say of it.
-        margins: how far from harm a run was: names, and how they are headed in a report.
-        margin_unit: of all of them.
-        exact_below: above it a margin may be a lower bound; None if all are exact.
+        Parameters: Parameters in the specification.
+        margins: Heading in reports of each margin, by name.
+        margin_unit: Unit of all margins.
+        exact_below: A margin from this value on may be a lower bound; None if all are exact.
     """
 
     class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-        """None, unless a subclass declares some."""
+        """No parameters, unless a subclass declares some."""
 
     margins: ClassVar[Mapping[str, str]] = {}
     margin_unit: ClassVar[str] = "m"
@@ -70,10 +69,10 @@ class Judge(Handlers):
         self.parameters = self.Parameters() if parameters is None else parameters
 
     def over(self, now_s: float) -> str | None:
-        """Return why the run is over, or None while it goes on; asked now and then."""
+        """Return why the run is over, or None while it continues; called repeatedly."""
         del now_s
         return None
 
     def verdict(self) -> Verdict:
-        """Return what the run was worth so far."""
+        """Return the verdict on the run so far."""
         raise NotImplementedError

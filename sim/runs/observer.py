@@ -1,8 +1,8 @@
-"""The observer: runs in the launcher's process and hears what the run's story is made of.
+"""The observer: an actor of the launcher that passes messages to judge, report and console.
 
-It controls nothing. What wants the story (judge, report, console, launcher) is a sink: a
-function of topic, message and header, called on the observer's loop in order of arrival. A robot
-whose own topics belong to the story derives its observer, which its application names.
+It controls nothing. Each receiver is a sink: a function of topic, message and header, called on the
+observer's loop in order of arrival. A robot with further topics for its report derives an observer,
+which its application names.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ Sink = Callable[[Topic[Any], Any, Header], None]
 
 
 class Observer(Actor):
-    """Passes everything it hears to its sinks."""
+    """Passes all its messages to its sinks."""
 
     class Parameters(Actor.Parameters, frozen=True):
-        """What it hears besides.
+        """Further inputs.
 
         Attributes:
-            judged: keys of the topics that the judge hears.
+            judged: Keys of the judge's topics.
         """
 
         judged: TopicsHeard = ()
@@ -55,7 +55,7 @@ class Observer(Actor):
     @on(bus_topics.DIAGNOSTIC)
     def heard(self, message: Any, header: Header) -> None:
         """Pass one message on."""
-        # Each topic heard here has a type of its own.
+        # Each of these topics has a different type.
         self._pass_on(self._topic_of[type(message)], message, header)
 
     def _pass_on(self, topic: Topic[Any], message: Any, header: Header) -> None:
@@ -67,6 +67,6 @@ def observer_class(spec: SystemSpec) -> type[Observer]:
     """Return the observer of a system's runs.
 
     Raises:
-        ValueError: the application, or the class it names, does not exist.
+        ValueError: The application or its observer does not exist.
     """
     return import_class(application_class(spec).observer, Observer, "observer")

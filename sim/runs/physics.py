@@ -1,7 +1,7 @@
-"""What the engine does with MuJoCo: it ends a run whose world blew up, and shows recorded robots.
+"""MuJoCo in the engine: the end of runs with unstable physics, and the display of recorded robots.
 
-MuJoCo resets a world whose numbers have blown up to its start and goes on. The rest of the run is
-no consequence of what the robot did. So such a run ends, and cannot be judged.
+MuJoCo resets an unstable world to its start and continues. The rest of the run would not follow
+from the robot's actions. So such a run ends and cannot be judged.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ _BAD = {int(mujoco.mjtWarning.mjWARN_BADQPOS): "position",
         int(mujoco.mjtWarning.mjWARN_BADQVEL): "velocity",
         int(mujoco.mjtWarning.mjWARN_BADQACC): "acceleration",
         int(mujoco.mjtWarning.mjWARN_BADCTRL): "control"}
-"""Places in `mjData.warning` after which MuJoCo resets the world, or ignores what was asked."""
+"""Entries of `mjData.warning` after which MuJoCo resets the world or ignores a command."""
 
 _FIRST, _LAST = min(_BAD), max(_BAD)
 
 
 def report_instability(world: Actor, data: mujoco.MjData) -> bool:
-    """End the run if its world has blown up, and return whether it has: it publishes no more.
+    """Report unstable physics, which ends the run. Return whether the world must stop publishing.
 
     Args:
-        world: the actor that steps it.
-        data: its state.
+        world: The actor that steps the world.
+        data: State of the world.
     """
     counts = data.warning.number
     if not counts[_FIRST:_LAST + 1].any():
@@ -41,19 +41,19 @@ def report_instability(world: Actor, data: mujoco.MjData) -> bool:
 
 
 class RobotModel:
-    """A robot in MuJoCo that is moved by messages: `rampart replay --viewer` and `--video` show it.
+    """A MuJoCo robot that messages move, for `rampart replay --viewer` and `--video`.
 
-    An application names a derived class as `model`. It is made with the application of the run.
+    An application names a derived class as `model`. Its argument is the application of the run.
 
     Args:
-        model: the robot, and what is around it; its first joint is free.
-        data: its state; None for a new one.
+        model: The robot and its surroundings; its first joint is free.
+        data: State; None for a new one.
 
     Attributes:
-        model: as given.
-        data: its state.
-        camera: films it; it follows the first body.
-        options: what is drawn.
+        model: As given.
+        data: State.
+        camera: Camera that follows the first body.
+        options: Drawing options.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData | None = None) -> None:
@@ -68,19 +68,19 @@ class RobotModel:
             model.vis.headlight.diffuse[:] = 0.6
 
     def take(self, topic: Topic[Any], body: Any) -> None:
-        """Move the robot as a message says.
+        """Move the robot according to a message.
 
         Args:
-            topic: of the message.
-            body: of the message.
+            topic: Topic of the message.
+            body: The message.
         """
 
     def stand(self, position_m: Sequence[float], attitude: Sequence[float]) -> None:
-        """Put the robot somewhere; a pose with a number that is not finite is ignored.
+        """Set the pose of the robot; a pose that is not finite is ignored.
 
         Args:
             position_m: x, y, z of the first body.
-            attitude: quaternion w, x, y, z.
+            attitude: Quaternion w, x, y, z.
         """
         pose = (*position_m, *attitude)
         if all(map(math.isfinite, pose)):

@@ -1,12 +1,11 @@
-"""The network of a virtual run, and how long things take between its processes.
+"""The network of a virtual run, and the delays between its processes.
 
-In virtual time nothing takes any time by itself. What passes between the sending of a message and
-its arrival, between a death and its discovery, between a fork and the new process's first word, is
-drawn from the distributions that `python -m benchmarks.timing` has measured (`timing.toml`).
+In virtual time nothing takes time by itself. The delays of messages, of the discovery of a death,
+and of the start of a process are drawn from the distributions that `python -m benchmarks.timing`
+measured (`timing.toml`).
 
-Zenoh carries the messages of one process to another over one TCP link, so without further ado
-nothing is lost and nothing overtakes; `measured` is that. The other networks are for finding out
-what the controller makes of worse ones.
+Zenoh carries the messages between two processes over one link, so none is lost or overtaken. The
+network `measured` models this. The other networks test the controller under worse conditions.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from rampart.sim.virtual.virtual_bus import Link
 
 
 class NetworkModel(msgspec.Struct, frozen=True):
-    """What a network does to messages.
+    """Delays and faults of a network.
 
     Args:
-        name: As typed by the user.
+        name: Name on the command line.
         title: One line for people.
-        delay: Whether messages take the measured time; else none.
-        extra_s: Added to it, at most: a message is held up by a uniform share of it.
+        delay: Whether messages take the measured time; if not, none.
+        extra_s: Largest further delay; a message takes a uniform share of it.
         loss: Probability that a copy never arrives.
         duplication: Probability that a second copy arrives.
-        reordering: Probability that a message may be overtaken by those after it.
+        reordering: Probability that later messages may overtake a message.
     """
 
     name: str
@@ -67,7 +66,7 @@ def find_network(name: str) -> NetworkModel:
     """Return a network by name.
 
     Raises:
-        ValueError: There is none.
+        ValueError: The name is unknown.
     """
     if name not in NETWORKS:
         raise ValueError(f"unknown network {name!r}; known: {', '.join(NETWORKS)}")
@@ -75,13 +74,13 @@ def find_network(name: str) -> NetworkModel:
 
 
 class SeededNetwork:
-    """Says when messages arrive; the same seed and the same questions give the same answers.
+    """Draws the arrival times of messages, reproducibly from a seed.
 
     Args:
-        model: What it does to messages.
-        seed: Of all its dice.
+        model: Delays and faults of the network.
+        seed: Seed of all draws.
         timing: Distribution of the delay; the measured one if None.
-        local: Nodes that share a process with all others: nothing happens on the way to them.
+        local: Nodes that share a process with all others; their messages take no time.
     """
 
     def __init__(self, model: NetworkModel, seed: Any, timing: Timing | None = None,
@@ -95,7 +94,7 @@ class SeededNetwork:
         self._links: dict[tuple[str, str], Link] = {}
 
     def link(self, source: str, reader: str) -> Link | None:
-        """Return the one link between two nodes; None if everything arrives at once."""
+        """Return the link between two nodes; None if messages arrive at once."""
         if source in self._local or reader in self._local:
             return None
         ends, model = (source, reader), self.model
@@ -105,7 +104,7 @@ class SeededNetwork:
         return self._links[ends]
 
     def _in_order(self) -> Link:
-        """Return a link that delays messages and does no more: most runs have only these."""
+        """Return a link that only delays messages; most runs have no others."""
         fill, delays_s, last_s = self._stock.fill, self._stock.draws_s, 0.0
 
         def arrivals(now_s: float) -> Sequence[float]:
@@ -119,7 +118,7 @@ class SeededNetwork:
         return arrivals
 
     def _troubled(self) -> Link:
-        """Return a link that does to messages what the model says."""
+        """Return a link with the faults of the model."""
         model, dice, last_s = self.model, self._rng.random, 0.0
 
         def arrivals(now_s: float) -> Sequence[float]:
@@ -153,10 +152,10 @@ class Timing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Distributions as quantiles: evenly spaced from the minimum to the maximum, milliseconds.
 
     Attributes:
-        message_ms: From sending to the reader's mailbox.
-        death_ms: From SIGKILL to those who watch the node: what the supervisor says, or the token.
-        exit_ms: From SIGKILL to the supervisor, by pidfd.
-        start_ms: From when a process is to be started to its first message: the fork, or the spare.
+        message_ms: From sending a message to the reader's mailbox.
+        death_ms: From SIGKILL to the readers of the supervisor's report.
+        exit_ms: From SIGKILL to the supervisor's pidfd.
+        start_ms: From the request for a process, forked or from the pool, to its first message.
         supervisor_back_ms: From the supervisor's SIGKILL to its successor's fork.
     """
 
@@ -175,13 +174,13 @@ class Timing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @lru_cache(maxsize=1)
 def measured() -> Timing:
-    """Return what was measured."""
+    """Return the measured distributions."""
     with _FILE.open("rb") as file:
         return msgspec.convert(tomllib.load(file), Timing)
 
 
 def drawer(quantiles_ms: tuple[float, ...], rng: random.Random) -> Callable[[], float]:
-    """Return a function that draws from a distribution: linear between its quantiles; seconds."""
+    """Return a function that draws seconds from a distribution, linear between its quantiles."""
     pieces = [(here, there - here) for here, there in pairwise(quantiles_ms)]
     share, count = rng.random, len(pieces)
 
@@ -195,13 +194,13 @@ def drawer(quantiles_ms: tuple[float, ...], rng: random.Random) -> Callable[[], 
 
 
 class Stock:
-    """Draws in stock, bit by bit those of a `drawer` that has the dice for itself alone.
+    """Blocks of draws, bit for bit those of a `drawer` that is the only user of its generator.
 
-    numpy's older generator is the same as Python's, and makes a block at once.
+    numpy's older generator is the same as Python's and makes a block at once.
 
     Args:
         quantiles_ms: As for `drawer`.
-        rng: The dice, whose further throws are drawn from a copy.
+        rng: The generator; draws come from a copy of its state.
     """
 
     BLOCK = 2048
@@ -215,7 +214,7 @@ class Stock:
         self._dice.set_state(("MT19937", np.array(words, dtype=np.uint32), used, 0, 0.0))
 
     def fill(self) -> None:
-        """Put the next block into the empty `draws_s`, the last one first."""
+        """Put the next block into the empty `draws_s`, in reverse order."""
         at = self._dice.random_sample(self.BLOCK) * len(self._low_ms)
         low = at.astype(int)
         block_s = (self._low_ms[low] + self._rise_ms[low] * (at - low)) * 1e-3

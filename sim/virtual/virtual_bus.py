@@ -1,7 +1,7 @@
 """A bus inside one process, for virtual time and tests: no sockets, no threads.
 
-What lies between two nodes is up to their `Link`: it says when each copy of a message arrives,
-which takes a virtual loop. Without one everything arrives at once, on any loop.
+A `Link` between two nodes decides when each copy of a message arrives; this needs a virtual loop.
+Without a link messages arrive at once, on any loop.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from rampart.sim.virtual.virtual_loop import VirtualLoop
 _ANSWER_S = 0.005
 
 Tap = Callable[[float, str, str, bytes], None]
-"""Sees each message as it is sent: when by the loop's clock, source, key, payload."""
+"""Called with each message that is sent: loop time, source, key, payload."""
 
 Link = Callable[[float], Sequence[float]]
-"""Way from one node to another: returns when the copies of a message sent now arrive, if any."""
+"""Returns the arrival times of the copies of a message that is sent now, if any arrive."""
 
 
 PeerChange = Callable[[str, int, bool], None]
-"""Called with a node, its incarnation, and whether it is there."""
+"""Called with a node, its incarnation, and whether it runs."""
 
 Route = tuple[Link | None, Deliver, Callable[[Deliver, str, bytes], None]]
-"""The link to a reader, what there takes the message, and its bus's `arrive`, for other loops."""
+"""Link to a reader, its callback, and its bus's `arrive`, which other loops use."""
 
 
 def _pattern(expression: str) -> re.Pattern[str]:
@@ -36,11 +36,11 @@ def _pattern(expression: str) -> re.Pattern[str]:
 
 
 class Hub:
-    """What the buses of one virtual system share: subscriptions and running nodes.
+    """State shared by the buses of one virtual system: subscriptions and running nodes.
 
     Args:
-        link: returns the one link from a node to another; None if everything arrives at once.
-        several_hosts: the nodes are on several hosts, and so nothing is posted.
+        link: Returns the link from one node to another; None if messages arrive at once.
+        several_hosts: The nodes are on several hosts, so nothing is posted.
     """
 
     def __init__(self, link: Callable[[str, str], Link | None] = lambda _source, _reader: None,
@@ -56,16 +56,16 @@ class Hub:
         self._watchers: list[tuple[str, PeerChange, VirtualBus]] = []
 
     def subscribe(self, expression: str, deliver: Deliver, bus: VirtualBus) -> None:
-        """Have messages on keys that match delivered to a bus."""
+        """Deliver messages on matching keys to a bus."""
         self._subscriptions.append((_pattern(expression), deliver, bus))
         self._forget_routes()
 
     def add(self, bus: VirtualBus) -> None:
-        """Know a bus that has been opened."""
+        """Add a bus that was opened."""
         self._buses.append(bus)
 
     def latest(self, expression: str, deliver: Deliver, reader: VirtualBus) -> None:
-        """Send a bus the newest message of each other one on each key that matches."""
+        """Send a bus the latest message of each other bus on each matching key."""
         pattern = _pattern(expression)
         for bus in self._buses:
             if bus is not reader:
@@ -74,22 +74,22 @@ class Hub:
                     bus.answer(route, key)
 
     def watch(self, node: str, changed: PeerChange, bus: VirtualBus) -> None:
-        """Have the coming and going of a node told to a bus."""
+        """Report starts and ends of a node to a bus."""
         self._watchers.append((node, changed, bus))
 
     def remove(self, bus: VirtualBus) -> None:
-        """Forget a bus."""
+        """Remove a bus."""
         self._buses = [b for b in self._buses if b is not bus]
         self._subscriptions = [s for s in self._subscriptions if s[2] is not bus]
         self._watchers = [w for w in self._watchers if w[2] is not bus]
         self._forget_routes()
 
     def routes_from(self, source: str) -> dict[str, list[Route]]:
-        """Return the table of a node's routes by key: always the same object, filled by `route`."""
+        """Return a node's routes by key: always the same dictionary, filled by `route`."""
         return self._routes.setdefault(source, {})
 
     def route(self, source: str, key: str) -> list[Route]:
-        """Return the ways from a node to all who hear a key, in the order of subscription."""
+        """Return the routes from a node to the subscribers of a key, in order of subscription."""
         found = self.routes_from(source)[key] = [
             (self._link(source, bus.node), deliver, bus.arrive)
             for pattern, deliver, bus in self._subscriptions if pattern.fullmatch(key)]
@@ -100,7 +100,7 @@ class Hub:
             table.clear()
 
     def announce(self, node: str, incarnation: int, *, alive: bool) -> None:
-        """Tell the watchers that a node appeared or vanished."""
+        """Report to the watchers that a node started or ended."""
         living = self.alive.setdefault(node, set())
         if alive:
             living.add(incarnation)
@@ -115,7 +115,7 @@ class VirtualBus:
     """One node's access to a `Hub`.
 
     Attributes:
-        latest_sent: By key, except commands.
+        latest_sent: Latest message by key, except commands.
     """
 
     bursts = False
@@ -132,7 +132,7 @@ class VirtualBus:
         self._virtual: VirtualLoop | None = None
 
     async def open(self) -> None:
-        """Join the hub."""
+        """See `Bus`."""
         self._hub.add(self)
         self._loop = loop = asyncio.get_running_loop()
         self._virtual = loop if isinstance(loop, VirtualLoop) else None
@@ -141,15 +141,15 @@ class VirtualBus:
 
     @property
     def is_open(self) -> bool:
-        """Whether it has joined, and not been cut off."""
+        """Whether it has joined and was not cut off."""
         return self._open
 
     def soon(self, call: Callable[[], None]) -> None:
-        """Run a call on the event loop after the present one, if this bus is open then."""
+        """Run a call in the loop's next turn, if this bus is still open."""
         asyncio.get_running_loop().call_soon(lambda: call() if self._open else None)
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
-        """Send to all present subscribers of the key."""
+        """See `Bus`."""
         loop, virtual, hub = self._loop, self._virtual, self._hub
         if not self._open or loop is None:
             return
@@ -171,7 +171,7 @@ class VirtualBus:
             self.latest_sent[key] = payload
 
     def post(self, key: str, payload: bytes) -> bool:
-        """Put a message where the other nodes look; False if not all nodes are on this host."""
+        """See `Bus`."""
         if self._hub.several_hosts:
             return False
         if self._open:
@@ -180,14 +180,14 @@ class VirtualBus:
         return True
 
     def record(self, key: str, payload: bytes) -> None:
-        """Nothing: a virtual run is recorded from what is sent."""
+        """Do nothing: a virtual run is recorded by a tap."""
 
     def posted(self, key: str) -> bytes | None:
-        """Return the newest message that was posted on a key."""
+        """See `Bus`."""
         return self._hub.postings.get(key)
 
     def answer(self, route: Route, key: str) -> None:
-        """Send what was published last on a key by one route, past the taps."""
+        """Send the latest message on a key by one route; taps do not see it."""
         link, deliver, arrive = route
         payload, virtual = self.latest_sent[key], self._virtual
         if virtual is None:
@@ -197,46 +197,42 @@ class VirtualBus:
                 virtual.post_at(at_s, deliver, key, payload)
 
     def arrive(self, deliver: Deliver, key: str, payload: bytes) -> None:
-        """Hand a message over, if this bus is still open.
+        """Deliver a message if this bus is still open.
 
-        On a virtual loop that is not asked: `cut` takes back what is posted.
+        A virtual loop delivers directly, because `cut` withdraws pending messages.
         """
         if self._open:
             deliver(key, payload)
 
     def has_readers(self, key: str) -> bool:
-        """Whether any node hears a key now."""
+        """See `Bus`."""
         routes = self._routes.get(key)
         return bool(self._hub.route(self.node, key) if routes is None else routes)
 
     def subscribe(self, key_expression: str, deliver: Deliver) -> None:
-        """Have `deliver` called for each message on keys that match; no other bus may have it."""
+        """See `Bus`; no other bus may use the same `deliver`."""
         self._readers.append(deliver)
         self._hub.subscribe(key_expression, deliver, self)
 
     def latest(self, key_expression: str, deliver: Deliver, answered: Callable[[], None]) -> None:
-        """Have `deliver` called with the newest message of each node that is there.
-
-        The question takes no time, an answer as long as any message; that there will be no more is
-        known after `_ANSWER_S`.
-        """
+        """See `Bus`. A query takes no time, an answer the time of a message."""
         self._readers.append(deliver)
         self._hub.latest(key_expression, deliver, self)
         loop = asyncio.get_running_loop()
         loop.call_later(_ANSWER_S, lambda: answered() if self._open else None)
 
     def watch(self, node: str, changed: PeerChange) -> None:
-        """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
+        """Call `changed` now if the node runs, and at each start and end."""
         self._hub.watch(node, changed, self)
         for incarnation in sorted(self._hub.alive.get(node, ())):
             self.soon(lambda i=incarnation: changed(node, i, True))  # type: ignore[misc]
 
     def moved(self) -> bool:
-        """Never: there are no routers."""
+        """See `Bus`; a virtual system has no routers."""
         return False
 
     def cut(self) -> None:
-        """Send and receive nothing any more, as when the process is killed; none is told yet."""
+        """Stop sending and receiving, as at a SIGKILL; watchers are not notified yet."""
         self._open = False
         self._hub.remove(self)
         if self._virtual is not None:
@@ -244,7 +240,7 @@ class VirtualBus:
         self._readers = []
 
     async def close(self) -> None:
-        """Leave the hub."""
+        """See `Bus`."""
         if not self._open:
             return
         self.cut()

@@ -1,12 +1,10 @@
 """Virtual time: an event loop that does not wait but moves its clock to the next timer.
 
-What runs on it is deterministic, since nothing depends on how fast the machine is, and takes only
-the time that the work itself takes. The actors do not notice: they know a `Clock`, and the clock
-reads `loop.time`.
+A run on this loop is deterministic, because nothing depends on the speed of the machine, and takes
+only the time of its computations. Actors read a `Clock`, and the clock reads `loop.time`.
 
-Calls and timers are kept in leaner objects than asyncio's, because a virtual run consists of
-little else: a mission makes a quarter of a million of them. Messages and ticks do without any:
-they are posted, with two arguments, and stand in the heap as they are.
+Calls and timers are leaner objects than asyncio's, because a mission makes a quarter of a million
+of them. Messages and ticks need no object: they are posted with two arguments and stay in the heap.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ Posted = Callable[[Any, Any], object]
 
 
 class _Call:
-    """A pending call that can be taken back; what asyncio uses of a `Handle`, `TimerHandle`."""
+    """A pending call that can be cancelled; the part of asyncio's handles that asyncio uses."""
 
     __slots__ = ("_args", "_callback", "_cancelled", "_context", "_when")
 
@@ -50,10 +48,10 @@ class _Call:
 
 
 class _Files(selectors.PollSelector):
-    """What the loop watches besides its timers; of its own after a fork, as an epoll is not.
+    """Files that the loop watches. Unlike an epoll, a poll is not shared after a fork.
 
     Attributes:
-        count: how many files; asked after each timer, for which its map is too slow.
+        count: Number of files; read after each timer, for which the selector's map is too slow.
     """
 
     count = 0
@@ -72,12 +70,12 @@ class _Files(selectors.PollSelector):
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """A loop whose time stands still while it works, and jumps when it would wait.
+    """A loop whose time stands still during callbacks and jumps where it would wait.
 
-    Callbacks run in the order in which they become due, and in that of scheduling if at once.
+    Callbacks run in the order of their times, and for equal times in the order of scheduling.
 
     Attributes:
-        now_s: what `time` returns, for callers that ask all the time.
+        now_s: The value of `time`, for frequent callers.
     """
 
     def __init__(self) -> None:
@@ -93,12 +91,12 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return self.now_s
 
     def jump(self, seconds: float) -> None:
-        """Let time pass unseen, as for a machine that was suspended."""
+        """Advance time without running timers, as if the machine was suspended."""
         self.now_s += seconds
 
     def call_soon(self, callback: Any, *args: Any,  # type: ignore[override]
                   context: Context | None = None) -> Any:
-        """As asyncio's; what comes back does what a Handle does."""
+        """As asyncio's; the result has the methods of a Handle."""
         call = _Call(callback, args, context, self.now_s)
         self._ready.append(call)  # type: ignore[attr-defined]
         return call
@@ -209,7 +207,7 @@ def fork() -> int:
 
 
 class VirtualClock(Clock):
-    """The clock of what runs on a virtual loop; read more often than anything else.
+    """The clock of a virtual loop, optimised for frequent reads.
 
     Args:
         loop: whose time it shows.

@@ -1,8 +1,7 @@
-"""The processes of a virtual run: actors as tasks, and what can happen to a process.
+"""The processes of a virtual run: actors as tasks that can be started, killed, stopped and slowed.
 
-Stands in for the kernel, the spawners and the launcher: it forks, kills, stops, wedges and slows
-down, tells the supervisor and the liveliness watchers of a death after the time that was measured
-for it, and brings the supervisor back. The actors, the supervisor included, are the real ones.
+This module models the kernel, the root and the pool. It reports a death to the supervisor after the
+measured delay, and restarts the supervisor. The actors and the supervisor are the real ones.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ FIRST_PID = 1000
 
 
 class Condition(Enum):
-    """What a process is doing."""
+    """Condition of a process."""
 
     STARTING = "starting"
     RUNNING = "running"
@@ -52,7 +51,7 @@ _CHANGES = {
     "stop": (Condition.RUNNING, Condition.STOPPED),
     "wedge": (Condition.RUNNING, Condition.WEDGED),
     "resume": (Condition.STOPPED, Condition.RUNNING)}
-"""What holds or resumes a process: the condition in which it helps, and that after it."""
+"""Condition before and after each way to hold or resume a process."""
 
 
 class VirtualProcess(msgspec.Struct, eq=False):
@@ -93,19 +92,19 @@ class _Handle(ProcessHandle):
 
 
 class VirtualMachine:
-    """A machine on a virtual loop; to the supervisor it is `Processes`.
+    """A machine on a virtual loop; it implements `Processes` for the supervisor.
 
     Args:
-        layout: What to run.
-        run: What all actors of the run have in common.
-        hub: Where their buses meet.
+        layout: Layout of the run.
+        run: Common context of all actors.
+        hub: Hub of their buses.
         clock: Simulated time; its source is the loop's time.
-        seed: Of the dice for how long things take.
+        seed: Seed of all delays.
 
     Attributes:
         failures: Actors that ended by an error, with the error.
-        on_restart: Called with the name when the supervisor was brought back.
-        shelves: What the nodes have kept; it outlives their processes.
+        on_restart: Called with the name of a restarted supervisor.
+        shelves: Checkpoints of the nodes; they outlive the processes.
     """
 
     has_routers = False
@@ -142,7 +141,7 @@ class VirtualMachine:
         self._loop.call_later(PERIOD_S, self._guard)
 
     def supervisor_heard(self, table: NodeTable) -> None:
-        """Note that the supervisor is heard, and which incarnations it has reached."""
+        """Note that the supervisor works, and the incarnations that it reports."""
         self._supervisor_heard_s = self._loop.time()
         for row in table.nodes:
             self._known[row.name] = max(self._known.get(row.name, 0), row.incarnation)
@@ -180,12 +179,12 @@ class VirtualMachine:
             self.hit("kill", SUPERVISOR)
 
     def _is_paused(self) -> bool:
-        """Whether whoever can be hit is stopped."""
+        """Whether all processes that can be hit are stopped."""
         return all(process.condition is Condition.STOPPED for process in self._processes.values()
                    if not self._spared.issuperset(process.names))
 
     def shut_down(self) -> None:
-        """End everything at once: the run is over."""
+        """End all processes at the end of the run."""
         self._down = True
         for process in list(self._processes.values()):
             self._end(process)
@@ -193,11 +192,11 @@ class VirtualMachine:
     # -- Processes: what the supervisor asks for ------------------------------------------------
 
     def living(self) -> list[RunProcess]:
-        """Return the processes that are there, the supervisor's own included."""
+        """Return all processes, including the supervisor's."""
         return [RunProcess(p.pid, 0, 0, p.names, p.incarnation) for p in self._processes.values()]
 
     def fork(self, names: tuple[str, ...], incarnation: int, answer: Answer) -> None:
-        """Start a process; its first word comes after the measured time."""
+        """Start a process; its first message comes after the measured time."""
         if self._down:
             raise ProcessLookupError("the machine is down")
         pid = next(self._pids)
