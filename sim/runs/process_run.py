@@ -1,4 +1,4 @@
-"""A run on real processes: in this process the observer and the injector."""
+"""A run on real processes; this process has the observer and the injector."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ _LOOK_S = 0.05
 _STALL_S = 0.5
 
 _KEEP_S = 1.0
-"""Wall seconds between two memories of the record, if nothing happens."""
+"""Longest wall time between two saved copies of the record."""
 
 _PAGE_S = 20.0
-"""Wall seconds within which the operator's page answers."""
+"""Wall seconds to wait for the operator's page."""
 
 _KEYS_S = 5.0
-"""Wall seconds between two looks at the certificates."""
+"""Wall seconds between two checks of the certificates."""
 
 _RELINK_S = 1.0
-"""Wall seconds in which a process that was stopped is linked to a router again."""
+"""Wall seconds until a process that was stopped is linked to a router again."""
 
 
 def hit(port: int, what: str, node: str, _pace_s: float) -> bool:
-    """Do something to the newest process of a node of a run, as a `ProcessControl`."""
+    """Signal the newest process of a node, as a `ProcessControl`."""
     try:
         signal_node(node, SIGNALS[what], port)
     except (SignalError, KeyError):
@@ -52,12 +52,11 @@ def hit(port: int, what: str, node: str, _pace_s: float) -> bool:
 
 
 def excused_s(late_s: float) -> float:
-    """Return how long nothing that was not heard counts, wall seconds.
+    """Return the wall seconds for which missing messages do not count.
 
     Args:
-        late_s: how much too late this process looked again. It was stopped if that is
-            more than a loaded machine does; then what was sent meanwhile comes now, or after it has
-            joined a router again.
+        late_s: Lateness of this process. More than a loaded machine explains means that it was
+            stopped. Then messages arrive now, or after it has joined a router again.
     """
     return late_s + _RELINK_S if late_s > _STALL_S else 0.0
 
@@ -66,15 +65,15 @@ class ProcessRun:
     """One run on processes. Use: `run`, once.
 
     Args:
-        trial: What is run.
-        scenario: What goes wrong, and when.
+        trial: The trial to run.
+        scenario: Faults and their times.
         link: Connection to the run's root; None to start one.
-        keep: Takes what a resumed run needs of the record; called in a thread. None for nothing.
+        keep: Saves a copy of the record for a resumed run; called in a thread. None saves nothing.
 
     Attributes:
         interrupted: Setting it ends the run for this reason.
-        failure: Why it could not go on; "" if it could.
-        unrecorded: Why it is not recorded to its end, although it was to be; "" if it is.
+        failure: Why the run could not continue; "" if it could.
+        unrecorded: Why the recording ended early; "" if it did not.
     """
 
     def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = (),
@@ -92,7 +91,7 @@ class ProcessRun:
         self._kept_marks, self._keep_at_s = -1, 0.0
 
     def interrupt(self, by: str) -> None:
-        """End the run, for the user wants that: by which signal."""
+        """End the run because of a signal of the user."""
         self.interrupted = f"interrupted by {by}"
 
     async def run(self) -> RunRecord:
@@ -112,7 +111,7 @@ class ProcessRun:
         finally:
             try:
                 await self.launcher.end()
-            except Exception as error:  # the verdict stands; the lifeline ends what is left
+            except Exception as error:  # the verdict stands; the lifeline ends all processes
                 if self._trial.console:
                     self._trial.console.say(f"at the end: {type(error).__name__}: {error}")
 
@@ -156,7 +155,7 @@ class ProcessRun:
                     trial.not_recorded(problem, clock.now())
                 await self._keep_memory(clock.now())
                 why = trial.ended(clock.now())
-            if launcher.failure:  # before its observer is told to end
+            if launcher.failure:  # before its observer ends
                 why = self.failure = launcher.failure
                 launcher.report(why)
         finally:
@@ -170,7 +169,7 @@ class ProcessRun:
         return trial.conclude(clock.now(), self.interrupted or why or "ended")
 
     async def _keep_memory(self, now_s: float) -> None:
-        """Keep what a resumed run needs of the record, if that is due."""
+        """Save a copy of the record for a resumed run, if that is due."""
         marks, wall_s = self._trial.recorder.marks(), time.monotonic()
         if self._keep is None or (marks == self._kept_marks and wall_s < self._keep_at_s):
             return
@@ -197,17 +196,17 @@ class ProcessRun:
         say(f"Operator's page: no answer at {page.url} for {_PAGE_S:g} s")
 
     async def _watch_keys(self) -> None:
-        """Tell of each certificate that expires: without it a process is only gone, then hung."""
+        """Report each certificate that expires, because its process would only seem to hang."""
         from rampart.actors.access import key_folder  # noqa: PLC0415 of the extra
 
-        plan, told = self.launcher.plan, set[str]()
+        plan, reported = self.launcher.plan, set[str]()
         names = [*plan.routers, *self.launcher.names]
         while True:
             try:
                 found = await asyncio.to_thread(key_folder.expired, Path(plan.keys), names)
             except (KeysError, OSError) as error:
                 found = {plan.keys: str(error)}
-            for name in found.keys() - told:
+            for name in found.keys() - reported:
                 self.launcher.report(found[name])
-            told = set(found)
+            reported = set(found)
             await asyncio.sleep(_KEYS_S)

@@ -1,4 +1,4 @@
-"""What is kept of any run, and the recorder that collects it from the messages. Pure."""
+"""The record of a run, and the recorder that makes it from the messages. Pure."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rampart.sim.faults.scenario import FaultOutcome
 from rampart.sim.runs.curves import Curve
 
 KEPT = 10_000
-"""Most events, intervals, decisions or names of a kind that are kept of a run."""
+"""Most events, intervals, decisions or names of a kind in a record."""
 
 Mission = Literal["success", "fail"]
 Safety = Literal["safe", "unsafe", "not known"]
@@ -33,11 +33,11 @@ Safety = Literal["safe", "unsafe", "not known"]
 _CRASHES = ("crashed", "stopped", "wedged", "given up")
 _RECOVERED = ("respawned", "resumed", "adopted")
 _ELSEWHERE = (fm.DecisionRecord, fm.ShadowRecord, bm.Diagnostic)
-"""Decisions have a list of their own; error reports are in the log of the run."""
+"""Decisions have a separate list, and error reports are in the log of the run."""
 
 
 class Interval(msgspec.Struct, frozen=True):
-    """Something was so from `from_s` until `to_s` (simulated seconds): `lane` says what kind.
+    """A state that held from `from_s` to `to_s`, simulated seconds; `lane` is its kind.
 
     Lanes: injection, detection, recovery, stop, down (a node without a running process).
     """
@@ -60,8 +60,8 @@ class EventLine(msgspec.Struct, frozen=True):
 class DecisionLine(msgspec.Struct, frozen=True):
     """A decision of the FTM Manager with its certificate, and in words.
 
-    `detected_s` is when the first detection behind it was made; `shadow` is what the strategy in
-    shadow would have run instead, where it differs.
+    `detected_s` is the time of the first detection behind it. `shadow` is the choice of the shadow
+    strategy where it differs.
     """
 
     t_s: float
@@ -81,24 +81,24 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One run. Times are simulated seconds from its start.
 
     Args:
-        run_id: name of the run.
+        run_id: Name of the run.
         mission: success or fail; None without a judge.
-        safety: by ground truth; not known if none ever came, None without a judge.
-        reasons: why the mission failed or the run was not safe; empty if all is well.
-        duration_s: length of the run.
-        events: crashes, detections and injections.
-        intervals: the same as bars for a timeline.
-        decisions: of the FTM Manager.
-        restarts: node name to number of restarts; nodes never restarted are left out.
-        given_up: nodes that were not restarted any more at its end.
-        failing: nodes that at its end failed again and again; see `supervised_process.FAILING`.
-        strategy: name of the manager's strategy, empty without FTMs.
-        seed: of everything random.
-        rate: simulated seconds per second.
-        faults: that were planned, and what became of them.
-        keeping_up: whether the machine kept up with the rate; None in virtual time.
-        audit: who did what on the operator's page.
-        curves: the robot's numbers; empty where its report draws others.
+        safety: By ground truth; not known without any, None without a judge.
+        reasons: Why the mission failed or the run was unsafe; empty if neither.
+        duration_s: Length of the run.
+        events: Crashes, detections and injections.
+        intervals: The same as bars of a timeline.
+        decisions: Decisions of the FTM Manager.
+        restarts: Number of restarts by node; nodes without restarts are left out.
+        given_up: Nodes that were no longer restarted at the end.
+        failing: Nodes that failed repeatedly at the end; see `supervised_process.FAILING`.
+        strategy: Name of the manager's strategy; "" without fault tolerance.
+        seed: Seed of the run.
+        rate: Simulated seconds per second.
+        faults: Planned faults and their outcomes.
+        keeping_up: Whether the machine kept up with the rate; None in virtual time.
+        audit: Audit log of the operator's page.
+        curves: Numbers of the robot; empty if its report draws others.
     """
 
     run_id: str
@@ -125,9 +125,9 @@ class RunRecorder:
     """Builds a `RunRecord` from the messages of a run.
 
     Args:
-        plan: of the run.
-        strategy: of the manager; empty without FTMs.
-        titles: of mechanisms and recoveries, see `SystemSpec.titles`.
+        plan: Plan of the run.
+        strategy: Strategy of the manager; "" without fault tolerance.
+        titles: Titles of mechanisms and recoveries, see `SystemSpec.titles`.
     """
 
     def __init__(self, plan: RunPlan, strategy: str = "",
@@ -155,7 +155,7 @@ class RunRecorder:
             bus_topics.INJECTION_REPORT.key: self._injection_report}
 
     def feed(self, topic: Topic[Any], message: Any, header: Header) -> None:
-        """Take a message; those of other topics are ignored."""
+        """Record a message; messages of other topics are ignored."""
         take = self._take.get(topic.key)
         if take is not None:
             take(message, header)
@@ -164,25 +164,25 @@ class RunRecorder:
                 self._note(header.stamp, line.level, line.text)
 
     def marks(self) -> int:
-        """Return a number that grows with everything that no memory may lack for long."""
+        """Return a number that grows with each event or decision."""
         return len(self._events) + len(self._decisions)
 
     def memory(self, now_s: float) -> bytes:
-        """Return what a resumed run needs of the record so far."""
+        """Return the record so far in the form that `recall` reads."""
         return msgspec.msgpack.encode(self.record(now_s))
 
     def recall(self, memory: bytes) -> RunRecord:
-        """Go on from the memory of the part before, and return the record of that part.
+        """Continue the record of the part before, and return it.
 
         Raises:
-            msgspec.DecodeError: the bytes are not a memory.
+            msgspec.DecodeError: The bytes are not a record.
         """
         record = msgspec.msgpack.decode(memory, type=RunRecord)
         self.continues(record)
         return record
 
     def continues(self, before: RunRecord) -> None:
-        """Take up the record of the part before."""
+        """Continue the record of the part before."""
         self._events = [*before.events, EventLine(
             before.duration_s, "fault", "the run was cut off; what it did until it was resumed "
             "was not watched")]
@@ -192,11 +192,11 @@ class RunRecorder:
         self._restarts.update(before.restarts)
 
     def record(self, duration_s: float, **more: Any) -> RunRecord:
-        """Return the record of the run so far; `more` are fields that others know."""
+        """Return the record so far; `more` are the other fields."""
         return RunRecord(**self.fields(duration_s), **more)
 
     def fields(self, duration_s: float) -> dict[str, Any]:
-        """Return what it knows of the fields of a record."""
+        """Return the fields of a record that come from messages."""
         still = [Interval(lane, name, from_s, max(from_s, min(
                      duration_s, from_s + (self._lasts_s.get(name, math.inf)
                                            if lane == "injection" else math.inf))), reason)
@@ -233,7 +233,7 @@ class RunRecorder:
 
     def _shadow(self, record: fm.ShadowRecord, header: Header) -> None:
         key = header.incarnation, record.decision
-        if key in self._decisions:  # it is told right after the decision, on the same way
+        if key in self._decisions:  # it is sent right after the decision
             self._decisions[key] = msgspec.structs.replace(
                 self._decisions[key],
                 shadow=f"{record.strategy}: {' and '.join(record.recoveries) or 'nothing'}")
@@ -256,10 +256,7 @@ class RunRecorder:
                 self._restarts[event.node] = self._restarts.get(event.node, 0) + 1
 
     def _nodes(self, table: fm.NodeTable, header: Header) -> None:
-        """End what is over though nobody was heard to say so: events are told once.
-
-        What is told while its router dies is lost; the table is repeated.
-        """
+        """End intervals whose final event was lost with a router. The node table is repeated."""
         for row in table.nodes:
             self._failing[row.name] = row.failing
             down = self._open.get(("down", row.name))
@@ -280,7 +277,7 @@ class RunRecorder:
     # -- for recorders of a robot ---------------------------------------------------------------
 
     def turn(self, lane: str, name: str, on: bool, t_s: float, reason: str = "") -> bool:
-        """Begin or end an interval; return whether that changed anything."""
+        """Begin or end an interval; return whether that is a change."""
         slot = (lane, name)
         if on == (slot in self._open):
             return False
@@ -290,14 +287,14 @@ class RunRecorder:
                 self._intervals.append(Interval(lane, name, from_s, max(from_s, t_s), why))
         elif self.has_room(self._open, KEPT):
             self._open[slot] = (t_s, reason)
-        return on == (slot in self._open)  # it is so now, unless there was no room
+        return on == (slot in self._open)  # false if there was no room
 
     def _note(self, t_s: float, kind: str, text: str) -> None:
         if self.has_room(self._events, KEPT):
             self._events.append(EventLine(t_s, kind, text))
 
     def has_room(self, kept: Sized, most: int) -> bool:
-        """Whether one more may be kept; if not it is counted."""
+        """Whether there is room for one more; it is counted if not."""
         if len(kept) < most:
             return True
         self._left_out += 1

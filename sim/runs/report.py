@@ -1,7 +1,7 @@
-"""What the report of any run needs: pages from templates, a timeline, files whole or not at all.
+"""The report of a run: a page from templates, with a timeline, written whole or not at all.
 
-A page needs nothing but itself: style and pictures are inline, there is no script, it can be
-printed and mailed. All text that came over the bus is escaped.
+A page is self-contained: style and pictures are inline, and it has no script. So it can be printed
+and mailed. All text from the bus is escaped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ NONE, MINUS = "–", "−"  # noqa: RUF001 - typography for people
 
 
 class Written(NamedTuple):
-    """What there is of a report, and in one line why the rest is missing; "" if it is whole."""
+    """The files of a report, and in one line why a file is missing; "" if none is."""
 
     html: Path | None
     data: Path | None
@@ -37,14 +37,14 @@ class Written(NamedTuple):
 
 
 def try_report(run: RunRecord, render: Callable[[Any], str], directory: str | Path) -> Written:
-    """Write `inspection-RUN.html` and `.json` into a directory, which is made if need be.
+    """Write `inspection-RUN.html` and `.json` to a directory, which is made if necessary.
 
-    Each appears complete or not at all; whatever goes wrong is told, not raised.
+    Each file is complete or missing. Errors are reported, not raised.
 
     Args:
-        run: the record.
-        render: makes the page of it.
-        directory: where to.
+        run: The record.
+        render: Returns the page of a record.
+        directory: Directory of the report.
     """
     problems: dict[str, list[str]] = {}
 
@@ -70,9 +70,9 @@ def render(run: RunRecord, title: str, margins: Sequence[tuple[str, str]] = ()) 
     """Return the page of a run of any system.
 
     Args:
-        run: the record.
-        title: of the system.
-        margins: how far from harm it was at its worst: heading and text of each.
+        run: The record.
+        title: Title of the system.
+        margins: Heading and text of each smallest margin.
     """
     return environment().get_template("runs/report.html").render(
         run=run, title=title, margins=margins, headline=_headline(run), lanes=lanes_of(run),
@@ -82,27 +82,27 @@ def render(run: RunRecord, title: str, margins: Sequence[tuple[str, str]] = ()) 
 def _headline(run: RunRecord) -> str:
     """Return the result of the run in a sentence."""
     if run.mission is None:
-        return "No judge heard this run."
+        return "This run had no judge."
     if run.safety == "unsafe":
         return "The system was not safe in this run."
     if run.safety == "not known":
-        return f"Safety cannot be judged: {'; '.join(run.reasons) or 'nothing was heard'}."
+        return f"Safety cannot be judged: {'; '.join(run.reasons) or 'no message shows it'}."
     return ("The task was done, and the system was safe." if run.mission == "success"
             else "The task was not done; the system was safe.")
 
 
 def in_words(error: Exception) -> str:
-    """Return an error in a few words, for a line that names the file."""
+    """Return the text of an error for a line that names the file."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file so that a reader sees the old or the new one, never a half.
+    """Replace a file atomically.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: The file cannot be written.
     """
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -116,7 +116,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def environment() -> jinja2.Environment:
-    """Return what all reports are rendered with: pages of `sim/`, all text escaped."""
+    """Return the environment of all reports: templates in `sim/`, all text escaped."""
     made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parents[1]), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
@@ -125,7 +125,7 @@ def environment() -> jinja2.Environment:
 
 
 def margin_text(value: float | None, unit: str, exact_below: float | None) -> str:
-    """Return a margin; from `exact_below` on only a bound is known, None: always exact."""
+    """Return a margin; from `exact_below` on (None: never) it is a lower bound."""
     if value is None or not math.isfinite(value):
         return NONE
     if exact_below is not None and value >= exact_below:
@@ -136,9 +136,9 @@ def margin_text(value: float | None, unit: str, exact_below: float | None) -> st
 def clock(seconds: float | None) -> str:
     """Return simulated seconds as minutes:seconds."""
     if seconds is None or not math.isfinite(seconds):
-        return "–"  # noqa: RUF001 - typography for people
+        return NONE
     minutes, rest = divmod(abs(round(seconds, 1)), 60)
-    sign = MINUS if round(seconds, 1) < 0 else ""  # of what came before the start
+    sign = MINUS if round(seconds, 1) < 0 else ""  # before the start
     return f"{sign}{int(minutes)}:{rest:04.1f}"
 
 
@@ -189,7 +189,7 @@ def ticks_of(duration_s: float) -> list[dict[str, Any]]:
 
 
 class Moment(NamedTuple):
-    """Something that happened at `at_s`, simulated seconds; the kind chooses its symbol.
+    """An event at `at_s`, simulated seconds; the kind chooses its symbol.
 
     Kinds: fault, detected, narrow (the smallest margin), unsafe, end; "" without a symbol.
     """
@@ -200,33 +200,33 @@ class Moment(NamedTuple):
 
 
 class RunPictures:
-    """Draws nothing; a robot's trial names a class derived from it, see `Trial.pictures`.
+    """Draws nothing. A robot's trial names a derived class, see `Trial.pictures`.
 
     Args:
-        records: of all runs that are to be drawn.
+        records: Records of all runs.
     """
 
     style = Markup("")
-    """CSS that the pictures need."""
+    """CSS of the pictures."""
 
     words = ""
-    """What a reader has to know to read them."""
+    """Explanation for readers."""
 
     def __init__(self, records: Sequence[Any]) -> None:
         del records
 
     def definitions(self) -> Markup:
-        """Return what several pictures refer to, such as a map, as HTML."""
+        """Return common parts of the pictures, such as a map, as HTML."""
         return Markup("")
 
     def picture(self, record: RunRecord, key: str, title: str, marks: Sequence[Moment]) -> Markup:
         """Return the picture of a run as HTML.
 
         Args:
-            record: of the run.
-            key: that makes ids in the page unique.
-            title: of the run.
-            marks: what is to be marked in it.
+            record: Record of the run.
+            key: Makes ids in the page unique.
+            title: Title of the run.
+            marks: Events to mark.
         """
         del record, key, title, marks
         return Markup("")

@@ -1,12 +1,11 @@
-"""What lies beside the report of a run so that it can be resumed, and how it is found again.
+"""The files with which a run can be resumed, and how they are found.
 
-In the report's directory are a manifest (`run.json`: which run that is, how it was started, and
-digests of the files that it was made from), the nodes' checkpoints, and the newest two memories of
-the run's record, named after the run. The directory is locked (flock(2)) by every process of the
-run: a run that is locked lives, whatever became of its launcher.
+The report's directory holds a manifest (`run.json`: the run's id, its arguments, and digests of its
+input files), the nodes' checkpoints, and the last two copies of the run's record. Every process of
+the run locks the directory (flock(2)). So a locked run lives, even if its launcher has died.
 
-A resumed run has the same run id and the next part number. Its simulated time goes on a little
-after the newest thing that was recorded, so that no state is from the future.
+A resumed run has the same run id and the next part number. Its simulated time continues a little
+after the newest record, so that no state is from the future.
 """
 
 from __future__ import annotations
@@ -30,29 +29,30 @@ FORMAT = 1
 _LARGEST_BYTES = 64 << 20
 
 _PATIENCE_S = 3.0
-"""Real seconds in which the processes of a run end whose launcher was killed."""
+"""Real seconds in which the processes of a run end after their launcher was killed."""
 
 AFTER_S = 2.0 + STARTUP_S[1]
-"""Real seconds from the newest memory of the record to the beginning of the next part: one is kept
-each second, states may be newer, and the processes start before the part begins."""
+"""Real seconds from the newest copy of the record to the beginning of the next part. A copy is made
+each second, checkpoints may be newer, and the processes start before the part begins.
+"""
 
 
 class ResumptionError(ValueError):
-    """A run cannot be resumed, now or later; the text is one line that names the run and why."""
+    """A run cannot be resumed. The text is one line that names the run and the reason."""
 
 
 class Manifest(msgspec.Struct, frozen=True):
-    """Which run a directory has, and how it was started.
+    """A run and its start.
 
     Attributes:
-        format: of this file.
-        run_id: name of the run.
-        part: how often it was resumed.
-        arguments: of the command line.
-        choices: what must be the same in a resumed run, by name.
-        rate: simulated seconds per second.
-        digests: SHA-256 of each file that it was made from, by path.
-        ended: how it ended; "" if it has not.
+        format: Version of the file format.
+        run_id: Name of the run.
+        part: Number of resumptions.
+        arguments: Arguments of the command line.
+        choices: Options that a resumed run must share, by name.
+        rate: Simulated seconds per second.
+        digests: SHA-256 of each input file, by path.
+        ended: How the run ended; "" if it has not.
     """
 
     format: int
@@ -80,7 +80,7 @@ def manifest_of(plan: RunPlan, arguments: Iterable[str], files: Iterable[Path]) 
 
 
 def differences(before: Manifest, now: Manifest) -> str:
-    """Return in words what a resumed run has that is not as it was; "" if all is."""
+    """Return the first difference between a run and its resumption; "" if there is none."""
     for name in sorted(before.choices.keys() | now.choices.keys()):
         was, is_now = before.choices.get(name), now.choices.get(name)
         if msgspec.json.encode(was) != msgspec.json.encode(is_now):
@@ -92,10 +92,10 @@ def differences(before: Manifest, now: Manifest) -> str:
 
 
 class RunFiles:
-    """What a run keeps in the directory of its report.
+    """The files of a run in the directory of its report.
 
     Args:
-        directory: of the report.
+        directory: Directory of the report.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -103,10 +103,10 @@ class RunFiles:
         self._lock = -1
 
     def lock(self) -> bool:
-        """Lock the directory for this process and those that it forks; return if that succeeds.
+        """Lock the directory for this process and its forks; return whether that succeeded.
 
         Raises:
-            OSError: there is no such directory.
+            OSError: The directory does not exist.
         """
         if self._lock < 0:
             self._lock = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -118,7 +118,7 @@ class RunFiles:
         return True
 
     def unlock(self) -> None:
-        """Let go of the directory. Harmless when repeated."""
+        """Unlock the directory. Harmless when repeated."""
         if self._lock >= 0:
             os.close(self._lock)
             self._lock = -1
@@ -127,7 +127,7 @@ class RunFiles:
         """Return the manifest.
 
         Raises:
-            ResumptionError: there is none, or it is damaged.
+            ResumptionError: The manifest is missing or damaged.
         """
         file = self.directory / MANIFEST
         try:
@@ -142,10 +142,10 @@ class RunFiles:
         return found
 
     def save(self, manifest: Manifest) -> None:
-        """Keep the manifest.
+        """Write the manifest.
 
         Raises:
-            ResumptionError: it cannot be kept.
+            ResumptionError: It cannot be written.
         """
         file = self.directory / MANIFEST
         try:
@@ -154,17 +154,17 @@ class RunFiles:
             raise ResumptionError(f"{file}: cannot be written: {error.strerror}") from None
 
     def saved(self) -> bytes | None:
-        """Return the manifest as it is on the disk; None if there is none, or it is unreadable."""
+        """Return the manifest's bytes; None if it is missing or unreadable."""
         try:
             return _content(self.directory / MANIFEST)
         except OSError:
             return None
 
     def put_back(self, saved: bytes | None) -> None:
-        """Have the manifest be again as it was before a run that did not start.
+        """Restore the manifest after a run that did not start.
 
         Raises:
-            OSError: it cannot be kept.
+            OSError: It cannot be written.
         """
         if saved is None:
             (self.directory / MANIFEST).unlink(missing_ok=True)
@@ -172,21 +172,21 @@ class RunFiles:
             _write(self.directory / MANIFEST, saved)
 
     def end(self, manifest: Manifest) -> None:
-        """Keep the manifest of a run that has ended, and its memories no longer.
+        """Write the manifest of a run that has ended, and remove the copies of its record.
 
         Raises:
-            ResumptionError: it cannot be kept.
-            OSError: a memory cannot be removed.
+            ResumptionError: The manifest cannot be written.
+            OSError: A copy cannot be removed.
         """
         self.save(manifest)
         for file in self._memories(manifest.run_id):
             file.unlink(missing_ok=True)
 
     def keep_memory(self, run_id: str, memory: bytes) -> None:
-        """Keep the newest memory of a run's record, and the one before it.
+        """Write a copy of a run's record, and keep the one before it.
 
         Raises:
-            OSError: it cannot be kept.
+            OSError: It cannot be written.
         """
         newest, before = self._memories(run_id)
         with contextlib.suppress(FileNotFoundError):
@@ -194,14 +194,14 @@ class RunFiles:
         _write(newest, hashlib.sha256(memory).digest() + memory)
 
     def recall(self, run_id: str, recall: Callable[[bytes], float]) -> tuple[float, list[str]]:
-        """Have the newest sound memory of a run's record recalled.
+        """Load the newest undamaged copy of a run's record.
 
         Args:
-            run_id: name of the run.
-            recall: takes a memory, and returns when it was kept, simulated seconds.
+            run_id: Name of the run.
+            recall: Takes the copy and returns its time, simulated seconds.
 
         Returns:
-            That time, 0 without a memory; and what was damaged, one line each.
+            That time, 0 without a copy; and one line per damaged copy.
         """
         problems: list[str] = []
         for file in self._memories(run_id):
@@ -217,7 +217,7 @@ class RunFiles:
         return 0.0, problems
 
     def _memories(self, run_id: str) -> tuple[Path, Path]:
-        """Return the files of the newest memory, and of the one before it."""
+        """Return the files of the newest copy and of the one before it."""
         name = f"record-{run_id}.memory"
         return self.directory / name, self.directory / f"{name}.before"
 
@@ -226,12 +226,12 @@ def find(reports: Path, which: str) -> tuple[RunFiles, Manifest]:
     """Return the files of a run that can be resumed, locked, and its manifest.
 
     Args:
-        reports: folder of the reports.
-        which: directory of a run's report, or its name in `reports`, or the run's id; "" for the
+        reports: Folder of the reports.
+        which: Directory of a run's report, its name in `reports`, or the run's id; "" for the
             newest run that did not end.
 
     Raises:
-        ResumptionError: there is none, or it has ended, lives, or is damaged.
+        ResumptionError: The run does not exist, has ended, lives, or is damaged.
     """
     directory = _newest(reports) if not which else _named(reports, which)
     files = RunFiles(directory)
@@ -283,7 +283,7 @@ def _content(file: Path) -> bytes:
 
 
 def _write(file: Path, content: bytes) -> None:
-    """Replace a file, whole or not at all, and have the disk confirm it."""
+    """Replace a file atomically and wait until it is on the disk."""
     beside = file.with_name(f"{file.name}~")
     try:
         with beside.open("wb") as opened:

@@ -1,9 +1,9 @@
-"""What a run is besides its processes: who hears it, when it is over, and what comes of it.
+"""A trial: the part of a run outside of its processes, with observer, end and result.
 
-A run of a system makes a `Trial`, has it make the actors that stand outside of the system, asks it
-now and then whether the run is over, and has it conclude. This one is for systems without a judge:
-those that are being specified, and those whose world is not simulated here. A robot whose runs end
-with a verdict derives its own, which its application names.
+A run makes a `Trial`. The trial makes the actors outside of the system, decides when the run is
+over, and returns its record. `Trial` itself serves systems without a judge, for example those whose
+world is not simulated here. A robot with its own verdict derives a class, which its application
+names.
 """
 
 from __future__ import annotations
@@ -52,33 +52,33 @@ _SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not 
 
 
 class Trial:
-    """A run that goes on for a while, without a judge.
+    """A run for a given time, without a judge.
 
     Class attributes:
-        judges: whether there is a verdict on it.
-        patient: whether it ends by itself, or when nothing progresses; else after a while.
-        injector: who carries out faults.
-        tells: who tells the story.
-        retunings: changes to a system that have a name, see `Job.retuned`.
-        margins: how far from harm a run was: names, and how they are headed in a report.
-        margin_unit: of all of them.
-        exact_below: above it a margin may be a lower bound; None if all are exact.
-        draws: whether its report has curves of all the robot's numbers.
-        resumes: whether what was seen in one part of a run is known in the next.
-        pictures: class path of the `RunPictures` that a campaign's report shows; "" for none.
+        judges: Whether a run has a verdict.
+        patient: Whether a run ends by itself or when it makes no progress; if not, after a time.
+        injector: Class of the fault injector.
+        tells: Class of the console.
+        retunings: Named changes to a system, see `Job.retuned`.
+        margins: Heading in reports of each margin, by name.
+        margin_unit: Unit of all margins.
+        exact_below: A margin from this value on may be a lower bound; None if all are exact.
+        draws: Whether the report has curves of all numbers of the robot.
+        resumes: Whether a resumed run continues the record of the part before.
+        pictures: Class path of the `RunPictures` in a campaign's report; "" for none.
 
     Args:
-        run: what is run.
-        limit_s: simulated seconds after which it is over, None for those of the specification;
-            for one that is patient, seconds without progress.
-        stream: for the story; None keeps quiet.
+        run: Context of the run.
+        limit_s: Length of the run, simulated seconds; None for the value in the specification. For
+            a patient trial, longest time without progress.
+        stream: Output of the console; None for none.
 
     Attributes:
-        name: of the directory in which its report goes.
-        title: of the run, for people.
-        about: what is about to run, and how it ends.
-        goals: how many there are, for faults at the beginning of one.
-        injects: the injector of its faults, if there are any, from `outside` on.
+        name: Name of the report's directory.
+        title: Title of the run.
+        about: Description of the run and its end, for the console.
+        goals: Number of goals, for faults at the beginning of a goal.
+        injects: The injector, if there are faults and `outside` was called.
     """
 
     judges: ClassVar[bool] = False
@@ -114,7 +114,7 @@ class Trial:
             run.system.timing, sorted(self._worlds), run.plan.rate, run.plan.begins_s)
 
     def sinks(self, clock: Clock) -> list[Sink]:
-        """Return what wants to hear the run's messages."""
+        """Return the receivers of the run's messages."""
         del clock
         return [self._look_at_world, self.recorder.feed, self._curves.take,
                 *([self.console.take] if self.console else ())]
@@ -130,11 +130,11 @@ class Trial:
         """Return the actors outside of the system: its observer, and the injector of its faults.
 
         Args:
-            context: returns that of an actor, by its name.
-            heard: is told what the supervisor says of the nodes.
-            scenario: what goes wrong, and when; without it there is no injector.
-            control: by which processes are hit.
-            nodes: names that may be hit.
+            context: Returns the context of an actor by its name.
+            heard: Called with each node table of the supervisor.
+            scenario: Faults and their times; without faults there is no injector.
+            control: Kills and stops processes.
+            nodes: Nodes that faults may hit.
         """
         def take(_topic: Topic[Any], message: Any, header: Header) -> None:
             if isinstance(message, NodeTable):
@@ -160,25 +160,25 @@ class Trial:
                 self.console.line(now_s, line)
 
     def outcomes(self) -> tuple[FaultOutcome, ...]:
-        """Return what has become of the faults so far."""
+        """Return the outcomes of the faults so far."""
         return (*self._outcomes_before, *(self.injects.outcomes() if self.injects else ()))
 
     def memory(self, now_s: float) -> bytes:
-        """Return what a resumed run needs of what was seen so far."""
+        """Return the record so far in the form that `recall` reads."""
         return self.recorder.memory(now_s)
 
     def recall(self, memory: bytes) -> float:
-        """Go on from the memory of the part before, and return when it was kept, simulated s.
+        """Continue from the record of the part before; return its end, simulated seconds.
 
         Raises:
-            msgspec.DecodeError: the bytes are not a memory.
+            msgspec.DecodeError: The bytes are not such a record.
         """
         before = self.recorder.recall(memory)
         self._outcomes_before = before.faults
         return before.duration_s
 
     def brought_back(self, name: str, now_s: float) -> None:
-        """Note that the launcher has brought an actor back."""
+        """Note that the launcher restarted an actor."""
         self._brought_back += 1
         if self.console:
             self.console.line(now_s, f"{name} brought back")
@@ -187,21 +187,21 @@ class Trial:
             topics.PROCESS_EVENT, event, Header(LAUNCHER, 1, self._brought_back, now_s))
 
     def not_recorded(self, why: str, now_s: float) -> None:
-        """Note that the recording of the run has ended before it."""
+        """Note that the recording ended before the run."""
         self.recorder.feed(topics.PROCESS_EVENT, ProcessEvent(RECORDER, "crashed", 0, 1, "", why),
                            Header(LAUNCHER, 1, 1, now_s))
 
     def excuse(self, stall_s: float) -> None:
-        """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
+        """Do not count simulated seconds in which the launcher was stopped."""
 
     def ended(self, now_s: float) -> str | None:
-        """Return why the run is over, or None: also because its world has blown up."""
+        """Return why the run is over, also if its physics are unstable, or None."""
         return self._unjudged or self.over(now_s)
 
     def settled(self, verdict: Verdict) -> Verdict:
-        """Return a verdict on the run, of which the end was not watched if the world was lost.
+        """Return a verdict that takes unstable physics into account.
 
-        An unsafe run stays unsafe; any other cannot be judged.
+        After that, an unsafe run stays unsafe, and any other cannot be judged.
         """
         if not self._unjudged:
             return verdict
@@ -210,7 +210,7 @@ class Trial:
             reasons=(self._unjudged, *verdict.reasons))
 
     def over(self, now_s: float) -> str | None:
-        """Return why the run is over, or None while it goes on."""
+        """Return why the run is over, or None while it continues."""
         is_over = self.limit_s is not None and now_s >= self.limit_s
         return "its time is over" if is_over else None
 
@@ -218,21 +218,21 @@ class Trial:
         """Return the record of the run, with a verdict if there is one.
 
         Args:
-            now_s: simulated time.
-            why: it is over.
+            now_s: Simulated time.
+            why: Why the run is over.
         """
         del why
         return self.recorder.record(now_s, **self._seen_to(now_s))
 
     def _seen_to(self, now_s: float) -> dict[str, Any]:
-        """Return the fields of a record that come from elsewhere than messages."""
+        """Return the fields of a record that do not come from messages."""
         log = self.run.plan.page.audit_log
         return {"faults": self.outcomes(), "audit": read_audit(Path(log)) if log else (),
                 "curves": self._curves.curves(),
                 "keeping_up": self._keeping_up.result(now_s) if self._keeping_up else None}
 
     def concluded(self, verdict: Verdict, now_s: float, why: str) -> RunRecord:
-        """Return the record of a run that has ended for a reason, and was judged."""
+        """Return the record of a judged run that ended for a reason."""
         verdict = self.settled(verdict)
         return self.recorder.record(
             now_s, **self._seen_to(now_s),
@@ -241,7 +241,7 @@ class Trial:
             reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
 
     def summary(self, record: RunRecord) -> dict[str, Any]:
-        """Return what scripts rely on: the last line of stdout with --json."""
+        """Return the data of the last line of stdout with --json."""
         return {
             "mission": record.mission, "safety": record.safety, "reasons": record.reasons,
             "duration_s": round(record.duration_s, 2), "restarts": record.restarts,
@@ -252,21 +252,21 @@ class Trial:
                        for fault in record.faults]}
 
     def judgement(self, record: RunRecord) -> Verdict:
-        """Return what only a judge knows of a run that is over."""
+        """Return the verdict on a run that is over."""
         return Verdict(success=record.mission == "success", safe=record.safety == "safe",
                        reasons=record.reasons)
 
     @classmethod
     def moments(cls, spec: SystemSpec, *, searched: bool = False) -> tuple[float, float] | None:
-        """Return between which simulated times a campaign injects faults, or a search does.
+        """Return the first and last simulated time at which a campaign or a search injects faults.
 
-        None: that follows from how long a run without a fault takes.
+        None if they follow from the length of a run without faults.
         """
         del spec, searched
         return None
 
     def report(self, record: RunRecord, directory: Path) -> Written:
-        """Write as much of a report as can be written."""
+        """Write the report, or as much of it as can be written."""
         return try_report(record, lambda run: render(run, self.title, self._margins(run)),
                           directory)
 
@@ -277,10 +277,10 @@ class Trial:
 
 
 class JudgedTrial(Trial):
-    """A run that a judge hears, which the system's specification names.
+    """A run with the judge that its specification names.
 
     Class attributes:
-        judge: class of the judge.
+        judge: Class of the judge.
     """
 
     judges = True
@@ -293,25 +293,25 @@ class JudgedTrial(Trial):
         given = {name: value for name, value in run.system.judge.items() if name != "class"}
         self._judge = self.judge(read_parameters(
             self.judge.Parameters, given, run.plan.system_file, "$.judge"))
-        self._hears = [(topic.key, getattr(self._judge, method))
+        self._handlers = [(topic.key, getattr(self._judge, method))
                        for topic, method in self.judge._handlers]
 
     def sinks(self, clock: Clock) -> list[Sink]:
-        """Return what wants to hear the run's messages: the judge first."""
+        """Return the receivers of the run's messages, the judge first."""
 
         def to_judge(topic: Topic[Any], message: Any, header: Header) -> None:
-            for key, hear in self._hears:
+            for key, take in self._handlers:
                 if key == topic.key:
-                    hear(message, header)
+                    take(message, header)
 
         return [to_judge, *super().sinks(clock)]
 
     def over(self, now_s: float) -> str | None:
-        """Return why the run is over: what the judge says, or that its time is over."""
+        """Return the judge's reason why the run is over, or that its time is over, or None."""
         return self._judge.over(now_s) or super().over(now_s)
 
     def conclude(self, now_s: float, why: str) -> RunRecord:
-        """Return the record of the run with the judge's verdict, and what became of faults."""
+        """Return the record of the run with the judge's verdict."""
         return self.concluded(self._judge.verdict(), now_s, why)
 
     def judgement(self, record: RunRecord) -> Verdict:
@@ -321,11 +321,11 @@ class JudgedTrial(Trial):
 
 
 def trial_class(spec: SystemSpec) -> type[Trial]:
-    """Return what a run of a system is: that of its application, or one that its judge hears.
+    """Return the class of a system's trials, by its application or its judge.
 
     Raises:
-        ValueError: the application, the judge, or a class that one of them names does not exist,
-            or the specification says when a mission ends.
+        ValueError: The application, the judge, or a class of one of them does not exist, or the
+            specification has a time limit for a mission.
     """
     path = application_class(spec).trial
     if path:

@@ -1,8 +1,8 @@
-"""A mission in virtual time: the real actors as tasks on one loop, many times faster than real.
+"""A mission in virtual time: the real actors as tasks on one loop, faster than real time.
 
-The same seed gives the same run, to the byte: sensors, network, processes and faults draw from
-dice of their own, all seeded from the plan, and time is the loop's. A hash over every message with
-its time of sending, and over whatever happens to processes, is the proof.
+The same seed gives the same run, byte for byte. Sensors, network, processes and faults have
+separate random generators, seeded from the plan, and time is the loop's. The proof is a hash over
+all messages with their times of sending.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ _HEAD = struct.Struct("<dI").pack
 
 
 class VirtualResult(msgspec.Struct, frozen=True):
-    """What came of a virtual run.
+    """Result of a virtual run.
 
     Attributes:
-        record: The story of the run.
-        judgement: What only a judge knows.
+        record: Record of the run.
+        judgement: Verdict.
         why: Why it ended.
-        trace: SHA-256 over everything that was sent, in hexadecimal.
-        messages: How many were sent.
-        wall_s: How long it took, without loading; of a branch, with what it has not made itself.
+        trace: SHA-256 over all messages, in hexadecimal.
+        messages: Number of messages.
+        wall_s: Duration without loading; for a branch, with the common beginning.
         failures: Actors that ended by an error, with the error's text.
-        tracebacks: Of these, as text.
+        tracebacks: Their tracebacks.
     """
 
     record: RunRecord
@@ -93,7 +93,7 @@ class Trace:
         self._waiting.clear()
 
     def digest(self) -> str:
-        """Return the hash of what was seen so far."""
+        """Return the hash so far."""
         self._flush()
         return self._hash.hexdigest()
 
@@ -106,14 +106,14 @@ class VirtualRun:
     """One trial in virtual time. Use: `run` or `branches`, once.
 
     Args:
-        trial: What is run; id, rate and ports of its plan do not matter.
-        network: What lies between the nodes; as measured if None.
-        scenario: What goes wrong, and when.
-        nodes: That faults may name, whether they run or not; those of the spec if None.
-        taps: Hear each message as it is sent: simulated time, key, payload.
+        trial: The trial; id, rate and ports of its plan are ignored.
+        network: Network between the nodes; the measured one if None.
+        scenario: Faults and their times.
+        nodes: Nodes that faults may name, whether they run or not; those of the spec if None.
+        taps: Called with each message: simulated time, key, payload.
 
     Raises:
-        ValueError: an actor class named in the spec cannot be had.
+        ValueError: An actor class cannot be loaded.
 
     Attributes:
         interrupted: Setting it, perhaps from a signal handler, ends the run for this reason.
@@ -137,30 +137,30 @@ class VirtualRun:
         self._nodes = can_be_hit(spec) if nodes is None else tuple(nodes)
 
     def run(self) -> VirtualResult:
-        """Run to the end, on a loop of its own."""
+        """Run to the end on a new loop."""
         result = self._on_loop()
         if result is None:
-            raise RuntimeError("a run without branches has ended in none")
+            raise RuntimeError("a run without branches has no result")
         return result
 
     def branches(self, scenarios: Sequence[Sequence[PlannedFault]], branch: Branch
                  ) -> VirtualResult | None:
-        """Run as several scenarios with a common beginning, each of one fault at least.
+        """Run several scenarios with a common beginning, each with at least one fault.
 
         Args:
-            scenarios: take the place of the one with which it was made.
-            branch: forks this process (`rampart.sim.virtual.virtual_loop.fork`) and returns true
-                in the child: what returns there is the result of that scenario.
+            scenarios: They replace the scenario of the constructor.
+            branch: Forks this process (`rampart.sim.virtual.virtual_loop.fork`) and returns true in
+                the child, which returns the result of that scenario.
 
         Returns:
-            None in the process that has run the common beginning, when all have departed.
+            None in the process of the common beginning, after all branches.
         """
         self._scenario = tuple(scenarios[0])
         return self._on_loop(scenarios, branch)
 
     def _on_loop(self, scenarios: Sequence[Sequence[PlannedFault]] = (),
                  branch: Branch | None = None) -> VirtualResult | None:
-        # What is loaded stays; what a run leaves behind goes without a collector, nearly all of it.
+        # Loaded objects stay, and nearly all objects of a run are freed without the collector.
         gc.collect()
         gc.freeze()
         threshold = gc.get_threshold()
@@ -204,7 +204,7 @@ class VirtualRun:
             if injector is not None and not (injector.planned or injector.open):
                 why = "all branches have departed"
         if injector is not None:
-            for number in tuple(injector.open):  # their moments never came
+            for number in tuple(injector.open):  # their times never came
                 injector.decide(number)
         now_s = clock.now()
         machine.shut_down()
