@@ -1,7 +1,7 @@
-"""Ctrl-C while a program loads ends it at once: an import cannot swallow it, and nothing is shown.
+"""Ctrl-C while a program loads ends it at once and prints nothing.
 
-`KeyboardInterrupt` is raised wherever the program is, in an `except` of another module's say.
-Where nothing runs yet that would have to be cleaned up, the process just ends.
+`KeyboardInterrupt` could be raised inside an import, which may swallow it. As there is nothing to
+clean up yet, the process just ends.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ EXIT_INTERRUPTED = 1
 
 
 def end_at_once() -> None:
-    """Have SIGINT end this process from now on, unless it is ignored or handled otherwise."""
+    """Let SIGINT end this process from now on, unless it is ignored or has another handler."""
     _change(signal.default_int_handler, _end)
 
 
 def raise_again() -> None:
-    """Have SIGINT raise `KeyboardInterrupt` again."""
+    """Let SIGINT raise `KeyboardInterrupt` again."""
     _change(_end, signal.default_int_handler)
 
 

@@ -1,24 +1,23 @@
-r"""Text of others, made fit for a terminal, a log or a line of a report.
+r"""Foreign text, made safe for a terminal, a log or a line of a report.
 
-What comes from the bus may hold anything: an escape sequence that clears the screen or retitles
-the window, a line feed that forges a line, an override that shows it backwards. None of it is shown
-as what it is: each character that is not printable (`str.isprintable`: controls C0 and C1,
-bidirectional overrides, separators of lines, unassigned ones) is written as `\uXXXX`, which is also
-how JSON writes it.
+Text from the bus may contain an escape sequence that clears the screen, a line feed that forges a
+line, or an override that reverses it. So each character that is not printable (`str.isprintable`:
+controls C0 and C1, bidirectional overrides, line separators, unassigned ones) is written as
+`\uXXXX`, as in JSON.
 """
 
 from __future__ import annotations
 
 LINE_CHARS = 600
-"""Longest line, unless told otherwise."""
+"""Default length of the longest line."""
 
 
 def printable(text: str, keep: str = "") -> str:
-    r"""Return a text with all that is not printable escaped.
+    r"""Return a text with all unprintable characters escaped.
 
     Args:
-        text: of anybody.
-        keep: characters that are left, such as "\n" in a text that was put together of safe lines.
+        text: Any text.
+        keep: Characters that are not escaped, such as "\n" between safe lines.
     """
     if text.isprintable():
         return text
@@ -26,9 +25,10 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def one_line(text: str, chars: int = LINE_CHARS) -> str:
-    """Return a text as one printable line of at most so many characters.
+    """Return a text as one printable line of limited length.
 
-    White space is joined. A longer one lacks its middle: an error ends with what was expected.
+    White space is joined. The middle of a longer line is cut, because errors end with the expected
+    value.
     """
     line = printable(" ".join(text.split()))
     end = chars // 4
@@ -36,7 +36,7 @@ def one_line(text: str, chars: int = LINE_CHARS) -> str:
 
 
 def shown(value: object, chars: int = 60) -> str:
-    """Return a value for a message, as Python writes it, cut to a length."""
+    """Return the repr of a value for a message, cut to a length."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of thousands of digits; nesting

@@ -1,8 +1,4 @@
-"""Reads a file up to a size.
-
-Nothing here knows a format. A file is read only as far as it may be long, so that neither a huge
-one nor a device without end fills the memory.
-"""
+"""Reads files of a limited size, so that no huge file or endless device fills the memory."""
 
 from __future__ import annotations
 
@@ -10,15 +6,15 @@ from pathlib import Path
 
 
 class FileError(ValueError):
-    """Content that is refused. The text says why; which file it is, the caller knows."""
+    """Content is refused. The text is the reason; the caller adds the file."""
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """Return the content of a file of at most so many bytes.
+    """Return the content of a file of at most `most` bytes.
 
     Raises:
-        FileError: it is longer.
-        OSError: it cannot be read.
+        FileError: The file is longer.
+        OSError: The file cannot be read.
     """
     with path.open("rb") as file:
         data = file.read(most + 1)
@@ -27,11 +23,11 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 
 def read_text(path: Path, most: int) -> str:
-    """Return the text in a file of at most so many bytes.
+    """Return the text of a file of at most `most` bytes.
 
     Raises:
-        FileError: it is longer, or not UTF-8.
-        OSError: it cannot be read.
+        FileError: The file is longer, or not UTF-8.
+        OSError: The file cannot be read.
     """
     try:
         return read_bytes(path, most).decode("utf-8")
@@ -40,10 +36,10 @@ def read_text(path: Path, most: int) -> str:
 
 
 def check_size(data: bytes | str, most: int) -> None:
-    """Refuse content that is longer than it may be.
+    """Check the size of content.
 
     Raises:
-        FileError: it is.
+        FileError: It is longer than `most`.
     """
     if len(data) > most:
         size = f"{most >> 20} MB" if most >= 1 << 20 else f"{most >> 10} kB"

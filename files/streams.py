@@ -1,13 +1,12 @@
-"""stdout and stderr that may be gone: what a program decides never depends on who reads it.
+"""stdout and stderr that may be closed: a program does not depend on the readers of its output.
 
-A terminal is closed, a pipe's reader has seen enough, the disk under a log is full, a descriptor
-was never open. Python raises then, wherever something is printed, and once more at exit, where that
-changes the exit code. After `secure` nothing is raised: what cannot be written is lost, `lost` says
-why, and the program goes on. A descriptor that is closed is opened on /dev/null, so that no file or
-socket takes its number and gets the story written into it.
+A terminal closes, the reader of a pipe ends, the disk of a log is full, or a descriptor was never
+open. Then Python raises at each print, and again at exit, where it changes the exit code. After
+`secure` nothing is raised. Output that cannot be written is lost, and `lost` returns the reason. A
+closed descriptor is opened on /dev/null, so that no file or socket gets its number and the output.
 
-Nor does the loop of a program wait for a reader that does not read: stderr that takes nothing for
-`PATIENCE_S` loses lines until it does again. stdout is waited for; it is the result.
+The program does not wait for a reader of stderr that stops reading: after `PATIENCE_S` lines are
+lost until the reader continues. It waits for readers of stdout, which is the result.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ from typing import Any
 from rampart.files.plain_text import one_line
 
 PATIENCE_S = 0.5
-"""Real seconds that stderr may take nothing, before lines are lost."""
+"""Real seconds without a read from stderr until lines are lost."""
 
 
 class _Unfailing(io.FileIO):
-    """A file descriptor that takes everything; `failure` says why something of it was lost.
+    """A file descriptor whose writes never fail; `failure` is the reason of lost output.
 
-    Without patience it waits until it is read.
+    Without patience a write waits until there is room.
     """
 
     def __init__(self, descriptor: int, patience_ms: float | None) -> None:
@@ -56,14 +55,14 @@ class _Unfailing(io.FileIO):
 
 
 def secure() -> None:
-    """Have nothing that is written to stdout or stderr raise, from now on and at exit.
+    """Let no write to stdout or stderr raise, from now on and at exit.
 
-    Streams that are not the process's own, a test's for example, stay as they are.
+    Replaced streams, such as those of a test, stay as they are.
     """
     for descriptor, flags in ((0, os.O_RDONLY), (1, os.O_WRONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(descriptor)
-        except OSError:  # those below it are open, so it gets this number
+        except OSError:  # lower ones are open, so it gets this number
             os.open(os.devnull, flags)
             os.set_inheritable(descriptor, True)
     for name, descriptor, patience_ms in (("stdout", 1, None), ("stderr", 2, 1000 * PATIENCE_S)):
@@ -86,13 +85,13 @@ def complain(text: str) -> None:
 
 
 def lost() -> OSError | None:
-    """Return why something of stdout was lost; None if nothing was."""
+    """Return why output on stdout was lost; None if none was."""
     raw = _raw(sys.stdout)
     return raw.failure if raw else None
 
 
 def lost_result() -> str:
-    """Return in words why stdout was lost; "" if it was not, or if its reader has seen enough."""
+    """Return in words why output on stdout was lost; "" if none was, or its reader ended."""
     with contextlib.suppress(OSError, ValueError):
         sys.stdout.flush()
     failure = lost()

@@ -1,4 +1,4 @@
-"""TOML of a bounded size and depth. `tomllib` reads it."""
+"""TOML of bounded size and depth, read with `tomllib`."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import Any
 from rampart.files.reading import FileError, check_size
 
 MAX_SIZE = 1 << 19
-"""Bytes of a file, characters of a text; the shipped ones have 16,000 at most."""
+"""Bytes of a file, characters of a text; shipped files have at most 16,000."""
 
 MAX_DEPTH = 32
-"""Of tables and arrays in each other."""
+"""Deepest nesting of tables and arrays."""
 
 MAX_KEY_PARTS = 200
-"""Of a dotted key: `tomllib` takes memory by the square of their number."""
+"""Most parts of a dotted key; `tomllib` takes memory by the square of their number."""
 
 _DOTTED = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){{{MAX_KEY_PARTS}}}""")
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 
 
 def parse(text: str, most: int = MAX_SIZE) -> dict[str, Any]:
-    """Return a document; a byte order mark at its beginning is no part of it.
+    """Return a document. A byte order mark at its beginning is skipped.
 
     Raises:
-        FileError: it is no TOML, or beyond the limits of this module.
+        FileError: The text is not TOML, or beyond the limits of this module.
     """
     check_size(text, most)
     if _DOTTED.search(text):

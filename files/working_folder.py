@@ -1,8 +1,8 @@
-"""Whether actors of one's own are looked for in the working folder, and beside a specification.
+"""Import of custom actors from the working folder and from the folder of a specification.
 
-With `-m` Python puts that folder first on its path, and executes what it finds there: in a folder
-that others can write, their code as this user. So processes of a run are started with `-P`, and
-these folders come last, each if only this user can write it.
+With `-m` Python puts the working folder first on its path. If others can write the folder, their
+code would run as this user. So processes of a run are started with `-P`, and these folders come
+last, each only if no other user can write it.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from pathlib import Path
 import rampart
 
 refused: dict[str, str] = {}
-"""Why folders are not searched, by the folder."""
+"""Reason for each folder that is not searched."""
 
 
 def admit(folder: Path | None = None) -> None:
-    """Have modules in a folder found, after all others, if only this user can write it.
+    """Search a folder for modules after all others, if only this user can write it.
 
-    What is installed, and what ships, comes first: a file `json.py` in the folder changes nothing.
+    Installed and shipped modules take precedence, so a file `json.py` in the folder has no effect.
 
     Args:
-        folder: of a specification that the user has named; the working folder if None.
+        folder: Folder of a specification named by the user; the working folder if None.
     """
     if why := why_not(folder):
         refused[str(folder or "")] = why
@@ -33,9 +33,9 @@ def admit(folder: Path | None = None) -> None:
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of a process of a run: it finds this Rampart, from any folder.
+    """Return the environment of a process of a run, which finds this Rampart from any folder.
 
-    The mathematical libraries get one thread: there are as many processes as there is work.
+    Mathematical libraries get one thread, because the work is already divided among processes.
     """
     found = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
     own = str(Path(rampart.__file__).resolve().parents[1])
@@ -44,7 +44,7 @@ def environment() -> dict[str, str]:
 
 
 def why_not(folder: Path | None = None) -> str:
-    """Return why modules in a folder are not looked for, "" if they are; argument as of `admit`."""
+    """Return why a folder is not searched, "" if it is; argument as of `admit`."""
     what = "the working folder" if folder is None else str(folder)
     try:
         folder = folder or Path.cwd()

@@ -15,7 +15,7 @@ _HOME_OF = {
     alias.name: line.module
     for line in ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body
     if isinstance(line, ast.ImportFrom) and line.module for alias in line.names}
-"""The module of each name, as type checkers are told it."""
+"""The module of each public name, from the stub that type checkers read."""
 
 __all__ = list(_HOME_OF)
 

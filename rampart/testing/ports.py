@@ -1,4 +1,4 @@
-"""Free numbers: TCP ports, and the base ports that tell runs apart."""
+"""Free TCP ports, and free base ports that identify runs."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from rampart.actors.bus import run_info
 
 
 def bases() -> Iterator[int]:
-    """Yield bases that no other worker of this test run takes, below the ephemeral ports.
+    """Yield base ports that no other worker of this test run takes, below the ephemeral ports.
 
-    Two workers (of pytest-xdist) with the same bases meet between the look for a free one and its
-    use.
+    Otherwise two workers of pytest-xdist could find the same port free before either uses it.
     """
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
@@ -28,21 +27,21 @@ _BASES = bases()
 
 
 def free_base_port() -> int:
-    """Return a number that no run has, for `--port`; as a TCP port it is free, too.
+    """Return a base port for `--port` that no run uses and that is free as a TCP port.
 
     Raises:
-        RuntimeError: none of a thousand is free.
+        RuntimeError: None of a thousand is free.
     """
     for base in islice(_BASES, 1000):
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
                 probe.bind(run_info.address(base))
-            with socket.create_server(("127.0.0.1", base)):  # for a page of its own
+            with socket.create_server(("127.0.0.1", base)):  # for the operator's page
                 pass
         except OSError:
             continue
         return base
-    raise RuntimeError("no free number")
+    raise RuntimeError("no free base port among 1000")
 
 
 def free_port() -> int:

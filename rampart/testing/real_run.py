@@ -1,4 +1,4 @@
-"""A real run from outside: started as a user starts it, watched, disturbed, and read to its end."""
+"""A real run, started, watched and disturbed from outside as by a user."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from rampart.testing.ports import free_base_port
 from rampart.testing.waiting import wait_until
 
 HEEDS_SIGNALS = ("env", "--default-signal=HUP,INT")
-"""Before a command: undoes what nohup, and shells with what they start in the background, do."""
+"""Prefix of a command: restores signals that nohup and shells ignore in background commands."""
 
 
 class RealRun:
-    """A run on processes of its own, with a base port of its own; a context manager.
+    """A run on real processes with a free base port; a context manager.
 
-    At its end the run is ended, and no process of it may be left.
+    The exit ends the run and checks that no process of it is left.
 
     Args:
-        directory: existing folder for output and report; the run's working directory, so custom
-            modules may lie there.
-        system: path, or name of one that ships.
-        arguments: more of the command line.
-        hmi: whether it serves the operator's page.
+        directory: Existing folder for output and report. It is the run's working directory, so
+            custom modules may be there.
+        system: Path, or name of a shipped system.
+        arguments: Further arguments of the command line.
+        hmi: Whether the run serves the operator's page.
 
     Class attributes:
-        command: starts a run.
+        command: Command that starts a run.
     """
 
     command: ClassVar[Sequence[str]] = (sys.executable, "-P", "-m", "rampart.cli.run")
@@ -67,20 +67,20 @@ class RealRun:
 
     @property
     def story(self) -> str:
-        """What it has told on stderr so far."""
+        """Its output on stderr so far."""
         return self._stderr.read_text()
 
     def story_from(self, byte: int) -> str:
-        """Return what it has told after so many bytes; a long story is read once."""
-        with self._stderr.open("rb") as told:
-            told.seek(byte)
-            return told.read().decode(errors="replace")
+        """Return its output on stderr from a byte on, to read a long output once."""
+        with self._stderr.open("rb") as file:
+            file.seek(byte)
+            return file.read().decode(errors="replace")
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
         """Wait until a condition holds.
 
         Raises:
-            AssertionError: it does not within `timeout_s`: what, and what the run has told.
+            AssertionError: It does not within `timeout_s`; the text is `what` and the run's output.
         """
         wait_until(condition, timeout_s, lambda: f"{what}\n{self.story}")
 
@@ -88,7 +88,7 @@ class RealRun:
         """Wait until a text appears on stderr.
 
         Raises:
-            AssertionError: it does not within `timeout_s`, or the run ends before.
+            AssertionError: It does not within `timeout_s`, or the run ends before.
         """
         self.wait_until(lambda: text in self.story or self.process.poll() is not None,
                         timeout_s, f"{text!r} did not appear")
@@ -97,7 +97,7 @@ class RealRun:
 
     @property
     def info(self) -> RunInfo:
-        """What the run publishes of itself to tools; waits until it is up."""
+        """The run as tools see it; waits until it is up."""
         self.wait_until(lambda: any(r.base_port == self.port for r in find_runs()), 30,
                         "the run did not come up")
         return next(r for r in find_runs() if r.base_port == self.port)
@@ -110,7 +110,7 @@ class RealRun:
             time.sleep(0.01)
 
     def pid(self, node: str) -> int | None:
-        """Return the process of a node, of its last incarnation; None if there is none."""
+        """Return the pid of the last incarnation of a node; None if it has no process."""
         found = [p for p in find_processes(self.port) if node in p.names]
         return max(found, key=lambda p: p.incarnation).pid if found else None
 
@@ -118,12 +118,12 @@ class RealRun:
         """Signal a node and return the pid it had: SIGSTOP stops it, SIGUSR2 makes it hang.
 
         Raises:
-            AssertionError: it is not there for 5 s.
+            AssertionError: The node has no process for 5 s.
         """
-        self.wait_until(lambda: self.pid(node) is not None, 5, f"{node} is not there")
+        self.wait_until(lambda: self.pid(node) is not None, 5, f"{node} has no process")
         pid = self.pid(node)
         if pid is None:
-            raise AssertionError(f"{node} is not there any more")
+            raise AssertionError(f"{node} has no process any more")
         os.kill(pid, number)
         return pid
 
@@ -137,8 +137,8 @@ class RealRun:
         """Wait for the end and return exit code and result.
 
         Raises:
-            AssertionError: it prints no result.
-            subprocess.TimeoutExpired: it does not end within `timeout_s`.
+            AssertionError: The run prints no result.
+            subprocess.TimeoutExpired: The run does not end within `timeout_s`.
         """
         code = self.process.wait(timeout_s)
         lines = self._stdout.read_text().splitlines()

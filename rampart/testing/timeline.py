@@ -1,7 +1,7 @@
 """Timelines for detection monitors: one character per 100 ms in, one out.
 
-An event happens at the beginning of its slot, the monitor is woken exactly when it is due, and
-what it finds is read in the middle of the slot: `-` idle, `A` active, `?` not known yet.
+An event happens at the beginning of its slot. The monitor is woken exactly when it is due. Its
+state is read in the middle of the slot: `-` idle, `A` active, `?` not known yet.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ NOTHING = "."
 
 def play(monitor: Monitor, handle: Callable[[str, float], None], events: Iterable[str],
          start_s: float = 0.0) -> str:
-    """Play events to a monitor and return what it found, slot by slot.
+    """Play events to a monitor and return its states, slot by slot.
 
     Args:
-        monitor: woken when it is due.
-        handle: told of each event but `.`, and of when it happens, simulated seconds.
-        events: one character per slot of 100 ms; `.` is none.
-        start_s: when the first slot begins, simulated seconds.
+        monitor: The monitor, which is woken when it is due.
+        handle: Called with each event but `.` and its time, simulated seconds.
+        events: One character per slot of 100 ms; `.` is no event.
+        start_s: Beginning of the first slot, simulated seconds.
 
     Raises:
-        AssertionError: the monitor is active without a reason or has one while idle, or is due
-            again at the time at which it was woken.
+        AssertionError: The monitor is active without a reason, has one while idle, or is due again
+            at the time at which it was woken.
     """
     found = []
     for slot, event in enumerate(events):
@@ -49,7 +49,7 @@ def wake(monitor: Monitor, until_s: float) -> None:
     """Wake a monitor whenever it is due, until a simulated time.
 
     Raises:
-        AssertionError: woken at its due time, it is due at the same time again.
+        AssertionError: Woken at its due time, it is due at the same time again.
     """
     while (due_s := monitor.due_s) <= until_s:
         monitor.expire(due_s)

@@ -1,4 +1,4 @@
-"""Actors in virtual time: hours take moments, and each run is the same.
+"""Actors in virtual time: an hour takes moments, and each run is the same.
 
 `run` calls a coroutine function on a virtual loop; in it, `VirtualSystem` has actors on one bus.
 """
@@ -42,13 +42,13 @@ TESTER = "tester"
 
 
 def run(scenario: Callable[[], Coroutine[Any, Any, T]]) -> T:
-    """Return what a coroutine function returns that is called in virtual time."""
+    """Run a coroutine function in virtual time and return its result."""
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         return runner.run(scenario())
 
 
 async def turns(count: int = 60) -> None:
-    """Let the loop turn without time passing; messages, posted for now, are handed over too."""
+    """Let the loop turn without advancing time; pending messages are delivered."""
     loop = asyncio.get_running_loop()
     for _ in range(count):
         turn = loop.create_future()
@@ -57,7 +57,7 @@ async def turns(count: int = 60) -> None:
 
 
 class Heard(NamedTuple, Generic[M]):
-    """A message as a tester receives it: when (simulated seconds), on which key, from whom."""
+    """A received message, with simulated time, key and header."""
 
     time_s: float
     key: str
@@ -66,22 +66,22 @@ class Heard(NamedTuple, Generic[M]):
 
 
 class VirtualSystem:
-    """Actors on one virtual bus, and a tester who starts, kills and disturbs them.
+    """Actors on one virtual bus, and a tester that starts, kills and disturbs them.
 
-    An asynchronous context manager within `run`. Actors that live at its end are killed; an error
-    by which an actor ended, that was not killed or stopped since, is raised there.
+    An asynchronous context manager within `run`. The exit kills the remaining actors, and raises
+    the error of an actor that failed and was not killed or stopped afterwards.
 
     Args:
-        context: what all actors have in common; by default no system and no application.
-        layout: class and parameters of the nodes that `start_node` starts.
-        keeps_checkpoints: whether an incarnation finds what the one before it kept.
-        topics: that parameters of the actors may name.
+        context: Common context of the actors; by default no system and no application.
+        layout: Classes and parameters of the nodes that `start_node` starts.
+        keeps_checkpoints: Whether an incarnation finds the checkpoints of the one before.
+        topics: Topics that parameters of the actors may name.
 
     Attributes:
-        bus: the tester's own access to the bus, for payloads that `say` would not make.
-        incarnations: those that were started last, by name.
-        members: names of all nodes of the system; what others make an actor remember is bounded.
-        register: tells actors which incarnation was issued last; by default, what was started.
+        bus: The tester's access to the bus, for payloads that `say` does not make.
+        incarnations: Last started incarnation by name.
+        members: Names of all nodes of the system; actors bound the state kept for other senders.
+        register: Returns the last issued incarnation of a node; by default, the last started one.
     """
 
     def __init__(self, context: RunContext | None = None, layout: Layout | None = None, *,
@@ -103,14 +103,14 @@ class VirtualSystem:
 
     @classmethod
     def load(cls, system: str | Path, **plan: Any) -> VirtualSystem:
-        """Return the system of a file, or of the name of a shipped one; no node is started yet.
+        """Load a system without starting its nodes.
 
         Args:
-            system: path or name.
-            plan: fields of the `RunPlan`, such as `seed` and `options`.
+            system: Path, or name of a shipped system.
+            plan: Fields of the `RunPlan`, such as `seed` and `options`.
 
         Raises:
-            ValueError: the system is unsound, or an actor cannot be imported; one line says where.
+            ValueError: The system is invalid, or an actor cannot be imported. The text is one line.
         """
         run = _load(system, plan)
         return cls(run, Layout(run.plan, run.system, run.application),
@@ -152,31 +152,31 @@ class VirtualSystem:
         """Start an actor, or its next incarnation.
 
         Args:
-            name: of the node.
-            cls: its class.
-            others: what the class takes besides the context.
-            parameters: as in the file of a system.
+            name: Name of the node.
+            cls: Class of the actor.
+            others: Further arguments of the class.
+            parameters: Parameters as in a specification.
         """
         actor = cls(self.context(name, parameters), *others)
         self.actors[name], self.tasks[name] = actor, asyncio.create_task(actor.run())
         return actor
 
     def start_node(self, name: str, *others: Any, **parameters: Any) -> Actor:
-        """Start a node as the file of the system specifies, with some parameters changed.
+        """Start a node as specified, with some parameters changed.
 
         Raises:
-            LookupError: the system has no node of this name, or no file.
+            LookupError: The system has no such node, or was not loaded from a file.
         """
         if self.layout is None or name not in self.layout.members:
             raise LookupError(f"no node {name!r} in the file of this system")
         member = self.layout.members[name]
-        # A value that a file must not contain may be the default all the same.
+        # A default may be a value that a file must not contain.
         given = {field.name: value for field in msgspec.structs.fields(member.parameters)
                  if (value := getattr(member.parameters, field.name)) != field.default}
         return self.start(name, member.actor, *others, **{**given, **parameters})
 
     async def kill(self, name: str) -> None:
-        """End an actor as SIGKILL would, and publish that as the supervisor does."""
+        """End an actor like SIGKILL, and publish the crash as the supervisor does."""
         task = self.tasks.pop(name)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
@@ -184,7 +184,7 @@ class VirtualSystem:
             name, "crashed", 1, self.incarnations[name], SUPERVISOR, ""), SUPERVISOR)
 
     async def stop(self, name: str) -> None:
-        """End an actor in order; what it raised, if it had ended by itself, is raised."""
+        """Stop an actor; if it had failed, raise its error."""
         self.actors[name].stop()
         await self.tasks.pop(name)
 
@@ -192,7 +192,7 @@ class VirtualSystem:
         """Let everything happen that needs no time.
 
         Raises:
-            AssertionError: time has passed.
+            AssertionError: Time has passed.
         """
         before = self.clock.now()
         await turns()
@@ -200,9 +200,9 @@ class VirtualSystem:
             raise AssertionError("time has passed")
 
     def hear(self, topic: Topic[M], member: str = "") -> list[Heard[M]]:
-        """Return a list to which each message of a topic, or of one member of it, is added.
+        """Return a list that receives each message of a topic, or of one member of it.
 
-        What cannot be decoded raises in the loop, as a defect of the test.
+        A message that cannot be decoded raises in the loop.
         """
         heard: list[Heard[M]] = []
 
@@ -213,9 +213,9 @@ class VirtualSystem:
         return heard
 
     def overhear(self, name: str) -> list[tuple[str, Any]]:
-        """Return a list to which all that an actor sends is added: key, and body as it travels.
+        """Return a list that receives key and encoded body of each message that an actor sends.
 
-        The key is below `rampart/`; the body consists of dictionaries, lists and numbers.
+        The key is below `rampart/`; the body consists of dictionaries, lists and plain values.
         """
         sent: list[tuple[str, Any]] = []
 
@@ -231,12 +231,12 @@ class VirtualSystem:
         """Publish a message in the name of any node.
 
         Args:
-            topic: a family of topics needs a member, by default the source.
-            message: what is published.
-            source: name of the node that publishes.
-            member: name in the key of a family.
-            incarnation: of the source.
-            stamp_s: simulated seconds; by default now.
+            topic: The topic. The member of a family is by default the source.
+            message: The message.
+            source: Name of the publishing node.
+            member: Name in the key of a family.
+            incarnation: Incarnation of the source.
+            stamp_s: Simulated seconds; by default now.
         """
         self._sequence += 1
         header = Header(source, incarnation, self._sequence,
@@ -249,12 +249,12 @@ class VirtualSystem:
         """Inject a fault into a topic where it is published, from now on.
 
         Args:
-            topic: what is disturbed.
+            topic: The topic.
             mode: `drop`, `freeze`, `stuck`, `delay`, `duplicate`, `restamp` or `corrupt`.
-            duration_s: simulated seconds; infinity for as long as the publisher lives.
-            name: of the injection, in the reports on `injection/report/NODE`.
-            member: name in the key of a family.
-            fields: of `Injection`, such as `share`, `delay_s` and `set_fields`.
+            duration_s: Simulated seconds; infinity for as long as the publisher lives.
+            name: Name of the injection in the reports on `inject/report`.
+            member: Name in the key of a family.
+            fields: Fields of `Injection`, such as `share`, `delay_s` and `set_fields`.
         """
         key = topic.key.replace("{name}", member)
         self.say(INJECT, Injection(name, key, mode, duration_s, **fields))
@@ -262,26 +262,26 @@ class VirtualSystem:
 
 def virtual_run(system: str | Path, *faults: str, seconds: float | None = None,
                 **plan: Any) -> VirtualResult:
-    """Run a system to its end, and return what came of it.
+    """Run a system to its end and return the result.
 
     Args:
-        system: path, or name of one that ships.
-        faults: as on the command line, `FAULT[@WHEN][+DURATION]`.
-        seconds: simulated, after which the run is over; those of the specification if None.
-        plan: fields of the `RunPlan`, such as `seed`, `ftm` and `options`.
+        system: Path, or name of a shipped system.
+        faults: As on the command line, `FAULT[@WHEN][+DURATION]`.
+        seconds: Length of the run, simulated seconds; None for the value of the specification.
+        plan: Fields of the `RunPlan`, such as `seed`, `ftm` and `options`.
 
     Returns:
-        Among others `judgement`, the judge's verdict; `record`, with `decisions` and what became
+        Among others `judgement`, the judge's verdict; `record`, with `decisions` and the outcomes
         of `faults`; `trace`, a hash over all messages; `speed`, simulated seconds per second; and
         `failures`, the actors that ended by an error.
 
     Raises:
-        ValueError: the system or a fault is unsound; one line says where.
+        ValueError: The system or a fault is invalid. The text is one line.
     """
     run = _load(system, plan)
     trial = trial_class(run.system)(run, seconds)
     if not trial.patient and trial.limit_s is None:
-        raise ValueError(f"{system}: has no [end]; say after how many seconds the run is over")
+        raise ValueError(f"{system}: has no [end]; expected seconds as an argument")
     return VirtualRun(trial, scenario=[parse_fault(text) for text in faults]).run()
 
 

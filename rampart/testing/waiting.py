@@ -1,4 +1,4 @@
-"""Waiting for what has to come true, within a time."""
+"""Wait for a condition, within a time."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ NOT_IN_TIME = "it did not happen in time"
 
 async def eventually(condition: Callable[[], bool], timeout_s: float = 10.0,
                      what: str = NOT_IN_TIME) -> None:
-    """Wait until a condition holds, in the loop's time: on a virtual loop that takes no time.
+    """Wait until a condition holds, in the loop's time; a virtual loop does not really wait.
 
     Raises:
-        AssertionError: it does not within `timeout_s`; `what` says so.
+        AssertionError: It does not within `timeout_s`; the text is `what`.
     """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout_s
@@ -29,7 +29,7 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 10.0,
     """Wait, outside of any event loop, until a condition holds.
 
     Raises:
-        AssertionError: it does not within `timeout_s`; `what` says so.
+        AssertionError: It does not within `timeout_s`; the text is `what`.
     """
     deadline = time.monotonic() + timeout_s
     while not condition():
