@@ -40,7 +40,7 @@ SPEC = (ROOT / "systems" / "paper.toml").read_text("utf-8")
 
 def refusal(capsys: pytest.CaptureFixture[str], program: Callable[[list[str]], int],
              *arguments: str) -> str:
-    """Run a program that has to refuse, and return what it says."""
+    """Run a program that must refuse its input, and return its output."""
     assert program(list(arguments)) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1, lines

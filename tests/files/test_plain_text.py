@@ -48,7 +48,7 @@ def harmless(sent: str) -> bool:
     ("plain", "plain"), ("Übergröße 🤖", "Übergröße 🤖"), ("\x1b[2J", "\\u001b[2J"),
     ("a\nb", "a\\u000ab"), ("\x9b", "\\u009b"), ("\u202e", "\\u202e"),
     ("\U000e0041", "\\udb40\\udc41")])
-def test_what_is_not_printable_is_written_as_its_number(text, shown):
+def test_an_unprintable_character_is_written_as_its_number(text, shown):
     assert printable(text) == shown
     assert json.loads(f'"{shown}"') == text
 
@@ -61,7 +61,7 @@ def test_one_line_is_one_line_and_not_too_long():
 
 
 @pytest.mark.parametrize("text", HOSTILE)
-def test_what_tools_print_is_harmless_whatever_they_are_told(text, capsys):
+def test_output_of_tools_is_harmless_for_any_text(text, capsys):
     say(f"{text} said")
     say_text(f"{text}")
     warn(text)
@@ -76,7 +76,7 @@ def test_what_tools_print_is_harmless_whatever_they_are_told(text, capsys):
 
 
 @pytest.mark.parametrize("topic", all_topics(), ids=lambda t: t.key)
-def test_a_console_shows_what_it_is_told_and_obeys_nothing_of_it(topic):
+def test_a_console_shows_control_characters_without_obeying_them(topic):
     stream = Terminal()
     console = MissionConsole(stream)
     picture = RunPicture(OsmosisLines())

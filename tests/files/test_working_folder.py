@@ -1,4 +1,4 @@
-"""Modules are imported from the working folder only if nobody else can put them there."""
+"""Modules are imported from the working folder only if no other user can write there."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ TANK_TOML = TANK.split("```toml\n")[1].split("```")[0]
 
 
 @pytest.mark.parametrize(("mode", "code"), [(0o755, 0), (0o757, 2)])
-def test_modules_beside_a_specification_are_found_if_nobody_else_can_put_them_there(
+def test_modules_beside_a_specification_are_imported_if_only_the_user_can_write_there(
         tmp_path, mode, code):
     there, here = tmp_path / "there", tmp_path / "here"
     there.mkdir()

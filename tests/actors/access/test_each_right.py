@@ -60,7 +60,7 @@ def test_every_key_of_topics_md_is_tried():
     assert {"summit_xl/command", "heartbeat/DM4", "recovery/RM3/command"} <= set(KEYS)
 
 
-def test_what_it_publishes_arrives_and_nothing_else(keyed):
+def test_an_identity_publishes_its_declared_outputs_only(keyed):
     heard, arrived = Heard(), {}
     with keyed.joined("bob") as viewer:
         held = viewer.declare_subscriber("rampart/**", heard.take)
@@ -81,7 +81,7 @@ def test_what_it_publishes_arrives_and_nothing_else(keyed):
         held.undeclare()
 
 
-def test_it_hears_what_it_declares_and_nothing_else(keyed):
+def test_an_identity_receives_its_declared_inputs_only(keyed):
     with keyed.joined("router_b") as everybody:
         for name in NODES:
             heard, expected = Heard(), may(name, "hears")
@@ -122,7 +122,7 @@ def test_it_answers_for_its_own_topics_only(keyed):
                 del held
 
 
-def test_it_asks_for_what_it_hears_only(keyed):
+def test_an_identity_queries_its_inputs_only(keyed):
     with keyed.joined("router_b") as everybody:
         held = everybody.declare_queryable(
             "rampart/**", lambda q: q.reply(q.key_expr, "answer"), complete=True)
@@ -137,7 +137,7 @@ def test_it_asks_for_what_it_hears_only(keyed):
         held.undeclare()
 
 
-def test_nobody_looks_into_the_router_itself(keyed):
+def test_no_identity_reads_the_router_s_admin_space(keyed):
     for name in ("bob", "ada", "DM4", "supervisor"):
         with keyed.joined(name) as session:
             own = f"@/{session.info.zid()}/"

@@ -120,7 +120,7 @@ def test_openssl_verifies_what_is_issued(keys):
         assert (done.returncode == 0) == works, (name, purpose, done.stderr)
 
 
-def test_what_cannot_be_done_with_a_folder_is_refused_in_one_line(keys):
+def test_an_impossible_change_of_a_folder_is_refused_in_one_line(keys):
     issue(keys, ["DM4"], "node")
     before = (keys / "authority.key").read_bytes()
     for what, why in (
@@ -198,7 +198,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("number", range(1, 12))
-def test_who_is_killed_leaves_whole_files_and_can_go_on(tmp_path, monkeypatch, number):
+def test_a_killed_command_leaves_whole_files_and_can_be_repeated(tmp_path, monkeypatch, number):
     folder, left, whole = tmp_path / "keys", iter(range(1, number)), Path.replace
 
     def replace(self, target):

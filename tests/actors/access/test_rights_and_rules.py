@@ -39,7 +39,7 @@ def test_a_key_is_its_publishers(key, who):
     assert who_says(key) == who
 
 
-def test_who_is_not_in_the_register_is_in_no_rule():
+def test_an_identity_that_is_not_in_the_register_has_no_rule():
     host = Host(nodes=frozenset(LAYOUT.members))
     register = Register().issued(["DM4", "DM5"], "node").revoked(["DM5"])
     assert set(rules_of(host, [host], RIGHTS, register)) == {"DM4"}
@@ -57,7 +57,7 @@ def test_an_operator_with_the_name_of_a_node_is_no_node():
 
 
 @pytest.mark.parametrize("system", ["osmosis", "tests/systems/cell.toml"])
-def test_the_rules_say_what_is_declared(system):
+def test_the_rules_match_the_declarations(system):
     layout = layout_of(system)
     wrong, speakers = disagreements(layout, rules_as_declared(layout))
     assert wrong == []

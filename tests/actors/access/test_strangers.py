@@ -171,7 +171,7 @@ def test_a_revoked_one_is_out_when_the_router_has_restarted(keyed):
     assert not is_let_in(keyed, stolen)  # the same name, another identity
 
 
-def test_who_is_in_is_cut_off_when_his_certificate_expires(keyed):
+def test_a_link_is_closed_when_its_certificate_expires(keyed):
     authority = (keyed.keys / "authority.key").read_bytes()
     short = written(keyed, new_certificate(
         authority, "safety_pilot", "node", addresses=(), now=dt.datetime.now(dt.UTC),
@@ -181,7 +181,7 @@ def test_who_is_in_is_cut_off_when_his_certificate_expires(keyed):
         assert wait_for(lambda: not list(session.info.routers_zid()))
 
 
-def test_nobody_poses_as_a_router_with_a_nodes_key(keyed, folder):
+def test_a_node_cannot_pose_as_a_router(keyed, folder):
     own = keyed.shown("DM4")
     socket = f"unixsock-stream/{folder}/router_b"
     there = Credentials(own.authority, own.own, {socket: "tls/127.0.0.1:9499"})
@@ -191,7 +191,7 @@ def test_nobody_poses_as_a_router_with_a_nodes_key(keyed, folder):
             zenoh.open(session_config((), ["tls/127.0.0.1:9499"], victim))
 
 
-async def test_who_is_refused_is_told_which_certificate_was_not_taken(keyed, monkeypatch):
+async def test_a_refused_client_reports_its_certificate(keyed, monkeypatch):
     monkeypatch.setattr("rampart.actors.bus.zenoh_bus.PATIENCE_S", 0.5)
     other = written(keyed, issued(new_authority(NOW, 9)))
     bus = ZenohBus("", [keyed.socket], credentials=other)

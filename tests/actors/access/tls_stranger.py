@@ -29,7 +29,7 @@ def config_of(endpoint: str, shown: dict[str, str]) -> zenoh.Config:
 
 
 def talk(config: zenoh.Config, keys: list[str]) -> dict[str, Any]:
-    """Join, say everything, hear everything, ask for everything; return how much came of it."""
+    """Join, publish, subscribe to and query everything; return how much succeeded."""
     heard: list[Any] = []
     try:
         session = zenoh.open(config)

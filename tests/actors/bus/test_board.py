@@ -1,4 +1,4 @@
-"""What is posted is read as it was posted, or not at all."""
+"""A posting is read unchanged or not at all."""
 
 import os
 import socket
@@ -55,7 +55,7 @@ def make_socket(file):
 @pytest.mark.parametrize("make", [
     os.mkdir, os.mkfifo, make_socket, lambda file: file.symlink_to("/dev/zero"),
     lambda file: file.write_bytes(bytes(10 * MOST_BYTES))])
-def test_what_is_no_posting_counts_as_none_and_keeps_no_reader_waiting(file, make):
+def test_a_file_that_is_not_a_posting_counts_as_absent_and_blocks_no_reader(file, make):
     file.unlink()
     make(file)
     assert FileBoard(str(file.parent)).read(KEY) is None
@@ -63,13 +63,13 @@ def test_what_is_no_posting_counts_as_none_and_keeps_no_reader_waiting(file, mak
 
 @pytest.mark.parametrize("make", [os.mkdir, os.mkfifo, make_socket,
                                   lambda file: file.symlink_to("/dev/full")])
-def test_what_cannot_be_posted_is_to_be_sent(file, make):
+def test_a_posting_that_cannot_be_written_is_refused(file, make):
     file.unlink()
     make(file)
     assert not FileBoard(str(file.parent)).post(KEY, b"message")
 
 
-def test_what_is_too_long_is_to_be_sent_and_so_is_everything_after_the_end_of_a_run(tmp_path):
+def test_a_posting_that_is_too_long_or_after_the_end_of_a_run_is_refused(tmp_path):
     board = FileBoard(str(tmp_path / "run"))
     assert not board.post(KEY, b"message")
     (tmp_path / "run").mkdir()
@@ -77,7 +77,7 @@ def test_what_is_too_long_is_to_be_sent_and_so_is_everything_after_the_end_of_a_
     assert not board.post(KEY, bytes(MOST_BYTES + 1))
 
 
-def test_of_several_hosts_everything_is_to_be_sent():
+def test_nothing_is_posted_with_several_hosts():
     bus = ZenohBus("a", [])
     assert not bus.post(KEY, b"message")
     assert bus.posted(KEY) is None

@@ -94,7 +94,7 @@ def test_an_item_that_a_list_lacks_is_named():
     (Level, ".height_m", ".height_m: not a path of a field, such as pose.x_m or ranges_m[0]"),
     (Level, "cells[one]", "cells[one]: not a path of a field, such as pose.x_m or ranges_m[0]"),
 ])
-def test_what_is_no_field_is_refused_in_one_line(kind, path, words):
+def test_an_invalid_field_is_refused_in_one_line(kind, path, words):
     with pytest.raises(ValueError, match=r".") as caught:
         Field(kind, path)
     assert str(caught.value) == words

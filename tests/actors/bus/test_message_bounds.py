@@ -1,4 +1,4 @@
-"""Every field of every message is bounded, and what is beyond a bound never reaches an actor."""
+"""Every field of every message is bounded, and a message beyond a bound reaches no actor."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_payload_that_is_too_long_is_refused():
 
 
 class Reader(Actor):
-    """Hears one topic and keeps what it hears."""
+    """Keeps the messages of one topic."""
 
     heard: list = []
 
@@ -115,7 +115,7 @@ def lived(kind, during=lambda _hub: None):
     return run(scenario)
 
 
-def test_what_is_beyond_a_bound_is_reported_counted_and_never_handled():
+def test_a_message_beyond_a_bound_is_reported_counted_and_never_handled():
     Reader.heard = []
     key = ftm_topics.STUB_TRIGGER.at()
 
@@ -133,7 +133,7 @@ def test_what_is_beyond_a_bound_is_reported_counted_and_never_handled():
     assert beats[-1]["rejected_payloads"] == 1
 
 
-def test_a_node_does_not_send_what_no_reader_would_take_and_says_so():
+def test_a_message_too_long_for_readers_is_reported_and_not_sent():
     sent = lived(Writer)
     assert not [key for key, _ in sent if key == topics.MISSION_STATUS.at()]
     report = next(body for key, body in sent if key == "diagnostic/node")
@@ -170,6 +170,6 @@ def test_a_value_to_be_injected_is_bounded_where_it_is_made_as_well():
 
 @pytest.mark.parametrize("field", ["x_m", "y_m", "yaw_rad"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_pose_that_is_no_pose_reaches_whoever_judges_it(field, value):
+def test_a_pose_that_is_not_finite_reaches_its_readers(field, value):
     body = {**smallest(bounds_of(topics.POSE)), field: value}
     assert judged(topics.POSE, pack("x", 1, 1, 0.0, body))[0]

@@ -1,4 +1,4 @@
-"""Two routers: a client needs one that answers, and goes over to the other when its own is gone."""
+"""Two routers: a client connects to one and changes to the other when it dies."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from rampart.actors.osmosis import topics
 from rampart.testing import eventually
 
 FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload([__name__])  # a process of its own that has no session yet
+FORKS.set_forkserver_preload([__name__])  # a fresh process without a session
 pytestmark = pytest.mark.alone
 
 
 def be_router(folder: str, name: str, ready) -> None:
-    """Be a router, in a process of its own."""
+    """Run a router in a separate process."""
 
     async def main() -> None:
         own = endpoint(folder, name)
@@ -97,7 +97,7 @@ async def send_until(bus: ZenohBus, reached, count: int = 1000) -> None:
     raise AssertionError("it did not happen in time")
 
 
-async def test_what_is_sent_first_arrives(routers, sockets):
+async def test_the_first_message_arrives(routers, sockets):
     await routers.start(*ROUTERS)
     async with client(sockets) as reader:
         heard = hear(reader)
@@ -116,7 +116,7 @@ async def test_a_stopped_router_is_not_waited_for(routers, sockets, stopped):
         await send_until(other, lambda: heard)
 
 
-async def test_who_starts_before_the_routers_waits_for_one(routers, sockets):
+async def test_a_client_that_starts_before_the_routers_waits_for_one(routers, sockets):
     async with asyncio.TaskGroup() as group:
         group.create_task(routers.start("router_b"))
         async with client(sockets) as one, client(sockets) as other:
@@ -124,14 +124,14 @@ async def test_who_starts_before_the_routers_waits_for_one(routers, sockets):
             await send_until(other, lambda: heard)
 
 
-async def test_without_routers_it_is_told_in_one_line(sockets, monkeypatch):
+async def test_without_routers_the_error_is_one_line(sockets, monkeypatch):
     monkeypatch.setattr(zenoh_bus, "PATIENCE_S", 0.05)
     with pytest.raises(BusError, match=rf"^no router at \S+{sockets}/router_a or \S+/router_b "
                                        r"\(node talker\)$"):
         await ZenohBus("talker", endpoints(sockets)).open()
 
 
-async def test_who_connects_and_says_nothing_holds_no_place_for_long(routers, sockets):
+async def test_a_silent_connection_blocks_the_router_only_briefly(routers, sockets):
     await routers.start("router_a")
     with contextlib.ExitStack() as stack:
         for _ in range(120):  # Zenoh has a hundred places for handshakes
@@ -148,7 +148,7 @@ async def test_a_second_router_of_a_name_is_refused_in_one_line(routers, sockets
         await ZenohBus("router_a", [], [endpoint(sockets, "router_a")]).open()
 
 
-async def test_when_a_router_dies_all_go_over_to_the_other_and_nothing_comes_out_of_sequence(
+async def test_clients_of_a_dead_router_change_to_the_other_and_messages_stay_in_sequence(
         routers, sockets):
     await routers.start(*ROUTERS)
     async with client(sockets, "node") as writer, client(sockets) as reader:
@@ -161,7 +161,8 @@ async def test_when_a_router_dies_all_go_over_to_the_other_and_nothing_comes_out
             heard.clear()
 
 
-async def test_who_has_gone_over_knows_it_once_and_comes_back_when_both_were_dead(routers, sockets):
+async def test_a_client_notices_a_change_of_router_once_and_returns_after_both_were_dead(
+        routers, sockets):
     await routers.start(*ROUTERS)
     async with client(sockets, "node") as writer, client(sockets) as reader:
         heard = hear(reader)
@@ -221,7 +222,7 @@ def be_client(folder: str, ready) -> None:
         async with client(folder, "hung") as bus:
             for topic in (topics.POSE, topics.MISSION_ORDER):
                 bus.subscribe(topic.at(), lambda _key, _payload: None)
-            bus.publish(topics.GOAL, topics.GOAL.at(), b"of one that hangs")
+            bus.publish(topics.GOAL, topics.GOAL.at(), b"from the hung client")
             await asyncio.sleep(0.2)
             ready.set()
             time.sleep(1000)
@@ -249,28 +250,29 @@ def ask(bus: ZenohBus) -> list[bytes]:
     return answers
 
 
-async def test_who_hangs_tells_what_it_said_last_and_who_is_stopped_is_not_waited_for(
+async def test_a_hung_client_answers_a_query_and_a_stopped_one_does_not_delay_it(
         routers, sockets):
     await routers.start(*ROUTERS)
     async with (hung_client(sockets) as hung, client(sockets, "node") as writer,
                 client(sockets) as reader):
-        writer.publish(topics.GOAL, topics.GOAL.at(), b"of one that works")
+        writer.publish(topics.GOAL, topics.GOAL.at(), b"from the working client")
         await asyncio.sleep(0.2)  # until the router knows that it can be asked
         answers = ask(reader)
-        await eventually(lambda: set(answers) == {b"of one that hangs", b"of one that works"})
+        both = {b"from the hung client", b"from the working client"}
+        await eventually(lambda: set(answers) == both)
         os.kill(hung, signal.SIGSTOP)
-        await eventually(lambda: all(  # it stops thread by thread, and one that runs answers
+        await eventually(lambda: all(  # it stops thread by thread, and a running thread answers
             thread.read_text().rpartition(") ")[2].startswith("T")
             for thread in Path(f"/proc/{hung}/task").glob("*/stat")))
         later, over = list[bytes](), list[bool]()
         reader.latest(topics.GOAL.at(), lambda _key, payload: later.append(payload),
                       lambda: over.append(True))
         await eventually(lambda: later)
-        assert (later, over) == ([b"of one that works"], [])
-        assert ask(writer) == [], "nobody asks itself"
+        assert (later, over) == ([b"from the working client"], [])
+        assert ask(writer) == [], "a client does not query itself"
 
 
-async def test_who_is_stopped_and_reads_no_more_keeps_nobody_else_waiting(routers, sockets):
+async def test_a_stopped_reader_delays_no_other_reader(routers, sockets):
     await routers.start(*ROUTERS)
     async with (hung_client(sockets) as hung, client(sockets, "node") as writer,
                 client(sockets) as reader):

@@ -1,4 +1,4 @@
-"""The folder of a run: who gets in, what is issued, and what is left behind."""
+"""The folder of a run: access, issued incarnations, and remains of dead runs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_place_too_deep_for_a_socket_is_not_chosen(tmp_path, monkeypatch):
         run_folder.remove(folder)
 
 
-def test_what_was_issued_last_is_known_and_to_which_process():
+def test_the_last_issued_incarnation_is_found_with_its_process():
     folder = run_folder.make(1, os.getpid())
     try:
         register = run_folder.register_of(folder)
@@ -82,7 +82,7 @@ def ended():
     return process.pid
 
 
-def test_what_dead_runs_left_is_removed_and_what_lives_or_is_not_theirs_stays(place, ended):
+def test_folders_of_dead_runs_are_removed_and_all_others_stay(place, ended):
     left, link, other = (place / f"rampart-{one}" for one in (
         f"7450-{ended}-abc", f"7450-{ended}-def", "notes"))
     for folder in (left, other):
@@ -110,7 +110,7 @@ def test_a_run_lives_as_long_as_its_folder_is_locked_whatever_its_process_is_cal
     assert not Path(of_a_container).exists()
 
 
-def test_what_is_forked_keeps_the_folder_of_its_run(place):
+def test_a_forked_process_keeps_the_folder_of_its_run(place):
     with subprocess.Popen([sys.executable, "-c", _MAKE, str(place), "1"], text=True,
                           stdin=subprocess.PIPE, stdout=subprocess.PIPE) as maker:
         assert maker.stdout is not None

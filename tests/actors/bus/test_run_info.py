@@ -38,24 +38,24 @@ def answering(answer: bytes) -> Iterator[int]:
 INFO = run_info.RunInfo(1, 7450, 1.0, 0.0, "x.toml", "", (), "r", 0, "a run")
 
 
-def test_a_launcher_tells_what_it_runs():
+def test_a_launcher_answers_with_its_run():
     with answering(msgspec.json.encode(INFO)) as port:
         assert run_info.ask(port) == INFO
 
 
-def test_another_users_socket_of_that_name_is_no_launcher(monkeypatch):
+def test_a_socket_of_another_user_is_not_a_launcher(monkeypatch):
     monkeypatch.setattr(run_info, "is_same_user", lambda _connection: False)
     with answering(msgspec.json.encode(INFO)) as port:
         assert run_info.ask(port) is None
 
 
 @pytest.mark.parametrize("answer", [b"nothing", b"{}", b'{"title": "\xff"}'])
-def test_an_answer_that_is_none_is_no_run(answer):
+def test_an_invalid_answer_is_not_a_run(answer):
     with answering(answer) as port:
         assert run_info.ask(port) is None
 
 
-def test_somebodys_socket_whose_name_is_no_text_does_not_matter():
+def test_a_socket_whose_name_is_not_utf_8_is_ignored():
     with (answering(msgspec.json.encode(INFO)) as port,
           socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stranger):
         stranger.bind(b"\0caf\xe9." + str(os.getpid()).encode())

@@ -1,4 +1,4 @@
-"""The bus over Zenoh: what becomes of a reader that gets more than it can handle."""
+"""The bus over Zenoh: floods, errors of deliveries, and sessions that cannot be opened."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rampart.testing import eventually
 MANY = 1500
 
 
-async def test_who_is_flooded_gets_round_to_its_timers(bus_folder):
+async def test_a_flooded_reader_still_runs_its_timers(bus_folder):
     reader = ZenohBus("reader", endpoints(bus_folder))
     await reader.open()
     heard, begun = [], asyncio.Event()
@@ -26,7 +26,7 @@ async def test_who_is_flooded_gets_round_to_its_timers(bus_folder):
     def slow(_key: str, payload: bytes) -> None:
         heard.append(payload)
         begun.set()
-        time.sleep(0.001)  # busy: it is nobody else's turn
+        time.sleep(0.001)  # blocks the loop
 
     reader.subscribe(topics.DETECTION.at("DM1"), slow)
     with open_session(endpoints(bus_folder)) as member:
@@ -49,7 +49,7 @@ async def test_who_is_flooded_gets_round_to_its_timers(bus_folder):
     assert max(later - one for one, later in pairwise([*turns, MANY])) <= MANY / 2
 
 
-async def test_a_session_that_cannot_be_opened_says_why(monkeypatch):
+async def test_a_session_that_cannot_be_opened_reports_the_reason(monkeypatch):
     def fail(*_: object) -> None:
         raise zenoh.ZError("no memory left")
 

@@ -1,4 +1,4 @@
-"""What a system's actors say to each other is checked before a run, and refused in one line."""
+"""Connections of a system's actors are checked before a run, and errors are one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run tells on the terminal."""
+"""Terminal output of a run."""
 
 from __future__ import annotations
 

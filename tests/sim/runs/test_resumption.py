@@ -77,7 +77,7 @@ def damaged(text: str):
      "no run that did not end"),
     (lambda _files: None, "b", "no such run"),
 ])
-def test_what_cannot_be_resumed_is_refused_in_one_line(tmp_path, system, change, which, why):
+def test_a_run_that_cannot_be_resumed_is_refused_in_one_line(tmp_path, system, change, which, why):
     change(begun(tmp_path / "reports", "a", system))
     with pytest.raises(ResumptionError) as refused:
         find(tmp_path / "reports", which)

@@ -215,7 +215,7 @@ def test_what_a_call_posts_for_now_waits_for_those_that_are_ready():
     assert run(scenario) == ["first", "second", "soon", "posted"]
 
 
-def test_a_loop_that_was_told_to_stop_does_not_wait():
+def test_a_stopped_loop_does_not_wait():
     loop = VirtualLoop()
     loop.stop()
     loop.run_forever()

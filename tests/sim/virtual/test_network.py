@@ -1,4 +1,4 @@
-"""The network of a virtual run: seeded, measured, and as bad as it is told to be."""
+"""The network of a virtual run: seeded, measured, and with the faults of its model."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_loss_duplication_and_overtaking_come_as_often_as_said():
     assert sum(later < earlier for earlier, later in pairwise(times)) > 1000
 
 
-def test_the_observer_hears_all_at_once_whatever_the_network_does():
+def test_the_observer_receives_messages_at_once_on_any_network():
     network = SeededNetwork(NetworkModel("x", "", loss=1.0), 1, local=("observer",))
     assert network.link("a", "observer") is None
     assert network.link("observer", "a") is None
