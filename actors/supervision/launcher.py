@@ -24,16 +24,13 @@ from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.supervision import requests
-from rampart.actors.supervision.process_title import end_run, kill, set_title
+from rampart.actors.supervision.process_title import RUN, end_run, kill, set_title
 from rampart.actors.supervision.requests import LaunchError
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 from rampart.files import working_folder
 from rampart.files.streams import complain
 
 __all__ = ["LaunchError", "Launcher"]
-
-TITLE = "run"
-"""Of the process that watches a run, if it is the root's child."""
 
 STARTUP_S = (0.8, 5.0)
 """Simulated time 0 lies between so many wall seconds after the start of the first actor: until
@@ -105,7 +102,7 @@ class Launcher:
         begun = await self._ask(requests.Begin(self.plan, self._title), requests.Begun)
         self.plan, self.names, self._load_s = begun.plan, begun.names, begun.load_s
         if self._is_child:
-            set_title(self.plan.base_port, self.plan.launcher_pid, (TITLE,), 1)
+            set_title(self.plan.base_port, self.plan.launcher_pid, (RUN,), 1)
             _clean_up_after(self.plan.launcher_pid, self.plan.folder)
 
     async def start(self) -> None:

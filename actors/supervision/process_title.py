@@ -20,6 +20,12 @@ from rampart.actors.bus.run_folder import remove
 from rampart.actors.foreign.descendants import kill_programs
 from rampart.actors.machine.unix_peer import process_state
 
+RUN = "run"
+"""The process that watches a run, if it is a child of the root."""
+
+POOL = "pool"
+"""A process of the pool."""
+
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 
 # It finds the room for titles from the environment's first variable, the first time it is called:

@@ -57,7 +57,7 @@ from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, load_system
 from rampart.actors.supervision import requests
 from rampart.actors.supervision.node_process import Role, live
 from rampart.actors.supervision.pool import Pool, wait
-from rampart.actors.supervision.process_title import kill, set_title
+from rampart.actors.supervision.process_title import POOL, kill, set_title
 from rampart.actors.supervision.requests import ForkRequest, LaunchError, Reply
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.system.layout import Layout, adapted_system, load_run, published_keys
@@ -70,9 +70,6 @@ PERIOD_S = 0.25
 
 SUPERVISOR_PATIENCE_S = 1.5
 """A supervisor that could have said a word for so long is hung; it says four a second."""
-
-POOL = "pool"
-"""Title of a process of the pool."""
 
 LAST_PORT = 32_000
 """Above are those that the kernel gives to outgoing connections."""

@@ -10,6 +10,7 @@ import msgspec
 
 from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR
+from rampart.actors.supervision.process_title import POOL, RUN
 from rampart.actors.system.layout import Layout, Unit
 from rampart.cli import systems
 from rampart.cli.look import topic_catalogue as catalogue
@@ -20,7 +21,7 @@ from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.escalation import succession
 from rampart.manager.strategies.registry import decide
 
-_LAUNCHER, _SPAWNERS = "launcher", ("spawner_a", "spawner_b")
+_ROOT = "root"
 
 
 class Process(msgspec.Struct, frozen=True):
@@ -127,8 +128,8 @@ def explain(layout: Layout) -> Explanation:
 
 
 def _processes(layout: Layout) -> Iterator[Process]:
-    for name in (SUPERVISOR, *_SPAWNERS):
-        yield Process(name, {}, "supervision", _LAUNCHER)
+    for name, parent in ((_ROOT, ""), (RUN, ""), (SUPERVISOR, _ROOT), (POOL, _ROOT)):
+        yield Process(name, {}, "supervision", parent)
     for name in layout.routers:
         yield Process(name, {}, "supervision", SUPERVISOR)
     for unit in layout.units.values():
@@ -154,7 +155,7 @@ def _talks(spec: SystemSpec) -> Iterator[Talk]:
 
 
 def _guards(layout: Layout) -> Iterator[Guard]:
-    yield Guard(_LAUNCHER, (SUPERVISOR, *_SPAWNERS), "restarts it")
+    yield Guard(_ROOT, (SUPERVISOR, POOL), "restarts it")
     by: dict[str, list[str]] = {SUPERVISOR: list(layout.routers)}
     for unit in layout.units.values():
         by.setdefault(_respawner(layout, unit), []).append(unit.name)

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rampart.actors.supervision.launcher import TITLE
-from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import RUN, find_processes
 from tests.whole.checkpoint_runs import write_near_mission
 from tests.whole.hunger import fill, small_disk
 from tests.whole.resumption_runs import first_part, one, resumed, started, wrongs
@@ -67,7 +66,7 @@ def test_a_run_whose_watching_process_was_killed_can_be_resumed(tmp_path):
     mission, report = str(write_near_mission(tmp_path)), str(tmp_path / "report")
     run = started(tmp_path, PORT, "--mission", mission, "--rate", "2", "--report", report)
     until_s = time.monotonic() + 60
-    while not (watching := [p.pid for p in find_processes(PORT) if p.names == (TITLE,)]) or not (
+    while not (watching := [p.pid for p in find_processes(PORT) if p.names == (RUN,)]) or not (
             list(Path(report).glob("record-*"))):
         assert time.monotonic() < until_s
         time.sleep(0.1)

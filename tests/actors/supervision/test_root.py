@@ -24,6 +24,8 @@ from rampart.actors.runtime.run_plan import load_document
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
+from rampart.cli import systems
+from rampart.cli.analyse.check_verbs import explain
 from rampart.cli.run_options import parse, plan_of
 from rampart.testing import eventually
 from tests import ROOT
@@ -272,10 +274,12 @@ async def test_with_the_watching_process_killed_the_run_ends_and_its_verdict_is_
 
 
 @pytest.mark.processes
-async def test_a_stopped_watching_process_is_continued(tmp_path):
+async def test_a_stopped_watching_process_is_continued_and_explain_knows_all_processes(tmp_path):
     root, port = started(tmp_path)
     with root:
         await eventually(lambda: len(find_processes(port)) >= 26, 20)
+        described = {p.name for p in explain(systems.check(str(tmp_path / "stub.toml"))).processes}
+        assert {"+".join(p.names) for p in find_processes(port)} <= described
         pid = process(port, "run")
         os.kill(pid, signal.SIGSTOP)
         await eventually(lambda: Path(f"/proc/{pid}/stat").read_text().split()[2] != "T", 1.0)

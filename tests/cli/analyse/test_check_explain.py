@@ -76,6 +76,9 @@ def test_what_a_system_is_for_scripts(capsys):
         "safety_pilot": "rampart.actors.osmosis.control.pilot.safety_pilot:SafetyPilot"},
         } in found["processes"]
     assert next(p for p in found["processes"] if p["kind"] == "world")["brought_back_by"] == ""
+    names = {process["name"] for process in found["processes"]}
+    assert {"root", "run", "supervisor", "pool", "router_a", "router_b"} < names
+    assert {name for guard in found["guards"] for name in (guard["by"], *guard["of"])} <= names
     crash = next(each for each in found["consequences"] if each["detection"] == "DM4")
     assert (crash["mechanisms"], crash["active"], crash["decided"], crash["escalation"]) == (
         ["FTM4"], ["FTM4"], ["RM3"], {"RM3": ["RM2", "RM1"]})
