@@ -266,10 +266,10 @@ class HostSupervisor(Supervisor):
 
     def _settle(self, process: SupervisedProcess) -> None:
         """Have the last states of a process that was handed over read, when it has ended."""
-        if process.asks or not process.handle.gone():
+        if process.is_requested or not process.handle.gone():
             self.call_later(_ENDING_S * self.clock.rate, partial(self._settle, process))
             return
-        process.let_go()
+        process.release()
         self._ending.difference_update(process.names)
         for node in process.names:
             if node in self._copies.nodes:

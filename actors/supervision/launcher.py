@@ -26,7 +26,7 @@ from rampart.actors.runtime.run_plan import OBSERVER, RunPlan, on_host
 from rampart.actors.supervision import requests
 from rampart.actors.supervision.process_title import RUN, end_run, kill, set_title
 from rampart.actors.supervision.requests import LaunchError
-from rampart.actors.supervision.unseen import tell_of_callbacks, watch
+from rampart.actors.supervision.unseen import report_callbacks, watch
 from rampart.files import working_folder
 from rampart.files.streams import complain
 
@@ -85,7 +85,7 @@ class Launcher:
         """Listen to the root, which may be interrupted by the user; `load` does it as well."""
         if self._writer is not None:
             return
-        tell_of_callbacks(asyncio.get_running_loop(), lambda line: self.report(line))  # noqa: PLW0108 it may change
+        report_callbacks(asyncio.get_running_loop(), lambda line: self.report(line))  # noqa: PLW0108 it may change
         link = self._link or self._start_root()
         reader, self._writer = await asyncio.open_unix_connection(sock=link, limit=_MAX_LINE)
         self._reading = asyncio.create_task(self._read(reader))

@@ -30,7 +30,7 @@ from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 from rampart.actors.runtime.clock import clock_of
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.supervision.process_title import set_title
-from rampart.actors.supervision.unseen import tell_of_callbacks
+from rampart.actors.supervision.unseen import report_callbacks
 from rampart.actors.system.layout import Layout, router
 from rampart.files.streams import complain
 from rampart.manager.spec.schema import Kind
@@ -162,7 +162,7 @@ def _take_place(layout: Layout, names: tuple[str, ...], incarnation: int) -> Non
 async def _run_actors(layout: Layout, role: Role, run: RunContext,
                       failed: Callable[[Exception], None], bus: ZenohBus | None) -> None:
     loop = asyncio.get_running_loop()
-    tell_of_callbacks(loop, lambda line: complain(f"{role}: {line}"))
+    report_callbacks(loop, lambda line: complain(f"{role}: {line}"))
     buses = {name: _bus_of(layout, name, bus if name == role.names[0] else None)
              for name in role.names}
     actors = [make_actor(layout, name, role.incarnation, run, loop, failed=failed, bus=one)

@@ -1,8 +1,8 @@
-"""The pool: warm processes, any of which may become any process of the run.
+"""The pool: processes that are ready, any of which can become any process of the run.
 
-The root forks them ahead of time, and each opens its session on the bus. That is two thirds of what
-a new process takes. In a run with keys the session is the node's, by whose key it is opened; such a
-process has Zenoh loaded only. A process of the pool that is stopped is ended at once.
+The root forks them in advance, and each opens its session on the bus, which takes two thirds of the
+time of a start. With credentials a session belongs to one node, so a process of the pool has only
+loaded Zenoh. The root kills a process of the pool that is stopped.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.requests import REQUEST_BYTES
 
 _PAUSE_S = 0.25
-"""A process is added when for so long no other was started."""
+"""The pool adds a process when no other process has started for this long."""
 
 
 class Pool:
@@ -29,10 +29,10 @@ class Pool:
 
     Args:
         number: Of processes.
-        fork: Forks one, given its end of the connection; returns its number.
+        fork: Forks a process, which gets the connection; returns its pid.
 
     Attributes:
-        waiting: Connections to its processes by their numbers, the oldest first.
+        waiting: Connections to its processes by pid, the oldest first.
     """
 
     def __init__(self, number: int, fork: Callable[[socket.socket], int]) -> None:
@@ -42,10 +42,10 @@ class Pool:
         self._since_s = time.monotonic()
 
     def take(self, request: bytes) -> int:
-        """Give a request to a process of the pool and return its number; 0 if there is none."""
+        """Give a request to a process of the pool and return its pid; 0 if there is none."""
         self._since_s = time.monotonic()
         for pid, connection in list(self.waiting.items()):
-            if process_state(pid) in "TtXZ":  # the root is about to be told so
+            if process_state(pid) in "TtXZ":  # a SIGCHLD to the root is on its way
                 continue
             with contextlib.suppress(OSError):  # it has just ended
                 connection.send(request)
@@ -63,36 +63,36 @@ class Pool:
         with theirs:
             try:
                 self.waiting[self._fork(theirs)] = ours
-            except OSError:  # no process or memory is left: perhaps later
+            except OSError:  # no process or memory is left; tried again later
                 ours.close()
 
     def forget(self, pid: int) -> bool:
-        """Let go of a process; False if it is none of the pool."""
+        """Remove a process; False if it is not in the pool."""
         connection = self.waiting.pop(pid, None)
         if connection is not None:
             connection.close()
         return connection is not None
 
     def end(self) -> None:
-        """End all; others follow."""
+        """Kill all; `fill` replaces them."""
         for pid in list(self.waiting):
             self.forget(pid)
             kill(pid)
 
 
 async def wait(control: socket.socket, plan: RunPlan) -> tuple[bytes, ZenohBus | None]:
-    """Be a process of the pool: open a session and wait for a request.
+    """Open a session and wait for a request, in a process of the pool.
 
     Args:
         control: Connection to the root.
         plan: Of the run.
 
     Returns:
-        The request, b"" if the root has ended; and the bus, None in a run with keys, where the
-        process joins by the key of its node.
+        The request, b"" if the root has ended; and the bus, None in a run with credentials, where
+        the process joins with those of its node.
 
     Raises:
-        BusError: there is no router.
+        BusError: No router runs.
     """
     shown = plan.credentials("")
     bus = ZenohBus("", endpoints(plan.folder) if shown is None else [], credentials=shown)

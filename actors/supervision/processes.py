@@ -1,8 +1,7 @@
-"""What the supervisor can do to processes, and how the kernel does it.
+"""The supervisor's interface to processes, and its implementation by kernel and root.
 
-The supervisor decides (who is dead, who is respawned when); this is the mechanism. `Processes` is
-what it asks for; `OsProcesses` is the machine. In virtual time
-`rampart.sim.virtual.virtual_processes` stands here.
+The supervisor decides, and acts through `Processes`. `OsProcesses` is this machine; a run in
+virtual time has `rampart.sim.virtual.virtual_processes` instead.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import os
 import select
 import signal
 import socket
-import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
@@ -24,116 +22,110 @@ from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.machine.patience import AT_LEISURE, Usage, usage
 from rampart.actors.machine.unix_peer import process_state
 from rampart.actors.supervision.process_title import RunProcess, find_processes, kill
-from rampart.actors.supervision.requests import REQUEST_BYTES, WORD, ForkRequest, Reply
+from rampart.actors.supervision.requests import ALIVE, REQUEST_BYTES, ForkRequest, Reply
 
 __all__ = ["OsProcesses", "ProcessHandle", "Processes", "RunProcess"]
 
-WORD_S = 0.25
-"""Wall seconds between two words to the root, and between two looks whether that is stopped."""
+ALIVE_S = 0.25
+"""Wall seconds between two messages to the root, each with a check whether the root is stopped."""
 
 Answer = Callable[[int, str], None]
-"""Called with the pid of a new process, or with 0 and why there is none, in one line."""
+"""Receives the pid of a new process, or 0 and why there is none, in one line."""
 
 
 class ProcessHandle:
-    """One process, held so that its number cannot come to mean another one.
+    """A hold on one process, which stays valid when the kernel reuses the pid.
 
-    This class itself is the hold on none: either there is no process, or (`is_gone` False) there
-    was no descriptor left to hold it by.
+    This class itself holds nothing: there is no process, or, if `is_gone` is False, no descriptor
+    was left to hold it by.
     """
 
     def __init__(self, *, is_gone: bool = True) -> None:
         self._is_gone = is_gone
 
     def kill(self) -> None:
-        """End it at once (SIGKILL), if it is still there."""
+        """Send SIGKILL, if the process still exists."""
 
     def gone(self) -> bool:
-        """Whether it certainly runs no more and holds nothing, its ports included."""
+        """Whether it certainly has ended and holds nothing, ports included."""
         return self._is_gone
 
     def stopped(self) -> bool:
-        """Whether it was stopped from outside (SIGSTOP); False if that cannot be known."""
+        """Whether it is stopped (SIGSTOP); False if that is not known."""
         return False
 
     def usage(self) -> Usage:
-        """Return what it has run, and waited for a processor, as far as that is known."""
+        """Return its run time and its wait for a processor, as far as they are known."""
         return AT_LEISURE
 
     def ignore(self) -> None:
         """Do not report its end any more."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Release the process."""
 
 
 class Processes(Protocol):
     """The processes of one run.
 
     Attributes:
-        has_routers: Whether its bus needs routers.
+        has_routers: Whether the bus of the run needs routers.
     """
 
     has_routers: bool
 
     def living(self) -> Sequence[RunProcess]:
-        """Return those that are there."""
+        """Return the processes of the run that exist."""
 
     def fork(self, names: tuple[str, ...], incarnation: int, answer: Answer) -> None:
         """Start a process for the named actors; `answer` is called once, now or later.
 
         Raises:
-            OSError: No request can be made now.
+            OSError: The root accepts no request now.
         """
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Take hold of a process; `ended` is called on the event loop when it ends.
 
         Raises:
-            ProcessLookupError: It is gone already.
-            OSError: There is no descriptor left to hold it by.
+            ProcessLookupError: It has ended already.
+            OSError: No descriptor is left.
         """
 
     def adapt(self, adapted: AdaptedSystem) -> None:
-        """Start processes by a changed system from now on."""
+        """Use a changed system for all later processes.
 
-    def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:
-        """End the processes held: asked to, in the sequence given, and killed if they linger."""
-
-    def close(self) -> None:
-        """Let go of everything."""
+        Raises:
+            OSError: The folder of the run is full or missing.
+        """
 
 
 class OsHandle(ProcessHandle):
-    """A pidfd: of any process, not of children only, so it can be adopted."""
+    """A pidfd. It works for any process, not only for children, so a supervisor can adopt it."""
 
     def __init__(self, pid: int, ended: Callable[[], None]) -> None:
-        self.pidfd = os.pidfd_open(pid)
+        self._pidfd = os.pidfd_open(pid)
         self._pid = pid
         self._ended = ended
         self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(self.pidfd, self._told)
+        self._loop.add_reader(self._pidfd, self._report_end)
 
-    def _told(self) -> None:
+    def _report_end(self) -> None:
         self.ignore()
         self._ended()
 
     def kill(self) -> None:
-        self.send(signal.SIGKILL)
-
-    def send(self, number: signal.Signals) -> None:
-        """Send a signal, if it is still there."""
-        if self.pidfd >= 0:
+        if self._pidfd >= 0:
             with contextlib.suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self.pidfd, number)
+                signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
 
     def gone(self) -> bool:
-        # Not the state in /proc: that is the main thread's, which may be a zombie while another
-        # thread still ends and holds the ports. A pidfd is readable when the last one has ended.
-        if self.pidfd < 0:
+        # Not the state in /proc: it is that of the main thread, which may be a zombie while another
+        # thread still holds the ports. A pidfd is readable when the last thread has ended.
+        if self._pidfd < 0:
             return True
-        poll = select.poll()  # not select(), which knows 1024 descriptors
-        poll.register(self.pidfd, select.POLLIN)
+        poll = select.poll()  # not select(), which handles only 1024 descriptors
+        poll.register(self._pidfd, select.POLLIN)
         return bool(poll.poll(0))
 
     def stopped(self) -> bool:
@@ -143,25 +135,25 @@ class OsHandle(ProcessHandle):
         return usage(self._pid)
 
     def ignore(self) -> None:
-        if self.pidfd >= 0:
-            self._loop.remove_reader(self.pidfd)
+        if self._pidfd >= 0:
+            self._loop.remove_reader(self._pidfd)
 
     def close(self) -> None:
-        if self.pidfd >= 0:
+        if self._pidfd >= 0:
             self.ignore()
-            os.close(self.pidfd)
-            self.pidfd = -1
+            os.close(self._pidfd)
+            self._pidfd = -1
 
 
 class OsProcesses:
-    """Processes of this machine, which the root of the run forks. To be made on a running loop.
+    """Processes of this machine, which the root of the run forks. Needs a running event loop.
 
     Args:
         folder: Of the run.
         port: Base port of the run.
-        launcher: Process id of the root.
-        root: Descriptor of the connection to it.
-        call_soon: Has the supervisor do something, which it is told in words, after what it does.
+        launcher: Pid of the root.
+        root: Descriptor of the connection to the root.
+        call_soon: Puts a call into the supervisor's mailbox, under a name.
     """
 
     has_routers = True
@@ -177,18 +169,18 @@ class OsProcesses:
         self._asked: dict[ForkRequest, Answer] = {}
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._root, self._answered)
-        self._word()
+        self._show_alive()
 
-    def _word(self) -> None:
-        """Show the root that this loop turns, and continue it if it was stopped."""
+    def _show_alive(self) -> None:
+        """Show the root that this event loop works, and continue the root if it is stopped."""
         with contextlib.suppress(OSError):
-            self._root.send(WORD)
+            self._root.send(ALIVE)
         if process_state(self._launcher) == "T":
             kill(self._launcher, signal.SIGCONT)
-        self._next_word = self._loop.call_later(WORD_S, self._word)
+        self._loop.call_later(ALIVE_S, self._show_alive)
 
     def fork(self, names: tuple[str, ...], incarnation: int, answer: Answer) -> None:
-        """Ask the root for a process, as `Processes`. The root answers each request once."""
+        """Request a process from the root, which answers each request once."""
         request = ForkRequest(names[0], incarnation)
         self._root.send(msgspec.json.encode(request))
         self._asked[request] = answer
@@ -206,38 +198,13 @@ class OsProcesses:
         self._call_soon(f"{reply.request}", lambda: answer(reply.pid, reply.error))
 
     def adapt(self, adapted: AdaptedSystem) -> None:
-        """Have every process that is forked from now on know a changed system.
-
-        Raises:
-            OSError: the folder of the run is full, or gone.
-        """
+        """Write a changed system to the run folder, where the root reads it before a fork."""
         change_system(self.folder, msgspec.json.encode(adapted))
 
     def living(self) -> list[RunProcess]:
-        """Return the processes of this run, found in /proc."""
+        """Return the processes of this run from /proc."""
         return find_processes(self._port, self._launcher)
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
-        """Open a pidfd; raises ProcessLookupError if there is no such process."""
+        """Open a pidfd."""
         return OsHandle(pid, ended)
-
-    def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:
-        """SIGTERM to all in their sequence, then SIGKILL for those that are there after a while."""
-        poll = select.poll()
-        waiting = {h.pidfd: h for h in handles if isinstance(h, OsHandle) and h.pidfd >= 0}
-        for fd, handle in waiting.items():
-            handle.send(signal.SIGTERM)
-            poll.register(fd, select.POLLIN)
-        deadline = time.monotonic() + grace_s
-        while waiting and (left := deadline - time.monotonic()) > 0:
-            for fd, _ in poll.poll(left * 1000):
-                poll.unregister(fd)
-                del waiting[fd]
-        for handle in waiting.values():
-            handle.kill()
-
-    def close(self) -> None:
-        """Let go of everything."""
-        self._next_word.cancel()
-        self._loop.remove_reader(self._root)
-        self._root.close()

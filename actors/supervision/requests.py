@@ -1,9 +1,8 @@
-"""What the root is asked, and what it answers.
+"""Messages between the root and its clients, the supervisor and `run`.
 
-Two kinds of processes ask it. The supervisor sends a `ForkRequest`, one datagram each, and gets one
-`Reply` for it; any datagram also shows that the supervisor's loop turns. The process that watches
-the run sends `FromRun` and receives `FromRoot`, as lines of
-JSON: so no document is too large.
+The supervisor sends each `ForkRequest` as a datagram, and receives one `Reply` to it. Any datagram
+also shows that the supervisor's event loop works. `run` sends `FromRun` and receives `FromRoot` as
+lines of JSON, which may be of any length.
 """
 
 from __future__ import annotations
@@ -15,23 +14,23 @@ from rampart.actors.runtime.run_plan import RunPlan
 REQUEST_BYTES = 4096
 """Longest `ForkRequest` or `Reply`: the name of a process, a number, a line."""
 
-WORD = b" "
-"""The supervisor sends it when it has nothing to ask for."""
+ALIVE = b" "
+"""A datagram by which the supervisor shows only that it works."""
 
 
 class LaunchError(Exception):
-    """The run cannot be started; the text is one line for the user."""
+    """The run cannot start; the text is one line for the user."""
 
 
 class ForkRequest(msgspec.Struct, frozen=True):
-    """Start a process: by the name of one of its actors, and its incarnation."""
+    """Start a process; `name` is one of its actors."""
 
     name: str
     incarnation: int
 
 
 class Reply(msgspec.Struct, frozen=True):
-    """The new process that was asked for, by its number, or why there is none."""
+    """The pid of the new process, or 0 and why there is none."""
 
     request: ForkRequest
     pid: int = 0
@@ -39,20 +38,20 @@ class Reply(msgspec.Struct, frozen=True):
 
 
 class Begin(msgspec.Struct, frozen=True, tag="begin"):
-    """Claim what a run needs, and load it."""
+    """Reserve the resources of a run, and load its system."""
 
     plan: RunPlan
     title: str
 
 
 class Start(msgspec.Struct, frozen=True, tag="start"):
-    """Start routers and supervisor, with this reading of the monotonic clock as time 0."""
+    """Start routers and supervisor; simulated time 0 is this reading of the monotonic clock."""
 
     origin_s: float
 
 
 class Recording(msgspec.Struct, frozen=True, tag="recording"):
-    """Tell tools which file the run is recorded in, and why nothing more is written to it."""
+    """The file of the recording, and why nothing more is written to it; the root informs tools."""
 
     file: str
     problem: str
@@ -63,7 +62,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
 
 
 class Begun(msgspec.Struct, frozen=True, tag="begun"):
-    """The plan with folder, ports and launcher; all actors; and how long loading took, seconds."""
+    """The plan with folder, ports and root; all actors; and how long loading took, seconds."""
 
     plan: RunPlan
     names: tuple[str, ...]
@@ -71,29 +70,29 @@ class Begun(msgspec.Struct, frozen=True, tag="begun"):
 
 
 class Done(msgspec.Struct, frozen=True, tag="done"):
-    """`Start` or `End` was carried out."""
+    """`Start` or `End` is carried out."""
 
 
 class Refused(msgspec.Struct, frozen=True, tag="refused"):
-    """`Begin` or `Start` was not possible."""
+    """`Begin` or `Start` failed."""
 
     why: str
 
 
 class Restarted(msgspec.Struct, frozen=True, tag="restarted"):
-    """The root has brought back the supervisor, or a router."""
+    """The root has restarted the supervisor."""
 
     name: str
 
 
 class Trouble(msgspec.Struct, frozen=True, tag="trouble"):
-    """Something that the root cannot do, in one line."""
+    """A problem of the root, in one line."""
 
     text: str
 
 
 class Interrupt(msgspec.Struct, frozen=True, tag="interrupt"):
-    """The user wants the run to end: by which signal."""
+    """The user wants the run to end, and has sent this signal."""
 
     signal: str
 

@@ -1,25 +1,27 @@
 """The root of a run: one process that forks and reaps, and does nothing else.
 
-It has loaded the system, so a process of the run is a fork of it, in about a millisecond. It holds
-no thread and no session (neither survives a fork), and waits in one selector loop for:
+It has loaded the system, so it forks a process of the run in about a millisecond. It has no thread
+and no session, since neither survives a fork. One selector loop waits for:
 
-* the process that watches the run, its child: console, observer, test oracle and report. That one
-  says when to start and when to end, and its exit code is the verdict, which comes by a pipe. If it
-  ends without a verdict, the run is ended and there is none;
-* the supervisor, by a socket that it was born with. It asks for processes, and by its words the
-  root knows that its loop turns. Dead or hung, it is replaced at once;
-* its children's ends, and signals;
+* its child `run`, which has the console, the observer, the test oracle and the report. `run`
+  orders start and end, and writes the verdict to a pipe. If it ends without a verdict, the root
+  ends the run;
+* the supervisor, by an inherited socket. It requests processes, and its messages show that its
+  event loop works. The root replaces it at once when it is dead or hung;
+* the ends of its children, and signals;
 * tools that look for the run.
 
-**No node has two processes.** The root answers each request once, and starts no process for nodes
-that have one: it kills that one and refuses. The requests of a supervisor that has ended are not
-carried out.
+**No node has two processes.** The root answers each request once. If a node still has a process,
+the root kills that process and refuses the request. It drops the requests of a dead supervisor.
 
-**Nothing is orphaned.** Every process of the run is a child of the root, and asks the kernel to be
-killed with it (prctl(2), PR_SET_PDEATHSIG), stopped ones included. Only the watching process is
-continued instead: it ends commands and removes the folder of the run. And the process of a command
-is asked to end, to end first what its program has forked. A stopped
-root is continued by the supervisor, and the root continues the watching process.
+**Nothing is orphaned.** Every process of the run is a child of the root, and the kernel kills it
+with the root, also if it is stopped (prctl(2), PR_SET_PDEATHSIG). There are two exceptions. The
+kernel continues `run`, which then ends commands and removes the folder of the run. It sends SIGTERM
+to the process of a command, which first ends whatever its program has forked. The supervisor
+continues a stopped root, and the root continues a stopped `run`.
+
+**An end has an order.** The root kills the supervisor, sends SIGTERM to the nodes in reverse order
+of their start, and soon kills whatever is left. The routers are last.
 """
 
 from __future__ import annotations
@@ -66,44 +68,45 @@ from rampart.files.plain_text import one_line
 from rampart.files.streams import complain
 
 PERIOD_S = 0.25
-"""Wall seconds between two looks at the supervisor. If the root was stopped, twice that counts."""
+"""Wall seconds between two checks of the supervisor. No gap between checks counts as more than two
+periods, so a root that was stopped does not blame the supervisor."""
 
 SUPERVISOR_PATIENCE_S = 1.5
-"""A supervisor that could have said a word for so long is hung; it says four a second."""
+"""A supervisor that could have sent a message for this long hangs; it sends four a second."""
 
 LAST_PORT = 32_000
-"""Above are those that the kernel gives to outgoing connections."""
+"""The kernel gives higher ports to outgoing connections."""
 
 EXIT_INTERRUPTED = 1
 
-_STOP_S, _KILLED_S, _RETRY_S = 1.2, 1.0, 0.05
+_STOP_S, _KILLED_S, _RETRY_S = 0.5, 1.0, 0.05
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 
-# A router holds a socket for each process of a run, and the supervisor a descriptor. With too few
-# of them nothing fails at once, and everything fails later.
-_DESCRIPTORS_EACH = 4
-_DESCRIPTORS_BESIDES = 40
+# With too few of these, nothing fails at the start and anything may fail later. A router has a
+# socket, and the supervisor a descriptor, for each process; a process has several threads.
+_NEEDED = {resource.RLIMIT_NOFILE: (40, 4), resource.RLIMIT_NPROC: (30, 4)}
+"""For a limit of setrlimit(2): the least that a run needs, besides and for each node's process."""
 
 _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass
-class Guarded:
-    """What the root knows of the supervisor.
+class SupervisorState:
+    """State of the supervisor, as the root sees it.
 
     Attributes:
-        pid: Of the present one, 0 if there is none.
-        incarnation: Of the last one.
-        turns: Whether the present one has said a word.
-        looked_s: When it was last looked at.
-        due_s: When the next one is due; None if that is not decided.
-        trouble: What was reported last.
+        pid: 0 if no supervisor runs.
+        incarnation: Of the last supervisor.
+        works: Whether the present one has sent a message.
+        checked_s: Time of the last check.
+        due_s: When to start the next one; None if that is not decided.
+        trouble: Last problem that was reported.
     """
 
     pid: int = 0
     incarnation: int = 0
-    turns: bool = False
-    looked_s: float = 0.0
+    works: bool = False
+    checked_s: float = 0.0
     due_s: float | None = None
     trouble: str = ""
     policy: RestartPolicy = field(default_factory=RestartPolicy)
@@ -111,14 +114,14 @@ class Guarded:
 
 
 class Root:
-    """One run's root. Use: `run`, or `serve`, once.
+    """The root of one run. Use: `run`, or `serve`, once.
 
     Args:
-        loaded: What is loaded of the run already; None to load it by its plan.
+        loaded: The loaded system; None to load it by the plan in `Begin`.
 
     Attributes:
-        plan: Of the run, as it is known so far.
-        death: What the watching process died of; "" if it did not.
+        plan: Of the run, as far as it is known.
+        death: Name of the signal that killed `run`; "" if none did.
     """
 
     def __init__(self, loaded: RunContext | None = None) -> None:
@@ -144,31 +147,31 @@ class Root:
         self._supervisor_link: socket.socket | None = None
         self._pool: Pool | None = None
         self._held: list[socket.socket] = []
-        self._supervisor = Guarded()
+        self._supervisor = SupervisorState()
 
     # -- the whole ------------------------------------------------------------------------------
 
     def run(self, watch: Callable[[socket.socket], int]) -> int | None:
-        """Fork the process that watches the run, and serve; return its verdict, None without one.
+        """Fork the process `run`, serve it, and return its verdict; None if it has none.
 
         Args:
-            watch: What that process does, with its end of the connection; returns the verdict.
+            watch: Called in `run` with its end of the connection; returns the verdict.
 
         Raises:
-            LaunchError: no process can be forked.
+            LaunchError: No process can be forked.
         """
         ours, theirs = socket.socketpair()
-        verdict, said = os.pipe()
+        verdict, verdict_in = os.pipe()
         self._take_signals()
         try:
-            self._watch_pid = self._forked()
+            self._watch_pid = self._fork_flushed()
         except OSError as error:
             raise LaunchError(f"no process can be started: {error.strerror}") from None
         if self._watch_pid == 0:
             ours.close()
-            self._watch(watch, theirs, said)
+            self._watch(watch, theirs, verdict_in)
         theirs.close()
-        os.close(said)
+        os.close(verdict_in)
         try:
             self.serve(ours)
             code = os.read(verdict, 1)
@@ -177,20 +180,20 @@ class Root:
         return EXIT_INTERRUPTED if self._interrupts > 1 else code[0] if code else None
 
     def serve(self, link: socket.socket) -> None:
-        """Do what is asked by a connection, to the end of the process that watches the run."""
+        """Serve the requests of `run` on a connection, until `run` ends."""
         if self._woken < 0:
             self._take_signals()
         self._libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self._link = link
-        self._selector.register(link, selectors.EVENT_READ, self._hear_run)
+        self._selector.register(link, selectors.EVENT_READ, self._receive_from_run)
         try:
-            if self._run is not None:  # meanwhile the other process gets ready as well
-                with contextlib.suppress(ValueError, OSError):  # reported when the run begins
+            if self._run is not None:  # meanwhile `run` prepares
+                with contextlib.suppress(ValueError, OSError):  # `Begin` reports it
                     self._load(self._run)
             while self._watch_pid or self._link is not None:
-                for key, _ in self._selector.select(self._look()):
+                for key, _ in self._selector.select(self._check()):
                     key.data()
-                self._heed_signals()
+                self._handle_signals()
                 if self._interrupts > 1:
                     break
         finally:
@@ -198,12 +201,12 @@ class Root:
             if self._watch_pid:
                 kill(self._watch_pid)
 
-    def _watch(self, watch: Callable[[socket.socket], int], link: socket.socket, said: int
+    def _watch(self, watch: Callable[[socket.socket], int], link: socket.socket, verdict: int
                ) -> NoReturn:
-        """Be the process that watches the run."""
+        """Live as the process `run`, in a fork."""
         try:
             self._become_child(signal.SIGCONT)
-            os.write(said, bytes([watch(link)]))
+            os.write(verdict, bytes([watch(link)]))
         finally:
             for stream in (sys.stdout, sys.stderr):
                 stream.flush()
@@ -212,7 +215,7 @@ class Root:
     # -- signals --------------------------------------------------------------------------------
 
     def _take_signals(self) -> None:
-        """Have signals wake the loop; those that are ignored, as under nohup, stay so."""
+        """Have signals wake the loop; a signal that is ignored, as under nohup, stays ignored."""
         self._woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         for number in (*_ENDS, signal.SIGTSTP, signal.SIGCHLD):
             if signal.getsignal(number) is not signal.SIG_IGN:
@@ -224,19 +227,19 @@ class Root:
         with contextlib.suppress(BlockingIOError):
             os.read(self._woken, 4096)
 
-    def _heed_signals(self) -> None:
+    def _handle_signals(self) -> None:
         while self._signals:
             number = self._signals.pop(0)
             if number in _ENDS:
                 self._interrupts += 1
-                self._tell(requests.Interrupt(signal.Signals(number).name))
+                self._send(requests.Interrupt(signal.Signals(number).name))
             elif number == signal.SIGTSTP:
                 complain("ctrl-Z has no effect; `rampart mission pause` holds the mission, "
                          "ctrl-C ends the run")
         self._reap()
 
     def _reap(self) -> None:
-        """Take note of children that have ended or were stopped."""
+        """Handle the children that have ended or were stopped."""
         while True:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG | os.WUNTRACED)
@@ -260,13 +263,13 @@ class Root:
             elif pid == self._supervisor.pid:
                 self._supervisor.pid = 0
                 self._unlink_supervisor()
-            elif not self._supervisor.turns and self.plan.routers.keys() & set(names):
+            elif not self._supervisor.works and self.plan.routers.keys() & set(names):
                 with contextlib.suppress(OSError):  # tried again with the next supervisor
-                    self._start_routers()  # who looks after them has no bus to start on
+                    self._start_routers()  # a supervisor that starts needs a bus
 
-    # -- the process that watches the run -------------------------------------------------------
+    # -- requests of `run` ----------------------------------------------------------------------
 
-    def _hear_run(self) -> None:
+    def _receive_from_run(self) -> None:
         assert self._link is not None  # noqa: S101 for the type checker
         try:
             data = self._link.recv(1 << 16)
@@ -297,10 +300,10 @@ class Root:
                     self._end()
         except (LaunchError, ValueError, OSError) as error:
             answer = requests.Refused(one_line(str(error)))
-        self._tell(answer)
+        self._send(answer)
 
-    def _tell(self, message: requests.FromRoot) -> None:
-        """Send a message to the process that watches the run, unless it hangs or is gone."""
+    def _send(self, message: requests.FromRoot) -> None:
+        """Send a message to `run`, unless it hangs or is gone."""
         if self._link is not None:
             with contextlib.suppress(OSError):
                 self._link.send(msgspec.json.encode(message) + b"\n", socket.MSG_DONTWAIT)
@@ -308,19 +311,19 @@ class Root:
     # -- start and end --------------------------------------------------------------------------
 
     def _load(self, run: RunContext) -> None:
-        """Load all that the processes of the run need.
+        """Load everything that the processes of the run need.
 
         Raises:
-            ValueError: the system is unsound.
-            OSError: a file cannot be read.
+            ValueError: The system is unsound.
+            OSError: A file cannot be read.
         """
         self._layout = layout = Layout(run.plan, run.system, run.application)
         published_keys(run.system, layout)
-        heard = chain(layout.topics.values(), *(m.actor.inputs() for m in layout.members.values()))
-        for topic in heard:
-            decoder(topic.type)  # now, and not in each process when it starts: 2 ms
+        used = chain(layout.topics.values(), *(m.actor.inputs() for m in layout.members.values()))
+        for topic in used:
+            decoder(topic.type)  # here once, instead of 2 ms in each process
         gc.collect()
-        gc.freeze()  # keeps the collector from touching, and so copying, the shared pages
+        gc.freeze()  # the collector of a child would touch, and so copy, the shared pages
 
     def _begin(self, request: requests.Begin) -> requests.Begun:
         self.plan = plan = msgspec.structs.replace(request.plan, launcher_pid=self._pid)
@@ -341,7 +344,7 @@ class Root:
         if self._layout is None:
             self._load(replace(self._run, plan=plan))
         names = tuple(self._loaded.members)
-        _raise_descriptors(len(names))
+        _raise_limits(len(names))
         os.environ.update(working_folder.environment())
         try:
             folder = run_folder.make(port, self._pid)
@@ -349,9 +352,9 @@ class Root:
             run_folder.issue(folder, (OBSERVER,), 1)
         except OSError as error:
             raise LaunchError(f"no folder for the run's sockets: {error}") from None
-        ports = kept_ports(port) if plan.keys else []
+        ports = reserve_ports(port) if plan.keys else []
         self._held += ports
-        self._take_plan(ports=tuple(one.getsockname()[1] for one in ports))
+        self._take_plan(ports=tuple(reserved.getsockname()[1] for reserved in ports))
         return requests.Begun(self.plan, names, _age_s())
 
     @property
@@ -392,21 +395,27 @@ class Root:
             recording=self._recording.file, recording_problem=self._recording.problem))
 
     def _end(self) -> None:
-        """End all processes of the run: in order if the supervisor can, by force what is left."""
+        """End all processes of the run: nodes by SIGTERM, then the rest by SIGKILL."""
         if self._has_ended:
             return
         self._has_ended = True
-        if self._supervisor.pid and kill(self._supervisor.pid, signal.SIGTERM):
-            self._await_end(lambda: not self._supervisor.pid, _STOP_S)
+        if self._supervisor.pid:  # first, else it would have them replaced
+            kill(self._supervisor.pid)
+            self._await_end(lambda: not self._supervisor.pid, _KILLED_S)
+        nodes = [pid for pid, names in reversed(self._children.items())
+                 if self.plan.routers.keys().isdisjoint(names)]
+        for pid in nodes:
+            kill(pid, signal.SIGTERM)
+        self._await_end(lambda: self._children.keys().isdisjoint(nodes), _STOP_S)
         for pid in self._children:
             kill(pid)
         self._await_end(lambda: not self._children, _KILLED_S)
         kill_orphans(self._pid)
         run_folder.remove(self.plan.folder)
-        for one in self._held:
-            if one in self._selector.get_map():
-                self._selector.unregister(one)
-            one.close()
+        for kept in self._held:
+            if kept in self._selector.get_map():
+                self._selector.unregister(kept)
+            kept.close()
 
     def _await_end(self, is_over: Callable[[], bool], within_s: float) -> None:
         until_s = time.monotonic() + within_s
@@ -418,82 +427,82 @@ class Root:
 
     # -- the supervisor -------------------------------------------------------------------------
 
-    def _look(self) -> float | None:
-        """Look after supervisor and pool; return in how many seconds to look again."""
+    def _check(self) -> float | None:
+        """Check supervisor and pool; return the seconds until the next check."""
         if self._has_ended or self._pool is None:
             return None
-        now_s, guarded = time.monotonic(), self._supervisor
-        if not guarded.pid:
-            self._bring_supervisor_back(now_s)
-        elif now_s >= guarded.looked_s + PERIOD_S:
-            guarded.looked_s = now_s
-            silent_s = guarded.patience.look(now_s, guarded.pid, usage(guarded.pid))
+        now_s, supervisor = time.monotonic(), self._supervisor
+        if not supervisor.pid:
+            self._replace_supervisor(now_s)
+        elif now_s >= supervisor.checked_s + PERIOD_S:
+            supervisor.checked_s = now_s
+            silent_s = supervisor.patience.look(now_s, supervisor.pid, usage(supervisor.pid))
             if silent_s >= SUPERVISOR_PATIENCE_S:
-                kill(guarded.pid)
+                kill(supervisor.pid)
         self._pool.fill()
-        return PERIOD_S if guarded.pid else _RETRY_S
+        return PERIOD_S if supervisor.pid else _RETRY_S
 
-    def _bring_supervisor_back(self, now_s: float) -> None:
+    def _replace_supervisor(self, now_s: float) -> None:
         """Start the next supervisor when it is due."""
-        guarded = self._supervisor
-        if guarded.due_s is None:
-            delay_s = guarded.policy.delay_s(now_s)
+        supervisor = self._supervisor
+        if supervisor.due_s is None:
+            delay_s = supervisor.policy.delay_s(now_s)
             if delay_s is None:
-                self._complain(f"the supervisor ended {guarded.policy.limits.intensity} times "
-                               f"within {guarded.policy.limits.period_s:.0f} s: it is started "
-                               "less often from now on")
+                self._complain(f"the supervisor ended {supervisor.policy.limits.intensity} times "
+                               f"within {supervisor.policy.limits.period_s:.0f} s: the root now "
+                               "restarts it less often")
                 return
-            guarded.due_s = now_s + delay_s
-        if now_s < guarded.due_s:
+            supervisor.due_s = now_s + delay_s
+        if now_s < supervisor.due_s:
             return
         try:
             self._start_supervisor()
         except OSError as error:
             self._complain(f"the supervisor cannot be started: {error.strerror}")
             return
-        guarded.due_s = None
-        guarded.policy.restarted(now_s)
-        guarded.trouble = ""
-        self._tell(requests.Restarted(self.plan.supervisor))
+        supervisor.due_s = None
+        supervisor.policy.restarted(now_s)
+        supervisor.trouble = ""
+        self._send(requests.Restarted(self.plan.supervisor))
 
     def _complain(self, trouble: str) -> None:
         if trouble != self._supervisor.trouble:
             self._supervisor.trouble = trouble
-            self._tell(requests.Trouble(trouble))
+            self._send(requests.Trouble(trouble))
 
     def _start_supervisor(self) -> None:
         self._start_routers()
-        guarded = self._supervisor
+        supervisor = self._supervisor
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             with theirs:
-                pid = self._fork((self.plan.supervisor,), guarded.incarnation + 1, theirs)
+                pid = self._fork((self.plan.supervisor,), supervisor.incarnation + 1, theirs)
         except OSError:
             ours.close()
             raise
-        guarded.pid, guarded.turns = pid, False
-        guarded.incarnation += 1
-        guarded.looked_s = time.monotonic()
-        guarded.patience.answered()
+        supervisor.pid, supervisor.works = pid, False
+        supervisor.incarnation += 1
+        supervisor.checked_s = time.monotonic()
+        supervisor.patience.answered()
         self._supervisor_link = ours
-        self._selector.register(ours, selectors.EVENT_READ, self._hear_supervisor)
+        self._selector.register(ours, selectors.EVENT_READ, self._receive_from_supervisor)
 
     def _unlink_supervisor(self) -> None:
-        """Hear no more of a supervisor that has ended, nor carry out what it has asked for."""
+        """Close the connection to a supervisor that has ended, with any requests left on it."""
         if self._supervisor_link is not None:
             self._selector.unregister(self._supervisor_link)
             self._supervisor_link.close()
             self._supervisor_link = None
 
     def _start_routers(self) -> None:
-        """Start both routers if there is none: without one a supervisor cannot start."""
+        """Start both routers if none runs: without one a supervisor cannot start."""
         if any(self.plan.routers.keys() & set(names) for names in self._children.values()):
             return
         issued = run_folder.issued(self.plan.folder)
         for name in self.plan.routers:
             self._fork((name,), issued.get(name, self.plan.incarnations) + 1)
 
-    def _hear_supervisor(self) -> None:
+    def _receive_from_supervisor(self) -> None:
         link = self._supervisor_link
         if link is None:  # it has ended since the selector saw this
             return
@@ -504,14 +513,14 @@ class Root:
         if not data:
             self._unlink_supervisor()
             return
-        self._supervisor.turns = True
+        self._supervisor.works = True
         self._supervisor.patience.answered()
-        if data == requests.WORD:
+        if data == requests.ALIVE:
             return
         request = msgspec.json.decode(data, type=ForkRequest)
         try:
             reply = Reply(request, self._carry_out(request))
-        except Exception as error:  # it serves the next request all the same
+        except Exception as error:  # the next request is served in any case
             reply = Reply(request, error=one_line(f"{type(error).__name__}: {error}"))
         with contextlib.suppress(OSError):  # it has ended
             link.send(msgspec.json.encode(reply), socket.MSG_DONTWAIT)
@@ -522,7 +531,7 @@ class Root:
         self._reap()
         if before := [pid for pid, other in self._children.items() if other == names]:
             kill(before[0])
-            raise ValueError(f"process {before[0]} of it has to end first")
+            raise ValueError(f"its process {before[0]} has not ended yet")
         assert self._pool is not None  # noqa: S101 for the type checker
         pooled = self._loaded.spare_of(names) != "none" and self._pool.take(
             msgspec.json.encode(request))
@@ -544,10 +553,10 @@ class Root:
         return tuple(node.name for node in layout.units[layout.unit_of[name]].nodes)
 
     def _follow_changes(self) -> None:
-        """Fork from now on by the system as it was changed last.
+        """Load the system as it was changed last, for the next forks.
 
         Raises:
-            ValueError: it makes no sense, and the one before stays.
+            ValueError: The change is unsound; the system before it stays.
         """
         changed = run_folder.changed_system(self.plan.folder, self._system_read)
         if changed is None or self._layout is None or self._run is None:
@@ -556,31 +565,31 @@ class Root:
         self._layout, self._run = adapted_system(
             self._layout, self._run, msgspec.json.decode(data, type=AdaptedSystem))
         if self._pool is not None:
-            self._pool.end()  # its processes know the system as it was
+            self._pool.end()  # its processes have the system before the change
 
     # -- children -------------------------------------------------------------------------------
 
-    def _forked(self) -> int:
+    def _fork_flushed(self) -> int:
         for stream in (sys.stdout, sys.stderr):
-            stream.flush()  # else the child has what is buffered as well
+            stream.flush()  # else the child would print buffered text again
         return os.fork()
 
     def _fork(self, names: tuple[str, ...], incarnation: int, link: socket.socket | None = None
               ) -> int:
-        """Fork a process of the run and return its number.
+        """Fork a process of the run and return its pid.
 
         Args:
-            names: of its actors.
-            incarnation: of it.
-            link: to the root, if it is the supervisor.
+            names: Its actors.
+            incarnation: Of the process.
+            link: The supervisor's connection to the root.
 
         Raises:
-            OSError: there is no process, or memory, left.
+            OSError: There is no process or memory left.
         """
-        pid = self._forked()
+        pid = self._fork_flushed()
         if pid == 0:
             self._in_child(lambda: asyncio.run(live(
-                self._loaded, Role(names, incarnation), self._known(link))), link)
+                self._loaded, Role(names, incarnation), self._context_of(link))), link)
         self._note(pid, names, incarnation)
         return pid
 
@@ -588,35 +597,35 @@ class Root:
         async def wait_and_live() -> int:
             try:
                 data, bus = await wait(control, self.plan)
-            except (BusError, OSError):  # there is no router, or the root has ended
+            except (BusError, OSError):  # no router runs, or the root has ended
                 return 0
             if not data:
                 return 0
             request = msgspec.json.decode(data, type=ForkRequest)
             role = Role(self._names_of(request.name), request.incarnation)
-            return await live(self._loaded, role, self._known(None), bus)
+            return await live(self._loaded, role, self._context_of(None), bus)
 
         def be_pooled() -> int:
             set_title(self.plan.base_port, self._pid, (POOL,), 1)
             return asyncio.run(wait_and_live())
 
-        pid = self._forked()
+        pid = self._fork_flushed()
         if pid == 0:
             self._in_child(be_pooled, control)
         self._children[pid] = ()
         return pid
 
-    def _known(self, link: socket.socket | None) -> RunContext:
+    def _context_of(self, link: socket.socket | None) -> RunContext:
         assert self._run is not None  # noqa: S101 for the type checker
         if link is None:
             return self._run
         known = run_folder.issued(self.plan.folder)
-        for name, incarnation in self._issued.items():  # one may not have begun yet
+        for name, incarnation in self._issued.items():  # its process may not have begun yet
             known[name] = max(known.get(name, 0), incarnation)
         return replace(self._run, root=link.fileno(), known_incarnations=known)
 
     def _in_child(self, be: Callable[[], int], *kept: socket.socket | None) -> NoReturn:
-        """Be a process of the run, in a fork."""
+        """Live as a process of the run, in a fork."""
         code = 1
         try:
             self._become_child(signal.SIGKILL, *kept)
@@ -631,11 +640,11 @@ class Root:
             os._exit(code)
 
     def _become_child(self, death: signal.Signals, *kept: socket.socket | None) -> None:
-        """Let go in a fork of the root's things, and be signalled when the root ends."""
+        """Release the root's resources in a fork, and have the root's death signalled."""
         self._libc.prctl(_PR_SET_PDEATHSIG, death, 0, 0, 0)
-        if os.getppid() != self._pid:  # it has ended before
+        if os.getppid() != self._pid:  # it ended before the prctl
             os._exit(EXIT_INTERRUPTED)
-        os.setpgid(0, 0)  # no terminal's foreground is here
+        os.setpgid(0, 0)  # out of the terminal's foreground
         wakes = signal.set_wakeup_fd(-1)
         for number in (signal.SIGTERM, signal.SIGTSTP, signal.SIGCHLD):
             signal.signal(number, signal.SIG_DFL)
@@ -643,67 +652,78 @@ class Root:
             signal.signal(number, signal.SIG_IGN)
         registered = [key.fileobj for key in self._selector.get_map().values()]
         pooled = self._pool.waiting.values() if self._pool else ()
-        for one in {*registered, *self._held, *pooled} - set(kept):
-            os.close(one) if isinstance(one, int) else one.close()
+        for opened in {*registered, *self._held, *pooled} - set(kept):
+            os.close(opened) if isinstance(opened, int) else opened.close()
         os.close(wakes)
         self._selector.close()
 
 
-def _raise_descriptors(processes: int) -> None:
-    """Have as many files open as are allowed.
+def _raise_limits(processes: int) -> None:
+    """Raise each of the limits that a run needs to its hard limit.
 
     Raises:
-        LaunchError: a run of so many processes needs more.
+        LaunchError: A hard limit is too low for this number of processes.
     """
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    needed = needed_descriptors(processes)
-    if most < needed:
-        raise LaunchError(f"open files: the hard limit is {most}, and {processes} processes need "
-                          f"{needed}; raise it, as with `ulimit -Hn {needed}` in the shell of a "
-                          "privileged user")
+    for kind, what, option in ((resource.RLIMIT_NOFILE, "open files", "n"),
+                               (resource.RLIMIT_NPROC, "processes and threads of a user", "u")):
+        _, hard = resource.getrlimit(kind)
+        resource.setrlimit(kind, (hard, hard))
+        needed = needed_of(kind, processes)
+        is_exempt = kind == resource.RLIMIT_NPROC and os.getuid() == 0
+        if hard < needed and hard != resource.RLIM_INFINITY and not is_exempt:
+            raise LaunchError(f"{what}: the hard limit is {hard}, and {processes} processes need "
+                              f"{needed}; raise it, as with `ulimit -H{option} {needed}` in the "
+                              "shell of a privileged user")
 
 
-def needed_descriptors(processes: int) -> int:
-    """Return how many files a process of a run with so many processes may have to hold open."""
-    return _DESCRIPTORS_BESIDES + _DESCRIPTORS_EACH * processes
+def needed_of(kind: int, processes: int) -> int:
+    """Return the least limit of a kind for a run with this number of processes of nodes.
+
+    Args:
+        kind: `resource.RLIMIT_NOFILE` or `resource.RLIMIT_NPROC`.
+        processes: Of nodes.
+    """
+    base, each = _NEEDED[kind]
+    return base + each * processes
 
 
 def _age_s() -> float:
-    """Return for how long this process has existed, real seconds (proc(5), field 22 of stat)."""
+    """Return the age of this process, real seconds (proc(5), field 22 of stat)."""
     begun_s = int(stat_fields(os.getpid())[19]) / os.sysconf("SC_CLK_TCK")
     return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - begun_s)
 
 
-def kept_ports(first: int) -> list[socket.socket]:
-    """Return sockets that keep ports of loopback for the routers of a run with keys.
+def reserve_ports(first: int) -> list[socket.socket]:
+    """Return sockets that reserve loopback ports for the routers of a run with credentials.
 
-    A router listens on a port that is kept all the same, for both have SO_REUSEADDR; no other run
-    takes it while the router is restarted, and the kernel gives it to no outgoing connection.
+    A router can listen on its reserved port, since both sockets have SO_REUSEADDR. While a router
+    restarts, no other run takes the port, and the kernel gives it to no outgoing connection.
 
     Args:
-        first: of the ports that are tried.
+        first: First port to try.
 
     Raises:
-        LaunchError: there are too few.
+        LaunchError: There are too few free ports.
     """
     found: list[socket.socket] = []
     for port in range(first, LAST_PORT + 1):
-        kept = socket.socket()
+        reserved = socket.socket()
         try:
-            kept.bind(("127.0.0.1", port))
+            reserved.bind(("127.0.0.1", port))
         except OSError:
-            kept.close()
+            reserved.close()
             continue
-        kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # not before: it would fit any
-        found.append(kept)
+        # Only now: with SO_REUSEADDR the bind would take a port that is in use.
+        reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        found.append(reserved)
         if len(found) == len(run_folder.ROUTERS):
             return found
-    raise LaunchError(f"--port {first}: no ports for the routers from there to {LAST_PORT}")
+    raise LaunchError(f"--port {first}: too few free ports from {first} to {LAST_PORT} "
+                      "for the routers")
 
 
 def main() -> int:
-    """Entry of a root that another process has started: `… root FD`, by a connection to that."""
+    """Serve the process that started this one, on the descriptor in its argument."""
     working_folder.admit()
     streams.secure()
     Root().serve(socket.socket(fileno=int(sys.argv[1])))

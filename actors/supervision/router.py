@@ -1,11 +1,11 @@
-"""A router of the bus as an actor: all that it does is done by its Zenoh session.
+"""A router of the bus as an actor: its Zenoh session does all the work.
 
-So it is supervised like everybody else: its heartbeat goes through the session that it is about.
+As an actor it is supervised like any node, and its heartbeat passes the session in question.
 
-It never closes that session; SIGTERM ends its process (`node_process`). `Session.close` takes the
-router's table of keys apart while threads still read its links, and what comes on one of them then
-finds a key without its context: Zenoh (1.10.2) panics, on stderr, with an `unwrap` in
-`undeclare_subscriber` as a rule. The kernel closes the links as soon, and harms nobody.
+It never closes that session; SIGTERM ends its process at once (`node_process`). `Session.close`
+deletes the router's table of keys while threads still read its links. A message on such a link then
+makes Zenoh (1.10.2) panic on stderr, mostly by an `unwrap` in `undeclare_subscriber`. The kernel
+closes the links as quickly, and without a panic.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from rampart.actors.runtime.actor import Actor, Context
 
 
 class Router(Actor):
-    """Hands on what its clients and the other router send (`rampart.actors.bus.zenoh_bus`)."""
+    """Forwards the messages of its clients and of the other router (`actors/bus/zenoh_bus.py`)."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        keep_large_apart()  # before it has links: their buffers come and go with its clients
+        keep_large_apart()  # before it has links, whose buffers come and go with its clients

@@ -1,16 +1,15 @@
-"""A process under supervision: its states, what moves it between them, what is then to be done.
+"""A supervised process: its states, the events that change them, and the actions that follow.
 
-`TRANSITIONS` is the whole of it; what is not in the table changes nothing. Time is an argument, and
-the actions are carried out by `rampart.actors.supervision.supervisor`.
+`TRANSITIONS` is the whole state machine; any other event changes nothing. Time is an argument, and
+`rampart.actors.supervision.supervisor` carries out the actions.
 
-How often it may be restarted is OTP's restart intensity, with backoff; the numbers are those of
-`[supervision]` in the system spec. Up to half of `intensity` restarts within `period_s` happen at
-once; beyond that each waits longer, doubling from `backoff_s`; one more than `intensity` and the
-policy gives up. What has crashed so often may yet be well again later, when a disk has room or a
-device is plugged in. So giving up is no end: single attempts follow, further and further apart, and
-only if one of them lasts for a whole period is the process as good as any other again. Until then
-it is not hidden: a silent detection module counts as active, a silent manager stops the Safety
-Pilot, a silent Safety Pilot trips the dead man.
+Restarts follow OTP's restart intensity, with backoff, by the numbers of `[supervision]` in the
+system spec. Up to half of `intensity` restarts within `period_s` happen at once. Each further one
+waits longer, doubling from `backoff_s`. After `intensity` restarts the policy gives up. The process
+may work again later, when a disk has room or a device is plugged in. So single attempts follow, at
+growing intervals. If one of them lasts for a whole period, the process counts as healthy again.
+Until then its silence has its usual effect: a silent detection module counts as active, a silent
+manager stops the Safety Pilot, and a silent Safety Pilot trips the dead man.
 """
 
 from __future__ import annotations
@@ -31,86 +30,86 @@ from rampart.actors.system.layout import Unit
 from rampart.manager.spec.tables import Supervision
 
 START_TIMEOUT_S = 3.0
-"""Wall seconds in which a new process must have sent its first heartbeat."""
+"""Wall seconds within which a new process has to send its first heartbeat."""
 
 MANY, MANY_SHARE = 2, 1 / 8
-"""When the heartbeats of so many processes are missing it is the machine, or the bus."""
+"""If this number and share of processes is late at once, the cause is the machine or the bus."""
 
 MOST_EXCUSED_S = 3.0
-"""Wall seconds that a process could have run after which it is blamed though many are silent."""
+"""Wall seconds of silence after which a process is replaced though many are silent. Only time in
+which it could have run counts."""
 
 STATUS = "fresh status of the manager"
-"""Stands among the names of a process' nodes for what the Safety Pilot depends on."""
+"""Stands among the names of the manager's process: the Safety Pilot depends on this status."""
 
 _USUAL = Supervision()
 _MOST_DOUBLINGS = 60
-"""Beyond which no wait doubles; far longer than any is allowed to be."""
+"""A bound on the exponent; the longest wait is reached long before."""
 
 
 class State(Enum):
-    """What a process is doing; all but `RESTARTING` are told to others, as `NodeState`."""
+    """State of a process; each but `RESTARTING` is published as the `NodeState` of this value."""
 
     STARTING = "starting"
-    """It was forked and was not heard yet."""
+    """It is forked and has sent no heartbeat yet."""
     RUNNING = "running"
     STOPPED = "stopped"
     WEDGED = "wedged"
     CRASHED = "crashed"
-    """It has ended, or there was none yet, and no other one was asked for."""
+    """It has ended, or never existed, and no restart is requested."""
     RESTARTING = "restarting"
-    """It was killed if it was there, and another one is forked as soon as it is gone."""
+    """It is killed, and the next one is forked as soon as it is gone."""
     GIVEN_UP = "given up"
-    """Like `RESTARTING`, much later."""
+    """As `RESTARTING`, but much later."""
 
 
 class Event(Enum):
-    """What happens to a process."""
+    """An event of a process."""
 
-    HEARD = auto()
+    HEARTBEAT = auto()
     SILENT = auto()
-    """It is not heard although it could be."""
+    """No heartbeat arrived in time, although the process could have run."""
     SILENT_STOPPED = auto()
-    """Likewise, and the kernel says that it is stopped."""
+    """As `SILENT`, and the kernel reports that it is stopped."""
     ENDED = auto()
     START = auto()
-    """The run begins, or the supervisor does and finds no process."""
+    """The run starts, or a new supervisor finds no process."""
     RESTART = auto()
-    """Another process is wanted in its place, and may be had."""
+    """A restart is requested and granted."""
     TOO_OFTEN = auto()
-    """Likewise, but there were too many already."""
+    """A restart is requested, but there were too many already."""
     STARTED = auto()
-    """Its first process was forked."""
+    """Its first process is forked."""
     FORKED = auto()
-    """Another process was forked."""
+    """A later process is forked."""
     ADOPTED = auto()
-    """A process was found when the supervisor began."""
+    """A new supervisor finds a living process."""
     ADAPTED = auto()
-    """It is to run by other parameters from now on."""
+    """It has new parameters."""
 
 
 class Action(Enum):
-    """What is to be done about it."""
+    """An action of the supervisor."""
 
-    TELL = auto()
-    """Publish the transition's word."""
+    REPORT = auto()
+    """Publish the transition as a `ProcessEvent`."""
     PUBLISH = auto()
-    """Publish the table of all nodes."""
+    """Publish the node table."""
     RECOVER = auto()
-    """Ask for a restart, if it is the supervisor's to ask."""
+    """Restart the process, unless a recovery module has to request that."""
     KILL = auto()
-    """End what is left of the process."""
     FORK = auto()
-    """Fork another one now."""
+    """Fork the next process now."""
     FORK_WHEN_GONE = auto()
-    """Likewise after `delay_s`, and not before the old process is gone."""
+    """Fork the next process after `delay_s`, when the old one is gone."""
     HOLD = auto()
     """Watch for its end."""
 
 
 class Transition(NamedTuple):
-    """Where an event leads, the word for it, and what is to be done, in this sequence.
+    """The next state, its name in a `ProcessEvent`, and the actions, in this order.
 
-    An action may cause a transition itself; then those after it are left out.
+    An action may itself cause a transition; then the later actions are skipped.
     """
 
     state: State
@@ -121,25 +120,25 @@ class Transition(NamedTuple):
 _A, _E, _S = Action, Event, State
 _PRESENT = (_S.STARTING, _S.RUNNING, _S.STOPPED, _S.WEDGED)
 _WAITING = (_S.RESTARTING, _S.GIVEN_UP)
-_SAID = (_A.TELL, _A.PUBLISH)
-_LOST = (_A.TELL, _A.PUBLISH, _A.RECOVER)
-_NEW = (_A.TELL, _A.PUBLISH, _A.HOLD)
-_OVER = (_A.KILL, _A.TELL, _A.PUBLISH, _A.FORK_WHEN_GONE)
+_WELL = (_A.REPORT, _A.PUBLISH)
+_LOST = (_A.REPORT, _A.PUBLISH, _A.RECOVER)
+_NEW = (_A.REPORT, _A.PUBLISH, _A.HOLD)
+_OVER = (_A.KILL, _A.REPORT, _A.PUBLISH, _A.FORK_WHEN_GONE)
 
 _ROWS: tuple[tuple[Iterable[State], Event, Transition], ...] = (
-    ((_S.STARTING,), _E.HEARD, Transition(_S.RUNNING, "running", _SAID)),
-    ((_S.STOPPED, _S.WEDGED), _E.HEARD, Transition(_S.RUNNING, "resumed", _SAID)),
+    ((_S.STARTING,), _E.HEARTBEAT, Transition(_S.RUNNING, "running", _WELL)),
+    ((_S.STOPPED, _S.WEDGED), _E.HEARTBEAT, Transition(_S.RUNNING, "resumed", _WELL)),
     ((_S.STARTING, _S.RUNNING), _E.SILENT, Transition(_S.WEDGED, "wedged", _LOST)),
     ((_S.RUNNING,), _E.SILENT_STOPPED, Transition(_S.STOPPED, "stopped", _LOST)),
     (_PRESENT, _E.ENDED, Transition(_S.CRASHED, "crashed", _LOST)),
     ((_S.CRASHED,), _E.START, Transition(_S.RESTARTING, "", (_A.FORK,))),
     ((*_PRESENT, _S.CRASHED), _E.RESTART, Transition(
         _S.RESTARTING, "", (_A.KILL, _A.FORK_WHEN_GONE))),
-    ((_S.GIVEN_UP,), _E.RESTART, Transition(_S.GIVEN_UP, "given up", (_A.TELL,))),
+    ((_S.GIVEN_UP,), _E.RESTART, Transition(_S.GIVEN_UP, "given up", (_A.REPORT,))),
     ((*_PRESENT, _S.CRASHED), _E.TOO_OFTEN, Transition(_S.GIVEN_UP, "given up", _OVER)),
     ((_S.RESTARTING,), _E.STARTED, Transition(_S.STARTING, "started", _NEW)),
     (_WAITING, _E.FORKED, Transition(_S.STARTING, "respawned", _NEW)),
-    ((_S.CRASHED,), _E.ADOPTED, Transition(_S.RUNNING, "adopted", (_A.TELL, _A.HOLD))),
+    ((_S.CRASHED,), _E.ADOPTED, Transition(_S.RUNNING, "adopted", (_A.REPORT, _A.HOLD))),
     ((_S.GIVEN_UP,), _E.ADAPTED, Transition(_S.CRASHED)))
 
 TRANSITIONS = {(state, event): then for states, event, then in _ROWS for state in states}
@@ -147,11 +146,11 @@ TRANSITIONS = {(state, event): then for states, event, then in _ROWS for state i
 
 @dataclass(slots=True)
 class RestartPolicy:
-    """Sliding window of restarts of one process. Times are in seconds of the caller's clock.
+    """Sliding window of the restarts of one process. Times are seconds of the caller's clock.
 
     Attributes:
         limits: Of the system spec.
-        attempts: Single ones since it gave up; 0 while it has not.
+        attempts: Number of single attempts since it gave up; 0 if it has not.
     """
 
     limits: Supervision = _USUAL
@@ -160,11 +159,11 @@ class RestartPolicy:
 
     @property
     def spent(self) -> str:
-        """What it allows, in words."""
+        """The limit, in words."""
         return f"{self.limits.intensity} restarts in {self.limits.period_s:.0f} s"
 
     def delay_s(self, now_s: float) -> float | None:
-        """Return how long to wait before the next restart, or None to give up."""
+        """Return the wait before the next restart, None to give up."""
         limits = self.limits
         while self._restarts and now_s - self._restarts[0] > limits.period_s:
             self._restarts.popleft()
@@ -177,9 +176,9 @@ class RestartPolicy:
             limits.backoff_s, count - free, limits.backoff_max_s)
 
     def attempt_in_s(self, now_s: float) -> float:
-        """Return how long to wait before the next attempt of what was given up.
+        """Return the wait before the next single attempt, which grows with each that failed.
 
-        Until the window has room for it, and longer after each that failed.
+        The window has room for a restart when the wait is over.
         """
         limits = self.limits
         pause_s = _doubled(limits.attempt_s, self.attempts, limits.attempt_max_s)
@@ -194,14 +193,14 @@ class RestartPolicy:
 
 
 FAILING = ((3, 1.0), (20, 10.0))
-"""So many processes of a node in a row, none of which worked for so many wall seconds, are no
-accident, and no single fault."""
+"""A node is failing if this number of processes in a row each worked for less than this number of
+wall seconds: that is neither an accident nor a single fault."""
 
 
 class Lives:
     """How long the last processes of a node worked. Pure; times are seconds of the caller's clock.
 
-    A process works from its first heartbeat on; one that is never heard does not.
+    A process works from its first heartbeat on.
     """
 
     def __init__(self) -> None:
@@ -209,22 +208,22 @@ class Lives:
         self._worked_s: deque[float] = deque(maxlen=max(count for count, _ in FAILING))
 
     def forked(self) -> None:
-        """Note that there is a process."""
+        """Note a new process."""
         self._began_s = math.inf
 
-    def heard(self, now_s: float) -> None:
+    def worked(self, now_s: float) -> None:
         """Note a heartbeat of it."""
         if self._began_s == math.inf:
             self._began_s = now_s
 
     def ended(self, now_s: float) -> None:
-        """Note that it ended, or is ended; harmless when repeated."""
+        """Note the end of the process; a repetition has no effect."""
         if self._began_s is not None:
             self._worked_s.append(max(0.0, now_s - self._began_s))
             self._began_s = None
 
     def failing(self, now_s: float) -> bool:
-        """Whether the last ones worked too short a time, and the present one has not for longer."""
+        """Whether the last processes, and the present one so far, worked for too short a time."""
         present_s = 0.0 if self._began_s is None else now_s - self._began_s
         worked_s = [*self._worked_s, present_s]
         return any(len(worked_s) > count and max(worked_s[-count - 1:]) < least_s
@@ -240,18 +239,18 @@ class SupervisedProcess:
     """One process of the run. Times are wall seconds of the caller's clock.
 
     Attributes:
-        unit: What runs in it.
-        state: What it is doing.
-        shown: What others are told of that: of a `RESTARTING` one, what it was before.
+        unit: The nodes that run in it.
+        state: Its state.
+        shown: The published state: while `RESTARTING`, the state before.
         incarnation: Of the present process.
-        highest: The highest incarnation that there was.
-        requested_by: The module that asked for it, until it was heard.
-        asks: Whether a process was asked for and there is no answer yet.
-        stays: Whether it is there and starts its program again, which has ended.
-        delay_s: How long to wait before the fork that was granted last.
-        heard_s: When each of its nodes was last heard, and the manager's status.
-        handle: On the process that is there.
-        next_step: Towards its fork, while that is under way; there is never more than one.
+        highest: The highest incarnation so far.
+        requested_by: The module that requested the process, until its first heartbeat.
+        is_requested: Whether a request to the root has no answer yet.
+        stays: Whether the process lives and is to restart its program, which has ended.
+        delay_s: The wait before the restart that was granted last.
+        heard_s: When the last heartbeat of each node, and the last status of the manager, came.
+        handle: The hold on the present process.
+        next_step: The timer of a restart under way; there is never more than one.
     """
 
     unit: Unit
@@ -263,7 +262,7 @@ class SupervisedProcess:
     incarnation: int = 0
     highest: int = 0
     requested_by: str = ""
-    asks: bool = False
+    is_requested: bool = False
     stays: bool = False
     delay_s: float = 0.0
     started_s: float = 0.0
@@ -274,21 +273,21 @@ class SupervisedProcess:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The actors in it."""
+        """The names of its nodes."""
         return tuple(n.name for n in self.unit.nodes)
 
     @property
     def waits(self) -> bool:
-        """Whether a fork is under way."""
+        """Whether a restart is under way."""
         return self.state in _WAITING
 
     @property
     def is_dead(self) -> bool:
-        """Whether others are told that there is none."""
+        """Whether the published state is that of a dead process."""
         return self.shown in (NodeState.CRASHED, NodeState.GIVEN_UP)
 
     def step(self, event: Event) -> Transition | None:
-        """Change the state as an event demands; None if there is no transition for it."""
+        """Change the state by an event; None if the event has no transition."""
         found = TRANSITIONS.get((self.state, event))
         if found is not None:
             self.state = found.state
@@ -299,7 +298,7 @@ class SupervisedProcess:
         return found
 
     def ask(self, now_s: float) -> tuple[Event, str]:
-        """Ask for a restart: return what comes of it, and in words why nothing does so far."""
+        """Request a restart; return the event that follows, and why it is not immediate."""
         if self.waits:
             return Event.RESTART, "an attempt will follow by itself"
         policy, failed = self.policy, self.policy.attempts
@@ -312,50 +311,50 @@ class SupervisedProcess:
         return Event.TOO_OFTEN, f"{why}, the next attempt is in {self.delay_s:.0f} s"
 
     def take(self, pid: int, incarnation: int) -> None:
-        """Note that another process is the present one, and let go of the one before."""
+        """Make another process the present one, and release the one before."""
         self.forget_step()
-        self.let_go()
+        self.release()
         self.pid, self.incarnation, self.heard_s, self.stays = pid, incarnation, {}, False
         self.lives.forked()
         self.highest = max(self.highest, incarnation)
 
-    def let_go(self) -> None:
-        """Hold nothing."""
+    def release(self) -> None:
+        """Release the process."""
         self.handle.close()
         self.handle = ProcessHandle()
 
     def kill(self) -> None:
-        """End it at once, and do not report that; not if only its program has to be replaced."""
+        """Kill the process without a report, unless it stays and only its program is replaced."""
         if not self.stays:
             self.handle.ignore()
             self.handle.kill()
 
     def forget_step(self) -> None:
-        """Have the next step towards a fork not taken."""
+        """Cancel the next step of a restart."""
         if self.next_step is not None:
             self.next_step.cancel()
 
     def rows(self, late_s: Callable[[str], float], now_s: float) -> Iterator[NodeInfo]:
-        """Return the rows of its nodes in the table of all; `late_s` says how late one was."""
+        """Return the rows of its nodes in the node table; `late_s` returns a node's lateness."""
         failing = self.lives.failing(now_s)
         for node in self.unit.nodes:
             yield NodeInfo(node.name, node.kind.value, self.pid, self.shown, self.incarnation,
                            restarts_of(self.incarnation), late_s(node.name), failing=failing)
 
     def is_late(self, now_s: float, timeout_s: float) -> bool:
-        """Whether a heartbeat of it is missing."""
+        """Whether a heartbeat is overdue."""
         return self.state is State.RUNNING and (
             now_s - min(self.heard_s.values(), default=now_s) > timeout_s / 2)
 
     def silence(self, now_s: float, timeout_s: float, used: Callable[[], Usage], *,
                 many: bool = False) -> str:
-        """Return in words what was not heard of it for too long although it could; "" if nothing.
+        """Return in words what is missing although the process could have run; "" if nothing is.
 
         Args:
             now_s: Now.
             timeout_s: Of a heartbeat.
-            used: Returns what the process has used; asked only if that matters.
-            many: Whether many are late.
+            used: Returns the usage of the process; called only if it matters.
+            many: Whether many processes are late.
         """
         if self.state is State.STARTING:
             could_s = self._could_answer_s(now_s, self.started_s, START_TIMEOUT_S, used)
@@ -380,6 +379,6 @@ class SupervisedProcess:
         return self.patience.look(now_s, self.pid, used(), since_s)
 
     def excuse(self, now_s: float, stall_s: float) -> None:
-        """Do not count as silence what the supervisor could not have heard."""
+        """Do not count as silence a time in which the supervisor could not receive."""
         self.started_s = min(now_s, self.started_s + stall_s)
         self.heard_s = {n: min(now_s, at_s + stall_s) for n, at_s in self.heard_s.items()}

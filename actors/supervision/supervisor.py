@@ -1,19 +1,18 @@
-"""The supervisor: starts the processes, watches them three ways, kills and respawns them.
+"""The supervisor: starts the processes of a host, observes their deaths, and restarts them.
 
-* *Crashed*: the process's pidfd becomes readable, at once; this works for processes that are
-  not children, so a restarted supervisor adopts those that it finds in /proc.
-* *Stopped*: no heartbeat, and the kernel says the process is stopped (SIGSTOP).
-* *Wedged*: no heartbeat although the process runs: its event loop turns no more. Of the manager,
-  whose silence stops the robot, the status counts as much as the heartbeat.
+* *Crashed*: the pidfd of the process becomes readable, at once. A pidfd needs no parent, so a
+  restarted supervisor adopts the processes that it finds in /proc.
+* *Stopped*: no heartbeat arrives, and the kernel reports that the process is stopped (SIGSTOP).
+* *Wedged*: no heartbeat arrives although the process runs, so its event loop hangs. The silence of
+  the manager stops the robot, so its status counts like its heartbeat.
 
-Who waits for a processor is neither (see `patience`). What follows is in `supervised_process`.
+A process that waits for a processor is neither (`patience`). `supervised_process` has the states.
 
-What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
-Manager arbitrates; everything else by the supervisor itself. So is a command whose program has
-ended: its process stays, reports that, and starts the program again when it reads "respawned",
-which makes it the next incarnation. OTP's rules hold: start in order, stop
-in reverse, SIGTERM before SIGKILL, a bounded restart intensity. A request is carried out when the
-new process was heard: until then it is repeated, for who asked may have missed its deadline.
+A recovery module that owns nodes (RM3, RM4) requests their restart, so the FTM Manager arbitrates.
+The supervisor restarts all others by itself. When the program of a command ends, the process of its
+node stays and reports that. It starts the program again when it reads "respawned", as the next
+incarnation. Processes start in the order of the specification, and restart intensity is bounded
+(OTP). A request stays open until a heartbeat of the new process arrives.
 """
 
 from __future__ import annotations
@@ -62,26 +61,23 @@ from rampart.manager.spec.adaptation import changed_actors
 from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.tables import FAILOVER_S
 
-STOP_GRACE_S = 0.5
-"""Wall seconds between SIGTERM and SIGKILL at the end of a run."""
-
 _CHECK_S = 0.1
-"""Simulated seconds between two looks at who is silent."""
+"""Simulated seconds between two checks for silent processes."""
 
 _LATE_S = 0.02
-"""Wall seconds by which it is late when its own process lacks processor time."""
+"""Wall seconds of lateness that show that the supervisor itself lacks processor time."""
 _ROUTERS_S = 0.03
-"""Wall seconds between two looks whether a router is stopped."""
+"""Wall seconds between two checks for stopped routers."""
 
 _GONE_S, _RETRY_S = 0.002, 0.05
-"""Wall seconds between two looks whether a killed process is gone, and between two attempts."""
+"""Wall seconds between two checks whether a killed process is gone, and between two attempts."""
 
 
 class Supervisor(Actor):
     """Keeps the processes of the run running."""
 
     class Parameters(Actor.Parameters, frozen=True):
-        """Whom it hears: the names of all nodes."""
+        """The names of all nodes, whose heartbeats it subscribes to."""
 
         nodes: tuple[str, ...] = ()
 
@@ -109,11 +105,11 @@ class Supervisor(Actor):
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
-        """Hear the heartbeats of the nodes that it starts."""
+        """Subscribe to the heartbeats of the nodes that it starts."""
         return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
     def listens(self, topic: Topic[Any]) -> bool:
-        """Receive what becomes of programs if there is any."""
+        """Subscribe to the ends of programs only if a node has one."""
         return topic is not topics.PROGRAM_END or any(node.command for node in self._spec.nodes)
 
     def _held(self, unit: Unit) -> SupervisedProcess:
@@ -127,53 +123,53 @@ class Supervisor(Actor):
         return self._processes.get(
             node if node in self._routers else self._layout.unit_of.get(node, ""))
 
-    # -- what it keeps; a supervisor of one host of several decides that -------------------------
+    # -- its units, which a supervisor of one host of several changes -----------------------------
 
     def units_at_start(self, running: Collection[str]) -> Iterable[str]:  # noqa: ARG002
-        """Return the units that it keeps from its start on.
+        """Return the units that it supervises from its start on.
 
         Args:
-            running: Units that run on its machine already.
+            running: Units that already run on this machine.
         """
         return self._layout.here
 
     def take_on(self, unit: str, above: int) -> None:
-        """Start a unit and keep it running from now on.
+        """Start a unit and supervise it.
 
         Args:
             unit: Its name.
-            above: Number that the incarnations of its processes have to exceed.
+            above: Incarnations of its processes have to exceed this number.
         """
         process = self._processes[unit] = self._held(self._layout.units[unit])
         process.incarnation = process.highest = above
         self._on(process, Event.START)
 
     def hand_over(self, unit: str) -> SupervisedProcess | None:
-        """End a unit and keep it no more; return its process, which may not have ended yet."""
+        """Kill a unit and release it; return its process, which may not have ended yet."""
         process = self._processes.pop(unit, None)
         if process is not None:
             process.forget_step()
             process.kill()
-            self._tell(process, "handed over", self.name)
+            self._report(process, "handed over", self.name)
         return process
 
     @property
     def layout(self) -> Layout:
-        """The layout of the system, as it was changed last."""
+        """The layout of the system, with its changes."""
         return self._layout
 
     def highest_of(self, node: str) -> int:
-        """Return the highest incarnation of a node that it keeps; 0 if it does not."""
+        """Return the highest incarnation of a node; 0 if the node is not supervised here."""
         process = self._process_of(node)
         return process.highest if process else 0
 
-    def _is_kept(self, process: SupervisedProcess) -> bool:
+    def _supervises(self, process: SupervisedProcess) -> bool:
         return self._processes.get(process.unit.name) is process
 
     # -- start and stop -------------------------------------------------------------------------
 
     def on_start(self) -> None:
-        """Adopt what runs, start what does not, in the order of the spec."""
+        """Adopt the processes that run and start the others, in the order of the spec."""
         living = self._machine.living()
         running = {self._layout.unit_of.get(process.names[0], "") for process in living}
         units = self.units_at_start(running - {""})
@@ -190,43 +186,32 @@ class Supervisor(Actor):
             self._look_at_routers()
 
     def on_stop(self) -> None:
-        """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger.
+        """Release all processes: the next supervisor adopts them, or the root ends them."""
+        for process in self._processes.values():
+            process.release()
 
-        Routers when all others have ended. After a failure none: the next supervisor adopts them.
-        """
-        handles: dict[bool, list[ProcessHandle]] = {False: [], True: []}  # of routers: True
-        for name, process in reversed(self._processes.items()):
-            if not self._dispatcher.stopping:
-                process.let_go()
-            elif process.stays or process.shown is not fm.NodeState.CRASHED:
-                process.handle.ignore()
-                handles[name in self._routers].append(process.handle)
-        for some in handles.values():
-            self._machine.end(some, STOP_GRACE_S)
-        self._machine.close()
-
-    # -- what it hears --------------------------------------------------------------------------
+    # -- messages -------------------------------------------------------------------------------
 
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
-        """Note that a node's loop turns."""
+        """Note that the event loop of a node works."""
         process = self._process_of(header.source)
         if process is None:
             return
         if process.waits or (
                 header.incarnation, message.pid) != (process.incarnation, process.pid):
-            return  # said before it was killed, or by another one
+            return  # sent before the kill, or by another process
         age_s = (self.clock.now() - self.came_s(header)) / self._plan.rate
         process.heard_s[header.source] = heard_s = self._loop.time() - age_s
-        process.lives.heard(heard_s)
+        process.lives.worked(heard_s)
         self._lateness.note(header.source, message.late_s)
         self._beats[header.source] = header.stamp, message
         process.requested_by = ""
-        self._on(process, Event.HEARD)
+        self._on(process, Event.HEARTBEAT)
 
     @on(topics.MANAGER_STATUS)
     def manager(self, _status: fm.ManagerStatus, header: Header) -> None:
-        """Note when the manager said this: an old status does not show that it works now."""
+        """Note the stamp of a status: an old one does not show that the manager works now."""
         process = self._process_of(header.source)
         if process is None or header.incarnation != process.incarnation or process.waits:
             return
@@ -236,15 +221,15 @@ class Supervisor(Actor):
 
     @on(topics.ADAPTED_SYSTEM)
     def adapted(self, message: fm.AdaptedSystem, header: Header) -> None:
-        """Fork by the changed system from now on, and start the changed modules anew."""
-        # A manager that died before it was heard counts from an older version.
+        """Use the changed system for later forks, and restart the changed modules."""
+        # The successor of a manager that died after the change counts from an older version.
         version = (header.incarnation, message.version)
         if version <= self._version:
             return
         try:
             layout, _ = adapted_system(self._layout, self.context.run, message)
             self._machine.adapt(message)
-        except (ValueError, OSError) as error:  # it is repeated, and tried again
+        except (ValueError, OSError) as error:  # the manager repeats the message
             self.report_diagnostic("adaptation", " ".join(str(error).split()), message.change)
             return
         self._version = version
@@ -253,37 +238,37 @@ class Supervisor(Actor):
         for unit in {self._layout.unit_of[name] for name in changed} & self._processes.keys():
             process = self._processes[unit]
             process.unit = self._layout.units[unit]
-            if process.step(Event.ADAPTED):  # it was given up: it may do better now
+            if process.step(Event.ADAPTED):  # it was given up, and may work now
                 process.forget_step()
                 process.policy = RestartPolicy(self._spec.supervision)
-            self._tell(process, "adapted", self.name, message.change)
+            self._report(process, "adapted", self.name, message.change)
             self._restart(process, self.name)
 
     @on(topics.RESPAWN)
     def respawn(self, request: fm.RespawnRequest, _header: Header) -> None:
-        """Kill what is left of a node and start it anew, once per failed incarnation."""
+        """Kill and restart a node, once per failed incarnation."""
         process = self._process_of(request.node)
         if process is None:
-            if request.node not in self._layout.unit_of:  # else another host's supervisor answers
+            if request.node not in self._layout.unit_of:  # else the other host's supervisor answers
                 self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
                     request.node, "refused", 0, 0, request.by, clip(f"no node {request.node!r}")))
         elif (process.state in (State.STARTING, State.RUNNING)
               and process.incarnation > request.failed_incarnation):
-            self._tell(process, "respawned", request.by, "already")
+            self._report(process, "respawned", request.by, "already")
         else:
             process.requested_by = request.by
             self._restart(process, request.by)
 
     @on(topics.PROGRAM_END)
     def program_ended(self, message: fm.ProgramEnd, header: Header) -> None:
-        """Take the end of a command's program as that of its incarnation; it is repeated."""
+        """Treat the end of a command's program as the end of its incarnation."""
         process = self._process_of(header.source)
         if process is None or message.pid != process.pid:
             return
         if header.incarnation < process.incarnation:
-            self._tell(process, "respawned", self.name, "already")
+            self._report(process, "respawned", self.name, "already")
         elif process.state is not State.CRASHED and not process.waits:
-            if len(process.names) > 1:  # they share an incarnation
+            if len(process.names) > 1:  # the nodes of a process share an incarnation
                 process.handle.kill()
                 return
             process.stays = True
@@ -293,9 +278,9 @@ class Supervisor(Actor):
 
     @every(_CHECK_S)
     def check(self) -> None:
-        """Look for processes whose loops are silent."""
-        # Silence counts only while this loop turned (one that was stopped, starved or waiting for a
-        # hung spawner has mail to read first), and not if the router died over which it hears all.
+        """Look for processes whose event loops are silent."""
+        # Silence counts only while this event loop worked: after a stop or without a processor it
+        # has messages to read first. Nor does it count if the router died that delivers them.
         self.read_postings()
         now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
         stall_s, self._checked_s = now - self._checked_s - period_s, now
@@ -307,7 +292,7 @@ class Supervisor(Actor):
         if missed_s:
             self.excuse(now, missed_s)
         late = sum(process.is_late(now, self._timeout_s) for process in self._processes.values())
-        # Late loops that still beat are the machine's overload as much as missing heartbeats.
+        # Event loops that are late show an overload as well as missing heartbeats do.
         behind = self._lateness.count(self._spec.timing.heartbeat_timeout_s / 4)
         many = max(late, behind) >= max(MANY, MANY_SHARE * len(self._processes))
         for process in self._processes.values():
@@ -318,12 +303,12 @@ class Supervisor(Actor):
                 self._on(process, event, detail=silence)
 
     def excuse(self, now_s: float, missed_s: float) -> None:
-        """Do not count as silence what could not be received for so long; wall seconds."""
+        """Do not count this time as silence: nothing could be received; wall seconds."""
         for process in self._processes.values():
             process.excuse(now_s, missed_s)
 
     def _look_at_routers(self) -> None:
-        """Find routers that are stopped at once: who is linked to one hears and says nothing."""
+        """Find a stopped router at once: its clients neither receive nor send."""
         self._absence.note(self._loop.time())
         for name in self._routers if not self._absence.excuses(self._loop.time()) else ():
             process = self._processes[name]
@@ -333,25 +318,25 @@ class Supervisor(Actor):
 
     @every(0.5)
     def repeat(self) -> None:
-        """Repeat the node table for those who joined late."""
+        """Repeat the node table for late subscribers."""
         self.publish_table()
         self._lateness.turn()
 
     def _ended(self, process: SupervisedProcess, pid: int, detail: str = "") -> None:
         self._end_programs(process)
-        # Else it was replaced, or is kept no more, since the news came to the mailbox.
-        if process.pid == pid and self._is_kept(process):
-            process.let_go()
+        # Since this came to the mailbox, the process may have been replaced or released.
+        if process.pid == pid and self._supervises(process):
+            process.release()
             process.stays = False
             self._on(process, Event.ENDED, detail=detail)
 
     def _end_programs(self, process: SupervisedProcess) -> None:
-        """End what the program of a command has left, whose process has ended."""
+        """Kill what a program has left behind, if the process of its node has ended."""
         if any(node.command for node in process.unit.nodes):
             kill_orphans(self._plan.launcher_pid)
 
     def _owns(self, process: SupervisedProcess) -> bool:
-        """Whether the supervisor itself brings the process back."""
+        """Whether the supervisor restarts the process by itself."""
         return process.unit.name in self._routers or (
             self._spec.layers.supervisor_respawn
             and process.unit.respawn == SUPERVISOR
@@ -360,18 +345,18 @@ class Supervisor(Actor):
     # -- acting ---------------------------------------------------------------------------------
 
     def _on(self, process: SupervisedProcess, event: Event, by: str = "", detail: str = "") -> None:
-        """Take a process's transition, and do what follows from it."""
+        """Change the state of a process by an event, and carry out the actions."""
         step, by = process.step(event), by or self.name
         if step is None:
             return
         if process.waits or process.state is State.CRASHED:
             process.lives.ended(self._loop.time())
         for action in step.actions:
-            if process.state is not step.state:  # the action before has led elsewhere
+            if process.state is not step.state:  # the last action has changed it again
                 return
             match action:
-                case Action.TELL:
-                    self._tell(process, step.word, by, detail)
+                case Action.REPORT:
+                    self._report(process, step.word, by, detail)
                 case Action.PUBLISH:
                     self.publish_table()
                 case Action.RECOVER:
@@ -380,7 +365,7 @@ class Supervisor(Actor):
                     process.kill()
                 case Action.FORK:
                     self._fork(process, by)
-                case Action.FORK_WHEN_GONE:  # the attempts of one given up are the supervisor's
+                case Action.FORK_WHEN_GONE:  # attempts after giving up are the supervisor's
                     by = self.name if process.state is State.GIVEN_UP else by
                     self._fork_when_gone(process, by, process.delay_s)
                 case Action.HOLD:
@@ -399,7 +384,7 @@ class Supervisor(Actor):
         process.next_step = self.call_later(delay_s * self.clock.rate, step)
 
     def _fork_when_gone(self, process: SupervisedProcess, by: str, delay_s: float = 0.0) -> None:
-        # The socket is free only when the old process is gone: a few more milliseconds.
+        # The old process holds its socket for some milliseconds after the SIGKILL.
         if delay_s > 0 or not (process.stays or process.handle.gone()):
             self._fork_in(process, max(delay_s, _GONE_S),
                           lambda: self._fork_when_gone(process, by))
@@ -410,14 +395,14 @@ class Supervisor(Actor):
         self._fork(process, by)
 
     def _fork(self, process: SupervisedProcess, by: str) -> None:
-        if process.asks:  # the answer is under way
+        if process.is_requested:  # the answer is on its way
             return
         incarnation = process.highest + 1
         answer = partial(self._forked, process, by, incarnation)
         if process.stays:
             answer(process.pid, "")
             return
-        process.asks = True
+        process.is_requested = True
         try:
             self._machine.fork(process.names, incarnation, answer)
         except OSError as error:
@@ -425,8 +410,9 @@ class Supervisor(Actor):
 
     def _forked(self, process: SupervisedProcess, by: str, incarnation: int, pid: int, error: str
                 ) -> None:
-        process.asks = False
-        if pid and not (process.waits and self._is_kept(process)):
+        process.is_requested = False
+        is_wanted = process.waits and self._supervises(process)
+        if pid and not is_wanted:
             kill(pid)
         elif pid:
             event = Event.FORKED if process.highest else Event.STARTED
@@ -435,16 +421,16 @@ class Supervisor(Actor):
             attempt = process.policy.attempts
             self._on(process, event, by,
                      f"attempt {attempt} since it was given up" if attempt else "")
-        elif process.waits and self._is_kept(process):
+        elif is_wanted:
             self.report_diagnostic("fork", error, process.unit.name)
             self._fork_in(process, _RETRY_S, lambda: self._fork(process, by))
 
     def _adopt_living(self, process: SupervisedProcess, living: Sequence[RunProcess]) -> bool:
-        """Adopt the highest incarnation that is there and end the others; False without any."""
+        """Adopt the highest living incarnation and kill the others; False if none lives."""
         found = sorted((p for p in living if p.names == process.names),
                        key=lambda p: -p.incarnation)
         for other in found[1:]:
-            with contextlib.suppress(OSError):  # gone, or for the next search
+            with contextlib.suppress(OSError):  # it has ended, or no descriptor is left
                 handle = self._machine.hold(other.pid, lambda: None)
                 handle.kill()
                 handle.close()
@@ -455,31 +441,31 @@ class Supervisor(Actor):
         return bool(found)
 
     def _hold(self, process: SupervisedProcess, pid: int) -> None:
-        if process.pid != pid:  # it was replaced while this waited
+        if process.pid != pid:  # it was replaced meanwhile
             return
-        process.let_go()
+        process.release()
         try:
             process.handle = self._machine.hold(pid, lambda: self._dispatcher.put(
                 f"exit {pid}", lambda: self._ended(process, pid)))
         except ProcessLookupError:
             self._ended(process, pid, "it ended before it could be watched")
-        except OSError as error:  # no descriptor left: perhaps later
+        except OSError as error:  # no descriptor is left; tried again later
             process.handle = ProcessHandle(is_gone=False)
             self.report_diagnostic("hold", str(error), process.unit.name)
             self.call_later(_RETRY_S * self.clock.rate, lambda: self._hold(process, pid))
         else:
-            if process.waits or not self._is_kept(process):
+            if process.waits or not self._supervises(process):
                 process.kill()
 
-    # -- what it says ---------------------------------------------------------------------------
+    # -- reports --------------------------------------------------------------------------------
 
-    def _tell(self, process: SupervisedProcess, event: str, by: str, detail: str = "") -> None:
+    def _report(self, process: SupervisedProcess, event: str, by: str, detail: str = "") -> None:
         for node in process.unit.nodes:
             self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
                 node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
     def rows(self) -> tuple[fm.NodeInfo, ...]:
-        """Return itself, and the nodes that it keeps."""
+        """Return the rows of the node table: its own, and those of its nodes."""
         own = fm.NodeInfo(
             self.name, Kind.SUPERVISION.value, self.context.pid, fm.NodeState.RUNNING,
             self._incarnation, restarts_of(self._incarnation), self._lateness.of(self.name))
@@ -494,5 +480,5 @@ class Supervisor(Actor):
             overflowed=beat[1].overflowed)
 
     def publish_table(self) -> None:
-        """Publish what it keeps."""
+        """Publish the node table."""
         self.publish(topics.NODES, fm.NodeTable(self.rows()))

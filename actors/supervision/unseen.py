@@ -1,8 +1,8 @@
-"""Nothing that runs on an event loop ends unseen: neither a task nor a callback.
+"""Reports of failed tasks and callbacks of an event loop.
 
-asyncio tells of a task's failure when its result is asked for or when it is collected, which
-may be never, and of a callback's on a log that is not shown. Here a failed callback is told in one
-line, and the end of a task that is to run as long as the loop is given to those who can act on it.
+asyncio reports a failed task only when its result is read or when it is collected, which may be
+never. It reports a failed callback to a log that is not shown. Here each failed callback makes one
+line, and the end of a task that should last as long as the loop calls a function.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 _DISTINCT = 100
-"""So many different failures of callbacks are told, each once; a flood of them is not."""
+"""How many different failures of callbacks are reported, each once."""
 
 
 def watch(task: asyncio.Task[Any], what: str, ended: Callable[[str], None]) -> None:
-    """Have `ended` called with one line when a task ends that was not cancelled."""
+    """Call `ended` with one line when a task ends without having been cancelled."""
 
     def done(task: asyncio.Task[Any]) -> None:
         if not task.cancelled():
@@ -26,17 +26,17 @@ def watch(task: asyncio.Task[Any], what: str, ended: Callable[[str], None]) -> N
     task.add_done_callback(done)
 
 
-def tell_of_callbacks(loop: asyncio.AbstractEventLoop, tell: Callable[[str], None]) -> None:
-    """Have `tell` called with one line for what a callback of the loop raises."""
-    told: set[str] = set()
+def report_callbacks(loop: asyncio.AbstractEventLoop, report: Callable[[str], None]) -> None:
+    """Call `report` with one line for each exception that a callback of the loop raises."""
+    reported: set[str] = set()
 
     def handle(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
         line = str(context.get("message", "a callback failed")) + (
             f": {describe(error)}" if error else "")
-        if line not in told and len(told) < _DISTINCT:
-            told.add(line)
-            tell(line)
+        if line not in reported and len(reported) < _DISTINCT:
+            reported.add(line)
+            report(line)
 
     loop.set_exception_handler(handle)
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from rampart.actors.supervision.root import needed_descriptors
+from rampart.actors.supervision.root import needed_of
 from rampart.cli.output import print_json, print_table
 from rampart.cli.verbs import JSON, add_verb
 
@@ -129,7 +129,7 @@ def folders() -> Iterator[Finding]:
 def limits() -> Iterator[Finding]:
     """Look at what this user may do."""
     _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed = needed_descriptors(PROCESSES)
+    needed = needed_of(resource.RLIMIT_NOFILE, PROCESSES)
     yield _finding("open files", f"hard limit {files}", there=files >= needed, needed=True,
                    cost=f"the full system needs {needed}: ulimit -Hn {needed}")
     _, nice = resource.getrlimit(resource.RLIMIT_NICE)

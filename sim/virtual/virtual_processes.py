@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
@@ -225,14 +225,6 @@ class VirtualMachine:
             return Usage("X", 0.0, 0.0)
         stopped = process.condition is Condition.STOPPED
         return Usage("T" if stopped else "S", min(self._loop.time(), process.held_s), 0.0)
-
-    def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:  # noqa: ARG002
-        """End processes."""
-        for handle in handles:
-            handle.kill()
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
     # -- what can happen to a process -----------------------------------------------------------
 

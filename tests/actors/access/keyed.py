@@ -22,7 +22,7 @@ from rampart.actors.access.certificates import new_authority, new_certificate
 from rampart.actors.access.rules import access_of
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, endpoint, session_config
 from rampart.actors.runtime.run_plan import RunPlan, load_system
-from rampart.actors.supervision.root import kept_ports
+from rampart.actors.supervision.root import reserve_ports
 from rampart.actors.system.layout import Layout
 from tests import ROOT
 
@@ -110,7 +110,7 @@ class Keyed:
 
     def __init__(self, folder: str, keys: Path, layout: Layout, where: str = "127.0.0.1"):
         self.folder, self.keys, self.layout = folder, keys, layout
-        self._kept = kept_ports(9_000)
+        self._kept = reserve_ports(9_000)
         self.port = self._kept[0].getsockname()[1]
         self.at = f"tls/{where}:{self.port}"
         self.socket = endpoint(folder, "router_a")

@@ -11,7 +11,7 @@ from rampart.actors.access.register import read_register
 from rampart.actors.access.rights import rights_of_all
 from rampart.actors.access.rules import Host, config_of, rules_of
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in, session_config
-from rampart.actors.supervision.root import kept_ports
+from rampart.actors.supervision.root import reserve_ports
 from tests.actors.access.keyed import layout_of, make_keys, opened, wait_for
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
@@ -27,7 +27,7 @@ class Hosts:
 
     def __init__(self, keys):
         self.keys = keys
-        self.kept = kept_ports(9_100)
+        self.kept = reserve_ports(9_100)
         self.at = {name: f"tls/127.0.0.1:{kept.getsockname()[1]}"
                    for name, kept in zip(("router_a", "router_a_ground"), self.kept, strict=True)}
 

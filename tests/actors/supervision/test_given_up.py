@@ -115,12 +115,12 @@ def test_a_node_is_failing_whose_last_processes_worked_for_a_short_time_only(
     for count, worked_s in works:
         for _ in range(count):
             one.forked()
-            one.heard(now_s + 9.0)  # a cold start of nine seconds counts for nothing
+            one.worked(now_s + 9.0)  # a cold start of nine seconds counts for nothing
             now_s += 9.0 + worked_s
             one.ended(now_s)
             one.ended(now_s + 5.0)
     one.forked()
-    one.heard(now_s)
+    one.worked(now_s)
     assert one.failing(now_s + present_s) == failing
 
 

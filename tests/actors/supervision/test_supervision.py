@@ -31,7 +31,7 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
 from rampart.cli.operate import kill_node
 from rampart.testing import eventually
-from tests.stub_actors import launched, stub_plan, write_stub_system
+from tests.stub_actors import IdlePose, launched, stub_plan, write_stub_system
 
 pytestmark = [pytest.mark.processes, pytest.mark.asyncio(loop_scope="module")]
 
@@ -198,7 +198,7 @@ async def test_the_world_and_nobody_else_goes_before_others_where_that_is_permit
     assert set().union(*nice.values()) == {own}
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
 async def test_the_supervisor_comes_back_and_adopts_the_living(witness, port, number):
     before = witness.pids()
     async with witness.comes_back("supervisor"):
@@ -292,10 +292,20 @@ def _catches(pid: int, number: signal.Signals) -> bool:
     return bool(int(caught, 16) >> number - 1 & 1)
 
 
-async def test_an_orderly_end_leaves_no_process_and_routers_end_last(tmp_path):
-    """And close no session, which makes Zenoh panic."""
+class Farewell(IdlePose):
+    """Writes a file when it is asked to end."""
+
+    def on_stop(self) -> None:
+        Path(self.context.run.plan.system_file).with_name("farewell").touch()
+
+
+async def test_an_orderly_end_stops_nodes_and_then_routers_also_with_a_hung_supervisor(tmp_path):
+    """And routers close no session, which makes Zenoh panic."""
     order: list[str] = []
-    async with running(tmp_path) as (launcher, witness):
+    file = tmp_path / "farewell.toml"
+    file.write_text(write_stub_system(tmp_path).read_text().replace(
+        "tests.stub_actors:IdlePose", "tests.actors.supervision.test_supervision:Farewell"))
+    async with running(tmp_path, system_file=str(file)) as (launcher, witness):
         os.kill(witness.pid("DM6"), signal.SIGSTOP)
         assert await asyncio.to_thread(find_runs)
         port, names = launcher.plan.base_port, ("DM1", "DM5", "RM1", *ROUTERS)
@@ -310,6 +320,8 @@ async def test_an_orderly_end_leaves_no_process_and_routers_end_last(tmp_path):
                     os.close(one)
 
         looking = asyncio.create_task(asyncio.to_thread(look))
+        os.kill(process(port, "supervisor"), signal.SIGSTOP)
+    assert (tmp_path / "farewell").exists()
     await asyncio.wait_for(looking, 12)
     assert set(order[-2:]) == set(ROUTERS)
     assert find_processes(port) == []

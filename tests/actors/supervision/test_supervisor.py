@@ -88,7 +88,6 @@ class Machine:
         self.is_slow = False
         self.waiting: list[Callable[[], None]] = []
         self.hold_error: Exception | None = None
-        self.ended: list[str] = []
         self.starving: set[str] = set()
         self.starves_from_s = 0.0
         self.turning = False
@@ -147,15 +146,6 @@ class Machine:
         return Handle(self, process, ended)
 
     def adapt(self, adapted: AdaptedSystem) -> None:
-        pass
-
-    def end(self, handles: Sequence[Handle], grace_s: float) -> None:
-        for handle in handles:
-            if isinstance(handle, Handle):  # else there was no process, or no descriptor for it
-                self.ended.append(handle._process.names[0])
-                handle.kill()
-
-    def close(self) -> None:
         pass
 
 
@@ -261,7 +251,6 @@ async def test_a_supervisor_that_fails_ends_nobody_and_its_next_life_adopts_all(
         world.supervisor.context.bus.publish = publish
     with contextlib.suppress(RuntimeError):
         await world.task
-    assert world.machine.ended == []
     assert set(world.machine.processes) - {killed.pid} == {
         p.pid for p in world.machine.processes.values() if not p.killed}
     world.machine.fork_error = None
@@ -270,14 +259,6 @@ async def test_a_supervisor_that_fails_ends_nobody_and_its_next_life_adopts_all(
     after = {p.pid for p in world.machine.processes.values() if not p.killed}
     assert len(after) == len(before)
     assert len(before - after) == 1
-
-
-@within(running)
-async def test_a_supervisor_that_is_told_to_stop_ends_all_in_reverse(world):
-    started = [p.names[0] for p in world.machine.processes.values()]
-    world.supervisor.stop()
-    await world.task
-    assert world.machine.ended == started[::-1]
 
 
 @pytest.mark.parametrize("way", ["silent", "repeats old news"])

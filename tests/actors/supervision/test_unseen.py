@@ -16,8 +16,8 @@ from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import load_system
 from rampart.actors.supervision.process_title import find_processes
-from rampart.actors.supervision.root import needed_descriptors
-from rampart.actors.supervision.unseen import tell_of_callbacks, watch
+from rampart.actors.supervision.root import needed_of
+from rampart.actors.supervision.unseen import report_callbacks, watch
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.process_run import ProcessRun
 from rampart.testing import free_base_port
@@ -69,7 +69,7 @@ async def test_the_end_of_a_task_is_told_unless_it_was_cancelled():
 async def test_what_a_callback_raises_is_told_once_and_a_flood_of_it_is_bounded():
     told: list[str] = []
     loop = asyncio.get_running_loop()
-    tell_of_callbacks(loop, told.append)
+    report_callbacks(loop, told.append)
     for _ in range(3):
         loop.call_soon(fail, "again")
     await turns()
@@ -143,7 +143,7 @@ async def test_a_run_may_open_as_many_files_as_the_hard_limit_allows(tmp_path):
 @pytest.mark.processes
 @pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"),
                     reason="only root can be a user who may start no process")
-@pytest.mark.parametrize("processes", [1, 3])
+@pytest.mark.parametrize("processes", [1, 3, 4, 12, 60])
 def test_a_run_that_may_start_too_few_processes_is_refused_in_one_line(tmp_path, processes):
     reads_all = ["--inh-caps=-all,+dac_override", "--ambient-caps=-all,+dac_override"]
     result = subprocess.run(
@@ -163,4 +163,5 @@ def test_a_run_that_may_open_too_few_files_is_refused_in_one_line(tmp_path):
          "--report", str(tmp_path / "report")],
         check=False, capture_output=True, text=True, timeout=60)
     assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
-    assert f"the hard limit is 64, and 23 processes need {needed_descriptors(23)}" in result.stderr
+    needed = needed_of(resource.RLIMIT_NOFILE, 23)
+    assert f"the hard limit is 64, and 23 processes need {needed}" in result.stderr
