@@ -1,7 +1,7 @@
-"""The socket by which a command without any client library publishes and hears.
+"""The socket by which a command publishes and subscribes without a client library.
 
-One packet is one message: a line with the key, below `rampart/`, then the body as JSON. From the
-command the line is `KEY` or `KEY STAMP`, to it `KEY STAMP SOURCE INCARNATION`.
+A packet is a message: a line with the key, without `rampart/`, then the body as JSON. The line from
+the command is `KEY` or `KEY STAMP`. The line to it is `KEY STAMP SOURCE INCARNATION`.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from rampart.actors.bus.envelope import AHEAD_S, UNREADABLE, Header
 from rampart.actors.bus.topic import Qos, Topic
 
 MAX_PACKET = 160_000
-"""Bytes of a message; what the kernel takes at once by default has room for it."""
+"""Bytes of a message; it fits into a socket buffer of default size."""
 
 _PACKETS_AT_ONCE = 16
-"""Before the loop turns: a flood of them stops nothing else."""
+"""Packets read in one turn of the event loop, so a flood does not block it."""
 
 _WAITING = 256
-"""Messages that wait for a command which does not read."""
+"""Messages that wait for a command that does not read."""
 
 
 class Channel:
     """The node's end of the socket of a command.
 
     Args:
-        publishes: topics by the keys that it may publish.
-        take: called with key, topic, body and stamp (None: now) of each sound message.
-        refuse: called with key and reason of each other one.
-        now: returns simulated seconds.
+        publishes: Topics by the keys that the command may publish.
+        take: Called with key, topic, body and stamp (None: now) of each valid message.
+        refuse: Called with key and reason of each other message.
+        now: Returns simulated seconds.
 
     Attributes:
-        other: the command's end, to be closed when it was inherited.
+        other: The command's end; closed here once the command has inherited it.
     """
 
     def __init__(self, publishes: Mapping[str, Topic[Any]],
@@ -57,19 +57,19 @@ class Channel:
         self._loop.add_reader(self.mine, self._readable)
 
     def close(self) -> None:
-        """Hear and say nothing more."""
+        """Close both ends."""
         self._loop.remove_reader(self.mine)
         self._loop.remove_writer(self.mine)
         self._waiting.clear()
         self.mine.close()
         self.other.close()
 
-    def say(self, key: str, topic: Topic[Any], body: msgspec.Struct, header: Header) -> None:
-        """Send a message to the command; of sensors and states the newest waits for it."""
+    def send(self, key: str, topic: Topic[Any], body: msgspec.Struct, header: Header) -> None:
+        """Send a message to the command. Commands queue; of other topics only the newest waits."""
         line = f"{key} {header.stamp!r} {header.source} {header.incarnation}\n"
         packet = line.encode() + msgspec.json.encode(body)
         if len(packet) > MAX_PACKET:
-            self._refuse(key, f"{len(packet)} bytes are too many for a packet, {MAX_PACKET} fit")
+            self._refuse(key, f"packet of {len(packet)} bytes; at most {MAX_PACKET} are allowed")
             return
         if not self._waiting and self._sent(packet):
             return
@@ -93,7 +93,7 @@ class Channel:
             self.mine.send(packet)
         except (BlockingIOError, InterruptedError):
             return False
-        except OSError:  # it has closed its end: its exit, if it is one, is told elsewhere
+        except OSError:  # it has closed its end; `ProgramProcess` reports an exit
             pass
         return True
 
@@ -117,7 +117,7 @@ class Channel:
 
     def _receive(self, packet: bytes) -> None:
         first, _, body = packet.partition(b"\n")
-        key, _, said = first.decode(errors="replace").strip().partition(" ")
+        key, _, stamp_text = first.decode(errors="replace").strip().partition(" ")
         topic = self._topics.get(key)
         if topic is None:
             known = ", ".join(self._topics) or "none"
@@ -127,12 +127,12 @@ class Channel:
             self._refuse(key, f"more than {MAX_PACKET} bytes")
             return
         try:
-            stamp = float(said) if said else None
+            stamp = float(stamp_text) if stamp_text else None
             message = self._decoders[key].decode(body)
         except UNREADABLE as error:
             self._refuse(key, f"not a {topic.type.__name__}: {error}")
             return
         if stamp is not None and not (math.isfinite(stamp) and stamp - self._now() <= AHEAD_S):
-            self._refuse(key, f"stamp {said}: simulated seconds, not ahead of now, are right")
+            self._refuse(key, f"stamp {stamp_text}: expected simulated seconds, not ahead of now")
             return
         self._take(key, topic, message, stamp)

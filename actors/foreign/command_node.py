@@ -1,11 +1,10 @@
-"""A node that is a command: the actor that stands for it, and starts and ends its program.
+"""A node that is a command: an actor that represents the node, and starts and ends its program.
 
-For the rest of the system this actor is the node: it sends the heartbeat, and publishes what the
-program sends on its socket, so that faults can be injected into it and recorders and other nodes
-find it. When the program ends, or hangs and is killed for that, the incarnation has failed: the
-actor reports that to the supervisor and stays. It starts the program again, as the next
-incarnation, when the supervisor has decided that. When this actor ends, however it does, so does
-the program with all that it has forked.
+For the rest of the system this actor is the node. It sends the heartbeat, and publishes what the
+program sends on its socket, so faults, recorders and other nodes treat it like any node. If the
+program ends, or hangs and is killed, the incarnation has failed. The actor reports that to the
+supervisor and stays. When the supervisor decides so, it starts the program again, as the next
+incarnation. When this actor ends in any way, the program ends with everything that it has forked.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class CommandNode(Actor):
     """Runs a command as a node."""
 
     class Parameters(Actor.Parameters, frozen=True):
-        """What the table of the node says of the command; see `rampart.manager.spec.nodes`."""
+        """The command, by the table of its node; see `rampart.manager.spec.nodes`."""
 
         command: tuple[str, ...]
         env: dict[str, str] = {}
@@ -66,14 +65,14 @@ class CommandNode(Actor):
         self._notify: NotifySocket | None = None
         self._pulse = self._new_pulse()
         self._failure = ""  # of this incarnation
-        if self._heartbeat.topic:  # by a client of its own; by its socket see `_take`
+        if self._heartbeat.topic:  # from its own client; for its socket see `_take`
             self.hear_topic(self._heartbeat.topic, self._own_topic)
         for key in self.parameters.hears:
             self.hear_topic(key, partial(self._pass_on, key))
 
     @classmethod
     def own_keys(cls, parameters: Any) -> tuple[str, ...]:
-        """Hear the heartbeat of a command with a Zenoh client of its own."""
+        """Subscribe to the heartbeat of a command that has its own Zenoh client."""
         beat = parameters.heartbeat
         return (beat.key,) if beat is not None and beat.key else ()
 
@@ -86,7 +85,7 @@ class CommandNode(Actor):
         self._start()
 
     def is_well(self) -> bool:
-        """Whether the program is there and shows that it works; one that hangs is killed."""
+        """Whether the program lives and shows that it works; kills a program that hangs."""
         if self._failure or self._program is None:
             self._report_failure()
             return False
@@ -94,19 +93,19 @@ class CommandNode(Actor):
             self._alive()
         if self._pulse.is_well(self.clock.now()):
             return True
-        silent = f"for {self._pulse.limit_s:g} s"
+        limit = f"for {self._pulse.limit_s:g} s"
         if self._program.is_stopped:
-            self._failure = f"was stopped {silent}"
-        elif self._pulse.heard:
-            self._failure = f"hung: not heard {silent}"
+            self._failure = f"was stopped {limit}"
+        elif self._pulse.has_beaten:
+            self._failure = f"hung: no heartbeat {limit}"
         else:
-            self._failure = (f"hung: not heard {silent} after its start; a larger startup_grace_s "
-                             "in [timing] gives it more time")
+            self._failure = (f"hung: no heartbeat {limit} after its start; a larger "
+                             "startup_grace_s in [timing] gives it more time")
         self._program.kill()
         return False
 
     def on_stop(self) -> None:
-        """End the program, and everything that it has forked."""
+        """End the program and everything that it has forked."""
         if self._program is not None:
             self._program.end()
         self._close()
@@ -114,7 +113,7 @@ class CommandNode(Actor):
 
     @on(PROCESS_EVENT)
     def respawned(self, message: ProcessEvent, _header: Header) -> None:
-        """Start the program again when the supervisor has decided that it is to be."""
+        """Start the program again when the supervisor decides so."""
         if (message.node, message.event, message.pid) == (
                 self.name, "respawned", self.context.pid
                 ) and message.incarnation > self._incarnation and self._program is None:
@@ -141,24 +140,22 @@ class CommandNode(Actor):
         who = f"{self.name} #{self._incarnation}"
         try:
             self._program = ProgramProcess(
-                program, parameters.command, folder=folder,
+                program, parameters.command[1:], folder=folder,
                 environment=self._environment(channel.other.fileno()), limits=parameters.limits,
                 log=self._log, inherited=[channel.other.fileno()], ended=self._ended)
-        except FileNotFoundError:  # the file itself was there a moment ago
-            self._failed("cannot be started: there is no interpreter as its first line names it")
         except (OSError, ValueError) as error:
             self._failed(f"cannot be started: {getattr(error, 'strerror', None) or error}")
         else:
             channel.other.close()
             self._log.note(f"{who} is process {self._program.pid}")
-            if self._notify is not None:  # not before: a sender has to be below the program
+            if self._notify is not None:  # only now: a sender has to be a descendant
                 asyncio.get_running_loop().add_reader(self._notify.socket, self._notified)
 
     def _environment(self, channel: int) -> Mapping[str, str]:
-        """Return the variables of this process, those of the node, and those of the run.
+        """Return the variables of this process, of the node, and of the run.
 
-        Without the search path for modules, by which the processes of a run find this Rampart:
-        another virtual environment has its own.
+        PYTHONPATH is left out: it leads to this Rampart, and the program may have another virtual
+        environment.
         """
         inherited = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         plan = self.context.run.plan
@@ -183,7 +180,7 @@ class CommandNode(Actor):
         self._failed(self._failure or how)
 
     def _failed(self, why: str) -> None:
-        """Note why this incarnation has failed, and report it until there is another one."""
+        """Note why this incarnation has failed, and report that until the next one starts."""
         self._close()
         self._program = None
         self._failure = clip(f"{self.parameters.command[0]} {why}; `rampart node log {self.name}`"
@@ -203,13 +200,13 @@ class CommandNode(Actor):
         self._channel = self._notify = None
 
     def _make_log_folder(self) -> None:
-        """Make the folder for its output; a link in the folder of the run leads tools there."""
+        """Make the folder for output, and a link to it in the folder of the run, for tools."""
         plan = self.context.run.plan
         folder, here = log_folder(plan), Path(plan.folder, LOGS)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            self.report_diagnostic("command", f"its output is not kept: {error}", self.name)
+            self.report_diagnostic("command", f"its output is not stored: {error}", self.name)
         if plan.folder and here != folder:
             with contextlib.suppress(FileExistsError):
                 here.symlink_to(folder)
@@ -217,7 +214,7 @@ class CommandNode(Actor):
     # -- its heartbeat --------------------------------------------------------------------------
 
     def _alive(self) -> None:
-        """Note that it shows that it works; what it has forked cannot while it is stopped."""
+        """Note a heartbeat; while the program is stopped, only its children can send one."""
         if self._program is not None and not self._program.is_stopped:
             self._pulse.beat()
 
@@ -252,4 +249,4 @@ class CommandNode(Actor):
 
     def _pass_on(self, key: str, message: Any, header: Header) -> None:
         if self._channel is not None:
-            self._channel.say(key, self.chosen_topic(key), message, header)
+            self._channel.send(key, self.chosen_topic(key), message, header)

@@ -1,9 +1,9 @@
-"""What programs of commands have forked, found in /proc and killed.
+"""Descendants of programs: found in /proc, and killed.
 
-The process of a command's node is the subreaper of its program (prctl(2)): whatever is forked below
-it, in any session, stays below it. When that process itself has ended, the root of the run adopts
-what is left. All of that is in sessions of its own, which the root and the nodes never are: a
-program is started in one, and no process can go back into the session of another.
+The process of a command's node is the subreaper of its program (prctl(2)), so everything that the
+program forks, in any session, stays below it. When the node's process ends, the root of the run
+adopts the rest. A program starts in its own session, which the root and the nodes do not share, and
+no process can join the session of another. So the root's orphans are known by their sessions.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from collections.abc import Callable, Iterable
 from rampart.actors.machine.unix_peer import stat_fields
 
 END_S = 2.0
-"""Wall seconds in which what was killed has to be gone; what is not waits for a disk."""
+"""Wall seconds in which a killed process has to be gone; a process that is not waits for a disk."""
 
 
 def _living() -> dict[int, tuple[int, int]]:
-    """Return parent and session of each process that has not ended."""
+    """Return parent and session of each living process."""
     pids = [int(entry.name) for entry in os.scandir("/proc") if entry.name.isdecimal()]
     return {pid: found for pid in pids if (found := _parent_and_session(pid))}
 
@@ -43,19 +43,19 @@ def _below(living: dict[int, tuple[int, int]], tops: Iterable[int]) -> set[int]:
 
 
 def descendants(*of: int) -> set[int]:
-    """Return the living processes below these."""
+    """Return the living descendants of these processes."""
     return _below(_living(), of) - set(of)
 
 
 def is_below(pid: int, top: int) -> bool:
-    """Whether a living process is below another one."""
+    """Whether a process lives and is a descendant of another one."""
     while pid != top and (found := _parent_and_session(pid)):
         pid = found[0]
     return pid == top
 
 
 def kill_all(find: Callable[[], Iterable[int]], within_s: float = END_S) -> bool:
-    """Kill what is found until nothing is; False if something is left after so many seconds."""
+    """Kill until `find` returns nothing; False if something is left after `within_s`."""
     until_s = time.monotonic() + within_s
     while left := list(find()):
         for pid in left:
@@ -68,13 +68,13 @@ def kill_all(find: Callable[[], Iterable[int]], within_s: float = END_S) -> bool
 
 
 def kill_programs(nodes: Iterable[int]) -> None:
-    """Kill what is below the processes of a run."""
+    """Kill all descendants of the processes of a run."""
     tops = list(nodes)
     kill_all(lambda: descendants(*tops))
 
 
 def kill_orphans(root: int) -> None:
-    """Kill what the root of a run has adopted from nodes that have ended; nothing if it is 0."""
+    """Kill what the root of a run has adopted from nodes that have ended; 0 is no root."""
     if root == 0:
         return
 

@@ -1,4 +1,4 @@
-"""The log of a program's output: a file of bounded size and rate, with the one before it."""
+"""The log of a program's output: a file of bounded size and rate, and the file before it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pathlib import Path
 LOG_BYTES = 5_000_000
 LOG_BYTES_PER_S = 1_000_000
 BURST_BYTES = 2_000_000
-"""So much at once, before `LOG_BYTES_PER_S` counts."""
+"""Bytes that may come at once, before `LOG_BYTES_PER_S` applies."""
 
 _NOTE_BYTES = 2000
 
 
 class OutputLog:
-    """A file of bounded size, with the one before it as `FILE.1`. No disk that fails ends anything.
+    """A file of bounded size, and the file before it as `FILE.1`. A failing disk raises nothing.
 
     Args:
         path: Of the file.
@@ -33,7 +33,7 @@ class OutputLog:
         self._at_s = time.monotonic()
 
     def write(self, data: bytes) -> None:
-        """Keep output, or count it where it is too much."""
+        """Write output; count it instead if there is too much."""
         now_s = time.monotonic()
         self._room = min(self._room + (now_s - self._at_s) * LOG_BYTES_PER_S, float(BURST_BYTES))
         self._at_s = now_s
@@ -47,7 +47,7 @@ class OutputLog:
             self._left_out += len(data)
 
     def note(self, text: str) -> None:
-        """Write a line that the program has not printed, whatever the rate."""
+        """Write a line that the program has not printed, at any rate."""
         self._room = max(self._room, float(_NOTE_BYTES))
         when = time.strftime("%Y-%m-%d %H:%M:%S")
         self.write(f"--- {when} {text}\n".encode(errors="replace")[:_NOTE_BYTES])
@@ -68,7 +68,7 @@ class OutputLog:
         return True
 
     def _open(self) -> None:
-        """Open the file, or the next one; at any time there is a file of that name."""
+        """Open the file, or the next one. A reader finds a file of that name at any time."""
         is_full = self._file >= 0
         self.close()
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC

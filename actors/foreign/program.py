@@ -1,4 +1,4 @@
-"""Which program the command of a node is, where it runs, and where its output is kept."""
+"""The program of a command: its file, its folder, and the place of its output."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import SpecificationError
 
 LOGS = "logs"
-"""Name of the folder with the output of commands, and of a link to it in the folder of the run."""
+"""Name of the folder with the output of commands, and of the link to it in the run folder."""
 
 
 def check_programs(plan: RunPlan, spec: SystemSpec) -> None:
-    """Make sure that the program of every command can be executed.
+    """Check that the program of every command is executable.
 
     Raises:
-        SpecificationError: one cannot; the message names file, node and program.
+        SpecificationError: A program is not; the message names file, node and program.
     """
     for node in spec.nodes:
         if node.command and (flaw := _flaw(plan, node)):
@@ -28,17 +28,17 @@ def check_programs(plan: RunPlan, spec: SystemSpec) -> None:
 
 
 def folder_of(plan: RunPlan, folder: str) -> Path:
-    """Return in which folder a command runs: one relative to that of the system's file."""
+    """Return the working directory of a command; it is relative to the system's file."""
     return Path(plan.system_file).resolve().parent / folder
 
 
 def find_program(name: str, folder: Path, path: str | None = None) -> str | None:
-    """Return the path of a program, None if nothing that can be executed has its name.
+    """Return the path of a program, None if no executable file has the name.
 
     Args:
-        name: With a slash in it relative to the folder, else one to be looked for in `PATH`.
-        folder: In which it runs.
-        path: Of its environment, if that says one.
+        name: Relative to the folder if it has a slash, else searched in `PATH`.
+        folder: Working directory of the command.
+        path: `PATH` of its environment, if that has one.
     """
     if "/" in name:
         found = folder / name
@@ -47,7 +47,7 @@ def find_program(name: str, folder: Path, path: str | None = None) -> str | None
 
 
 def log_folder(plan: RunPlan) -> Path:
-    """Return where the output of commands is kept: beside the report, if there is one."""
+    """Return the folder for the output of commands: beside the report, if there is one."""
     return (Path(plan.error_log).parent if plan.error_log else Path(plan.folder)) / LOGS
 
 
@@ -63,5 +63,5 @@ def _flaw(plan: RunPlan, node: NodeSpec) -> tuple[str, object, str] | None:
         return "command", command, f"no program {name!r} in PATH; one in the folder is './{name}'"
     file = folder / name
     if file.is_file():
-        return "command", command, f"{file} is not executable; chmod +x makes it so"
+        return "command", command, f"{file} is not executable; use chmod +x"
     return "command", command, f"no such file: {file}"

@@ -1,12 +1,16 @@
-"""The process of a command's program, as the process of its node holds it.
+"""The process of a command's program, as a child of its node's process.
 
-The node's process is parent and subreaper of all that the program forks, whatever session that puts
-itself into: when the program has ended, all of it is killed before anything else follows. If the
-node's process is killed, the kernel kills the program; see `descendants` for what that had forked.
-When the root of the run ends, the node's process is asked to end (SIGTERM, others are killed), for
-what its program has forked could not be found any more.
+The node's process is the parent of the program and the subreaper of everything that the program
+forks, in any session. When the program ends, the node's process kills all of that before it reports
+the end. If the node's process is killed, the kernel kills the program, and `descendants` deals with
+the rest. When the root of the run ends, the node's process gets a SIGTERM instead of a SIGKILL:
+afterwards nothing could find what the program has forked.
 
-Output is read as fast as it comes, so the program never waits for that.
+The program never waits for a reader of its output, which is read at once.
+
+It starts by `setpriv` (util-linux), which sets its PR_SET_PDEATHSIG, and gets its limits by
+prlimit(2). Python's `preexec_fn` could do both. But it needs a fork of this process with all its
+memory, 4 to 9 ms, and is not safe beside the threads of Zenoh.
 """
 
 from __future__ import annotations
@@ -14,9 +18,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ctypes
+import errno
 import math
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import time
@@ -29,14 +35,15 @@ from rampart.actors.machine.unix_peer import process_state
 from rampart.manager.spec.nodes import ChildLimits
 
 GRACE_S = 0.3
-"""Wall seconds that a program has to end in order, when it is asked to by SIGTERM."""
+"""Wall seconds that a program has to end after a SIGTERM."""
 
 _READ_BYTES = 1 << 16
 _READS_AT_ONCE = 64
+_MEGABYTE = 1_000_000
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 _libc = ctypes.CDLL(None, use_errno=True)
-_reported: dict[int, Callable[[int], None]] = {}
-"""By program, what to call with its status when it has ended."""
+_programs: dict[int, Callable[[int], None]] = {}
+"""The living programs by pid; each call receives the exit status."""
 
 
 class ProgramProcess:
@@ -44,17 +51,17 @@ class ProgramProcess:
 
     Args:
         program: Path of the file.
-        arguments: As the program gets them, its name first.
-        folder: In which it runs.
-        environment: All of it.
-        limits: What it may use.
-        log: Takes its output.
-        inherited: Descriptors that it gets.
-        ended: Called on the event loop, when nothing of it is left, with how it has ended.
+        arguments: Of the program, without its name.
+        folder: Its working directory.
+        environment: All of its variables.
+        limits: Of its resources.
+        log: Receives its output.
+        inherited: Descriptors that it inherits.
+        ended: Called on the event loop with how it has ended, when nothing of it is left.
 
     Raises:
         OSError: It cannot be started.
-        ValueError: A limit is above what this process may set.
+        ValueError: A limit is above the hard limit of this process.
     """
 
     def __init__(self, program: str, arguments: Sequence[str], *, folder: Path,
@@ -64,40 +71,45 @@ class ProgramProcess:
         self._ended = ended
         self._loop = asyncio.get_running_loop()
         self._loop.add_signal_handler(signal.SIGCHLD, _reap)
+        for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+            signal.signal(number, lambda *_: None)  # a program would inherit SIG_IGN
         _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+        most = _limits(limits)
         output, printed = os.pipe()
         try:
-            process = subprocess.Popen(  # noqa: S603 what the system names
-                arguments, executable=program, cwd=folder, env=environment,
-                stdin=subprocess.DEVNULL, stdout=printed, stderr=printed, pass_fds=inherited,
-                start_new_session=True,
-                preexec_fn=_preparation(limits))  # noqa: PLW1509 it takes no lock
+            process = subprocess.Popen(  # noqa: S603 the specification names the program
+                [_setpriv(), "--pdeathsig", "KILL", program, *arguments], cwd=folder,
+                env=environment, stdin=subprocess.DEVNULL, stdout=printed, stderr=printed,
+                pass_fds=inherited, start_new_session=True)
         except BaseException:
             os.close(output)
             raise
         finally:
             os.close(printed)
         self.pid = process.pid
-        process.returncode = 0  # it is waited for in `_reap`
-        _reported[self.pid] = self._over
+        process.returncode = 0  # `_reap` waits for it
+        _programs[self.pid] = self._end_seen
+        with contextlib.suppress(ProcessLookupError):  # it has ended already
+            for kind, value in most.items():
+                resource.prlimit(self.pid, kind, (value, value))
         os.set_blocking(output, False)
         self._output = output
         self._loop.add_reader(output, self._read, 1)
 
     @property
     def is_stopped(self) -> bool:
-        """Whether it was stopped from outside (SIGSTOP)."""
+        """Whether it is stopped (SIGSTOP)."""
         return process_state(self.pid) in "Tt"
 
     def kill(self) -> None:
-        """End it at once; `ended` is called when it is gone."""
-        if self.pid in _reported:  # else its number may be that of another process
+        """Kill it; `ended` is called when it is gone."""
+        if self.pid in _programs:  # else another process may have the pid
             os.kill(self.pid, signal.SIGKILL)
 
     def end(self) -> None:
-        """Ask it to end, and return when nothing of it is left; waits `GRACE_S` and little more."""
-        if _reported.pop(self.pid, None) is None:
+        """Send SIGTERM, and return when nothing of it is left, little more than `GRACE_S` later."""
+        if _programs.pop(self.pid, None) is None:
             return
         until_s = time.monotonic() + GRACE_S
         for number in (signal.SIGTERM, signal.SIGCONT):
@@ -108,7 +120,7 @@ class ProgramProcess:
             self._read()
         self._leave_nothing()
 
-    def _over(self, status: int) -> None:
+    def _end_seen(self, status: int) -> None:
         self._leave_nothing()
         self._ended(f"ended: {in_words(status)}")
 
@@ -124,7 +136,7 @@ class ProgramProcess:
                 data = os.read(self._output, _READ_BYTES)
             except BlockingIOError:
                 return
-            if not data:  # no process is left that could print
+            if not data:  # no process is left that can print
                 self._loop.remove_reader(self._output)
                 return
             self._log.write(data)
@@ -133,17 +145,17 @@ class ProgramProcess:
 def _reap() -> None:
     with contextlib.suppress(ChildProcessError):
         while (ended := os.waitpid(-1, os.WNOHANG))[0]:
-            if over := _reported.pop(ended[0], None):
-                over(ended[1])
+            if end_seen := _programs.pop(ended[0], None):
+                end_seen(ended[1])
 
 
 def _kill_descendants() -> None:
-    """Kill all that is below this process; a look into /proc only if there is anything."""
+    """Kill all descendants of this process; read /proc only if it has children."""
 
     def left() -> set[int]:
         try:
             while pid := os.waitpid(-1, os.WNOHANG)[0]:
-                _reported.pop(pid, None)  # of another command in this process
+                _programs.pop(pid, None)  # of another command in this process
         except ChildProcessError:
             return set()
         return descendants(os.getpid())
@@ -151,34 +163,31 @@ def _kill_descendants() -> None:
     kill_all(left)
 
 
-def _preparation(limits: ChildLimits) -> Callable[[], None]:
-    """Return what the child does before it becomes the program."""
-    megabyte = 1_000_000
-    wanted = ((resource.RLIMIT_AS, limits.memory_mb, megabyte, "memory_mb"),
+def _limits(limits: ChildLimits) -> dict[int, int]:
+    wanted = ((resource.RLIMIT_AS, limits.memory_mb, _MEGABYTE, "memory_mb"),
               (resource.RLIMIT_CPU, limits.processor_s, 1, "processor_s"),
               (resource.RLIMIT_NOFILE, limits.open_files, 1, "open_files"),
-              (resource.RLIMIT_FSIZE, limits.file_mb, megabyte, "file_mb"))
-    most = {kind: math.ceil(value * unit) for kind, value, unit, _ in wanted if value is not None}
-    for kind, value, _, field in wanted:
+              (resource.RLIMIT_FSIZE, limits.file_mb, _MEGABYTE, "file_mb"))
+    most = {}
+    for kind, value, unit, field in wanted:
+        if value is None:
+            continue
+        most[kind] = math.ceil(value * unit)
         hard = resource.getrlimit(kind)[1]
-        if kind in most and hard != resource.RLIM_INFINITY and most[kind] > hard:
+        if hard != resource.RLIM_INFINITY and most[kind] > hard:
             raise ValueError(f"limits.{field} = {value:g} is above the hard limit")
-    parent = os.getpid()
+    return most
 
-    def prepare() -> None:
-        _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        if os.getppid() != parent:
-            os._exit(127)
-        for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
-            signal.signal(number, signal.SIG_DFL)
-        for kind, value in most.items():
-            resource.setrlimit(kind, (value, value))
 
-    return prepare
+def _setpriv() -> str:
+    found = shutil.which("setpriv")
+    if found is None:
+        raise FileNotFoundError(errno.ENOENT, "no program setpriv (util-linux) in PATH")
+    return found
 
 
 def in_words(status: int) -> str:
-    """Return how a process ended, by its status as of waitpid(2)."""
+    """Return in words how a process ended; `status` is that of waitpid(2)."""
     code = os.waitstatus_to_exitcode(status)
     if code >= 0:
         return f"exit code {code}"

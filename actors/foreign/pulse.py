@@ -1,4 +1,4 @@
-"""Whether a command still turns, by what it shows of it, and the socket of sd_notify(3)."""
+"""The heartbeat of a command, and the socket of sd_notify(3)."""
 
 from __future__ import annotations
 
@@ -14,57 +14,57 @@ from rampart.actors.foreign.descendants import is_below
 from rampart.actors.machine.unix_peer import receive_signed
 
 _DATAGRAM_BYTES = 8192
-_DIGITS, _MOST_S = 12, 3600.0
-"""Of an extension of the timeout, and real seconds that it allows at most."""
+_MOST_S = 3600.0
+"""Longest extension of the timeout, real seconds."""
 
 
 @dataclass(slots=True)
 class Pulse:
-    """How long a command has been silent. Pure; times are simulated seconds.
+    """The silence of a command. Pure; times are simulated seconds.
 
-    Only time in which the node's process itself turned counts: between two looks `look_s` at most.
+    Only time in which the node's process itself worked counts: at most `look_s` between two checks.
 
     Args:
-        timeout_s: Silent for so long, it hangs.
-        first_s: Within so many it has to be heard first.
-        look_s: The longest time between two looks that counts.
+        timeout_s: A command that is silent for longer hangs.
+        first_s: The same until its first heartbeat.
+        look_s: The longest time between two checks that counts.
     """
 
     timeout_s: float
     first_s: float
     look_s: float
     silent_s: float = 0.0
-    heard: bool = False
+    has_beaten: bool = False
     _extended_s: float = 0.0
     _ends: bool = False
     _at_s: float | None = None
 
     @property
     def limit_s(self) -> float:
-        """How long it may be silent now."""
-        usual_s = self.timeout_s if self.heard else max(self.first_s, self.timeout_s)
+        """The longest silence that is allowed now."""
+        usual_s = self.timeout_s if self.has_beaten else max(self.first_s, self.timeout_s)
         return max(usual_s, self._extended_s)
 
     def beat(self) -> None:
-        """It was heard; one that ends shows by its end that it does."""
+        """Note a heartbeat; after `stopping` it has no effect."""
         if not self._ends:
-            self.silent_s, self.heard, self._extended_s = 0.0, True, 0.0
+            self.silent_s, self.has_beaten, self._extended_s = 0.0, True, 0.0
 
     def extend(self, seconds: float) -> None:
-        """It may be silent for so long from now on, before its next beat."""
+        """Allow this silence from now until the next heartbeat."""
         self.silent_s, self._extended_s = 0.0, seconds
 
     def stopping(self) -> None:
-        """It ends by itself, within its timeout."""
+        """Note that the command is ending, for which it has its timeout."""
         self.beat()
         self._ends = True
 
     def trigger(self) -> None:
-        """It has said itself that something is wrong."""
+        """Note that the command reports an error of itself."""
         self.silent_s = math.inf
 
     def is_well(self, now_s: float) -> bool:
-        """Whether it is not silent for too long."""
+        """Whether the silence is not too long."""
         if self._at_s is not None:
             self.silent_s += min(max(0.0, now_s - self._at_s), self.look_s)
         self._at_s = now_s
@@ -72,21 +72,20 @@ class Pulse:
 
 
 def extension_s(microseconds: str) -> float | None:
-    """Return the real seconds that `EXTEND_TIMEOUT_USEC=` asks for, an hour at most.
+    """Return the value of `EXTEND_TIMEOUT_USEC=` in real seconds, an hour at most.
 
     Returns:
-        None if that is not a number.
+        None if the value is not a number.
     """
     if not (microseconds.isascii() and microseconds.isdecimal()):
         return None
-    digits = microseconds.lstrip("0") or "0"
-    return min(int(digits) * 1e-6, _MOST_S) if len(digits) <= _DIGITS else _MOST_S
+    return min(float(microseconds) * 1e-6, _MOST_S)
 
 
 class NotifySocket:
-    """Receives what a program sends to its service manager (sd_notify(3)).
+    """Receives the messages of a program to its service manager (sd_notify(3)).
 
-    A sender that is not below this process, or has ended by the time of reading, is refused.
+    It refuses a sender that is not a descendant of this process, or has ended before it reads.
 
     Args:
         node: Name of the node.
@@ -105,7 +104,7 @@ class NotifySocket:
         self.socket.bind(f"\0{self.name[1:]}")
 
     def take(self, most: int = 16) -> list[str]:
-        """Return the assignments of the datagrams that wait, such as `WATCHDOG=1`, in order."""
+        """Return the assignments in the waiting datagrams, such as `WATCHDOG=1`, in order."""
         found: list[str] = []
         with contextlib.suppress(OSError):
             for _ in range(most):
@@ -118,5 +117,5 @@ class NotifySocket:
         return found
 
     def close(self) -> None:
-        """Hear nothing more."""
+        """Close the socket."""
         self.socket.close()

@@ -1,1 +1,1 @@
-"""What the kernel of this machine knows of its processes, and does for them."""
+"""Processes of this machine, as the kernel shows them."""

@@ -1,9 +1,9 @@
-"""Did the observer itself run? What did not run cannot say what was missing meanwhile.
+"""Absence of an observer: a process that did not run itself cannot know what was missing.
 
-A process that was stopped and goes on, alone or with everybody else as when a container is paused,
-finds every deadline passed while the proof to the contrary is still under way: mail waits unread,
-others go on a little later, links that were silent for too long are opened again. So an observer
-that was absent draws no conclusion from that time, and none about others for `GRACE_S` after it.
+A process that was stopped and continues finds every deadline passed. The same holds for all
+processes of a container that was paused. But messages wait unread, other processes continue a
+little later, and links have to be opened again. So an observer draws no conclusion from the time of
+its absence, nor for `GRACE_S` after it.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from __future__ import annotations
 import math
 
 ABSENT_S = 0.3
-"""An observer that does something at least each 0.2 s and has not for so long was stopped."""
+"""An observer that acts at least every 0.2 s was stopped if it has not acted for this long."""
 
 GRACE_S = 1.0
-"""Within which the others go on as well, and are heard. Links within a host outlast a pause (see
-`rampart.actors.bus.zenoh_session`), so this is the time in which all processes are continued."""
+"""Time in which all other processes continue, and send. Links within a host outlast a pause (see
+`rampart.actors.bus.zenoh_session`)."""
 
 AGAIN_S = 2.0
-"""Not sooner does the next absence count: one that is always late is not always excused."""
+"""Least time to the next absence that counts, so an observer that is always late has no excuse."""
 
 
 class Absence:
-    """Of one observer. Pure; seconds of the caller's clock.
+    """The absence of one observer. Pure; times are seconds of the caller's clock.
 
     Args:
         now_s: Now.
-        rate: Seconds of that clock in a real one: the others need real time to go on.
+        rate: Seconds of that clock per real second: other processes need real time to continue.
     """
 
     def __init__(self, now_s: float, rate: float = 1.0) -> None:
@@ -35,7 +35,7 @@ class Absence:
         self._until_s = -math.inf
 
     def note(self, now_s: float) -> float:
-        """Note that the observer runs; return for how long it was absent, 0 if it was not."""
+        """Note that the observer runs; return how long it was absent, 0 if it was not."""
         gap_s, self._ran_s = now_s - self._ran_s, now_s
         if gap_s <= ABSENT_S or now_s <= self._until_s + AGAIN_S * self._rate:
             return 0.0
@@ -43,10 +43,10 @@ class Absence:
         return gap_s
 
     def excuses(self, now_s: float) -> bool:
-        """Whether it may conclude nothing about others yet."""
+        """Whether the observer may not draw conclusions yet."""
         return now_s < self._until_s
 
     @property
     def until_s(self) -> float:
-        """From when on it may."""
+        """When it may draw conclusions again."""
         return self._until_s

@@ -1,4 +1,4 @@
-"""Where the C library puts what this process asks it for."""
+"""The heap of the C library."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ LARGE_BYTES = 32_768
 
 
 def keep_large_apart() -> None:
-    """Have what is large lie in pages of its own from now on, which go back when it is freed.
+    """Give each large block its own pages from now on, which return to the kernel when it is freed.
 
-    Else the space that it leaves in the heap is filled with what is small and stays, and the next
-    large block takes new pages: mallopt(3), without which glibc raises the threshold to the size of
-    what was freed. Nothing, where libc cannot.
+    In the heap, small blocks that stay would fill the space of a freed block, and the next large
+    one would take new pages. By default glibc raises the threshold to the size of a freed block
+    (mallopt(3)). A C library without mallopt is left as it is.
     """
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)
     if set_option is not None:

@@ -1,18 +1,18 @@
-"""Hung, or merely without a processor? How long a process could have answered and did not.
+"""Distinguishes a hung process from one that waits for a processor.
 
-A deadline alone takes a starved process for a hung one: on a busy machine a process may wait for a
-processor longer than any sensible deadline, and killing it makes the machine busier. So only time
-counts in which the process could have run:
+A deadline alone does not. On a busy machine a process may wait for a processor longer than any
+useful deadline, and a kill makes the machine busier. So only time in which the process could have
+run counts:
 
-* not what it spent in the run queue, which the kernel counts (`/proc/PID/schedstat`, proc(5));
-* of a process that is on the run queue right now, only what it has run, for the kernel adds the
-  wait that is not over yet later: spinning is found out, waiting is not;
-* of the time before the first look, for which there are no figures, all or nothing: nothing if it
-  is on the run queue then, and mostly waits until the next look;
-* nothing while the kernel itself makes it wait (state D: a disk, or memory that is swapped);
-* and no more than a moment a look, so that a caller that stood still itself blames no other.
+* Its wait in the run queue does not count (`/proc/PID/schedstat`, proc(5)).
+* If it is in the run queue right now, only its run time counts, since the kernel adds the present
+  wait later. So a process that spins is found, and one that waits is not blamed.
+* There are no figures for the time before the first check. That time does not count if the process
+  is in the run queue then, and mostly waits until the next check. Otherwise all of it counts.
+* Time in state D does not count: the kernel makes the process wait for a disk or swapped memory.
+* Between two checks only a short time counts, so a caller that was stopped blames no process.
 
-A stopped process (state T) is not on the run queue: all of its time counts.
+A stopped process (state T) is not in the run queue, so all of its time counts.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from rampart.actors.machine.unix_peer import process_state
 
 
 class Usage(NamedTuple):
-    """What the kernel has counted for the main thread of a process, and its state letter now.
+    """State letter of a process, and the kernel's figures for its main thread.
 
-    A thread that sleeps may wait for another one of its process, and that one for a processor: then
-    the state is R as well.
+    A sleeping main thread may wait for another thread, which waits for a processor. Then the state
+    is R, too.
     """
 
     state: str
@@ -38,11 +38,11 @@ class Usage(NamedTuple):
 
 
 AT_LEISURE = Usage("S", 0.0, 0.0)
-"""Of a process that waits for nothing."""
+"""Usage of a process that does not wait for a processor."""
 
 
 def usage(pid: int) -> Usage:
-    """Return the usage of a process; without figures, where the kernel keeps none."""
+    """Return the usage of a process; its figures are 0 where the kernel has none."""
     try:
         text = Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii")
         ran_ns, waited_ns, _slices = map(int, text.split())
@@ -65,10 +65,10 @@ def _is_on_run_queue(thread: Path) -> bool:
 
 @dataclass(slots=True)
 class Patience:
-    """With one process that owes an answer. Pure; times are seconds of the caller's clock.
+    """Patience with one process that owes an answer. Pure; times are seconds of the caller's clock.
 
     Args:
-        look_s: The longest time between two looks that counts.
+        look_s: The longest time between two checks that counts.
     """
 
     look_s: float
@@ -79,17 +79,17 @@ class Patience:
     _doubtful_s: float = 0.0
 
     def answered(self) -> None:
-        """It owes nothing: begin anew."""
+        """Note an answer: nothing counts so far."""
         self._pid = 0
 
     def look(self, now_s: float, pid: int, used: Usage, owes_since_s: float | None = None) -> float:
-        """Return for how many seconds a process that has not answered could have.
+        """Return for how many seconds the process could have answered.
 
         Args:
             now_s: Now.
-            pid: Of the process; another one than at the last look begins anew.
-            used: By it.
-            owes_since_s: Since when it owes the answer, if not since the first look.
+            pid: Of the process; a pid other than the last one starts from 0.
+            used: Its usage.
+            owes_since_s: Since when it owes the answer, if not since the first check.
         """
         if pid != self._pid:
             self._pid = pid

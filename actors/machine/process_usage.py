@@ -1,8 +1,7 @@
-"""What the processes of a run use: processor time, memory, age, as the kernel counts them.
+"""Processor time, memory and age of processes, by `/proc/PID/stat` (proc_pid_stat(5)).
 
-One read of `/proc/PID/stat` a process (proc_pid_stat(5)). Memory is the resident set; nodes are
-forked from a spawner that has loaded everything, so most of it is shared and the sum over all
-nodes says more than the machine gives.
+Memory is the resident set. Nodes are forks of a root that has loaded everything and share most of
+it, so the sum over all nodes exceeds the memory in use.
 """
 
 from __future__ import annotations
@@ -20,13 +19,12 @@ _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 @dataclass(frozen=True, slots=True)
 class ProcessCount:
-    """What the kernel has counted for one process so far.
+    """The kernel's figures for one process.
 
     Attributes:
-        cpu_s: processor time, in user and kernel mode, of all its threads.
-        memory_bytes: resident set.
-        started_s: when it was started, on the clock of `CLOCK_BOOTTIME`; with the pid it tells
-            two processes apart.
+        cpu_s: Processor time, in user and kernel mode, of all its threads.
+        memory_bytes: Resident set.
+        started_s: When it started, by `CLOCK_BOOTTIME`; pid and start identify a process.
     """
 
     cpu_s: float
@@ -36,14 +34,14 @@ class ProcessCount:
 
 @dataclass(frozen=True, slots=True)
 class ProcessUsage:
-    """What a process uses now.
+    """The present usage of a process.
 
     Attributes:
-        cpu_share: processor time over real time since it was last looked at; 1.0 is one core.
-            At the first look, since its start.
-        cpu_s: processor time since its start.
-        memory_bytes: resident set.
-        age_s: real seconds since its start.
+        cpu_share: Processor time per real time since the last reading, or since its start; 1.0 is
+            one core.
+        cpu_s: Processor time since its start.
+        memory_bytes: Resident set.
+        age_s: Real seconds since its start.
     """
 
     cpu_share: float
@@ -53,7 +51,7 @@ class ProcessUsage:
 
 
 def read_count(pid: int) -> ProcessCount | None:
-    """Return the kernel's counts for a process, None if there is no such process."""
+    """Return the kernel's figures for a process, None if there is no such process."""
     stat = stat_fields(pid)
     if not stat:
         return None
@@ -62,11 +60,11 @@ def read_count(pid: int) -> ProcessCount | None:
 
 
 class UsageMeter:
-    """Looks at processes again and again, and says what they have used since the last look.
+    """Reads processes repeatedly, and returns their usage since the last reading.
 
     Args:
-        read: how to count for one process.
-        now: real seconds on the clock of `ProcessCount.started_s`.
+        read: Returns the figures of one process.
+        now: Returns real seconds by the clock of `ProcessCount.started_s`.
     """
 
     def __init__(
@@ -78,7 +76,7 @@ class UsageMeter:
         self._last: dict[int, tuple[float, ProcessCount]] = {}
 
     def look(self, pids: Iterable[int]) -> dict[int, ProcessUsage]:
-        """Return what those of the processes use that exist; the others are forgotten."""
+        """Return the usage of those processes that exist, and forget all others."""
         before, self._last = self._last, {}
         found = {}
         for pid in pids:
@@ -88,7 +86,7 @@ class UsageMeter:
             now_s = self._now()
             self._last[pid] = (now_s, count)
             since_s, start = before.get(pid, (0.0, None))
-            if start is None or start.started_s != count.started_s:  # new, or its number is reused
+            if start is None or start.started_s != count.started_s:  # new, or its pid is reused
                 since_s, start = count.started_s, ProcessCount(0.0, 0, count.started_s)
             spent_s, span_s = max(0.0, count.cpu_s - start.cpu_s), now_s - since_s
             found[pid] = ProcessUsage(

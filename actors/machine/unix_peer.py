@@ -1,4 +1,4 @@
-"""Who is at the other end of a unix socket, and what that process is doing."""
+"""The peer of a unix socket, and the state of a process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _STAT_BYTES = 4096
 
 
 def peer(connection: socket.socket) -> tuple[int, int]:
-    """Return process and user at the other end, as the kernel knows them (unix(7), SO_PEERCRED)."""
+    """Return pid and user id of the process at the other end (unix(7), SO_PEERCRED)."""
     pid, uid, _gid = _CREDENTIALS.unpack(
         connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     return pid, uid
@@ -23,14 +23,14 @@ def is_same_user(connection: socket.socket) -> bool:
 
 
 def receive_signed(connection: socket.socket, size: int) -> tuple[bytes, int]:
-    """Receive one datagram and return it with the process that sent it, as the kernel knows it.
+    """Receive one datagram; return it with the pid of its sender, by the kernel.
 
-    The socket needs SO_PASSCRED (unix(7)) before the datagram is sent. The process is 0 if the
-    sender belongs to another user, or if there was none: the connection was closed.
+    The socket needs SO_PASSCRED (unix(7)) before the datagram is sent. The pid is 0 if the sender
+    belongs to another user, or if the connection was closed.
 
     Raises:
-        BlockingIOError: there is none yet.
-        OSError: the connection is broken.
+        BlockingIOError: No datagram waits.
+        OSError: The connection is broken.
     """
     data, ancillary, _flags, _address = connection.recvmsg(
         size, socket.CMSG_SPACE(_CREDENTIALS.size))
@@ -49,7 +49,7 @@ def process_state(pid: int) -> str:
 
 def stat_fields(pid: int) -> list[bytes]:
     """Return the fields of /proc/PID/stat after the name; none if there is no such process."""
-    try:  # a third of what pathlib takes; of the routers it is asked 66 times a second
+    try:  # a third of the time of pathlib; the supervisor calls this 66 times a second
         stat = os.open(f"/proc/{pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
         return []

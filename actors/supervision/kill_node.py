@@ -1,4 +1,4 @@
-"""Signals to the processes of nodes, which are found in /proc by their titles."""
+"""Signals to the processes of nodes, found in /proc by their titles."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ SIGNALS["WEDGE"] = signal.SIGUSR2
 
 
 class SignalError(Exception):
-    """A node cannot be signalled; one line for the user."""
+    """A node cannot be signalled; the text is one line for the user."""
 
 
 class UnknownNodeError(SignalError):
-    """No process of this machine is the node's."""
+    """The node has no process on this machine."""
 
 
 def signal_node(node: str, name: str, port: int | None = None) -> RunProcess:
-    """Send a signal of `SIGNALS` to the newest process of a node and return which it was.
+    """Send a signal of `SIGNALS` to the newest process of a node, and return the process.
 
     Args:
-        node: its name, as in the process's title.
-        name: of the signal, e.g. "KILL".
-        port: base port of the run; None if there is but one.
+        node: Its name, as in the title of the process.
+        name: Of the signal, e.g. "KILL".
+        port: Base port of the run; None if there is only one.
 
     Raises:
-        SignalError: there is no such node or signal, or it may not be sent.
+        SignalError: There is no such node or signal, or sending it is not permitted.
     """
     victim = find_node(node, name, port)
     try:
@@ -39,10 +39,10 @@ def signal_node(node: str, name: str, port: int | None = None) -> RunProcess:
 
 
 def find_node(node: str, name: str, port: int | None = None) -> RunProcess:
-    """Return what `signal_node` would signal.
+    """Return the process that `signal_node` would signal.
 
     Raises:
-        SignalError: there is no such node or signal.
+        SignalError: There is no such node or signal.
     """
     if name not in SIGNALS:
         raise SignalError(f"unknown signal {name!r}; known: {', '.join(SIGNALS)}")

@@ -1,7 +1,7 @@
-"""The hold of the process that watches a run on its root: it begins, starts and ends the run.
+"""The connection of the process `run` to the root, by which it loads, starts and ends the run.
 
-As a rule it is the root's child and was born with a connection. One that was not, as a benchmark,
-starts a root of its own.
+`run` is a child of the root and inherits the connection. Tests and benchmarks have none, and start
+a root.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ from rampart.files.streams import complain
 __all__ = ["LaunchError", "Launcher"]
 
 STARTUP_S = (0.8, 5.0)
-"""Simulated time 0 lies between so many wall seconds after the start of the first actor: until
-then all processes start at once, and silence is no fault."""
+"""Least and most wall seconds from the start of the processes to simulated time 0. Until then,
+silence is not a fault."""
 
 _LOADS = 1.4
-"""How many, in times that the machine took to load the first process; all run after 0.9 to 1.25."""
+"""The same, in multiples of the time to load the root; all processes run after 0.9 to 1.25."""
 
 _MAX_LINE = 1 << 26
 _Answer = TypeVar("_Answer", bound=requests.FromRoot)
 
 
 class Launcher:
-    """One run's root, as the process that watches the run holds it.
+    """The client of one run's root.
 
     Use on a running event loop: `load`, `start`, `end`.
 
     Args:
         plan: Of the run.
         title: Of the run, for people.
-        link: Connection to the root; None to start one.
+        link: Connection to the root; None to start a root.
 
     Attributes:
-        plan: Of the run; from `load` on with folder, ports and the root's process id.
+        plan: Of the run; from `load` on with folder, ports and the root's pid.
         names: Of the actors, from `load` on.
-        failure: Why the run has to end, "" as long as it can go on.
+        failure: Why the run has to end, "" while it can continue.
         recording: Returns the file of the recording, and why nothing more is written to it.
-        on_restart: Called with the name of what the root has brought back.
-        on_interrupt: Called with the name of the signal by which the user wants the run to end.
-        report: Called with one line when something cannot be done.
+        on_restart: Called with the name of a process that the root has restarted.
+        on_interrupt: Called with the name of the signal by which the user ends the run.
+        report: Called with one line about each problem.
     """
 
     def __init__(self, plan: RunPlan, title: str, link: socket.socket | None = None) -> None:
@@ -82,7 +82,7 @@ class Launcher:
         self._load_s = 0.0
 
     async def connect(self) -> None:
-        """Listen to the root, which may be interrupted by the user; `load` does it as well."""
+        """Connect to the root, which forwards the user's interrupts; `load` does it as well."""
         if self._writer is not None:
             return
         report_callbacks(asyncio.get_running_loop(), lambda line: self.report(line))  # noqa: PLW0108 it may change
@@ -92,11 +92,11 @@ class Launcher:
         watch(self._reading, "the connection to the root", self.failed)
 
     async def load(self) -> None:
-        """Have the root claim what the run needs, and load it.
+        """Have the root reserve the resources of the run and load its system.
 
         Raises:
-            LaunchError: spec, airport or mission are unsound; another run has the base port; there
-                is no place for the run's sockets, or fewer files may be open than the run needs.
+            LaunchError: Spec, airport or mission is unsound; another run has the base port; there
+                is no place for the run's sockets, or a limit of open files or processes is too low.
         """
         await self.connect()
         begun = await self._ask(requests.Begin(self.plan, self._title), requests.Begun)
@@ -109,38 +109,38 @@ class Launcher:
         """Set simulated time 0 and start routers and supervisor, which starts the rest.
 
         Raises:
-            LaunchError: no process can be started.
+            LaunchError: No process can be started.
         """
         self.plan = msgspec.structs.replace(self.plan, origin_s=self.origin_s())
         await self._ask(requests.Start(self.plan.origin_s), requests.Done)
 
     def origin_s(self) -> float:
-        """Return the reading of the monotonic clock at simulated time 0, all being loaded now."""
+        """Return the reading of the monotonic clock at simulated time 0, if loading ends now."""
         startup_s = STARTUP_S[1] if self.plan.part else min(
             max(STARTUP_S[0], _LOADS * self._load_s), STARTUP_S[1])
         return time.monotonic() + startup_s - self.plan.begins_s / self.plan.rate
 
     def failed(self, why: str) -> None:
-        """Note that the run has to end, for a part of this process has failed."""
+        """Note that the run has to end because a part of this process has failed."""
         self.failure = self.failure or why
 
     def look_at_recording(self) -> tuple[str, str]:
-        """Return file and problem of the recording; the root tells them to tools."""
+        """Return file and problem of the recording, and pass them to the root for tools."""
         recorded = self.recording()
         if recorded != self._recorded:
             self._recorded = recorded
-            self._tell(requests.Recording(*recorded))
+            self._send(requests.Recording(*recorded))
         return recorded
 
     def observers_bus(self) -> ZenohBus:
-        """Return the bus of an observer in this process, which hears all nodes; not yet open."""
+        """Return the bus of an observer in this process; it is not open yet."""
         name = on_host(OBSERVER, self.plan.host)
         return ZenohBus(name, endpoints(self.plan.folder),
                         recorder=RecorderConnection(self.plan.base_port),
                         credentials=self.plan.credentials(name))
 
     async def end(self) -> None:
-        """End all processes of the run: in order if the supervisor can, by force what is left."""
+        """Have the root end all processes of the run."""
         writer, self._writer = self._writer, None
         if writer is None or self._reading is None:
             return
@@ -182,7 +182,7 @@ class Launcher:
         self.failed("the root of the run has ended")
         self._answers.put_nowait(None)
 
-    def _tell(self, request: requests.FromRun) -> None:
+    def _send(self, request: requests.FromRun) -> None:
         if self._writer is not None:
             self._writer.write(msgspec.json.encode(request) + b"\n")
 
@@ -190,9 +190,9 @@ class Launcher:
         """Send a request and return the answer.
 
         Raises:
-            LaunchError: the root has refused it, or has ended.
+            LaunchError: The root has refused it, or has ended.
         """
-        self._tell(request)
+        self._send(request)
         answer = await self._answers.get()
         if isinstance(answer, requests.Refused):
             raise LaunchError(answer.why)
@@ -202,12 +202,13 @@ class Launcher:
 
 
 def _clean_up_after(root: int, folder: str) -> None:
-    """Start the thread that ends this process, and all of the run, when the root has ended.
+    """Start a thread that ends this process, and all of the run, when the root has ended.
 
-    The kernel ends the root's other children; not what commands have forked, nor the folder.
+    The kernel kills the root's other children. Processes that commands have forked, and the folder
+    of the run, are left to this thread.
 
     Raises:
-        LaunchError: there may be no thread.
+        LaunchError: No thread can be started.
     """
     ended = os.pidfd_open(root)
 

@@ -1,8 +1,7 @@
-"""What runs in a node's process after the fork: title, signals, actors, exit code.
+"""The process of a node after the fork: title, signals, actors, exit code.
 
-SIGTERM asks the actors to end in order; a router it ends at once (see `router`). SIGUSR2 wedges the
-event loop for good, process and liveliness token still there: the fault that only a heartbeat from
-the loop can show.
+SIGTERM ends the actors in order, and a router at once (see `router`). SIGUSR2 hangs the event loop
+permanently, while process and session stay: only a missing heartbeat shows this fault.
 """
 
 from __future__ import annotations
@@ -39,28 +38,27 @@ WORLD_NICE = -10
 """Niceness of the simulated world, where that is permitted."""
 
 OF_A_PART = 10**9
-"""More incarnations of a node than one part of a run has: in a resumed run the next part's begin
-there, so that its states are newer."""
+"""More than the incarnations of a node in one part of a run. The numbers of the next part, in a
+resumed run, begin above it, so its states are newer."""
 
 EXIT_OK = 0
 EXIT_FAILED = 1
-EXIT_BUS = 3
 
 
 def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
                loop: asyncio.AbstractEventLoop, *,
                failed: Callable[[Exception], None] = lambda _error: None,
                bus: Bus | None = None) -> Actor:
-    """Build one actor of the system, not yet running.
+    """Build one actor of the system; it does not run yet.
 
     Args:
-        layout: of the run.
-        name: of the actor.
-        incarnation: of its process.
-        run: what all actors of the run have in common.
-        loop: that it will run on.
-        failed: is told its error.
-        bus: that it is to have; None for one of its own.
+        layout: Of the run.
+        name: Of the actor.
+        incarnation: Of its process.
+        run: The context that all actors of the run share.
+        loop: The event loop that it will run on.
+        failed: Called with its error.
+        bus: Its bus; None for a new one.
     """
     member = layout.members.get(name) or router(name)
     clock = clock_of(layout.plan, loop.time)
@@ -78,7 +76,7 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
 
 
 def _bus_of(layout: Layout, name: str, bus: ZenohBus | None = None) -> ZenohBus:
-    """Return the bus of an actor: the one given, under its name from now on, or one of its own."""
+    """Return the bus of an actor: the given one, which takes its name, or a new one."""
     plan = layout.plan
     recorder = RecorderConnection(plan.base_port)
     board = None if layout.hosts.several else board_of(plan.folder)
@@ -91,7 +89,7 @@ def _bus_of(layout: Layout, name: str, bus: ZenohBus | None = None) -> ZenohBus:
 
 
 def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:
-    """Return what an actor's session dials, and where it listens, which a router's does."""
+    """Return the endpoints that an actor's session dials, and those where a router listens."""
     folder, place = layout.plan.folder, layout.plan.routers.get(name)
     if place is None:
         return endpoints(folder), []
@@ -102,7 +100,7 @@ def _ends(layout: Layout, name: str) -> tuple[list[str], list[str]]:
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore | None:
-    """Return where a node of the system keeps its state; nothing is opened yet."""
+    """Return the checkpoint store of a node; None if it keeps no state."""
     plan = layout.plan
     if not (plan.checkpoints and layout.spec.layers.checkpoints):
         return None
@@ -111,7 +109,7 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore |
 
 
 class Role(NamedTuple):
-    """Which actors a process runs, and its incarnation."""
+    """The actors of a process, and its incarnation."""
 
     names: tuple[str, ...]
     incarnation: int
@@ -124,15 +122,15 @@ async def live(layout: Layout, role: Role, run: RunContext, bus: ZenohBus | None
     """Run the actors of one process to their end and return the exit code.
 
     Args:
-        layout: of the run.
-        role: who they are.
-        run: what all actors of the run have in common.
-        bus: open already, if there is one.
+        layout: Of the run.
+        role: The actors.
+        run: The context that all actors of the run share.
+        bus: An open bus for the first actor, if there is one.
     """
-    told: list[Exception] = []
+    reported: list[Exception] = []
 
-    def tell(error: Exception) -> None:  # at once: what replaces this process may kill it
-        told.append(error)
+    def report(error: Exception) -> None:  # at once: the supervisor may kill this process
+        reported.append(error)
         complain(f"{role} failed: {type(error).__name__}: {error}")
         _log_traceback(layout.plan.error_log, str(role), error)
 
@@ -141,20 +139,20 @@ async def live(layout: Layout, role: Role, run: RunContext, bus: ZenohBus | None
         if any(node.kind is Kind.WORLD for node in layout.spec.nodes if node.name in role.names):
             go_first()
         signal.signal(signal.SIGUSR2, wedge)
-        await _run_actors(layout, role, run, tell, bus)
+        await _run_actors(layout, role, run, report, bus)
     except BusError as error:
-        if error not in told:
+        if error not in reported:
             complain(f"{'+'.join(role.names)}: {error}")
-        return EXIT_BUS
-    except Exception as error:  # the last stop before the exit code: nothing may pass unseen
-        if error not in told:
-            tell(error)
+        return EXIT_FAILED
+    except Exception as error:  # the last handler before the exit: every error is reported
+        if error not in reported:
+            report(error)
         return EXIT_FAILED
     return EXIT_OK
 
 
 def _take_place(layout: Layout, names: tuple[str, ...], incarnation: int) -> None:
-    """Have others know this process as that of its nodes."""
+    """Make this process known as that of its nodes."""
     set_title(layout.plan.base_port, layout.plan.launcher_pid, names, incarnation)
     issue(layout.plan.folder, names, incarnation, os.getpid())
 
@@ -184,17 +182,16 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
 
 
 def go_first() -> None:
-    """Give this process, its threads to come included, the processor before others, if possible.
+    """Raise the priority of this process and its later threads, if that is permitted.
 
-    The world is to be where it would be at this time, however busy the machine: a real one does
-    not wait for a processor. It takes the privilege of lowering one's niceness.
+    A real world does not wait for a processor, so a busy machine should not slow the simulated one.
     """
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, WORLD_NICE)
 
 
 def wedge(_signal: int, _frame: Any) -> None:
-    """Handle SIGUSR2: turn no more, and stay."""
+    """Handle SIGUSR2: hang permanently."""
     while True:
         time.sleep(3600)
 

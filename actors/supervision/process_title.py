@@ -1,9 +1,9 @@
-"""Names of processes as `ps` shows them, and the way back from a name to its process.
+"""Titles of processes, as `ps` shows them, and the search for a process by its title.
 
-The title is the registry: a restarted supervisor, `kill-node` and the clean-up after a killed
-launcher find a run's processes in /proc, with no file that could be stale and no bus that could
-be down. Format: `rampart[PORT/LAUNCHER] NAME #INCARNATION`, where LAUNCHER is
-the launcher's pid, which tells two runs on one port apart; several actors in one process are `A+B`.
+The title is the registry. A restarted supervisor, `kill-node` and the clean-up after a killed root
+find the processes of a run in /proc, without a file that could be stale or a bus that could fail.
+Format: `rampart[PORT/ROOT] NAME #INCARNATION`. ROOT is the root's pid, which distinguishes two runs
+on one port. Several actors in one process are `A+B`.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ POOL = "pool"
 
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 
-# It finds the room for titles from the environment's first variable, the first time it is called:
-# now, as long as none has been replaced.
+# The first call finds the memory for titles, by the first variable of the environment. So it comes
+# now, before a variable is replaced.
 setproctitle.getproctitle()
 
 
 @dataclass(frozen=True, slots=True)
 class RunProcess:
-    """A process of a run as found in /proc."""
+    """A process of a run in /proc; `launcher` is the pid of its root."""
 
     pid: int
     port: int
@@ -51,7 +51,7 @@ def set_title(port: int, launcher: int, names: tuple[str, ...], incarnation: int
 
 
 def parse_title(pid: int, title: str) -> RunProcess | None:
-    """Return what a process title says, or None if it is none of ours."""
+    """Parse a process title; None if it is not of a run."""
     match = _TITLE.match(title)
     if match is None:
         return None
@@ -59,7 +59,7 @@ def parse_title(pid: int, title: str) -> RunProcess | None:
 
 
 def find_processes(port: int | None = None, launcher: int | None = None) -> list[RunProcess]:
-    """Return the running processes of all runs of this user, or of one base port or launcher.
+    """Return the processes of this user's runs, of all or of one base port or root.
 
     Zombies are left out: they run no code and hold nothing.
     """
@@ -75,13 +75,13 @@ def _process_at(entry: Path) -> RunProcess | None:
         if not raw.startswith(b"rampart[") or entry.stat().st_uid != os.getuid():
             return None
     except OSError:
-        return None  # it ended while we looked
+        return None  # it has just ended
     process = parse_title(int(entry.name), raw.rstrip(b"\0").decode(errors="replace"))
     return process if process and process_state(process.pid) not in "ZX" else None
 
 
 def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> bool:
-    """Send a signal to a process; False if it is gone."""
+    """Send a signal to a process; False if it has ended."""
     try:
         os.kill(pid, number)
     except ProcessLookupError:
@@ -90,7 +90,7 @@ def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> bool:
 
 
 def end_run(launcher: int, folder: str) -> None:
-    """Leave nothing of a run whose launcher has ended but this process: nor its folder."""
+    """End all other processes of a run whose root has ended, and remove its folder."""
     kill_programs(process.pid for process in find_processes(launcher=launcher))
     for process in find_processes(launcher=launcher):
         if process.pid != os.getpid():

@@ -87,23 +87,23 @@ async def test_its_end_is_the_end(end):
     end.command.close()
     for _ in range(10):
         await asyncio.sleep(0)
-    end.channel.say("tug/order", ORDER, Text("x"), HEADER)
+    end.channel.send("tug/order", ORDER, Text("x"), HEADER)
     assert end.taken == []
 
 
 async def test_what_the_command_hears(end):
-    end.channel.say("tug/order", ORDER, Text("x" * MAX_PACKET), HEADER)
-    end.channel.say("tug/order", ORDER, Text("go"), HEADER)
+    end.channel.send("tug/order", ORDER, Text("x" * MAX_PACKET), HEADER)
+    end.channel.send("tug/order", ORDER, Text("go"), HEADER)
     assert end.command.recv(1000) == b'tug/order 1.5 driver 2\n{"text":"go"}'
     (refused,) = end.refused
-    assert refused.startswith(f"tug/order: {MAX_PACKET + 34} bytes are too many")
+    assert refused.startswith(f"tug/order: packet of {MAX_PACKET + 34} bytes; at most")
 
 
 async def test_for_one_that_does_not_read_the_newest_sample_waits_and_commands_up_to_a_bound(end):
     text = Text("x" * 60_000)
     for number in range(400):
-        end.channel.say("tug/order", ORDER, text, HEADER)
-        end.channel.say("tug/wheels", WHEELS, Wheels(float(number)), HEADER)
+        end.channel.send("tug/order", ORDER, text, HEADER)
+        end.channel.send("tug/wheels", WHEELS, Wheels(float(number)), HEADER)
     assert "tug/order: the command does not read its socket; a message to it is lost" in end.refused
     assert len(end.channel._waiting) <= channel_module._WAITING
     end.command.setblocking(False)

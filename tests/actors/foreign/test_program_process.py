@@ -41,7 +41,7 @@ class Started:
         self.log = folder / "it.log"
         self.ends: list[str] = []
         self.process = ProgramProcess(
-            program, ["it", "-c", script], folder=folder, environment=dict(os.environ),
+            program, ["-c", script], folder=folder, environment=dict(os.environ),
             limits=ChildLimits(**limits), log=OutputLog(self.log), inherited=[],
             ended=self.ends.append)
 
@@ -145,20 +145,30 @@ async def test_daemons_that_end_before_it_leave_no_zombies(tmp_path):
     assert await started.end() == "ended: exit code 4"
 
 
-@pytest.mark.parametrize(("file", "error"), [
-    ("none", FileNotFoundError), ("no_interpreter", FileNotFoundError), ("odd", OSError),
-    ("not_executable", PermissionError)])
+@pytest.mark.parametrize(("file", "code", "reason"), [
+    ("none", 127, "No such file"), ("no_interpreter", 127, "No such file"),
+    ("odd", 127, "not found"), ("not_executable", 126, "Permission denied")])
 @isolated
-async def test_what_cannot_be_started_is_an_error_and_leaves_nothing(tmp_path, file, error):
+async def test_a_file_that_is_not_a_program_ends_at_once_and_says_why(tmp_path, file, code, reason):
     (tmp_path / "no_interpreter").write_text("#!/nowhere/sh\n")
-    (tmp_path / "odd").write_bytes(b"\x7fNONSENSE")
+    (tmp_path / "odd").write_bytes(b"\x7fNONSENSE")  # setpriv has a shell run it
     (tmp_path / "not_executable").write_text("#!/bin/sh\n")
     for name in ("no_interpreter", "odd"):
         (tmp_path / name).chmod(0o755)
+    started = Started(tmp_path, "", program=str(tmp_path / file))
+    assert await started.end() == f"ended: exit code {code}"
+    assert reason in started.log.read_text()
+
+
+@isolated
+async def test_without_setpriv_or_a_folder_nothing_starts_or_is_left(tmp_path, monkeypatch):
     before = len(list(Path("/proc/self/fd").iterdir()))
-    with pytest.raises(error):
-        Started(tmp_path, "", program=str(tmp_path / file))
-    assert len(list(Path("/proc/self/fd").iterdir())) <= before + 1  # of the signals, once
+    with pytest.raises(FileNotFoundError):
+        Started(tmp_path / "none", "")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match="setpriv"):
+        Started(tmp_path, "")
+    assert len(list(Path("/proc/self/fd").iterdir())) <= before + 3  # of the loop's signals, once
     assert descendants(os.getpid()) == set()
 
 
@@ -187,7 +197,7 @@ from rampart.actors.foreign.program_process import ProgramProcess
 from rampart.manager.spec.nodes import ChildLimits
 
 async def main():
-    ProgramProcess("/bin/sh", ["it", "-c", sys.argv[2]], folder=Path(sys.argv[1]),
+    ProgramProcess("/bin/sh", ["-c", sys.argv[2]], folder=Path(sys.argv[1]),
                    environment=dict(os.environ), limits=ChildLimits(),
                    log=OutputLog(Path(sys.argv[1], "it.log")), inherited=[], ended=print)
     await asyncio.sleep(600)
