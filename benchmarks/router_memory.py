@@ -27,8 +27,8 @@ from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint, endpoints
-from rampart.actors.machine.heap import keep_large_apart
 from rampart.actors.osmosis import topics
+from rampart.actors.supervision.router import keep_large_apart
 
 CLIENTS = 10
 LIFE_S = 0.12

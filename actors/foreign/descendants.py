@@ -54,23 +54,14 @@ def is_below(pid: int, top: int) -> bool:
     return pid == top
 
 
-def kill_all(find: Callable[[], Iterable[int]], within_s: float = END_S) -> bool:
-    """Kill until `find` returns nothing; False if something is left after `within_s`."""
-    until_s = time.monotonic() + within_s
-    while left := list(find()):
+def kill_all(find: Callable[[], Iterable[int]]) -> None:
+    """Kill until `find` returns nothing, for at most `END_S`."""
+    until_s = time.monotonic() + END_S
+    while (left := list(find())) and time.monotonic() < until_s:
         for pid in left:
             with contextlib.suppress(OSError):
                 os.kill(pid, signal.SIGKILL)
-        if time.monotonic() > until_s:
-            return False
         time.sleep(0.001)
-    return True
-
-
-def kill_programs(nodes: Iterable[int]) -> None:
-    """Kill all descendants of the processes of a run."""
-    tops = list(nodes)
-    kill_all(lambda: descendants(*tops))
 
 
 def kill_orphans(root: int) -> None:

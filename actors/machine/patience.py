@@ -50,17 +50,10 @@ def usage(pid: int) -> Usage:
         ran_ns = waited_ns = 0
     state = process_state(pid)
     with contextlib.suppress(OSError):  # it has ended
-        if state == "S" and any(map(_is_on_run_queue, Path(f"/proc/{pid}/task").iterdir())):
+        if state == "S" and any(process_state(f"{pid}/task/{thread.name}") == "R"
+                                for thread in Path(f"/proc/{pid}/task").iterdir()):
             state = "R"
     return Usage(state, ran_ns / 1e9, waited_ns / 1e9)
-
-
-def _is_on_run_queue(thread: Path) -> bool:
-    try:
-        stat = (thread / "stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:  # it has ended
-        return False
-    return stat.rpartition(")")[2].split()[0] == "R"
 
 
 @dataclass(slots=True)

@@ -41,13 +41,13 @@ def receive_signed(connection: socket.socket, size: int) -> tuple[bytes, int]:
     return data, 0
 
 
-def process_state(pid: int) -> str:
-    """Return the state letter of /proc/PID/stat, or "X" if there is no such process."""
+def process_state(pid: int | str) -> str:
+    """Return the state letter of a process, or of a thread PID/task/TID; "X" if it has ended."""
     stat = stat_fields(pid)
     return stat[0].decode() if stat else "X"
 
 
-def stat_fields(pid: int) -> list[bytes]:
+def stat_fields(pid: int | str) -> list[bytes]:
     """Return the fields of /proc/PID/stat after the name; none if there is no such process."""
     try:  # a third of the time of pathlib; the supervisor calls this 66 times a second
         stat = os.open(f"/proc/{pid}/stat", os.O_RDONLY | os.O_CLOEXEC)

@@ -30,8 +30,6 @@ from rampart.actors.supervision.unseen import report_callbacks, watch
 from rampart.files import working_folder
 from rampart.files.streams import complain
 
-__all__ = ["LaunchError", "Launcher"]
-
 STARTUP_S = (0.8, 5.0)
 """Least and most wall seconds from the start of the processes to simulated time 0. Until then,
 silence is not a fault."""

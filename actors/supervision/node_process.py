@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rampart.actors.access.rules import access_of
-from rampart.actors.bus.bus import Bus, BusError
+from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import ROUTERS, board_of, is_here, issue, register_of
 from rampart.actors.bus.zenoh_bus import ZenohBus
@@ -48,7 +48,7 @@ EXIT_FAILED = 1
 def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
                loop: asyncio.AbstractEventLoop, *,
                failed: Callable[[Exception], None] = lambda _error: None,
-               bus: Bus | None = None) -> Actor:
+               bus: ZenohBus | None = None) -> Actor:
     """Build one actor of the system; it does not run yet.
 
     Args:
@@ -58,14 +58,12 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         run: The context that all actors of the run share.
         loop: The event loop that it will run on.
         failed: Called with its error.
-        bus: Its bus; None for a new one.
+        bus: An open bus, which takes its name; None for a new one.
     """
     member = layout.members.get(name) or router(name)
-    clock = clock_of(layout.plan, loop.time)
-    bus = bus or _bus_of(layout, name)
-
     return member.actor(Context(
-        name, incarnation, clock, bus, member.parameters, run,
+        name, incarnation, clock_of(layout.plan, loop.time), _bus_of(layout, name, bus),
+        member.parameters, run,
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s,
@@ -75,7 +73,7 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         command_age_s=layout.hosts.command_age_s))
 
 
-def _bus_of(layout: Layout, name: str, bus: ZenohBus | None = None) -> ZenohBus:
+def _bus_of(layout: Layout, name: str, bus: ZenohBus | None) -> ZenohBus:
     """Return the bus of an actor: the given one, which takes its name, or a new one."""
     plan = layout.plan
     recorder = RecorderConnection(plan.base_port)
@@ -161,10 +159,9 @@ async def _run_actors(layout: Layout, role: Role, run: RunContext,
                       failed: Callable[[Exception], None], bus: ZenohBus | None) -> None:
     loop = asyncio.get_running_loop()
     report_callbacks(loop, lambda line: complain(f"{role}: {line}"))
-    buses = {name: _bus_of(layout, name, bus if name == role.names[0] else None)
-             for name in role.names}
-    actors = [make_actor(layout, name, role.incarnation, run, loop, failed=failed, bus=one)
-              for name, one in buses.items()]
+    buses = (bus, *(None for _ in role.names[1:]))
+    actors = [make_actor(layout, name, role.incarnation, run, loop, failed=failed, bus=each)
+              for name, each in zip(role.names, buses, strict=True)]
 
     def stop_all() -> None:
         for actor in actors:

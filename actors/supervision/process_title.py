@@ -17,7 +17,7 @@ from pathlib import Path
 import setproctitle
 
 from rampart.actors.bus.run_folder import remove
-from rampart.actors.foreign.descendants import kill_programs
+from rampart.actors.foreign.descendants import descendants, kill_all
 from rampart.actors.machine.unix_peer import process_state
 
 RUN = "run"
@@ -91,7 +91,8 @@ def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> bool:
 
 def end_run(launcher: int, folder: str) -> None:
     """End all other processes of a run whose root has ended, and remove its folder."""
-    kill_programs(process.pid for process in find_processes(launcher=launcher))
+    nodes = [process.pid for process in find_processes(launcher=launcher)]
+    kill_all(lambda: descendants(*nodes))
     for process in find_processes(launcher=launcher):
         if process.pid != os.getpid():
             kill(process.pid)

@@ -10,8 +10,22 @@ closes the links as quickly, and without a panic.
 
 from __future__ import annotations
 
-from rampart.actors.machine.heap import keep_large_apart
+import ctypes
+
 from rampart.actors.runtime.actor import Actor, Context
+
+_M_MMAP_THRESHOLD = -3  # malloc.h of glibc
+LARGE_BYTES = 32_768
+
+
+def keep_large_apart() -> None:
+    """Give each large block its own pages from now on, which return to the kernel when it is freed.
+
+    In the heap, small blocks that stay would fill the space of a freed block, and the next large
+    one would take new pages. By default glibc raises the threshold to the size of a freed block
+    (mallopt(3)).
+    """
+    ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE_BYTES)
 
 
 class Router(Actor):

@@ -157,11 +157,6 @@ class RestartPolicy:
     attempts: int = 0
     _restarts: deque[float] = field(default_factory=deque)
 
-    @property
-    def spent(self) -> str:
-        """The limit, in words."""
-        return f"{self.limits.intensity} restarts in {self.limits.period_s:.0f} s"
-
     def delay_s(self, now_s: float) -> float | None:
         """Return the wait before the next restart, None to give up."""
         limits = self.limits
@@ -307,7 +302,8 @@ class SupervisedProcess:
             self.delay_s = delay_s
             return Event.RESTART, ""
         self.delay_s = policy.attempt_in_s(now_s)
-        why = f"attempt {failed} failed" if failed else policy.spent
+        why = f"attempt {failed} failed" if failed else (
+            f"{policy.limits.intensity} restarts in {policy.limits.period_s:.0f} s")
         return Event.TOO_OFTEN, f"{why}, the next attempt is in {self.delay_s:.0f} s"
 
     def take(self, pid: int, incarnation: int) -> None:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
 import subprocess
 import sys
 
 import pytest
 
-from rampart.actors.machine import heap
-
 KEPT_MB = """
 import ctypes
 import psutil
-from rampart.actors.machine.heap import LARGE_BYTES
-from rampart.actors.supervision.router import Router
+from rampart.actors.supervision.router import LARGE_BYTES, Router
 from rampart.testing.virtual import VirtualSystem, run
 
 async def one():
@@ -42,8 +38,3 @@ def test_a_router_keeps_nothing_of_what_was_large(as_router, least, most):
     done = subprocess.run([sys.executable, "-c", KEPT_MB.format(as_router=as_router)],
                           capture_output=True, text=True, check=True, timeout=60)
     assert least < float(done.stdout) < most
-
-
-def test_a_c_library_that_cannot_is_left_alone(monkeypatch):
-    monkeypatch.setattr(ctypes, "CDLL", lambda _name: object())
-    heap.keep_large_apart()
