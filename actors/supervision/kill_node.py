@@ -46,10 +46,7 @@ def find_node(node: str, name: str, port: int | None = None) -> RunProcess:
     """
     if name not in SIGNALS:
         raise SignalError(f"unknown signal {name!r}; known: {', '.join(SIGNALS)}")
-    return _find(find_processes(port), node, port)
-
-
-def _find(processes: list[RunProcess], node: str, port: int | None) -> RunProcess:
+    processes = find_processes(port)
     where = f" on port {port}" if port is not None else ""
     if not processes:
         raise SignalError(f"no run found{where}; start one with `python launch.py`")

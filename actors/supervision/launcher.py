@@ -71,7 +71,6 @@ class Launcher:
         self.report: Callable[[str], None] = complain
         self._title = title
         self._link = link
-        self._is_child = link is not None
         self._root: subprocess.Popen[bytes] | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
@@ -99,7 +98,7 @@ class Launcher:
         await self.connect()
         begun = await self._ask(requests.Begin(self.plan, self._title), requests.Begun)
         self.plan, self.names, self._load_s = begun.plan, begun.names, begun.load_s
-        if self._is_child:
+        if self._link is not None:
             set_title(self.plan.base_port, self.plan.launcher_pid, (RUN,), 1)
             _clean_up_after(self.plan.launcher_pid, self.plan.folder)
 

@@ -62,7 +62,7 @@ class ProcessHandle:
         """Do not report its end any more."""
 
     def close(self) -> None:
-        """Release the process."""
+        """Release the process. Nothing may be called afterwards."""
 
 
 class Processes(Protocol):
@@ -115,15 +115,12 @@ class OsHandle(ProcessHandle):
         self._ended()
 
     def kill(self) -> None:
-        if self._pidfd >= 0:
-            with contextlib.suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
 
     def gone(self) -> bool:
         # Not the state in /proc: it is that of the main thread, which may be a zombie while another
         # thread still holds the ports. A pidfd is readable when the last thread has ended.
-        if self._pidfd < 0:
-            return True
         poll = select.poll()  # not select(), which handles only 1024 descriptors
         poll.register(self._pidfd, select.POLLIN)
         return bool(poll.poll(0))
@@ -135,14 +132,11 @@ class OsHandle(ProcessHandle):
         return usage(self._pid)
 
     def ignore(self) -> None:
-        if self._pidfd >= 0:
-            self._loop.remove_reader(self._pidfd)
+        self._loop.remove_reader(self._pidfd)
 
     def close(self) -> None:
-        if self._pidfd >= 0:
-            self.ignore()
-            os.close(self._pidfd)
-            self._pidfd = -1
+        self.ignore()
+        os.close(self._pidfd)
 
 
 class OsProcesses:

@@ -32,7 +32,6 @@ import ctypes
 import gc
 import os
 import resource
-import select
 import selectors
 import signal
 import socket
@@ -263,7 +262,8 @@ class Root:
             elif pid == self._supervisor.pid:
                 self._supervisor.pid = 0
                 self._unlink_supervisor()
-            elif not self._supervisor.works and self.plan.routers.keys() & set(names):
+            elif not (self._has_ended or self._supervisor.works) and (
+                    self.plan.routers.keys() & set(names)):
                 with contextlib.suppress(OSError):  # tried again with the next supervisor
                     self._start_routers()  # a supervisor that starts needs a bus
 
@@ -420,9 +420,8 @@ class Root:
     def _await_end(self, is_over: Callable[[], bool], within_s: float) -> None:
         until_s = time.monotonic() + within_s
         self._reap()
-        while not is_over() and (left_s := until_s - time.monotonic()) > 0:
-            if select.select([self._woken], [], [], left_s)[0]:
-                self._wake()
+        while not is_over() and time.monotonic() < until_s:
+            time.sleep(0.002)
             self._reap()
 
     # -- the supervisor -------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import select
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -325,6 +326,27 @@ async def test_an_orderly_end_stops_nodes_and_then_routers_also_with_a_hung_supe
     await asyncio.wait_for(looking, 12)
     assert set(order[-2:]) == set(ROUTERS)
     assert find_processes(port) == []
+
+
+def router_incarnations(port: int, within_s: float) -> set[int]:
+    found, until_s = set(), time.monotonic() + within_s
+    while time.monotonic() < until_s:
+        found |= {p.incarnation for p in find_processes(port) if set(p.names) & set(ROUTERS)}
+    return found
+
+
+async def test_an_end_while_the_supervisor_starts_starts_no_router_again(tmp_path):
+    async with running(tmp_path) as (launcher, _):
+        port, root = launcher.plan.base_port, launcher.plan.launcher_pid
+        children = Path(f"/proc/{root}/task/{root}/children")
+        before = children.read_text().split()
+        os.kill(process(port, "supervisor"), signal.SIGKILL)
+        while not (new := set(children.read_text().split()).difference(before)):
+            pass
+        os.kill(int(new.pop()), signal.SIGSTOP)  # before it sends anything
+        looking = asyncio.create_task(asyncio.to_thread(router_incarnations, port, 2.5))
+        await asyncio.sleep(0.1)
+    assert await looking == {1}
 
 
 async def test_an_unsound_spec_is_one_line(tmp_path):
