@@ -75,7 +75,7 @@ class Overload(DetectionModule):
         self._waited_s: dict[int, float] = {}
         self._sampled_s = self._was_late_s = -math.inf
         self._may_wait = False
-        self._knows_from_s = self.known_after_s(chosen.clear_s)
+        self._knows_from_s = self.known_after_s(chosen.within_s)
         self.monitor = self.judged_by(Sustained(0.0, chosen.clear_s, self._knows_from_s))
 
     @classmethod

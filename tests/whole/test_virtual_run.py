@@ -201,6 +201,12 @@ def test_an_overload_in_which_nearly_nothing_arrives_leaves_no_latch_behind():
     assert record.decisions[-1].active == ()
 
 
+def test_killed_detection_modules_know_the_state_again_before_their_silence_counts(short):
+    kills = [f"kill:DM{n}@{3 * n}" for n in range(1, 15)]
+    result = run_job(job(*kills, system="osmosis", options=short))
+    assert (result.success, result.safe, decisions(result)) == (True, True, [])
+
+
 def test_killed_guards_come_back_and_the_mission_goes_on(short):
     record = run_virtually(job("kill:supervisor@12", "kill:ftm_manager@14", "kill:safety_pilot@16",
                                "kill:supervisor@18", "kill:graph_planner@18.01",

@@ -106,6 +106,8 @@ class ConsistencyMonitor(Finding):
         self._now_s = now_s
         self._found = found = list(self._contradictions())
         self._since_s = {name: self._since_s.get(name, now_s) for name, *_ in found}
+        if not found and self._outputs.keys() == _SUBJECTS.keys():
+            self.known = True  # a respawned module has seen the whole chain, and it is consistent
         for name, output, reason, lasts_s in found:
             if now_s >= self._since_s[name] + lasts_s - 1e-9:
                 self.nodes, self.reason = (output.name,), f"{output.source}: {reason}"

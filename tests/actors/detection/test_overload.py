@@ -87,6 +87,6 @@ def test_it_lasts_while_many_wait_for_a_processor_but_not_for_ever(waits_until_s
 
 
 def test_a_successor_says_nothing_before_it_knows():
-    assert states([], until_s=0.9, incarnation=2) == []
-    assert states([], until_s=2.0, incarnation=2) == [(1.0, "idle")]
-    assert states([(0.5, "abc", 0.2)], until_s=0.9, incarnation=2) == [(0.5, "active")]
+    assert states([], until_s=0.4, incarnation=2) == []
+    assert states([], until_s=2.0, incarnation=2) == [(0.5, "idle")]
+    assert states([(0.3, "abc", 0.2)], until_s=0.9, incarnation=2) == [(0.3, "active")]

@@ -194,6 +194,20 @@ def test_a_lasting_contradiction_names_the_first_in_the_chain_who_is_wrong(case)
     assert reason in monitor.reason
 
 
+@pytest.mark.parametrize(("changes", "knows"), [({}, True), ({"route": {"step": 3}}, False)])
+def test_a_respawned_module_knows_what_it_has_seen_whole_unless_it_is_contradictory(changes, knows):
+    story = Story()
+    for what, fields in changes.items():
+        story.change(what, **fields)
+    monitor = ConsistencyMonitor(ConsistencyLimits(), 0.0, known=False)
+    monitor.take(story.mission, "mission_manager", 1, 0.0, 0.0)
+    assert not monitor.known
+    monitor, _ = watch(story, 0.5, monitor)
+    assert (monitor.known, monitor.active) == (knows, False)
+    monitor, found = watch(story, 4.0, monitor, 0.5)
+    assert (found is None) is knows
+
+
 @pytest.mark.parametrize("changes", [
     {},
     {**PAUSED, **IDLE_GOAL, **IDLE_ROUTE},
