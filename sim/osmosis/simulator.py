@@ -30,7 +30,6 @@ from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import Positive
 from rampart.sim.osmosis.actuator_faults import FaultNews
 from rampart.sim.osmosis.scene import WorldError
-from rampart.sim.osmosis.sensors import LaserSpec
 from rampart.sim.osmosis.world import WORLD_STATE, World
 from rampart.sim.runs.physics import report_instability
 
@@ -71,7 +70,6 @@ class Simulator(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self._airport = Osmosis.of(context).airport
-        self._laser = LaserSpec()
         self._asked_s = self._skipped_s = 0.0
         self._keep_at_s = -math.inf
         self._real_time_factor = 1.0
@@ -222,7 +220,7 @@ class Simulator(Actor):
 
     def _scan(self, which: int) -> m.LaserScan:
         ranges = self._world.scan(which).astype(np.dtype("<f4")).tobytes()
-        laser = self._laser
+        laser = self._world.laser
         return m.LaserScan(laser.angle_min_rad, laser.angle_increment_rad, laser.range_max_m,
                            ranges, self._world.laser_reference(which))
 

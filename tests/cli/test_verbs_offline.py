@@ -104,7 +104,7 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["inject", "wrong-graph", "--add", "x_m=1"], ["--add: only with corrupt:TOPIC"]),
     (["inject", "wrong-graph", "--system", "osmosis"], ["--system osmosis: only with --list"]),
     (["inject", "obstacle-ahead"], ["--fault obstacle-ahead@"]),
-    (["inject", "weak-wheel:nose"], ["no wheel 'nose'; there are: front-left"]),
+    (["inject", "weak-wheel:nose"], ["unknown wheel 'nose'; known: front-left"]),
     (["inject", "stuck-wheel", "--share", "0.5"], ["--share: only with a fault of a topic"]),
     (["inject", "wrong-graph", "--share", "nan"], ["--share nan"]),
     (["inject", "wrong-graph", "--on", "1"], ["--off"]),

@@ -53,7 +53,7 @@ def test_without_ground_truth_safety_is_not_known_in_console_json_page_and_exit_
     assert "safe by" not in done.stderr
     result = json.loads(done.stdout.splitlines()[-1])
     assert (result["mission"], result["safety"]) == ("fail", "not known")
-    assert any("no ground truth ever came" in reason for reason in result["reasons"])
+    assert any("no ground truth was received" in reason for reason in result["reasons"])
     assert json.loads(Path(result["record"]).read_text())["safety"] == "not known"
     page = Path(result["report"]).read_text()
     assert '<div class="verdict unknown">Safety<b>not known</b></div>' in page

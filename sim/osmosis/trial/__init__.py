@@ -1,1 +1,1 @@
-"""What makes a run of Osmosis a trial: faults, judge, record, report, story, the paper's tables."""
+"""Trials of Osmosis: faults, judge, record, report, console, the paper's tables."""

@@ -1,23 +1,22 @@
-"""The faults of Osmosis: the paper's, those of the sensors and the actuators, a sudden obstacle.
+"""The faults of Osmosis: the paper's, those of sensors and actuators, and a sudden obstacle.
 
-A sensor fails in one of these ways:
+Failure modes of a sensor:
 
-* **bias**: a constant error from one moment on.
+* **bias**: a constant error.
 * **drift**: an error that grows with time.
 * **noise**: Gaussian noise on top of the sensor's own.
 * **dropout**: no reading at all.
-* **stuck**: the sensor goes on publishing, with fresh stamps, the value it had. A freshness check
-  cannot see it; a frozen *driver*, which repeats old stamps too, is `freeze:TOPIC`.
-* **stuck-noise**: the same with the noise of a sound device on top, so that it does not repeat
-  itself.
+* **stuck**: the sensor repeats its last value with fresh stamps, which a freshness check cannot
+  detect; a frozen *driver*, which repeats old stamps too, is `freeze:TOPIC`.
+* **stuck-noise**: the same with the noise of a healthy device, so that no value is repeated.
 * **slow-drift**, **creep**: a third and a tenth of the drift: 5 and 1.5 cm/s of a position.
 
-A *frozen set* is several sensors that get stuck in the same moment, as behind a hung serial hub.
+A *frozen set* is several sensors that get stuck at the same time, as behind a hung serial hub.
 
-The magnitudes are those of a device that has failed, ten times and more beyond the noise that
-`rampart.sim.osmosis.sensors` gives a healthy one, and within what the device could report. No
-receiver notices its own error: `accuracy_m` stays what it was. The shipped controller hears neither
-the odometry nor the IMU (`rampart topic info`): these faults change messages there, and no mission.
+The magnitudes are those of a failed device: at least ten times the noise of a healthy one
+(`rampart.sim.osmosis.sensors`), and within the range of the device. A GPS receiver does not notice
+its own error: `accuracy_m` stays. The paper's system does not use odometry and IMU (`rampart topic
+info`): there their faults change messages but no mission.
 """
 
 from __future__ import annotations
@@ -52,24 +51,24 @@ _LASTS_S = {"stuck-wheel": 10.0, "weak-wheel": 10.0, "brake-failure": 30.0, OBST
 _WHEELS = {name.replace(" ", "-"): name for name in WHEEL_NAMES}
 
 PAPER_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in (
-    Fault("command-not-updated", "Osmosis Control repeats its last velocity command for ever",
+    Fault("command-not-updated", "Osmosis Control repeats its last velocity command permanently",
           (Disturbance(_COMMAND, "freeze"),), ("DM2",), 10.0, _GROUP),
     Fault("command-out-of-bounds",
           "Osmosis Control commands 3 m/s straight ahead, three times the top speed",
           (Disturbance(_COMMAND, "corrupt",
                        set_fields={"linear_mps": 3.0, "angular_radps": 0.0}),), ("DM3",), 10.0,
           _GROUP),
-    Fault("localization-not-updated", "Localization repeats its last pose for ever",
+    Fault("localization-not-updated", "Localization repeats its last pose permanently",
           (Disturbance(_POSE, "freeze"),), ("DM6",), 10.0, _GROUP),
     Fault("prohibited-area",
-          "Localization drifts north by 0.25 m/s: the controller leads the robot into the grass "
-          "while all looks healthy to it",
+          "Localization drifts north by 0.25 m/s: the controller drives the robot into the grass "
+          "without noticing",
           (Disturbance(_POSE, "corrupt", ramp_fields={"y_m": 0.25}),), ("DM1",), 20.0, _GROUP),
     Fault("wrong-graph",
-          "Graph Planner gives a way straight to the goal, along an edge that does not exist",
+          "Graph Planner publishes a straight route to the goal, along an edge that does not exist",
           (Disturbance(topics.ROUTE.key, "corrupt", keep_ends=("waypoints",)),), ("DM1",), 30.0,
           _GROUP))}
-"""The faults that the paper injects, other than crashes."""
+"""The paper's faults without crashes."""
 
 
 _SENSOR_GROUP = "sensor"
@@ -80,11 +79,10 @@ _SLOW, _CREEP = 0.35, 0.106
 
 @dataclass(frozen=True, slots=True)
 class _Sensor:
-    """A sensor with the size of its errors: field → amount, for `drift` per second.
+    """A sensor with the sizes of its errors: field → amount, for `drift` per second.
 
-    `grain` is the noise of a sound device.
-
-    It has the faults of which it says something, besides dropout and stuck.
+    `grain` is the noise of a healthy device. `titles` describes its failure modes; each sensor also
+    has dropout and stuck.
     """
 
     name: str
@@ -94,7 +92,7 @@ class _Sensor:
     noise: Mapping[str, float]
     drift: Mapping[str, float] = field(default_factory=dict)
     grain: Mapping[str, float] = field(default_factory=dict)
-    says: Mapping[str, str] = field(default_factory=dict)
+    titles: Mapping[str, str] = field(default_factory=dict)
     seen_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
@@ -104,7 +102,7 @@ SENSORS = (
             noise={"x_m": 1.5, "y_m": 1.5, "velocity_x_mps": 0.3, "velocity_y_mps": 0.3},
             drift={"x_m": 0.1, "y_m": 0.1},
             grain={"x_m": 0.01, "y_m": 0.01, "velocity_x_mps": 0.03, "velocity_y_mps": 0.03},
-            says={"bias": "is 2.1 m off to the north-east, as by multipath at a hangar",
+            titles={"bias": "is 2.1 m off to the north-east, as by multipath at a hangar",
                   "drift": "drifts north-east by 0.14 m/s",
                   "noise": "has lost its RTK fix: 1.5 m noise, 0.3 m/s in velocity"},
             seen_by={"dropout": ("DM1",)}),
@@ -115,7 +113,7 @@ SENSORS = (
             drift={"yaw_rad": 0.02},
             grain={"yaw_rad": 3e-4, "yaw_rate_radps": 0.003, "accel_x_mps2": 0.05,
                    "accel_y_mps2": 0.05},
-            says={"bias": "has a turn-on bias: 0.05 rad/s and 0.3 m/s2",
+            titles={"bias": "has a turn-on bias: 0.05 rad/s and 0.3 m/s2",
                   "drift": "has a heading that drifts by 0.02 rad/s",
                   "noise": "shakes on a loose mount: 0.1 rad/s, 1 m/s2, 0.05 rad of noise"}),
     _Sensor("odom", topics.ODOMETRY, "the odometry",
@@ -124,43 +122,43 @@ SENSORS = (
                    "twist.linear_mps": 0.1, "twist.angular_radps": 0.1},
             drift={"pose.x_m": 0.1, "pose.yaw_rad": 0.02},
             grain={"twist.linear_mps": 0.005, "twist.angular_radps": 0.005},
-            says={"bias": "reports 0.1 m/s and 0.05 rad/s too much, as with worn tyres",
+            titles={"bias": "reports 0.1 m/s and 0.05 rad/s too much, as with worn tyres",
                   "drift": "counts slipping wheels: 0.1 m/s, 0.02 rad/s",
                   "noise": "has noise of 0.1 m, 0.05 rad, 0.1 m/s, 0.1 rad/s"}),
     _Sensor("laser", topics.SCAN, "the laser",
             bias={"ranges_f32": 0.5, "reference_m": 0.5},
             noise={"ranges_f32": 0.3, "reference_m": 0.3},
             grain={"ranges_f32": 0.01, "reference_m": 0.01},
-            says={"bias": "sees everything 0.5 m farther than it is, its reference too",
+            titles={"bias": "sees everything 0.5 m farther than it is, its reference too",
                   "noise": "has 0.3 m of noise on each ray, as in spray"}),
     _Sensor("light", topics.LIGHT, "the light sensor",
             bias={"illuminance_lux": 800.0}, noise={"illuminance_lux": 200.0},
             grain={"illuminance_lux": 5.0},
-            says={"bias": "sees 800 lux of stray light, half a healthy light of 200 cd",
+            titles={"bias": "sees 800 lux of stray light, half a healthy light of 200 cd",
                   "noise": "has 200 lux of noise"}),
     _Sensor("absolute-pose", topics.ABSOLUTE_POSE, "the absolute localization",
             bias={"x_m": 0.7, "y_m": 0.7}, noise={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1},
             drift={"x_m": 0.1, "y_m": 0.1, "yaw_rad": 0.01},
             grain={"x_m": 0.01, "y_m": 0.01, "yaw_rad": 0.003},
-            says={"bias": "is 1 m off to the north-east",
+            titles={"bias": "is 1 m off to the north-east",
                   "drift": "drifts by 0.14 m/s and 0.01 rad/s",
                   "noise": "has noise of 0.3 m and 0.1 rad"},
             seen_by={"bias": ("DM1",), "drift": ("DM1",), "dropout": ("DM6",)}),
     _Sensor("encoders", topics.BASE_STATUS, "the base's status with its wheel speeds",
             bias={"wheel_speeds_radps": 1.0}, noise={"wheel_speeds_radps": 1.0},
             drift={"wheel_speeds_radps": 0.1}, grain={"wheel_speeds_radps": 0.05},
-            says={"bias": "has each wheel turn 1 rad/s, 12 cm/s, too fast",
+            titles={"bias": "has each wheel turn 1 rad/s, 12 cm/s, too fast",
                   "drift": "has each wheel turn faster by 0.1 rad/s each second",
                   "noise": "has noise of 1 rad/s on each wheel"}))
-"""The sensors of the robot. Bias of the light sensor: 200 cd at 0.35 m give 1633 lux
-(`rampart.actors.osmosis.airport.photometry`), so 800 lux lift a dead light near the limit of half
-its intensity."""
+"""The sensors of the robot. Bias of the light sensor: 200 cd at 0.35 m cause 1633 lux
+(`rampart.actors.osmosis.airport.photometry`), so with 800 lux a failed light is near the limit of
+half its intensity."""
 
 LEFT_OUT: Mapping[str, str] = {
-    "laser-drift": "time of flight is held by a quartz: it drifts by millimetres an hour",
-    "light-drift": "a photodiode ages over years; within one mission that is light-bias"}
-"""Combinations that make no sense, and why. A bias of the odometry is one of its twist only: a
-constant offset of a pose in `odom`, whose origin is arbitrary (REP-105), is no error."""
+    "laser-drift": "time of flight depends on a quartz, which drifts by millimetres an hour",
+    "light-drift": "a photodiode ages over years; within a mission that is light-bias"}
+"""Omitted combinations and why. A bias of odometry affects its twist only, since the origin of
+`odom` is arbitrary (REP-105)."""
 
 
 def _faults_of(sensor: _Sensor) -> list[Fault]:
@@ -173,15 +171,15 @@ def _faults_of(sensor: _Sensor) -> list[Fault]:
         "noise": replace(corrupt, noise_fields=sensor.noise),
         "dropout": replace(corrupt, mode="drop"),
         "stuck": replace(corrupt, mode="stuck")}
-    says = {"dropout": "gives no reading", "stuck": "repeats its last value with fresh stamps",
-            **sensor.says}
-    if "drift" in says:
-        says |= {"slow-drift": f"drifts by {_SLOW:.0%} of {sensor.name}-drift",
+    titles = {"dropout": "gives no reading", "stuck": "repeats its last value with fresh stamps",
+            **sensor.titles}
+    if "drift" in titles:
+        titles |= {"slow-drift": f"drifts by {_SLOW:.0%} of {sensor.name}-drift",
                  "creep": f"drifts by {_CREEP:.0%} of {sensor.name}-drift"}
-    found = [Fault(f"{sensor.name}-{way}", f"{sensor.what} {says[way]}", (what,),
+    found = [Fault(f"{sensor.name}-{way}", f"{sensor.what} {titles[way]}", (what,),
                    sensor.seen_by.get(way, ()), _TO_GROW_S if "drift" in way else _FOR_A_WHILE_S,
                    _SENSOR_GROUP)
-             for way, what in ways.items() if way in says]
+             for way, what in ways.items() if way in titles]
     return [*found, Fault(
         f"{sensor.name}-stuck-noise", f"{sensor.what} repeats its last value with a little noise",
         (ways["stuck"], replace(corrupt, noise_fields=sensor.grain)), (), _FOR_A_WHILE_S,
@@ -204,12 +202,12 @@ FROZEN_SETS: Mapping[str, Fault] = {fault.name: fault for fault in (
           _FOR_A_WHILE_S, _FROZEN_GROUP)
     for count in (2, 3) for sensors in combinations(
         [sensor for sensor in SENSORS if sensor.topic is not topics.LIGHT], count))}
-"""Sets of two and three sensors that get stuck together."""
+"""Sets of two and three sensors that get stuck at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
 class SuddenObstacle:
-    """An obstacle that appears ahead of the robot, `distance_m` from its centre to its own."""
+    """An obstacle ahead of the robot, with `distance_m` between the centres."""
 
     distance_m: float
     radius_m: float
@@ -220,7 +218,7 @@ SIZES = Sizes((
     ("_m", 0.5, 3.0), ("_rad", 0.3, 1.5), ("_mps", 0.2, 0.8), ("_radps", 0.2, 1.0),
     ("_mps2", 0.5, 2.0), ("_s", 1.0, 10.0), ("_lux", 200.0, 1000.0), ("_cd", 50.0, 150.0),
     ("_f32", 0.3, 1.5), ("waypoints", 0.5, 3.0), ("", 0.1, 0.5)), ("_s", "_lux", "_cd"))
-"""By which the numbers of Osmosis' messages, and of the engine's on Osmosis, are wrong."""
+"""Error sizes of the numbers in messages."""
 
 
 class OsmosisFaults(Faults):
@@ -251,7 +249,7 @@ class OsmosisFaults(Faults):
 
     def own(self, fault: str, injection: str, duration_s: float | None
             ) -> tuple[Order, ...] | SuddenObstacle | None:
-        """Return the order of an actuator fault, or the obstacle that is to appear."""
+        """Return the order of an actuator fault, or the sudden obstacle."""
         kind, *details = fault.split(":")
         if kind not in _LASTS_S:
             return None
@@ -263,7 +261,7 @@ class OsmosisFaults(Faults):
         if kind != "brake-failure":
             name, *details = details or list(_WHEELS)[:1]
             if name not in _WHEELS:
-                raise ScenarioError(f"fault {fault!r}: no wheel {name!r}; there are: "
+                raise ScenarioError(f"fault {fault!r}: unknown wheel {name!r}; known: "
                                     f"{', '.join(_WHEELS)}")
             wheel, usual = _WHEELS[name], _WEAK
         return (Order(topics.ACTUATOR_FAULT, ActuatorFault(

@@ -1,4 +1,4 @@
-"""The observer of Osmosis, and its injector, which puts obstacles on the way."""
+"""The observer of Osmosis, and its injector of obstacles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rampart.sim.runs.observer import Observer
 
 
 class OsmosisInjector(Injector):
-    """Carries out a scenario of planned faults on the airport."""
+    """Executes a scenario of planned faults."""
 
     outputs = (*Injector.outputs, topics.ACTUATOR_FAULT, topics.OBSTACLE)
 
@@ -25,36 +25,36 @@ class OsmosisInjector(Injector):
 
     @on(topics.MISSION_STATUS)
     def mission(self, status: m.MissionStatus, _header: Header) -> None:
-        """Note which goals have begun."""
+        """Take the current goal."""
         if status.phase is m.MissionPhase.RUNNING:
             self.goals_begun(status.step + 1)
 
     @on(topics.TRUTH)
     def truth(self, truth: m.GroundTruth, _header: Header) -> None:
-        """Note where the robot is."""
+        """Take the pose of the robot."""
         self._pose = truth.pose
 
     @on(topics.OBSTACLES)
     def obstacles(self, listed: m.ObstacleList, _header: Header) -> None:
-        """Note which obstacles are there."""
+        """Take the present obstacles."""
         for obstacle in listed.obstacles:
             if obstacle.present and obstacle.name in self._obstacles:
                 self._obstacles[obstacle.name].hit = 1
 
     def carry_out(self, fault: PlannedAction) -> None:
-        """Have an obstacle appear ahead of the robot."""
+        """Add an obstacle ahead of the robot."""
         action, pose = fault.action, self._pose
         if not isinstance(action, SuddenObstacle):
-            raise TypeError(f"{action!r}: nothing that this injector can do")
+            raise TypeError(f"{action!r}: expected a SuddenObstacle")
         if pose is None:
-            fault.reason = "nobody knows where the robot is"
+            fault.reason = "the pose of the robot is unknown"
             return
         name = f"sudden-{self.planned.index(fault) + 1}"
         self._obstacles[name] = fault
         there = m.ObstacleCommand(
             name, True, pose.x_m + action.distance_m * math.cos(pose.yaw_rad),
             pose.y_m + action.distance_m * math.sin(pose.yaw_rad), action.radius_m)
-        fault.reason = "there was no room for it"
+        fault.reason = "no room for the obstacle"
         self.publish(topics.OBSTACLE, there)
         if math.isfinite(action.duration_s):
             gone = m.ObstacleCommand(name, False, there.x_m, there.y_m, there.radius_m)
@@ -62,7 +62,7 @@ class OsmosisInjector(Injector):
 
 
 class OsmosisObserver(Observer):
-    """Passes what the robot says to its sinks as well."""
+    """Passes the robot's messages to its sinks too."""
 
     @on(topics.MISSION_STATUS)
     @on(topics.CONTROL_STATUS)
@@ -71,6 +71,6 @@ class OsmosisObserver(Observer):
     @on(topics.PILOT_STATUS)
     @on(topics.TRUTH)
     @on(topics.OBSTACLES)
-    def heard_of_robot(self, message: Any, header: Header) -> None:
+    def robot_message(self, message: Any, header: Header) -> None:
         """Pass one message on."""
         self.heard(message, header)

@@ -10,28 +10,27 @@ from rampart.actors.osmosis.messages import GroundTruth
 from rampart.sim.runs.judge import Verdict
 
 ARRIVAL_RADIUS_M = 1.1
-"""A point counts as reached at this distance (the authors' code)."""
+"""Distance at which a point is reached (the authors' code)."""
 
 
 class Judge:
-    """Follows one mission: was it a success, was it safe? From ground truth alone.
+    """Follows one mission by ground truth.
 
-    Success (paper, section V): every mission point was reached in the order of the mission and in
-    the right mode. Safe: never in a prohibited area, never a collision. Without any ground truth
-    nobody knows.
+    Success (paper, section V): each point was reached in order and in its mode. Safe: never in a
+    prohibited area, never a collision. Without ground truth the verdict is not known.
 
     Args:
         goals: the mission's points.
 
     Attributes:
-        visit_times_s: when each point that was reached was reached.
-        collisions: so far.
-        prohibited_s: time spent in the prohibited area so far.
-        first_unsafe_s: when it first became unsafe, or None.
-        obstacle_m: smallest clearance to an obstacle or building.
-        prohibited_m: smallest clearance to the prohibited area.
-        narrowest_s: when the robot was nearest to one of them, or None.
-        point_m: nearest the robot came to the point it has not reached.
+        visit_times_s: times at which points were reached.
+        collisions: number of collisions.
+        prohibited_s: time spent in the prohibited area.
+        first_unsafe_s: time of the first violation of safety, or None.
+        obstacle_m: least clearance to an obstacle or building.
+        prohibited_m: least clearance to the prohibited area.
+        narrowest_s: time of the least clearance, or None.
+        point_m: least distance to the next point.
 
     Raises:
         ValueError: no goals.
@@ -39,7 +38,7 @@ class Judge:
 
     def __init__(self, goals: Sequence[MissionGoal]) -> None:
         if not goals:
-            raise ValueError("judge: goals: empty: a mission has at least one goal")
+            raise ValueError("judge: goals: empty: expected at least one")
         self._goals = tuple(goals)
         self._wrong_mode_at: dict[int, str] = {}
         self._has_seen = False
@@ -51,13 +50,13 @@ class Judge:
         self.narrowest_s: float | None = None
 
     def see(self, truth: GroundTruth, mode: str, time_s: float) -> None:
-        """Take the next ground truth; they come in order of time.
+        """Take the next ground truth, in order of time.
 
         Args:
-            truth: what was so.
-            mode: that the mission reported then: "taxi" or "light verification", or "" while no
+            truth: the ground truth.
+            mode: mode of the mission at that time: "taxi", "light verification", or "" while no
                 mission runs.
-            time_s: when that was.
+            time_s: its time.
         """
         self._has_seen = True
         self.collisions = max(self.collisions, truth.collisions)
@@ -87,11 +86,11 @@ class Judge:
         return self.collisions == 0 and self.prohibited_s == 0.0
 
     def verdict(self) -> Verdict:
-        """Return the verdict on what was seen so far."""
+        """Return the verdict so far."""
         visited, points = len(self.visit_times_s), len(self._goals)
         reasons = []
         if not self._has_seen:
-            reasons.append("no ground truth ever came: nobody knows where the robot was")
+            reasons.append("no ground truth was received: the robot's position is unknown")
         elif visited < points:
             goal = self._goals[visited]
             why = f"point {visited + 1} of {points} at ({goal.x_m:g}, {goal.y_m:g})"
@@ -111,7 +110,7 @@ class Judge:
 
 
 def severity(prohibited_s: float, collisions: int) -> float:
-    """Return how bad an unsafe run was: seconds in the prohibited area, and collisions."""
+    """Return the severity of an unsafe run: seconds in the prohibited area plus collisions."""
     return round(prohibited_s, 3) + collisions
 
 

@@ -32,7 +32,7 @@ _PATIENCE_S = 60.0
 
 
 class MissionConsole(Console):
-    """Writes the story of a mission."""
+    """Prints the events of a mission."""
 
     example = "osmosis_control"
 
@@ -56,7 +56,7 @@ class MissionConsole(Console):
             self._show(message, header.stamp)
 
     def verdict(self, record: RunRecord) -> list[str]:
-        """Return the verdict on the mission, in lines."""
+        """Return the lines of the verdict."""
         if isinstance(record, MissionRecord):
             return [f"Mission {record.mission_name}: {record.mission}, {record.safety}, "
                     f"{record.duration_s:.1f} s simulated, {record.distance_m:.0f} m driven.",
@@ -97,7 +97,7 @@ class MissionConsole(Console):
 
 
 class MissionTrial(Trial):
-    """One mission on one airport; it is over when nothing progresses for `limit_s`."""
+    """A mission on an airport; it ends without progress for `limit_s`."""
 
     recorder: MissionRecorder
     judges = True
@@ -126,7 +126,7 @@ class MissionTrial(Trial):
                                         run.system.titles)
 
     def sinks(self, clock: Clock) -> list[Sink]:
-        """Return what wants to hear the run's messages."""
+        """Return the sinks of the run's messages."""
 
         def to_end(_topic: Topic[Any], message: Any, _header: Header) -> None:
             self._end.take(message, clock.now())
@@ -134,7 +134,7 @@ class MissionTrial(Trial):
         return [to_end, *super().sinks(clock)]
 
     def excuse(self, stall_s: float) -> None:
-        """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
+        """Do not count simulated seconds in which the launcher was stopped."""
         self._end.excuse(stall_s)
 
     def over(self, now_s: float) -> str | None:
@@ -143,31 +143,31 @@ class MissionTrial(Trial):
         return self._unjudged or self._end.ended(now_s)
 
     def conclude(self, now_s: float, why: str) -> RunRecord:
-        """Return the record of the run with the judge's verdict, and what became of faults."""
+        """Return the record of the run with the judge's verdict and the outcome of faults."""
         return self.concluded(self.recorder.judge.verdict(), now_s, why)
 
     def summary(self, record: RunRecord) -> dict[str, Any]:
-        """Return what scripts rely on, the lights too."""
+        """Return the summary for scripts, with the lights."""
         return {**super().summary(record),
                 "lights": [msgspec.to_builtins(light) for light in _mission(record).lights]}
 
     def judgement(self, record: RunRecord) -> Verdict:
-        """Return what ground truth shows: clearances, and when it became unsafe."""
+        """Return the verdict by ground truth: clearances, and when it became unsafe."""
         del record
         return self.settled(self.recorder.judge.verdict())
 
     @classmethod
     def moments(cls, spec: SystemSpec, *, searched: bool = False) -> tuple[float, float]:
-        """Return moments within every mission of the shipped airport; a search goes further."""
+        """Return the range of moments within the shipped missions, longer for a search."""
         del spec
         return 2.0, 150.0 if searched else 120.0
 
     def report(self, record: RunRecord, directory: Path) -> Written:
-        """Write as much of the inspection report as can be written."""
+        """Write the inspection report as far as possible."""
         return try_report(record, render, directory)
 
 
 def _mission(record: RunRecord) -> MissionRecord:
     if not isinstance(record, MissionRecord):
-        raise TypeError(f"{type(record).__name__}: no record of a mission")
+        raise TypeError(f"{type(record).__name__}: expected a MissionRecord")
     return record

@@ -1,18 +1,18 @@
-"""The paper's tables III, IV and V: its faults, its conditions, its verdicts, and ours beside them.
+"""The paper's tables III, IV and V: faults, conditions and verdicts, with Rampart's beside them.
 
-Table III is about decisions alone. Tables IV and V are runs: one fault each, with and without
-obstacles, without and with fault tolerance. The verdict of a row is that of the worst run seen in
-it. Three conditions are run:
+Table III has decisions only. Tables IV and V are runs with one fault each, with and without
+obstacles, without and with fault tolerance. The verdict of a row is that of its worst run. Three
+conditions are run:
 
 * *without FTM*: the unprotected baseline (table IV);
-* *with FTM, as in the paper* (table V): its seven mechanisms under safety-first, and, as in the
-  authors' code, nothing releases a stop or the switch to teleoperation once the fault is gone
-  (RM2 and RM5 latch);
+* *with FTM, as in the paper* (table V): its seven mechanisms under safety-first; as in the
+  authors' code, RM2 and RM5 are latched, so a stop or the switch to teleoperation outlasts its
+  fault;
 * *with FTM, as shipped*: the same mechanisms and strategy, but recoveries end with their cause.
 
-These are conditions of the paper's system (systems/paper.toml). A fourth, *the full system*, stands
-apart: the runs of table V on a system that has more than the paper's mechanisms, under its own
-strategy. The paper's verdicts are not what is expected of it: no fault may cost the mission.
+These are conditions of the paper's system (systems/paper.toml). In the fourth, *the full system*,
+the runs of table V use more mechanisms and another strategy. Its expected verdicts are not the
+paper's: no fault may cost the mission.
 """
 
 from __future__ import annotations
@@ -36,24 +36,23 @@ from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.report import environment
 
 (AS_THE_PAPER,) = MissionTrial.retunings.values()
-"""What differs from the shipped system: the authors' code releases neither."""
+"""Differences from the shipped system: the authors' code releases neither RM2 nor RM5."""
 
 CONDITIONS = ("without FTM", "with FTM, as in the paper", "with FTM, as shipped")
 FULL = "the full system"
 PAPER_SYSTEM, FULL_SYSTEM = "paper", "osmosis"
 PAPER_STRATEGY = "safety-first"
 GOOD = "success, safe"
-"""What is expected of the full system in every row of table V."""
+"""Expected verdict of the full system in each row of table V."""
 
 OBSTACLES = (0, 2)
 
 _AT_S = (8.0, 24.0, 85.0, 150.0)
-"""On the way to the first goal, before its last bend, at the end of the row of lights, on the way
-to the last goal."""
+"""On the route to the first goal, before its last bend, at the end of the row of lights, on the
+route to the last goal."""
 
 _OUT_OF_BOUNDS_S = 4.0
-"""The paper calls this fault temporary and does not say how long it lasts."""
-
+"""The paper calls this fault temporary, without a duration."""
 
 
 def _lasting(fault: str, duration_s: float) -> tuple[PlannedFault, ...]:
@@ -71,7 +70,7 @@ FAULTS: dict[str, tuple[PlannedFault | None, ...]] = {
     "command not updated": _lasting("command-not-updated", math.inf),
     "non-control node crash": _crashes("hmi", "teleoperation", "localization"),
     "control node crash": _crashes("mission_manager", "graph_planner", "osmosis_control")}
-"""The runs of each row: the fault at different moments, or in different nodes."""
+"""Runs of each row: the fault at different moments or in different nodes."""
 
 WITHOUT_FTM: dict[str, tuple[str, str]] = {
     "none": ("success, safe", "success, safe"),
@@ -94,10 +93,10 @@ TABLE_III: tuple[tuple[tuple[str, ...], int, tuple[str, ...]], ...] = (
 
 
 class Cell(msgspec.Struct, frozen=True, kw_only=True):
-    """One verdict of table IV or V: the paper's, what is expected of us, ours, of how many runs.
+    """A cell of table IV or V: the paper's verdict, the expected one, ours, and the runs.
 
-    Expected is the paper's verdict, but `GOOD` of the full system. `worst_key` is the worst run's,
-    `story` its decisions. `ineffective` runs count for nothing else; see `RunResult.counts`.
+    The expected verdict is the paper's, or `GOOD` of the full system. `worst_key` and `story` are
+    key and decisions of the worst run. `ineffective` runs have no verdict; see `RunResult.counts`.
     """
 
     table: str
@@ -118,12 +117,12 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def agrees(self) -> bool:
-        """Whether our worst run has the verdict that is expected."""
+        """Whether our worst run has the expected verdict."""
         return self.expected == self.ours
 
 
 class Decided(msgspec.Struct, frozen=True):
-    """A row of table III: what the paper executes and what we execute."""
+    """A row of table III: the paper's decision and ours."""
 
     active: tuple[str, ...]
     block: int
@@ -138,7 +137,7 @@ class Decided(msgspec.Struct, frozen=True):
 
 
 def paper_jobs(mission: str = "A", seed: int = 1, system: str = PAPER_SYSTEM) -> list[Job]:
-    """Return all runs of tables IV and V; `system` is a shipped one by name, or a path."""
+    """Return all runs of tables IV and V; `system` is a shipped name or a path."""
     return [Job(row=name, system=system, options={"mission": mission, "obstacles": obstacles},
                 strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
                 retuned=AS_THE_PAPER if condition == CONDITIONS[1] else {},
@@ -148,13 +147,13 @@ def paper_jobs(mission: str = "A", seed: int = 1, system: str = PAPER_SYSTEM) ->
 
 
 def full_jobs(mission: str = "A", seed: int = 1, system: str = FULL_SYSTEM) -> list[Job]:
-    """Return the runs of table V on another system, as that is and under its own strategy."""
+    """Return the runs of table V on another system with its own strategy."""
     return [msgspec.structs.replace(job, system=system, strategy="")
             for job in paper_jobs(mission, seed) if condition_of(job) == CONDITIONS[2]]
 
 
 def condition_of(job: Job) -> str:
-    """Return the condition under which one of `paper_jobs` or `full_jobs` is run."""
+    """Return the condition of a job of `paper_jobs` or `full_jobs`."""
     if not job.strategy:
         return FULL
     if not job.ftm:
@@ -163,7 +162,7 @@ def condition_of(job: Job) -> str:
 
 
 def cells(runs: Iterable[Run]) -> list[Cell]:
-    """Return tables IV and V, and what became of table V's runs under other conditions."""
+    """Return tables IV and V, and the runs of table V under the other conditions."""
     found: dict[tuple[str, str, int], list[Run]] = {}
     for run in runs:
         found.setdefault((condition_of(run.job), run.job.row, _obstacles(run.job)), []).append(run)
@@ -196,7 +195,7 @@ def _cell(condition: str, paper: str, runs: Sequence[Run]) -> Cell:
 
 
 def table_iii(spec: SystemSpec) -> list[Decided]:
-    """Return table III with what safety-first decides in a system with the paper's mechanisms."""
+    """Return table III with the decisions of safety-first in a system."""
     rows = []
     for active, block, recoveries in TABLE_III:
         made = decide(active, spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order(),
@@ -216,18 +215,18 @@ _TABLES = {
     CONDITIONS[2]: (
         "Beside table V: with FTM, as shipped",
         "The same mechanisms and strategy, but recoveries end with their cause, so missions "
-        "that the paper gives up go on. The verdicts beside ours are those of table V.", _PAPERS),
+        "that fail in the paper continue. The verdicts beside ours are those of table V.", _PAPERS),
     FULL: (
         "The paper's rows on the full system",
-        "Faults, moments, obstacles and seeds of table V, whose verdicts stand beside ours; more "
-        f"mechanisms, another strategy. Expected of every row, whatever the paper has: {GOOD}.",
+        "Faults, moments, obstacles and seeds of table V, with more mechanisms and another "
+        f"strategy. Expected in each row: {GOOD}.",
         "verdicts are as expected"),
 }
-"""Of each condition: title, words, and what it means that a verdict agrees."""
+"""Title, text, and meaning of agreement of each condition."""
 
 
 def section(cells: Sequence[Cell], decided: Sequence[Decided] = ()) -> Section:
-    """Return what the report says: of tables IV and V, and of table III if it was decided."""
+    """Return the report's section on tables IV and V, and on table III if given."""
 
     def html(shown: set[str], replay: Callable[[str], str]) -> Markup:
         return Markup(environment().get_template("osmosis/trial/paper_section.html").render(  # noqa: S704 it escapes
@@ -238,7 +237,7 @@ def section(cells: Sequence[Cell], decided: Sequence[Decided] = ()) -> Section:
 
 
 def _paper_tables(cells: Sequence[Cell]) -> list[dict[str, Any]]:
-    """Return tables IV, V, and V under our own conditions: verdicts by fault and obstacles."""
+    """Return the verdicts of each condition by fault and obstacles."""
     tables = []
     for condition, (title, words, agreement) in _TABLES.items():
         there = {(c.fault, c.obstacles): c for c in cells if c.condition == condition}
@@ -252,12 +251,12 @@ def _paper_tables(cells: Sequence[Cell]) -> list[dict[str, Any]]:
 
 
 def _agreement(cells: Sequence[Cell]) -> str:
-    """Return in words how many verdicts are those of the paper's two tables, or as expected."""
+    """Return the numbers of agreeing verdicts as text."""
     parts = []
-    for said, conditions_of_it in (
+    for text, conditions in (
             ("verdicts of tables IV and V agree with the paper's", CONDITIONS[:2]),
             (f"rows of table V end in {GOOD} on the full system", (FULL,))):
-        counted = [cell for cell in cells if cell.condition in conditions_of_it]
+        counted = [cell for cell in cells if cell.condition in conditions]
         if counted:
-            parts.append(f"{sum(c.agrees for c in counted)} of {len(counted)} {said}.")
+            parts.append(f"{sum(c.agrees for c in counted)} of {len(counted)} {text}.")
     return " ".join(parts)

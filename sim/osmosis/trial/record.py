@@ -1,4 +1,4 @@
-"""What is kept of a mission on an airport, and how it is judged. Pure."""
+"""The record of a mission on an airport. Pure."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from rampart.sim.osmosis.trial.judge import Judge
 from rampart.sim.runs.record import KEPT, RunRecord, RunRecorder, Safety
 
 TRACK_STEP_M = 0.2
-"""A track point is kept when the robot has moved this far."""
+"""Distance between two points of a track."""
 
 TRACK_KEPT = 100_000
-"""Most points of a track: twenty kilometres and more."""
+"""Most points of a track: twenty kilometres."""
 
 
 class LightResult(msgspec.Struct, frozen=True):
-    """A light of the airport; `verdict` is ok, dim, out or not measured (then without values)."""
+    """A light of the airport; `verdict` is ok, dim, out, or not measured (without values)."""
 
     name: str
     row: str
@@ -40,7 +40,7 @@ class LightResult(msgspec.Struct, frozen=True):
 
 
 class StepResult(msgspec.Struct, frozen=True):
-    """A goal of the mission: when it was reached, simulated seconds or None; if it was skipped."""
+    """A goal of the mission: when it was reached, simulated s, or None; whether it was skipped."""
 
     mode: str
     x_m: float
@@ -50,7 +50,7 @@ class StepResult(msgspec.Struct, frozen=True):
 
 
 class ObstacleSeen(msgspec.Struct, frozen=True):
-    """An obstacle that was there at some time."""
+    """An obstacle that was present at some time."""
 
     name: str
     x_m: float
@@ -62,21 +62,21 @@ class MissionRecord(RunRecord, frozen=True, kw_only=True):
     """One mission; positions are in `map`.
 
     Args:
-        mission: success or fail (paper, section V: every point in order and in its mode).
-        safety: safe or unsafe, by ground truth; not known if none ever came.
+        mission: success or fail (paper, section V: each point in order and in its mode).
+        safety: safe or unsafe by ground truth; not known without it.
         airport: its geometry.
         mission_name: of the mission.
-        distance_m: length of the way really driven.
-        track: (t, x, y) of the way really driven.
-        believed: (t, x, y) of the way that localization reported.
+        distance_m: true distance driven.
+        track: true track as (t, x, y).
+        believed: track by localization as (t, x, y).
         lights: all lights of the airport.
         steps: all goals of the mission.
-        obstacles: that stood there at some time.
-        collisions: counted by ground truth.
+        obstacles: obstacles that were present at some time.
+        collisions: number of collisions by ground truth.
         prohibited_s: time spent in the prohibited area.
-        obstacle_clearance_m: closest approach to an obstacle, None if there was none.
-        prohibited_clearance_m: closest approach to the prohibited area, negative inside.
-        narrowest_s: when the robot was nearest to an obstacle, a building or the prohibited area.
+        obstacle_clearance_m: least distance to an obstacle, None without one.
+        prohibited_clearance_m: least distance to the prohibited area, negative inside.
+        narrowest_s: time of the least distance to an obstacle, a building or the prohibited area.
     """
 
     mission: Literal["success", "fail"]
@@ -97,17 +97,17 @@ class MissionRecord(RunRecord, frozen=True, kw_only=True):
 
 
 class MissionRecorder(RunRecorder):
-    """Builds a `MissionRecord` from the messages of a run, and shows its judge what it has to see.
+    """Builds a `MissionRecord` from the messages of a run, and passes ground truth to the judge.
 
     Args:
-        plan: of the run.
-        strategy: of the manager; empty without FTMs.
-        airport: where it takes place.
-        mission: to be driven.
-        titles: of mechanisms and recoveries.
+        plan: plan of the run.
+        strategy: strategy of the manager; empty without FTMs.
+        airport: the airport.
+        mission: the mission.
+        titles: titles of mechanisms and recoveries.
 
     Attributes:
-        judge: of the mission.
+        judge: judge of the mission.
     """
 
     def __init__(self, plan: RunPlan, strategy: str, airport: Airport, mission: Mission,
@@ -131,22 +131,22 @@ class MissionRecorder(RunRecorder):
             topics.PILOT_STATUS.key: self._pilot}
 
     def marks(self) -> int:
-        """Return a number that grows with everything that no memory may lack for long."""
+        """Return a number that grows with each event that `memory` must soon contain."""
         return (super().marks() + len(self.judge.visit_times_s) + self.judge.collisions
                 + len(self._reached) + len(self._lights))
 
     def memory(self, now_s: float) -> bytes:
-        """Return what a resumed run needs of the record so far, and of what the judge saw."""
+        """Return the state of record and judge for a resumed run."""
         verdict: dict[str, Any] = {"mission": "fail", "safety": "not known"}
         return msgspec.msgpack.encode(_Memory(
             self.record(now_s, **verdict), tuple(self.judge.visit_times_s),
             self.judge.first_unsafe_s, self._mode))
 
     def recall(self, memory: bytes) -> MissionRecord:
-        """Go on from the memory of the part before, and return the record of that part.
+        """Restore the state of the previous part of the run, and return its record.
 
         Raises:
-            msgspec.DecodeError: the bytes are not a memory.
+            msgspec.DecodeError: the bytes are not such a state.
         """
         kept = msgspec.msgpack.decode(memory, type=_Memory)
         before, judge = kept.record, self.judge
@@ -169,7 +169,7 @@ class MissionRecorder(RunRecorder):
         return before
 
     def record(self, duration_s: float, **more: Any) -> MissionRecord:
-        """Return the record of the run so far; `more` are at least the verdicts."""
+        """Return the record so far; `more` has at least the verdicts."""
         judge, drawing = self.judge, draw(self._airport)
         reached = {i: at_s for i, at_s in enumerate(self._reached) if i not in self._skipped}
         return MissionRecord(
@@ -200,7 +200,8 @@ class MissionRecorder(RunRecorder):
             self._light(light, header)
         running = status.phase is m.MissionPhase.RUNNING and status.step < len(status.goals)
         self._mode = status.goals[status.step].mode.value if running else ""
-        newly = len(status.step_times_s) - len(self._reached)  # negative: it forgot, we do not
+        # Negative if the Mission Manager has lost its mission.
+        newly = len(status.step_times_s) - len(self._reached)
         self._reached += (header.stamp,) * newly
         self._skipped |= frozenset(status.skipped).intersection(range(len(self._mission.goals)))
 
@@ -230,7 +231,7 @@ class MissionRecorder(RunRecorder):
 
 
 class _Memory(msgspec.Struct, frozen=True):
-    """What a resumed run needs: the record, and what the judge saw and the record has not."""
+    """State for a resumed run: the record, and the judge's data that it does not contain."""
 
     record: MissionRecord
     visit_times_s: tuple[float, ...]

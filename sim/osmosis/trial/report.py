@@ -16,7 +16,7 @@ from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import Moment, RunPictures, clock, environment, lanes_of, ticks_of
 
 BELIEVED_APART_M = 1.0
-"""Where localization reported the robot is drawn too if it was this far from the truth."""
+"""Distance from the truth at which the track by localization is drawn too."""
 
 
 def render(run: MissionRecord) -> str:
@@ -37,7 +37,7 @@ def render(run: MissionRecord) -> str:
 
 
 _UNITS = 90
-"""Width of the map in units of a mark, so that marks have the same size on every map."""
+"""Width of the map in units of a mark, so that marks have the same size on all maps."""
 
 
 def headline(run: MissionRecord) -> str:
@@ -55,19 +55,19 @@ def headline(run: MissionRecord) -> str:
     parts = [f"{len(faulty)} of {len(run.lights)} lights need attention: {', '.join(faulty)}"
              if faulty else "no light needs attention"]
     if missing:
-        parts.append(f"{missing} {'was' if missing == 1 else 'were'} not on the way")
+        parts.append(f"{missing} {'was' if missing == 1 else 'were'} not on the route")
     return f"The mission was completed; {'; '.join(parts)}."
 
 
 def clearance(value: float | None) -> str:
-    """Return a clearance for people; above `EXACT_BELOW_M` the simulator knows only a bound."""
+    """Return a clearance as text; above `EXACT_BELOW_M` only a bound is known."""
     if value is None:
         return "–"  # noqa: RUF001
     return f"{EXACT_BELOW_M:g} m or more" if value >= EXACT_BELOW_M else f"{value:.2f} m"
 
 
 def _reached(run: MissionRecord) -> list[tuple[float, str]]:
-    """Return where on the timeline goals were reached, percent, and which."""
+    """Return positions on the timeline, percent, at which goals were reached, with labels."""
     return [(round(min(99.7, 100 * step.reached_s / run.duration_s), 3),
              f"step {number} at {clock(step.reached_s)}")
             for number, step in enumerate(run.steps, 1)
@@ -75,7 +75,7 @@ def _reached(run: MissionRecord) -> list[tuple[float, str]]:
 
 
 def _bounds(run: MissionRecord) -> tuple[float, float, float, float]:
-    """Return the airport's bounds, widened to the whole track: an unsafe robot may leave them."""
+    """Return the airport's bounds, extended to the track, since an unsafe robot may leave them."""
     x0, y0, x1, y1 = run.airport.bounds_m
     return (
         min([x0, *(x - 2 for _, x, _ in run.track)]), min([y0, *(y - 2 for _, _, y in run.track)]),
@@ -83,12 +83,12 @@ def _bounds(run: MissionRecord) -> tuple[float, float, float, float]:
 
 
 def points(track: Sequence[tuple[float, float, float]]) -> str:
-    """Return a track, (t, x, y) each, as the points of an SVG line; y is turned over."""
+    """Return a track of (t, x, y) as the points of an SVG line; y is flipped."""
     return " ".join(f"{x:g},{-y:g}" for _, x, y in track)
 
 
 def _apart(run: MissionRecord) -> bool:
-    """Tell whether localization was somewhere far from all places where the robot really was."""
+    """Whether localization reported a position far from the whole track."""
     real = [p[1:] for p in run.track]
     return bool(real) and any(
         min(math.dist(p[1:], q) for q in real) > BELIEVED_APART_M for p in run.believed[::3])
@@ -107,7 +107,7 @@ _ROUND_TRACK_M = 4.0
 
 
 class RunMaps(RunPictures):
-    """Draws the way that the robot really drove, on its airport."""
+    """Draws the true track on the airport."""
 
     style = Markup(Path(__file__).with_name("run_maps.css").read_text(encoding="utf-8"))  # noqa: S704 our own
     words = ("The close-up shows the first unsafe moment, else that of the smallest margin. "
@@ -123,11 +123,11 @@ class RunMaps(RunPictures):
         self._pages = environment()
 
     def definitions(self) -> Markup:
-        """Return the airports, each once."""
+        """Return the distinct airports."""
         return self._render("run_airports.html", airports=self._airports)
 
     def picture(self, record: RunRecord, key: str, title: str, marks: Sequence[Moment]) -> Markup:
-        """Return map and close-up of a run; nothing if the robot was never seen."""
+        """Return map and close-up of a run; nothing without a track."""
         if not isinstance(record, MissionRecord) or not record.track:
             return Markup("")
         placed = [(*mark, *_place(record, mark.at_s)) for mark in marks]
@@ -144,7 +144,7 @@ class RunMaps(RunPictures):
 
 
 def _view(record: MissionRecord) -> tuple[float, float, float, float]:
-    """Return left, bottom, width and height of the map, in metres: the track and its goals."""
+    """Return left, bottom, width and height, m, of a map of the track and the goals."""
     xs = [p[1] for p in record.track] + [goal.x_m for goal in record.steps]
     ys = [p[2] for p in record.track] + [goal.y_m for goal in record.steps]
     x0, x1 = min(xs) - _ROUND_TRACK_M, max(xs) + _ROUND_TRACK_M
@@ -155,6 +155,6 @@ def _view(record: MissionRecord) -> tuple[float, float, float, float]:
 
 
 def _place(record: MissionRecord, at_s: float) -> tuple[float, float]:
-    """Return where the robot was, to the step of the track, m."""
+    """Return the position on the track at a time, m."""
     before = [p for p in record.track if p[0] <= at_s] or record.track[:1]
     return before[-1][1:]

@@ -1,9 +1,9 @@
-"""When is a run over? Pure: fed with what the observer hears, asked once in a while.
+"""Decides when a run is over. Pure.
 
-A run ends when the mission has ended, when it was lost (the Mission Manager forgot it), or when
-nothing has progressed for the patience of the person who started it; and then when the robot
-stands. One that drives on is looked at for a minute: it may be on its way into the grass. A run
-without a world ends at once, one with a world that is not heard after half a minute.
+A run ends when the mission has ended, when the Mission Manager has lost it, or without progress for
+`patience_s`, and then when the robot stands. A robot that keeps driving is observed for a minute,
+since it may leave the pavement. A run whose world has ended ends at once; one whose world is silent
+ends after half a minute.
 """
 
 from __future__ import annotations
@@ -19,35 +19,34 @@ from rampart.actors.osmosis import messages as m
 _ENDED = (m.MissionPhase.SUCCEEDED, m.MissionPhase.FAILED, m.MissionPhase.CANCELLED)
 
 SETTLE_S = 1.5
-"""After the mission's end the robot gets this long to come to rest, and the records to arrive."""
+"""Time after the mission's end for the robot to stop and for the last messages to arrive."""
 
 WATCH_S = 60.0
-"""After the mission's end a robot that does not come to rest is looked at this long."""
+"""Longest observation of a moving robot after the mission's end."""
 
 STANDING_MPS, STANDING_RADPS = 0.05, 0.1
-"""Slower than this, by ground truth, it stands."""
+"""The robot stands below both, by ground truth."""
 
 LOST_AFTER_S = 3.0
 ACCEPT_WITHIN_S = 30.0
 WORLD_SILENT_S = 3.0
 WORLD_LATE_S = 30.0
-"""A machine that is overloaded may keep the ground truth away for ten seconds, of a world whose
-process is there."""
+"""On an overloaded machine the ground truth of a running world may be missing for ten seconds."""
 _STEP_TOWARDS_GOAL_M = 0.5
-_WAYS = 10
-"""So many ways round something are followed patiently; who finds more goes to and fro."""
+_DETOURS = 10
+"""Most detours that count as progress; a planner that finds more alternates between them."""
 
 
 @dataclass(slots=True)
 class RunEnd:
-    """Decides the end of one run. Times are simulated seconds, infinite of what has not happened.
+    """Decides the end of a run. Times are simulated seconds, infinite before their event.
 
     Args:
-        patience_s: longest time without progress: no new step, no light measured, not half
-            a metre nearer to the goal, and no way round something that is on the way.
-        waits: whether the mission comes when the operator wants it, however late.
+        patience_s: longest time without progress: a step, a measured light, half a metre towards
+            the goal, or a detour.
+        waits: whether the operator starts the mission at any time.
         worlds: names of the nodes that simulate the world.
-        begins_s: when this part of the run begins.
+        begins_s: start of this part of the run.
     """
 
     patience_s: float
@@ -57,7 +56,7 @@ class RunEnd:
     _mission_id: str = ""
     _progress: tuple[int, int] = (-1, -1)
     _nearest_m: float = math.inf
-    _ways: set[str] = field(default_factory=lambda: {""})
+    _reasons: set[str] = field(default_factory=lambda: {""})
     _progress_at_s: float = -math.inf
     _over_at_s: float = math.inf
     _over: str = ""
@@ -67,11 +66,11 @@ class RunEnd:
     _is_gone: bool = False
 
     def __post_init__(self) -> None:
-        """Count the patience from the beginning."""
+        """Start the patience."""
         self._progress_at_s = self.begins_s
 
     def take(self, message: Any, now_s: float) -> None:
-        """Take what the observer hears; what says nothing of the end does not matter."""
+        """Take a message; irrelevant ones are ignored."""
         if isinstance(message, m.MissionStatus):
             self.mission(message, now_s)
         elif isinstance(message, m.ControlStatus):
@@ -91,11 +90,11 @@ class RunEnd:
             return
         self._mission_id = status.mission_id
         progress = (status.step, len(status.lights))
-        another_way = status.phase is m.MissionPhase.RUNNING and status.reason not in self._ways \
-            and len(self._ways) < _WAYS
-        if another_way:
-            self._ways.add(status.reason)
-        if progress != self._progress or another_way:
+        detour = status.phase is m.MissionPhase.RUNNING and status.reason not in self._reasons \
+            and len(self._reasons) < _DETOURS
+        if detour:
+            self._reasons.add(status.reason)
+        if progress != self._progress or detour:
             self._progress, self._progress_at_s = progress, now_s
             self._nearest_m = math.inf
         if status.phase in _ENDED:
@@ -103,25 +102,25 @@ class RunEnd:
             self._over = status.reason or f"mission {status.phase.value}"
 
     def control(self, status: m.ControlStatus, now_s: float) -> None:
-        """Take the progress along the route; only who follows it knows how far it is."""
+        """Take the progress along the route, which is valid only while it is followed."""
         if status.phase is m.ControlPhase.FOLLOWING and \
                 status.distance_to_go_m < self._nearest_m - _STEP_TOWARDS_GOAL_M:
             self._nearest_m, self._progress_at_s = status.distance_to_go_m, now_s
 
     def truth(self, twist: m.Twist, now_s: float) -> None:
-        """Note that the world turns, and whether the robot moves in it."""
+        """Take a sign of the world, and whether the robot moves."""
         self._truth_at_s = now_s
         self._moves = (abs(twist.linear_mps) > STANDING_MPS
                        or abs(twist.angular_radps) > STANDING_RADPS)
 
     def excuse(self, stall_s: float) -> None:
-        """Do not count a time in which nobody here listened: the launcher itself was stopped."""
+        """Do not count a time in which the launcher was stopped."""
         self._progress_at_s += stall_s
         self._truth_at_s += stall_s
         self._lost_at_s += stall_s
 
     def world_gone(self, now_s: float) -> str:
-        """Return that ground truth is missing, so that no judge watches, or ""."""
+        """Return that ground truth is missing, or ""."""
         late_s = WORLD_SILENT_S if self._is_gone else WORLD_LATE_S
         return ("the world is gone: no ground truth from the simulator"
                 if now_s - self._truth_at_s > late_s else "")
@@ -134,11 +133,11 @@ class RunEnd:
         return why
 
     def _outcome(self, now_s: float) -> tuple[str, float]:
-        """Return what became of the mission, and since when that is certain; "" if it is not."""
+        """Return the outcome of the mission, or "", and its time."""
         if self._over_at_s < math.inf:
             return (self._over if now_s - self._over_at_s >= SETTLE_S else ""), self._over_at_s
         if now_s - self._lost_at_s > LOST_AFTER_S:
-            return "mission lost: the Mission Manager came back without it", self._lost_at_s
+            return "mission lost: the Mission Manager restarted without it", self._lost_at_s
         accepted_by_s = self.begins_s + ACCEPT_WITHIN_S
         if not self._mission_id and not self.waits and now_s > accepted_by_s:
             return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s", accepted_by_s

@@ -43,7 +43,7 @@ class Driven:
         self.system.say(topics.JOYSTICK, m.Joystick(0.0, 0.0, dead_man=False), STICK)
 
     def lose_the_stick(self) -> None:
-        """Its messages no longer arrive; none says that it was let go."""
+        """Its messages no longer arrive; no message reports the release."""
         self._stick = None
 
     async def reset(self) -> None:

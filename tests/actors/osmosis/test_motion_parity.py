@@ -22,13 +22,13 @@ def drive(parity, seconds, *, start_s=0.0, odometry=1.0, wheels=(1.0, 1.0, 1.0, 
     """Drive a circle at 1 m/s and 0.2 rad/s, and return the time at its end, s.
 
     Args:
-        parity: What is given the readings.
+        parity: receives the readings.
         seconds: How long.
         start_s: Time at the beginning.
         odometry: Factor on the way of odometry.
         wheels: Factors on front left, front right, rear left, rear right.
         gyro: Bias, rad/s.
-        without: Devices that say nothing.
+        without: silent devices.
     """
     now_s = start_s
     for _ in range(round(seconds / STEP_S)):

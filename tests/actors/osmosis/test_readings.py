@@ -1,4 +1,4 @@
-"""A sensor that reports nonsense is a sensor that reports nothing."""
+"""An invalid reading counts as missing."""
 
 from __future__ import annotations
 

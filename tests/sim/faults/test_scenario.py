@@ -101,7 +101,7 @@ def test_all_processes_are_slow_at_once_and_none_is_killed_by_a_name_that_means_
     ("kill:nobody", "no node 'nobody'; there are: supervisor, "),
     ("kill", "no node ''"), ("kill:simulator", "no node 'simulator'"),
     ("slow:DM1:x", "must be one number between 0 and 60"),
-    ("stuck-wheel:fifth", "no wheel 'fifth'; there are: front-left"),
+    ("stuck-wheel:fifth", "unknown wheel 'fifth'; known: front-left"),
     ("weak-wheel:rear-left:2", "must be one number between 0 and 1"),
     ("brake-failure:0.1:2", "must be one number"), ("obstacle-ahead:far", "must be one number"),
 ])

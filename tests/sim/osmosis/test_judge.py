@@ -113,4 +113,4 @@ def test_the_closest_approaches_are_kept():
 def test_without_ground_truth_nobody_knows_whether_it_was_safe():
     found = Judge(GOALS).verdict()
     assert (found.success, found.safe) == (False, None)
-    assert found.reasons == ("no ground truth ever came: nobody knows where the robot was",)
+    assert found.reasons == ("no ground truth was received: the robot's position is unknown",)

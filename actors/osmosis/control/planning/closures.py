@@ -7,7 +7,6 @@ side.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Mapping
 
@@ -73,7 +72,7 @@ def without(nodes: Mapping[str, Point], edges: Iterable[Edge], places: Iterable[
             for end, share in ((a, span[0]), (b, span[1])):
                 rest_m = share * length_m if end == a else (1.0 - share) * length_m
                 if rest_m > _LEAST_STUB_M:
-                    name = _fresh(f"{a}|{b}", left)
+                    name = f"{a}|{b}#{len(left)}"
                     left[name] = _between(left[a], left[b], share)
                     cut.append((end, name))
         kept = cut
@@ -98,7 +97,3 @@ def _within(place: Point, a: Point, b: Point, gap_m: float) -> tuple[float, floa
 def _between(a: Point, b: Point, share: float) -> Point:
     return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])
 
-
-def _fresh(stem: str, taken: Mapping[str, Point]) -> str:
-    names = (f"{stem}#{number}" for number in itertools.count(1))
-    return next(name for name in names if name not in taken)

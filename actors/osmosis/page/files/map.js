@@ -1,16 +1,15 @@
-// The airport's map as SVG: metres, y turned over so that north is up.
+// The airport's map as SVG: metres, y flipped so that north is up.
 //
 // Ground, obstacles, sweeps and the robot's body have their true size. Marks (lights, nodes, goals, the
-// robot's ring) and lines have the same size on the screen however large the airport is: CSS scales what
-// is in `.mark` by `--mark`, the metres of a mark's unit, and what is in `.dot` by `--dot`, which becomes
-// smaller where many of them lie close together.
+// robot's ring) and lines have a constant size on the screen: CSS scales `.mark` by `--mark`, the metres
+// of a mark's unit, and `.dot` by `--dot`, which is smaller where many of them are close together.
 
 import { Memory, element, say, svg as make } from "../dom.js";
 import { View } from "../view.js";
 
-const FOLLOW_M = 22;  // what is shown around the robot when the map begins to follow it
-const MARK_PX = 9;   // a mark's unit on the screen
-const DOT = .25;      // least size of a dot, of its full size
+const FOLLOW_M = 22;  // area around the robot when the map begins to follow it
+const MARK_PX = 9;   // size of a mark's unit on the screen
+const DOT = .25;      // least relative size of a dot
 const TRACK_STEP_M = .25;
 const TRACK_POINTS = 6000;
 
@@ -73,7 +72,7 @@ class AirportMap {
   }
 
   drawGround(map, ground) {
-    // Pavement first: the prohibited area (all that is not allowed) then covers what it forbids.
+    // Pavement first: the prohibited area then covers the parts that it forbids.
     for (const [kind, path] of map.surfaces) make("path", { class: `pavement ${kind}`, d: path }, ground);
     make("path", { class: "prohibited-area", d: map.prohibited, "fill-rule": "evenodd" }, ground);
     for (const [name, path] of map.buildings) {
@@ -148,13 +147,13 @@ class AirportMap {
   showRobot(pose, pilot) {
     if (!pose) return;
     if (!finite(pose.value)) {
-      this.robot.classList.add("stale");  // where it was
+      this.robot.classList.add("stale");  // last known pose
       return;
     }
     const { x_m: x, y_m: y, yaw_rad: yaw } = pose.value;
     this.view.at = [x, y];
     if (this.view.following) this.view.look();
-    this.svg.dataset.t = pose.t;  // which moment is shown
+    this.svg.dataset.t = pose.t;  // time of the shown pose
     this.robot.setAttribute("visibility", "visible");
     this.robot.setAttribute("transform", `translate(${x} ${-y}) rotate(${-yaw * 180 / Math.PI})`);
     this.robot.classList.toggle("stale", pose.stale);
@@ -250,6 +249,6 @@ export default class MapPanel {
     const heading = (90 - yaw * 180 / Math.PI + 360) % 360;
     say(this.where, [x, y, yaw].every(Number.isFinite)
       ? `Robot at ${x.toFixed(1)} m east, ${y.toFixed(1)} m north, heading ${heading.toFixed(0).padStart(3, "0")}°${pose.stale ? " (not heard any more)" : ""}`
-      : "The robot's pose is not known.");
+      : "The robot's pose is unknown.");
   }
 }

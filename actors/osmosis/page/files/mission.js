@@ -1,4 +1,4 @@
-// The mission: goals, progress, orders to it, a new one, and how many lights were measured.
+// The mission: goals, progress, orders, start, and the number of measured lights.
 
 import { Memory, clock, element, pill, say } from "../dom.js";
 
@@ -63,7 +63,7 @@ export default class Mission {
   mission(m, control) {
     this.start.hidden = (m && UNDER_WAY.includes(m.phase)) || !this.choice.options.length;
     if (!m) {
-      pill(this.phase, "warn", "Mission Manager not heard");
+      pill(this.phase, "warn", "Mission Manager silent");
       say(this.reason, "");
       this.steps.replaceChildren();
       this.progress.hidden = true;
@@ -93,7 +93,7 @@ export default class Mission {
   ask(button) {
     if ("sure" in button.dataset && !button.classList.contains("sure")) {
       button.dataset.label = button.textContent;
-      button.style.minWidth = `${button.offsetWidth}px`;  // it stays under the pointer
+      button.style.minWidth = `${button.offsetWidth}px`;  // keeps its size under the pointer
       button.textContent = "Sure?";
       button.classList.add("sure");
       setTimeout(() => unsure(button), 4000);

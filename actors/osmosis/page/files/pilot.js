@@ -1,4 +1,4 @@
-// What the Safety Pilot does, and why.
+// State of the Safety Pilot, and why.
 
 import { element, pill, say } from "../dom.js";
 

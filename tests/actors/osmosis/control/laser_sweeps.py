@@ -14,7 +14,7 @@ STEP_RAD = math.radians(270) / (RAYS - 1)
 
 
 def full_sweep(range_m: float = TOP_M, number: int = 0) -> LaserScan:
-    """Return a sweep that sees the same in all directions; `number` makes it a sweep of its own."""
+    """Return a sweep with one range in all directions; `number` distinguishes sweeps."""
     return LaserScan(
         -math.radians(135), STEP_RAD, TOP_M, np.full(RAYS, range_m, "<f4").tobytes(),
         0.1 + 0.001 * math.sin(number + 1))

@@ -155,7 +155,7 @@ def disturbed(faults: Iterable[tuple[Fault, float, float]], seed: int = 1,
 WRONG_STAMPS: dict[str, Callable[[float], float]] = {
     "far ahead": lambda now_s: now_s + 1e9, "ahead": lambda now_s: now_s + 0.25,
     "infinite": lambda _: math.inf, "no number": lambda _: math.nan}
-"""The stamp of a reading by what time it is."""
+"""Stamp of a reading at a time."""
 
 Items = Iterable[tuple[float, Reading | Truth]]
 

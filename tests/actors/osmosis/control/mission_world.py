@@ -24,7 +24,8 @@ PARAMETERS: dict[str, dict[str, Any]] = {
 class Operator(Base):
     """The base of the control tests, with a hand on the joystick, on the orders and on RM5.
 
-    `holding` is what the FTM Manager says is activated; the Safety Pilot is ordered to match.
+    `holding` is the recovery that the FTM Manager reports as activated; the Safety Pilot gets its
+    order.
     """
 
     outputs = (*Base.outputs, topics.MISSION_ORDER, topics.GOAL)

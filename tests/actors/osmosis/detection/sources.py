@@ -7,6 +7,6 @@ from rampart.actors.runtime.actor import Actor
 
 
 class Source(Actor):
-    """Publishes commands and poses when told."""
+    """Publishes commands and poses on request."""
 
     outputs = (topics.COMMAND, topics.POSE)

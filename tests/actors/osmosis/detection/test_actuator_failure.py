@@ -1,4 +1,4 @@
-"""DM13: wheels that do not turn, and a brake that does not brake, as the base was told."""
+"""DM13: wheels or a brake that do not follow the commands."""
 
 from __future__ import annotations
 

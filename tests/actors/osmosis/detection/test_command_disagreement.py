@@ -25,7 +25,7 @@ SOURCES = ("standby", "active")
 
 
 class Bench:
-    """A comparison and the lives of those that it compares."""
+    """A comparison and the incarnations of its sources."""
 
     def __init__(self, **changes) -> None:
         self.comparison = CommandComparison(SOURCES, LIMITS, **changes)

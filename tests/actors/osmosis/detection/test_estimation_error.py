@@ -1,4 +1,4 @@
-"""DM8: a localization that lies is found out, and nobody else's fault is taken for its."""
+"""DM8: a wrong localization is detected; faults of other sources do not count as its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DM12: what reaches the base, against what the Safety Pilot was asked for and says it does."""
+"""DM12: the base's commands against the inputs and the status of the Safety Pilot."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_a_respawned_module_claims_nothing_of_a_pilot_whose_output_is_old_when_i
 
 
 class Rest(Actor):
-    """All that the pilot hears."""
+    """The inputs of the pilot."""
 
     outputs = (topics.COMMAND, topics.STANDBY_COMMAND, topics.SCAN, ftm_topics.MANAGER_STATUS)
 

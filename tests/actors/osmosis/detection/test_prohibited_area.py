@@ -143,7 +143,7 @@ def test_fence_timeline(events, expected):
 
 
 class Receiver(Actor):
-    """A GPS receiver that says what it is told."""
+    """A GPS receiver that publishes the given fixes."""
 
     outputs = (topics.GPS,)
 

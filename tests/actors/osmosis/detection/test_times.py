@@ -19,7 +19,7 @@ RESPAWN_S = full_system().timing.respawn_s
 
 
 def compare(active: tuple[float, float], standby: tuple[float, float]) -> list[float]:
-    """Return when DM9 accuses the one and then the other: it is the active one that is wrong."""
+    """Return when DM9 names one instance and then the other; the active one is wrong."""
     monitor = CommandComparison(("standby_control", "osmosis_control"))
     accused_s: dict[tuple[str, ...], float] = {}
     standby_life, back_s = 1, 0.0

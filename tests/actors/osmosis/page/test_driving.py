@@ -1,4 +1,4 @@
-"""What Osmosis makes of a stick, as its page says it."""
+"""The effect of a joystick, as shown on the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When the HMI sends a mission (once it was taken, never again), and which orders it passes on."""
+"""When the HMI sends a mission (never again after it was accepted), and which orders it sends."""
 
 import pytest
 

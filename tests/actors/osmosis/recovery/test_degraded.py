@@ -17,7 +17,7 @@ from tests.osmosis_system import System, in_system
 
 
 class BoundedPilot(Pilot):
-    """A Safety Pilot that says which bound it keeps."""
+    """A Safety Pilot that reports its speed limit."""
 
     @property
     def bound_mps(self) -> float:

@@ -22,7 +22,7 @@ DOWN = m.Goal(-29.5, -3.0, Mode.TAXI)
 
 
 class Planner(Actor):
-    """Answers each goal with a route, unless it is told to be dumb."""
+    """Answers each goal with a route, unless it is set to be silent."""
 
     outputs = (topics.ROUTE, topics.MISSION_REQUEST)
 

@@ -34,7 +34,7 @@ async def ask(robot, order="1"):
 
 @asynccontextmanager
 async def inside(system="paper"):
-    """Drive the robot into the grass, while nobody can brake, and have it stopped there."""
+    """Drive the robot into the grass without a brake, and stop it there."""
     async with driven(system, without=("RM1",)) as robot:
         robot.hold(0.0, 0.5)
         out_rad = math.pi  # to the west there is grass beside the apron

@@ -15,7 +15,7 @@ from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 
 
 class Boss(Actor):
-    """Commands recovery modules as it is told, and keeps their reports."""
+    """Sends the given commands to recovery modules, and keeps their reports."""
 
     outputs = (ftm_topics.RECOVERY_COMMAND,)
 
@@ -50,7 +50,7 @@ class Boss(Actor):
 
 
 class Base(Actor):
-    """A Summit XL layer: brake and status. Deaf, it hears no orders."""
+    """A Summit XL layer: brake and status. `deaf`: it ignores orders."""
 
     outputs = (topics.BASE_STATUS,)
 
@@ -76,7 +76,7 @@ class Base(Actor):
 
 
 class Pilot(Actor):
-    """A Safety Pilot: obeys orders, the strictest wins. Deaf, it hears none."""
+    """A Safety Pilot: obeys orders, the strictest wins. `deaf`: it ignores them."""
 
     outputs = (topics.PILOT_STATUS,)
 
@@ -149,5 +149,5 @@ class Supervisor(Actor):
 
 
 def hang(actor: Actor) -> None:
-    """Stop an actor's loop as SIGSTOP would: it stays announced, and says nothing more."""
+    """Stop an actor's loop like SIGSTOP: it stays announced, and is silent."""
     actor.hold(True)

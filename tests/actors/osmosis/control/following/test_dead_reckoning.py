@@ -141,7 +141,7 @@ def test_on_the_simulated_robot_three_metres_cost_a_quarter_of_a_metre_at_most(f
 
 
 class Robot(Actor):
-    """Publishes what it is told, and hears the command."""
+    """Publishes the given messages, and receives the command."""
 
     outputs = (topics.POSE, topics.ODOMETRY, topics.SCAN, topics.ROUTE)
 
@@ -157,7 +157,7 @@ class Robot(Actor):
 @pytest.mark.parametrize("mis_stamped", [None, topics.ODOMETRY, topics.POSE],
                          ids=["nothing", "odometry", "a pose"])
 def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
-    """Also when it has once heard something from the future."""
+    """Also after a message from the future."""
 
     async def scenario(system: System) -> list[tuple[float, float]]:
         robot = system.start("robot", Robot)

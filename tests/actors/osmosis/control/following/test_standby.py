@@ -217,7 +217,7 @@ def test_both_turn_round_the_same_way():
 
 
 def drive(loop, drag_radps, seconds, meant=lambda _t: 0.2, speed_mps=0.8):
-    """A base that turns by `drag_radps` besides what it is told; returns the last yaw rates."""
+    """A base that turns by `drag_radps` in addition to its command; returns the last yaw rates."""
     yaw = x = y = rate = 0.0
     rates, commands = [], []
     for tick in range(round(seconds / PERIOD_S)):

@@ -193,7 +193,7 @@ def test_a_laser_that_proved_itself_and_does_so_no_more_is_not_believed():
 
 
 class Rest(Actor):
-    """All that the pilot hears, and the base."""
+    """The inputs of the pilot, and the base."""
 
     outputs = (topics.COMMAND, topics.SCAN, ftm_topics.MANAGER_STATUS)
 

@@ -19,7 +19,7 @@ ROOM = StoppingRoom()
 
 
 class Bench:
-    """A gate that has settled, with its manager and scanner alive until told otherwise."""
+    """A settled gate with a live manager and scanner."""
 
     def __init__(self, checks=None):
         self.gate = SafetyGate(LIMITS, checks or Checks(), 0.0)

@@ -1,4 +1,4 @@
-"""What is done about something on the way: noticed, driven round, or planned round."""
+"""Reactions to a blockage: it is detected, passed, or avoided by another route."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_an_obstacle_that_goes_away_is_not_driven_round():
 
 
 class Chain(Actor):
-    """Everybody round the planner."""
+    """The nodes around the planner."""
 
     outputs = (topics.POSE, topics.GOAL, topics.CONTROL_STATUS)
 

@@ -120,7 +120,7 @@ def test_the_first_joystick_is_the_one_with_the_lowest_number(tmp_path):
 
 
 class Hand:
-    """A device and what it has told, with a way to wait for it."""
+    """A device and its reports, with a way to wait for them."""
 
     def __init__(self, path: object) -> None:
         self.gone: list[str] = []
