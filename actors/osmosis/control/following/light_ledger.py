@@ -248,10 +248,6 @@ class RowInspection:
         self.is_incomplete = arrived and not self.ledger.is_complete(self._row)
         return detour.light if detour is not None else ""
 
-    def to_send_again(self, now_s: float) -> list[LightMeasurement]:
-        """Return the unconfirmed measurements that are due again."""
-        return self.ledger.to_send_again(now_s) if self._goes_back else []
-
     @property
     def missed(self) -> tuple[str, ...]:
         """The unmeasured lights along all routes to this goal."""

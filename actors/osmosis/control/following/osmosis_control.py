@@ -165,5 +165,5 @@ class OsmosisControl(Actor):
     def repeat(self) -> None:
         """Repeat the status and unconfirmed measurements."""
         self.publish(topics.CONTROL_STATUS, self.core.status)
-        for light in self._lights.to_send_again(self.clock.now()):
+        for light in self._lights.ledger.to_send_again(self.clock.now()):
             self.publish(topics.LIGHT_MEASURED, light)
