@@ -259,7 +259,7 @@ class Keeper:
             self._report("checkpoints are kept again")
 
     def failed(self) -> None:
-        """Record that this process ends by a failure of its own."""
+        """Record that this process failed."""
         if self._store is None or self._newest is None:
             return
         soon = self._now() - self._began_s <= SOON_S

@@ -55,7 +55,7 @@ def child(folder: Path, acknowledge: int, mode: str, number: int, start: int) ->
 
 
 def one(folder: Path, mode: str, number: int, start: int) -> dict[str, object]:
-    """Have one child live and die, and tell what it left."""
+    """Run one child until it dies, and return what it left."""
     read_end, write_end = os.pipe()
     pid = os.fork()
     if pid == 0:

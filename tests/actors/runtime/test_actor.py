@@ -45,7 +45,7 @@ class Talker(Actor):
 
 
 class Listener(Actor):
-    """Keeps what it hears."""
+    """Keeps the messages that it receives."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -115,7 +115,7 @@ async def test_a_message_arrives_with_its_header(make_bus):
 
 
 class Twice(Listener):
-    """Has two handlers more of what its base class hears."""
+    """Has a second handler for each topic of its base class."""
 
     @on(topics.POSE)
     def second(self, message: m.Pose, header: Header) -> None:
@@ -252,7 +252,7 @@ async def test_timers_run_at_the_rate_of_simulated_time(make_bus):
 
 
 class Former(Talker):
-    """Has said everything long before anybody came."""
+    """Publishes before the newcomer starts."""
 
     outputs = (topics.POSE, topics.GOAL, ftm_topics.RESET)
 

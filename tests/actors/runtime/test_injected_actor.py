@@ -20,7 +20,7 @@ from tests.virtual_time import within
 
 
 class Talker(Actor):
-    """Says where it is ten times a second, and asks for a reset once a second."""
+    """Publishes a pose ten times a second, and a reset once a second."""
 
     outputs = (topics.POSE, ftm_topics.RESET)
 
@@ -37,7 +37,7 @@ class Talker(Actor):
 
 
 class Listener(Actor):
-    """Keeps what it hears."""
+    """Keeps the messages that it receives."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

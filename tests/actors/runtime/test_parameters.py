@@ -1,4 +1,4 @@
-"""Parameters of actors: what a class declares is what a spec may say, and all that it may say."""
+"""Parameters of actors: a specification may set those that the class declares, and no others."""
 
 from __future__ import annotations
 
@@ -122,15 +122,15 @@ def test_a_look_at_a_spec_imports_nothing_of_its_author_s(tmp_path):
     assert cli_systems.load(str(file)).detections[2].actor == "no.such:Bounds"
 
 
-# -- actors of one's own -------------------------------------------------------------------------
+# -- custom actors -------------------------------------------------------------------------
 
 
 class Plain(Actor):
-    """Of one who has not heard of `Parameters`."""
+    """Declares no parameters."""
 
 
 class Lamp(Actor):
-    """Declares some."""
+    """Declares parameters."""
 
     class Parameters(Actor.Parameters, frozen=True, kw_only=True):
         brightness_cd: NonNegative

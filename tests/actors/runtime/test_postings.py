@@ -1,4 +1,4 @@
-"""A state that says the same again is posted: it is sent when it changes, and once a second."""
+"""A repeated state is posted: it is sent when it changes, and once a second."""
 
 import asyncio
 from contextlib import asynccontextmanager
@@ -14,11 +14,11 @@ from rampart.testing.virtual import VirtualSystem
 from tests.virtual_time import within
 
 PERIOD_S = 0.1
-"""Of heartbeats, as of an actor whose system says nothing else."""
+"""Default period of heartbeats."""
 
 
 class Level(Message, frozen=True):
-    """What is said."""
+    """A level."""
 
     value: float
 
@@ -27,7 +27,7 @@ LEVEL = Topic("level", Level, Qos.STATE, 10, "", "A level.", resend_s=1)
 
 
 class Gauge(Actor):
-    """Says a level ten times a second."""
+    """Publishes a level ten times a second."""
 
     outputs = (LEVEL,)
     value: ClassVar[float] = 1.0
@@ -38,7 +38,7 @@ class Gauge(Actor):
 
 
 class Reader(Actor):
-    """Keeps what comes of the level, and of the heartbeats of the gauge, and when that came."""
+    """Keeps the levels and heartbeats of the gauge, with their arrival times."""
 
     def on_start(self):
         self.levels, self.ages_s, self.beats = [], [], 0
