@@ -131,6 +131,14 @@ async def test_without_routers_the_error_is_one_line(sockets, monkeypatch):
         await ZenohBus("talker", endpoints(sockets)).open()
 
 
+async def test_without_routers_no_actor_that_shares_the_bus_waits_for_ever(sockets, monkeypatch):
+    monkeypatch.setattr(zenoh_bus, "PATIENCE_S", 0.05)
+    bus = ZenohBus("observer", endpoints(sockets))
+    async with asyncio.timeout(5):
+        found = await asyncio.gather(bus.open(), shared(bus).open(), return_exceptions=True)
+    assert [type(error) for error in found] == [BusError, BusError]
+
+
 async def test_a_silent_connection_blocks_the_router_only_briefly(routers, sockets):
     await routers.start("router_a")
     with contextlib.ExitStack() as stack:
