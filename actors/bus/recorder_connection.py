@@ -55,7 +55,7 @@ def parse_frame(data: bytes | memoryview) -> tuple[float, str, bytes]:
         at_s, length = _HEAD.unpack_from(data)
         key = bytes(data[_HEAD.size:_HEAD.size + length])
         if len(key) < length:
-            raise ValueError(f"key of {len(key)} bytes, expected {length}")
+            raise ValueError(f"not a frame: key of {len(key)} bytes, expected {length}")
         if not math.isfinite(at_s):
             raise ValueError(f"not a frame: sent at {at_s}")
         return at_s, key.decode(), bytes(data[_HEAD.size + length:])
