@@ -1,9 +1,9 @@
-"""The commands: `rampart` and `kill-node`, and what they share."""
+"""The commands `rampart` and `kill-node`, and their common parts."""
 
 import os
 
-# Before numpy is imported: its mathematical libraries get one thread. What is computed here is
-# small, and a process with one thread can be forked (see `Launcher.begin`).
+# Before numpy is imported: its libraries use one thread. The computations here are small, and a
+# process with one thread can be forked (see `Launcher.begin`).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 

@@ -1,4 +1,4 @@
-"""Options of the command line that the application of a system adds."""
+"""Options that the application of a system adds to the command line."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from rampart.actors.runtime.application import Application
 from rampart.cli.output import UsageError
 
 
-def add(parser: argparse.ArgumentParser, kind: type[Application], said: Mapping[str, Any], *,
+def add(parser: argparse.ArgumentParser, kind: type[Application], chosen: Mapping[str, Any], *,
         crossed: bool = False) -> None:
     """Add an option for each field of an application's options.
 
     Args:
-        parser: of the command.
+        parser: parser of the command.
         kind: the application.
-        said: what the system's spec chooses, for the help.
+        chosen: values of the specification, for the help.
         crossed: the command makes many runs in virtual time, and takes several values of each.
     """
     fields = [field for field in msgspec.structs.fields(kind.Options)
@@ -31,7 +31,7 @@ def add(parser: argparse.ArgumentParser, kind: type[Application], said: Mapping[
     group = parser.add_argument_group(f"options of this system ({kind.__name__})")
     for field in fields:
         plain, extra = _parts(kind, field.name)
-        default = said.get(field.name, field.default)
+        default = chosen.get(field.name, field.default)
         if crossed:
             default = extra.get("campaign", default)
         shown = "" if default in ("", msgspec.NODEFAULT) else f" (default: {default})"
@@ -46,10 +46,10 @@ def add(parser: argparse.ArgumentParser, kind: type[Application], said: Mapping[
 
 
 def chosen(options: argparse.Namespace, kind: type[Application]) -> dict[str, Any]:
-    """Return what was given on the command line; files as paths that every process finds.
+    """Return the given options, with absolute paths of files.
 
     Raises:
-        UsageError: a value is not what its field takes.
+        UsageError: a field does not accept a value.
     """
     return {field.name: _value(kind, field, value)
             for field in msgspec.structs.fields(kind.Options)
@@ -57,10 +57,10 @@ def chosen(options: argparse.Namespace, kind: type[Application]) -> dict[str, An
 
 
 def alternatives(options: argparse.Namespace, kind: type[Application]) -> list[dict[str, Any]]:
-    """Return every combination of the values that were given, separated by commas, or by default.
+    """Return all combinations of the values, which are separated by commas.
 
     Raises:
-        UsageError: a value is not what its field takes.
+        UsageError: a field does not accept a value.
     """
     found: dict[str, list[Any]] = {}
     for field in msgspec.structs.fields(kind.Options):
@@ -76,7 +76,7 @@ def _number(kind: type[Application], field: msgspec.structs.FieldInfo, value: st
     try:
         return plain(value) if plain in {int, float} else value
     except ValueError:
-        raise UsageError(f"--{field.name.replace('_', '-')} {value}: must be a number; several are "
+        raise UsageError(f"--{field.name.replace('_', '-')} {value}: must be a number, or several "
                          "separated by commas") from None
 
 
@@ -91,10 +91,10 @@ def _value(kind: type[Application], field: msgspec.structs.FieldInfo, value: Any
 
 
 def _parts(kind: type[Application], name: str) -> tuple[Any, dict[str, Any]]:
-    """Return the plain type of a field and what its `Meta` says of it, `description` included."""
+    """Return the plain type of a field, and the `extra` of its `Meta` with `description`."""
     hint = get_type_hints(kind.Options, include_extras=True)[name]
     if get_origin(hint) is not Annotated:
         return hint, {}
-    plain, *said = get_args(hint)
-    meta = next((s for s in said if isinstance(s, msgspec.Meta)), msgspec.Meta())
+    plain, *notes = get_args(hint)
+    meta = next((note for note in notes if isinstance(note, msgspec.Meta)), msgspec.Meta())
     return plain, {"description": meta.description or "", **(meta.extra or {})}

@@ -1,4 +1,4 @@
-"""Completion in the shell (argcomplete): verbs, and nodes, topics and faults of the run at hand.
+"""Completion in the shell (argcomplete): verbs, and nodes, topics and faults of the run.
 
 `eval "$(register-python-argcomplete rampart kill-node)"` in the shell's start-up file turns it on.
 """
@@ -19,7 +19,7 @@ from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer the shell and end, if it is the shell that has started this program."""
+    """Answer the shell and end, if the shell has started this program for completion."""
     argcomplete.autocomplete(parser)
 
 
@@ -29,14 +29,14 @@ def nodes(**_: Any) -> list[str]:
 
 
 def topics(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    """Return the keys that the system at hand publishes."""
+    """Return the keys that the nodes of the run, or of the shipped system, publish."""
     with contextlib.suppress(UsageError, ValueError):
         return sorted(published_keys(systems.at_hand(None, getattr(parsed_args, "port", None))))
     return []
 
 
 def faults(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    """Return the faults of the system at hand, by name, and those of its processes."""
+    """Return the named faults of the run, or of the shipped system, and those of processes."""
     with contextlib.suppress(UsageError, ValueError):
         known = faults_of(systems.at_hand(None, getattr(parsed_args, "port", None)))
         return [*known.named, *(fault.name for fault in known.offered()),

@@ -1,4 +1,4 @@
-"""A tool's stay in a run: to its end, into the next one, until the user has had enough."""
+"""Tools that follow a run to its end, and then the next one."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.cli.session import Session, connect, pause
 
 LOOK_S = 0.25
-"""Real seconds between two looks whether a run has ended or begun."""
+"""Real seconds between two checks whether a run has ended or begun."""
 
 _AGAIN_S = 5.0
 
 _USAGE_EVERY = 4
-"""Looks between two at /proc: its clock ticks 100 times a second, the observer expects one."""
+"""Samples for each look at /proc, whose clock ticks 100 times per second."""
 
 
 def is_over(run: RunInfo) -> bool:
-    """Whether the launcher of a run has ended; its nodes do not outlive it."""
+    """Whether the launcher of a run has ended; its nodes end with it."""
     return process_state(run.pid) in {"X", "Z"}
 
 
 async def wait_for_run(port: int | None, stop: asyncio.Event) -> bool:
-    """Wait until there is a run to join; return False if `stop` came first."""
+    """Wait for a run to join; return False if `stop` comes first."""
     while not stop.is_set():
         runs = await asyncio.to_thread(find_runs)
         if any(port in {None, run.base_port} for run in runs):
@@ -44,19 +44,19 @@ async def wait_for_run(port: int | None, stop: asyncio.Event) -> bool:
 
 async def sessions(port: int | None, stop: asyncio.Event, *, follow: bool, option: str = "--port"
                    ) -> AsyncGenerator[Session, None]:
-    """Yield a session of the run and, if `follow`, of each that comes after it.
+    """Yield a session of the run and, if `follow`, of each later run.
 
-    Whoever iterates ends the loop's body when `is_over` or `stop`.
+    The body of the caller's loop ends when `is_over` or `stop` is true.
 
     Args:
-        port: base port of the run; None if there is only one.
-        stop: the user has had enough.
+        port: base port of the run; None for the only one.
+        stop: ends the iteration.
         follow: wait for a run if there is none, and for the next.
-        option: by which the verb is told the base port.
+        option: name of the verb's option for the base port.
 
     Raises:
-        UsageError: there is no run and `follow` is not set, or it must be chosen.
-        NoEffectError: its routers let nothing through, and `follow` is not set.
+        UsageError: there is no run and `follow` is not set, or there are several.
+        NoEffectError: the routers of the run send no messages, and `follow` is not set.
     """
     while not follow or await wait_for_run(port, stop):
         try:
@@ -76,7 +76,7 @@ async def sessions(port: int | None, stop: asyncio.Event, *, follow: bool, optio
 
 @contextlib.contextmanager
 def stopped_by_signals(stop: asyncio.Event) -> Iterator[None]:
-    """Have SIGINT, SIGTERM and SIGHUP set an event."""
+    """Set an event on SIGINT, SIGTERM and SIGHUP."""
     loop = asyncio.get_running_loop()
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as it is under nohup
@@ -91,10 +91,10 @@ def stopped_by_signals(stop: asyncio.Event) -> Iterator[None]:
 
 
 def draw(session: Session, picture: RunPicture) -> None:
-    """Have everything that a session hears drawn into a picture, with the lines of its robot."""
+    """Keep all messages of a session in a picture, with the lines of its robot."""
     clock = session.clock
 
-    def hear(topic: Topic[Any]) -> None:
+    def subscribe(topic: Topic[Any]) -> None:
         if topic in (*DECODED, *picture.lines.read):
             session.listen(topic, topic.pattern, lambda _key, header, body: picture.heard(
                 topic, header, body, clock.now()))
@@ -107,20 +107,20 @@ def draw(session: Session, picture: RunPicture) -> None:
         picture.lines = systems.lines_of(spec)
         known = systems.declared(spec)
         known += systems.own_topics_of(spec)
-    except UsageError as error:  # of a run from elsewhere, say: the common topics are enough
-        warn(f"{error}; topics of its own are not counted")
+    except UsageError as error:  # for example a run from another folder
+        warn(f"{error}; only topics of the engine are counted")
     for topic in known:
-        hear(topic)
+        subscribe(topic)
 
 
 class Watch:
-    """What is heard in one run, and what its processes use.
+    """Messages and processor use of one run.
 
     Attributes:
         session: the connection to the run.
-        picture: what was heard.
-        used: what `ProcessObserver.look` told last; nothing on a replay, where the process numbers
-            may be anybody's today.
+        picture: the messages.
+        used: last result of `ProcessObserver.look`; empty for a replay, whose process numbers may
+            belong to other processes today.
     """
 
     def __init__(self, session: Session) -> None:
@@ -133,11 +133,11 @@ class Watch:
         draw(session, self.picture)
 
     def look(self) -> float:
-        """Take a sample, and look at the processes if it is time to; return the simulated time."""
+        """Take a sample, look at the processes if due, and return the simulated time."""
         now_s = self.session.clock.now()
         self.picture.sample(now_s)
         table = self.picture.latest(topics.NODES)
-        if table is not None and not self.session.run.replay_of:  # before, whom to look at?
+        if table is not None and not self.session.run.replay_of:
             if self._looks % _USAGE_EVERY == 0:
                 self.used = self._processes.look(table)
             self._looks += 1

@@ -1,6 +1,6 @@
-"""A run as the other hosts have it: `launch.py --host NAME`, where NAME is not the first host.
+"""A run on a further host: `launch.py --host NAME`, where NAME is not the first host.
 
-It waits for the first host, runs what belongs here, and ends when the run does.
+It waits for the first host, runs the processes of this host, and ends with the run.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ EXIT_OVER, EXIT_FAILED = 0, 1
 
 
 class HostRun:
-    """One host's part in a run.
+    """The part of one host in a run.
 
     Args:
-        options: of the command line.
-        plan: what of the plan is this host's own.
-        directory: for checkpoints and tracebacks.
+        options: options of the command line.
+        plan: the part of the plan that this host chooses.
+        directory: directory of checkpoints and tracebacks.
 
     Raises:
-        UsageError: an option is the first host's to say.
+        UsageError: the first host chooses one of the given options.
     """
 
     def __init__(self, options: argparse.Namespace, plan: RunPlan, directory: Path) -> None:
-        why = f"on host {plan.host} the first host's command line decides that"
+        why = f"on host {plan.host}, the command line of the first host decides this"
         refuse(options, _LEFT_TO_THE_FIRST, why)
         for name, value in plan.options.items():
             raise UsageError(f"--{name.replace('_', '-')} {value}: {why}")
@@ -66,14 +66,14 @@ class HostRun:
             link: connection to the root.
 
         Raises:
-            UsageError: this host may not take part.
-            LaunchError: its processes cannot be started.
+            UsageError: the first host refuses this host.
+            LaunchError: the processes of this host cannot be started.
         """
         launcher, task, why = OtherLauncher(self._plan, _say, link), asyncio.current_task(), ""
         assert task is not None  # noqa: S101 for the type checker
 
         def interrupt(_signal: str) -> None:
-            launcher.on_interrupt = lambda _signal: None  # it ends already
+            launcher.on_interrupt = lambda _signal: None  # the end has begun
             task.cancel()
 
         launcher.on_interrupt = interrupt
@@ -103,7 +103,7 @@ class HostRun:
                      f"{one_line(event.detail)}".rstrip())
 
         launcher.report = _say
-        launcher.on_restart = lambda name: _say(f"{clock.now():8.2f} s  {name} brought back")
+        launcher.on_restart = lambda name: _say(f"{clock.now():8.2f} s  {name} restarted")
         name = on_host(OBSERVER, plan.host)
         observer = HostObserver(Context(
             name, 1, clock, launcher.observers_bus(), {"supervisor": plan.supervisor},

@@ -43,7 +43,7 @@ _GROUPS = {
     "operate": ("reset", "inject", "adapt", "bench"),
     "analyse": ("check", "explain", "decide", "tree", "verify", "cut-sets", "campaign"),
     "administer": ("keys", "tokens")}
-"""In the help. Verbs of other packages come last, under `robots`."""
+"""Groups of the help. Verbs of other packages come last, under `robots`."""
 
 _HELP = """usage: rampart VERB ...
 
@@ -66,7 +66,7 @@ class RampartParser(argparse.ArgumentParser):
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
-        """Names of the verbs, those of other packages included, by the title of their group."""
+        """Title of a group → names of its verbs, with those of other packages."""
         grouped = {name for names in _GROUPS.values() for name in names}
         return {**_GROUPS, "robots": tuple(sorted(
             action.dest for action in self.verbs._choices_actions if action.dest not in grouped))}
@@ -82,8 +82,8 @@ class RampartParser(argparse.ArgumentParser):
 def build_parser() -> RampartParser:
     """Return the parser with all verbs; each sets `run`, a function of the options.
 
-    A package adds verbs of its own by entry points of the group `rampart.verbs`: functions of the
-    verbs' subparsers, the formatter class, and a parent parser with `--port`.
+    A package adds verbs by entry points of the group `rampart.verbs`: functions of the verbs'
+    subparsers, the formatter class, and a parent parser with `--port`.
     """
     parser = RampartParser(prog="rampart")
     parser.add_argument("--version", action="version",
@@ -98,10 +98,10 @@ def build_parser() -> RampartParser:
     common = argparse.ArgumentParser(add_help=False)
     PORT(common)
     of_packages = {verb.name: verb for verb in entry_points(group="rampart.verbs")}
-    for _, found in sorted(of_packages.items()):  # one that is installed twice counts once
+    for _, found in sorted(of_packages.items()):  # a package may be installed twice
         try:
             found.load()(verbs, FORMATTER, common)
-        except Exception as error:  # of somebody else's package: the other verbs are there
+        except Exception as error:  # of another package: the other verbs must work
             warn(f"verb {found.name} ({found.value}): {type(error).__name__}: {error}")
     return parser
 
@@ -109,14 +109,14 @@ def build_parser() -> RampartParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code.
 
-    0 it worked; 1 it was asked for and had no effect, or nothing answered; 2 bad usage, unknown
-    name, no run found, or the answer could not be written.
+    0 success; 1 no effect, or no answer; 2 bad usage, unknown name, no run found, or output that
+    cannot be written.
     """
     if arguments is None:
         arguments = sys.argv[1:]
     if arguments[:1] == ["run"]:
         interrupts.end_at_once()
-        from rampart.cli.run import main as run  # noqa: PLC0415 physics and all: other verbs need not
+        from rampart.cli.run import main as run  # noqa: PLC0415 other verbs need no physics
 
         return run(arguments[1:], "rampart run")
     streams.secure()
@@ -128,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _as_if_last(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> list[str]:
-    """Return arguments with `--port` and `--json` of a family behind the verb that takes them."""
+    """Return arguments with `--port` and `--json` of a family moved behind its verb."""
     verbs = next(action.choices for action in parser._actions
                  if isinstance(action, argparse._SubParsersAction))
     family = verbs.get(arguments[0]) if arguments else None
@@ -144,10 +144,10 @@ def _as_if_last(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> li
 
 
 def _run(arguments: Sequence[str]) -> int:
-    working_folder.admit()  # for actors of one's own, as in the processes of a run
+    working_folder.admit()  # for the user's actors, as in the processes of a run
     try:
         if arguments[:1] == ["campaign"]:
-            from rampart.cli.analyse import campaign_verb  # noqa: PLC0415 other verbs need no campaigns
+            from rampart.cli.analyse import campaign_verb  # noqa: PLC0415 others need no campaigns
 
             options = campaign_verb.parse(arguments[1:])
         else:
@@ -163,7 +163,7 @@ def _run(arguments: Sequence[str]) -> int:
         return 2 if isinstance(error, UsageError) else 1
     except KeyboardInterrupt:
         return 130
-    except OSError as error:  # of a disk; what the user named wrongly was refused above
+    except OSError as error:  # of a disk; wrong names are a UsageError
         warn(" ".join(str(error).split()))
         return 2
 

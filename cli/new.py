@@ -51,13 +51,13 @@ def new(options: argparse.Namespace) -> int:
         try:
             folder.mkdir()
         except FileExistsError:
-            raise UsageError(f"{name}: is there already; nothing was changed") from None
+            raise UsageError(f"{name}: exists already; nothing was changed") from None
         try:
             fill(folder, name)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
-    say(f"{name}/ is a robot that runs: cd {name}, then make run, make test; README.md leads on")
+    say(f"{name}/ contains a robot that runs: cd {name}, then make run, make test; see README.md")
     return 0
 
 
@@ -65,11 +65,11 @@ def check(name: str) -> None:
     """Refuse a name that no package can have here.
 
     Raises:
-        UsageError: it is none.
+        UsageError: it is such a name.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or keyword.iskeyword(name):
-        raise UsageError(f"NAME {name!r}: must be small letters, digits and _, a letter first, at "
-                         "most 31 of them, and no word of Python's: it is the name of a package")
+        raise UsageError(f"NAME {name!r}: expected at most 31 small letters, digits and _, a "
+                         "letter first, not a keyword of Python: it becomes the name of a package")
     if name in {"tests", "world", "controller", "driver", "manager"} or (
             not Path(name).exists() and importlib.util.find_spec(name) is not None):
         raise UsageError(f"NAME {name!r}: another module or node has this name already")

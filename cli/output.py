@@ -1,4 +1,4 @@
-"""How verbs talk: errors of the user, tables, JSON."""
+"""Output of the verbs: errors, tables, JSON."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _WARNING_CHARS = 4000
 
 
 class UsageError(Exception):
-    """The user asked for something that cannot be; one line. Exit code 2."""
+    """The request cannot be fulfilled; one line. Exit code 2."""
 
 
 class NoEffectError(Exception):
-    """It was asked for, and nothing came of it; one line. Exit code 1."""
+    """The request had no effect; one line. Exit code 1."""
 
 
 FORMAT = 1
-"""Of every JSON object that a verb prints; it grows when a field changes its meaning.
+"""Number in every JSON object that a verb prints; it grows when a field changes its meaning.
 
 See docs/reference/json.md.
 """
@@ -36,19 +36,19 @@ _NEAREST = 3
 
 
 def unknown(what: str, value: str, known: Iterable[str]) -> UsageError:
-    """Return the error for a name that is none; it lists those that are, or the nearest of many."""
+    """Return the error of an unknown name, with the known names, or the nearest of many."""
     names = list(known)
     if len(names) <= _LISTED:
         return UsageError(f"unknown {what} {value!r}; known: {', '.join(names) or 'none'}")
     near = difflib.get_close_matches(value, names, _NEAREST, 0.4)
     return UsageError(f"unknown {what} {value!r}; " + (
         f"the nearest of {len(names)}: {', '.join(near)}" if near else
-        f"none of {len(names)} is like it"))
+        f"none of {len(names)} is similar"))
 
 
 @contextlib.contextmanager
 def refusing(*kinds: type[Exception]) -> Iterator[None]:
-    """Have what the engine refuses told to the user as it is.
+    """Turn errors of some kinds into a `UsageError` with the same text.
 
     Raises:
         UsageError: instead of an error of these kinds.
@@ -61,10 +61,10 @@ def refusing(*kinds: type[Exception]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def using(file: object) -> Iterator[None]:
-    """Have the user told of a file that cannot be read or written, or is not what it should be.
+    """Turn errors of a file into a `UsageError` with the name of the file.
 
     Raises:
-        UsageError: instead of an error of the file, which it names.
+        UsageError: instead of an error of the operating system, or of the contents.
     """
     try:
         yield
@@ -89,7 +89,7 @@ def between(option: str, value: float, least: float, most: float, why: str = "")
 
 
 def say(text: str = "") -> None:
-    """Print one line now, also into a pipe; whoever it quotes cannot make it two."""
+    """Print one line at once; text of others in it cannot break it in two."""
     print(printable(text), flush=True)
 
 
@@ -105,9 +105,9 @@ def warn(text: str) -> None:
 
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[str], None]]:
-    """Give a function that shows on a terminal what is being done, in the place of what was.
+    """Yield a function that shows the present step in one line of a terminal.
 
-    At the end all is wiped away.
+    The line is cleared at the end.
     """
     def show(text: str) -> None:
         if sys.stderr.isatty():
@@ -120,12 +120,12 @@ def progress() -> Iterator[Callable[[str], None]]:
 
 
 def rendered(template: Path, *, escaped: bool = False, **values: Any) -> str:
-    """Return a template of Jinja filled in, numbers in their shortest form.
+    """Return a filled-in Jinja template, with numbers in their shortest form.
 
     Args:
-        template: its file.
-        escaped: what is filled in is escaped, as XML needs it.
-        values: by name.
+        template: file of the template.
+        escaped: escape the values for XML.
+        values: values by name.
     """
     import jinja2  # noqa: PLC0415 few verbs need it
 
@@ -141,9 +141,9 @@ def print_json(data: Any, *, indent: bool = True, names: bool = False) -> None:
     """Print data as JSON; NaN and infinity become null.
 
     Args:
-        data: a struct or dictionary is printed with its `format` first.
-        indent: on several lines.
-        names: a dictionary by names that are nobody's to choose, to which nothing can be added.
+        data: a struct or dictionary is printed with `format` as its first field.
+        indent: print several lines.
+        names: the keys are user data, so no `format` field is added.
     """
     if isinstance(data, msgspec.Struct) and not data.__struct_config__.array_like:
         data = msgspec.to_builtins(data)
@@ -154,7 +154,7 @@ def print_json(data: Any, *, indent: bool = True, names: bool = False) -> None:
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print rows in aligned columns; numbers to the right."""
+    """Print rows in aligned columns, numbers to the right."""
     table = [[printable(str(cell)) for cell in row] for row in (head, *rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(head))]
     right = [bool(rows) and all(isinstance(row[i], (int, float)) for row in rows)

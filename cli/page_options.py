@@ -1,7 +1,7 @@
-"""What can be said on the command line of the operator's page: where it is, for whom, how safe.
+"""Options of the operator's page: address, tokens, encryption.
 
-All of it is checked before anything is started, so that a page that could not be served, or would
-be open to strangers, is one line and no surprise.
+They are checked before a process starts. A page that cannot be served, or that would be open to
+strangers, is refused in one line.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from rampart.actors.web.visitors import VisitorError, lists_visitors, read_visit
 from rampart.cli.output import UsageError
 from rampart.cli.verbs import flag, option, whole, word
 
-TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
+TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 a name
 
 NAMES = ("hmi_port", "hmi_host", "hmi_token_file", "hmi_cert", "hmi_key", "hmi_unencrypted",
          "hmi_behind")
 
 _SOON_DAYS = 7.0
-"""A certificate that ends within so many days is told."""
+"""Days before its expiry from which a certificate causes a note."""
 
 OPTIONS = (
     whole("--hmi-port", "PORT", "port of the operator's page (default: 8080)", 8080),
@@ -50,14 +50,14 @@ OPTIONS = (
 
 
 def own_token(options: argparse.Namespace) -> str:
-    """Return the token of the environment, and take it from there: nothing that is started has it.
+    """Return the token of the environment, and remove it there: no child process inherits it.
 
     Raises:
-        UsageError: there is one on the command line.
+        UsageError: there is a token on the command line.
     """
     own = os.environ.pop(TOKEN_VARIABLE, "")
     if options.hmi_token is not None:
-        raise UsageError("--hmi-token: a command line is read by every user of this machine; put "
+        raise UsageError("--hmi-token: every user of this machine can read a command line; put "
                          "another token into a file of mode 0600 for --hmi-token-file FILE, or "
                          f"into the variable {TOKEN_VARIABLE}")
     return own
@@ -65,23 +65,23 @@ def own_token(options: argparse.Namespace) -> str:
 
 def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
             ) -> PagePlan:
-    """Return where the page is, for whom, encrypted how.
+    """Return address, tokens and encryption of the page.
 
-    Tokens come from a file or the environment, which other users cannot read as they can read a
-    command line; where none is given and one is needed it is made.
+    Tokens come from a file or the environment, because other users can read a command line. If a
+    token is required and none is given, a random one is made.
 
     Args:
-        options: of the command line.
-        own: token of the environment, "" for none.
-        note: is told what is odd, and no error.
+        options: options of the command line.
+        own: token of the environment, "" without one.
+        note: called with each warning.
 
     Raises:
-        UsageError: an option makes no sense, or the page could not be served like this.
+        UsageError: options contradict each other, or the page cannot be served.
     """
     if options.no_hmi or options.virtual:
         if options.wait:
-            raise UsageError("--wait: the mission is started from the operator's page, which there "
-                             f"is not with --{'no-hmi' if options.no_hmi else 'virtual'}")
+            raise UsageError("--wait: the operator's page starts the mission; not with "
+                             f"--{'no-hmi' if options.no_hmi else 'virtual'}")
         return PagePlan(0 if options.no_hmi else options.hmi_port)
     host: str = options.hmi_host
     token, listed = _tokens(options, own)
@@ -105,12 +105,12 @@ def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
 
 
 def audited(page: PagePlan, file: Path) -> PagePlan:
-    """Return the plan of a page that keeps in a file who did what, if there is a page."""
+    """Return the plan of the page with a file for its audit log, if there is a page."""
     return msgspec.structs.replace(page, audit_log=str(file)) if page.port else page
 
 
 def _tokens(options: argparse.Namespace, own: str) -> tuple[str, str]:
-    """Return the token that everybody shows, or the path of the list of those who have one."""
+    """Return the common token, or the path of a list of personal tokens."""
     source = TOKEN_VARIABLE
     try:
         if options.hmi_token_file:
@@ -118,7 +118,7 @@ def _tokens(options: argparse.Namespace, own: str) -> tuple[str, str]:
             file = Path(options.hmi_token_file)
             if lists_visitors(file):
                 if not read_visitors(file):
-                    raise VisitorError("lists nobody; rampart tokens issue NAME --role ROLE --file "
+                    raise VisitorError("is empty; rampart tokens issue NAME --role ROLE --file "
                                        f"{file}")
                 return "", str(file.resolve())
             own = read_secret(file)
@@ -134,32 +134,31 @@ def _certificate(options: argparse.Namespace, note: Callable[[str], None]
     if not (cert or key):
         return None
     if not cert:
-        raise UsageError(f"--hmi-key {key}: --hmi-cert FILE is needed as well")
+        raise UsageError(f"--hmi-key {key}: expected --hmi-cert FILE, too")
     if not key and Path(cert).is_file() and not holds_key(Path(cert)):
-        raise UsageError(f"--hmi-cert {cert}: holds no key; --hmi-key FILE is needed as well")
+        raise UsageError(f"--hmi-cert {cert}: contains no key; expected --hmi-key FILE, too")
     key = options.hmi_key = key or cert
     if options.hmi_unencrypted:
-        raise UsageError(f"--hmi-unencrypted: with --hmi-cert {cert} the page is encrypted; leave "
-                         "one of them out")
+        raise UsageError(f"--hmi-unencrypted: contradicts --hmi-cert {cert}; expected one of them")
     try:
         _, found = load(Path(cert), Path(key))
     except TlsError as error:
         raise UsageError(f"--hmi-cert, --hmi-key: {error}") from None
     host = options.hmi_host
     if not found.names:
-        note(f"--hmi-cert {cert}: is for no name or address (no subjectAltName): browsers will "
+        note(f"--hmi-cert {cert}: contains no name or address (subjectAltName); browsers will "
              "refuse it")
     elif host not in ANY and not found.covers(host):
         note(f"--hmi-cert {cert}: is for {', '.join(found.names)}, not for {host}: browsers that "
              f"open the page at {host} will refuse it")
     if (days := days_left(found)) < _SOON_DAYS:
-        note(f"--hmi-cert {cert}: ends in {days:.1f} days; a new one in its place is taken while "
-             "the page is served")
+        note(f"--hmi-cert {cert}: expires in {days:.1f} days; the page will use a new file without "
+             "a restart")
     return found
 
 
 def _shown(host: str, certificate: Certificate | None) -> str:
-    """Return under which name the page is shown: one that browsers accept, if there is one."""
+    """Return the host of the printed address, if possible one that browsers accept."""
     names = certificate.plain_names if certificate else ()
     if host in ANY:
         others = (name for name in names if not is_loopback(name))
@@ -168,15 +167,15 @@ def _shown(host: str, certificate: Certificate | None) -> str:
 
 
 def _check_address(host: str, port: int) -> None:
-    """Refuse an address that is not this machine's, and a port that another program serves."""
+    """Refuse an address of another machine, and a port that is in use."""
     try:
         family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, number) as probe:
             probe.bind(address)
     except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or str(error)
-        raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
-                         "for all it has") from None
+        raise UsageError(f"--hmi-host {host}: expected an address of this machine, or 0.0.0.0 for "
+                         f"all ({why})") from None
     with socket.socket(family, kind, number) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

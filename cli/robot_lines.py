@@ -1,5 +1,5 @@
-"""What a robot adds to `rampart status`, `rampart top` and `rampart live metrics`."""
-# ruff: noqa: ARG002 a robot that says nothing needs nothing
+"""The lines of a robot in `rampart status`, `rampart top` and `rampart live metrics`."""
+# ruff: noqa: ARG002 the base class has no lines
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any, ClassVar, NamedTuple
 from rampart.actors.bus.topic import Topic
 
 SILENT = "silent"
-"""What there is to say of whoever was not heard."""
+"""Text for a state of which no message has arrived."""
 
 Latest = Callable[[Topic[Any]], Any]
-"""Returns the newest message of a topic, None if none was heard."""
+"""Returns the newest message of a topic, None without any."""
 
 
 class Row(NamedTuple):
-    """A line of `rampart top`: what it is about, words, style, and the state that it tells of."""
+    """A line of `rampart top`: label, text, style, and the topic that it shows."""
 
     label: str
     text: str
@@ -25,7 +25,7 @@ class Row(NamedTuple):
 
 
 class RobotLines:
-    """The lines of a robot that says nothing; an application may name a class derived from this.
+    """The lines of a robot: none. An application may name a derived class.
 
     Class attributes:
         read: topics for `rampart top` and `rampart live metrics`.
@@ -37,12 +37,12 @@ class RobotLines:
 
     def status(self, latest: Latest, plan: Mapping[str, Any], kinds: Collection[str]
                ) -> list[tuple[str, str]]:
-        """Return the lines of `rampart status`: a word, and what there is to say.
+        """Return the lines of `rampart status`: label and text.
 
         Args:
-            latest: of `status_read`.
-            plan: of the run, as plain data.
-            kinds: of the nodes that there are.
+            latest: gives the messages of `status_read`.
+            plan: plan of the run, as plain data.
+            kinds: kinds of the nodes of the run.
         """
         return []
 
@@ -51,7 +51,7 @@ class RobotLines:
         return {}
 
     def rows(self, latest: Latest, width: int) -> list[Row]:
-        """Return the lines of `rampart top` for a screen so many cells wide."""
+        """Return the lines of `rampart top` for a screen of some width in cells."""
         return []
 
     def data(self, latest: Latest) -> dict[str, Any]:

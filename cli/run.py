@@ -62,7 +62,7 @@ from rampart.sim.virtual.network import find_network
 EXIT_SUCCESS, EXIT_FAILED, EXIT_USAGE, EXIT_UNSAFE, EXIT_NOT_KNOWN = 0, 1, 2, 3, 4
 
 PROGRAM: ContextVar[str] = ContextVar("program", default="launch.py")
-"""What was typed to start this; messages begin with it."""
+"""Name of the command, at the beginning of messages."""
 
 
 class Run:
@@ -74,14 +74,14 @@ class Run:
         self._options = options
         kind = trial_class(spec)
         if kind.patient and options.duration is not None:
-            raise UsageError(f"--duration {options.duration:g}: a mission ends by itself; "
-                             "--patience S ends one that makes no progress")
+            raise UsageError(f"--duration {options.duration:g}: a mission ends by itself, or by "
+                             "--patience S without progress")
         if not kind.patient:
             refuse(options, ("wait", "patience"),
                    f"{spec.name} has no mission: its runs end after --duration S")
             if options.virtual and (options.duration or spec.end.after_s) is None:
-                raise UsageError("--virtual: in virtual time a run has to end: give --duration S, "
-                                 f"or {spec.name} an [end] with after_s")
+                raise UsageError("--virtual: expected --duration S, or an [end] with after_s in "
+                                 f"{spec.name}: a run in virtual time has to end")
         application = load_application(plan, spec)
         if note := application.check(spec, virtual=options.virtual):
             _say(note)
@@ -105,7 +105,7 @@ class Run:
         self._scenario = [parse_fault(text) for text in options.fault]
         known = system_topics(spec) if self._scenario else ()
         for i, planned in enumerate(self._scenario):
-            action_of(planned, f"f{i}", can_be_hit(spec), known, faults_of(spec))  # not in mid-run
+            action_of(planned, f"f{i}", can_be_hit(spec), known, faults_of(spec))
             if planned.goal > self._trial.goals:
                 raise UsageError(f"--fault {planned.text()}: mission {self._trial.name} has "
                                  f"{self._trial.goals} goals")
@@ -121,8 +121,8 @@ class Run:
                 return self._in_virtual_time()
             files = self._files
             if files is not None and not files.lock():
-                raise UsageError(f"--report {files.directory}: a run is under way that keeps its "
-                                 "checkpoints there")
+                raise UsageError(f"--report {files.directory}: another run keeps its checkpoints "
+                                 "there")
             saved = files.saved() if files is not None else None
             try:
                 root = Root(self._context)
@@ -143,10 +143,10 @@ class Run:
         return await self._on_processes(ProcessRun(self._trial, self._scenario, link, keep))
 
     def _not_watched(self, root: Root) -> int:
-        """Conclude a run whose watching process has ended without a verdict."""
+        """Conclude a run whose process `run` has ended without a verdict."""
         why = ("the process that watched the run was killed" if root.death else
                "the process that watched the run has failed")
-        _say(f"{why}{root.death and f' by {root.death}'}: the run was ended")
+        _say(f"{why}{root.death and f' by {root.death}'}: the run has ended")
         plan = root.plan
         lasted_s = Clock(plan.origin_s, plan.rate).now() if plan.origin_s else 0.0
         record = self._trial.conclude(max(0.0, lasted_s), why)
@@ -154,17 +154,17 @@ class Run:
             record, safety="not known", reasons=(*record.reasons, why)), why)
 
     def _resume(self, before: Manifest) -> None:
-        """Go on where a run was cut off.
+        """Continue an interrupted run.
 
         Raises:
-            UsageError: what is started is not that run.
+            UsageError: the options, the system or its files differ from those of that run.
         """
         files = self._files
         if self._options.virtual:
-            raise UsageError("--resume: not in virtual time: the same --seed gives the same run")
+            raise UsageError("--resume: not with --virtual: the same --seed gives the same run")
         if files is None:
-            raise UsageError(f"--resume: {self._context.system.name} keeps nothing to go on from; "
-                             "expected layers.checkpoints, one machine, and no judge of its own")
+            raise UsageError(f"--resume: {self._context.system.name} cannot be resumed; expected "
+                             "layers.checkpoints, one host, and a judge that can resume")
         if why := differences(before, self._manifest):
             raise UsageError(f"--resume {files.directory}: {why}")
         begins_s, problems = files.recall(before.run_id, self._trial.recall)
@@ -207,7 +207,7 @@ class Run:
                          taps=[recording.take] if recording else [])
         console = self._trial.console
         if console is None:
-            raise TypeError("a run from the command line tells its story")
+            raise TypeError("expected a console")
         console.banner(self._trial.about, self._plan, self._trial.run.system, virtual=True)
         try:
             with _interruptible(run, *_ends()):
@@ -224,14 +224,14 @@ class Run:
                 with Path(self._plan.error_log).open("a", encoding="utf-8") as log:
                     log.write(result.tracebacks)
             except OSError as error:
-                _say(f"{self._plan.error_log}: tracebacks are lost: {in_words(error)}")
+                _say(f"{self._plan.error_log}: cannot write tracebacks: {in_words(error)}")
         return self._conclude(result.record, trace=result.trace, recording=_recording(
             self._options.record or "", recording.problem if recording else ""))
 
     def _conclude(self, record: RunRecord, failure: str = "", **more: Any) -> int:
-        """Tell what came of the run; no disk and no reader that fails changes the verdict."""
-        if self._files is not None and not failure:  # else it was cut off, and can be resumed
-            with contextlib.suppress(ResumptionError, OSError):  # of a full disk the report tells
+        """Report the run and return the exit code, which no error of a disk or reader changes."""
+        if self._files is not None and not failure:  # else it can be resumed
+            with contextlib.suppress(ResumptionError, OSError):  # the report names a full disk
                 self._files.end(msgspec.structs.replace(
                     self._manifest, ended=f"{record.mission or 'without a mission'}, "
                     f"{record.safety or 'without a judge'}"))
@@ -263,7 +263,7 @@ class Run:
 
 
 def _recording(file: str, problem: str) -> dict[str, str] | None:
-    """Return what the result of a run has of its recording; None if there is none."""
+    """Return the field `recording` of the result, None without a recording."""
     return {"file": file, "problem": problem} if file else None
 
 
@@ -273,10 +273,10 @@ def _say(text: str) -> None:
 
 @contextlib.contextmanager
 def _kept(directory: Path) -> Iterator[None]:
-    """Have a directory for what is kept of a run: say if there are tracebacks, leave none empty.
+    """Provide the directory of a run; print whether it has tracebacks, and remove it if empty.
 
     Raises:
-        UsageError: it cannot be made, or not be written.
+        UsageError: it cannot be created or written.
     """
     log = directory / ERROR_LOG
     made = not directory.exists()
@@ -284,23 +284,23 @@ def _kept(directory: Path) -> Iterator[None]:
         directory.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=directory).close()
     except OSError as error:
-        raise UsageError(f"--report {directory}: no directory that can be written "
+        raise UsageError(f"--report {directory}: expected a directory that can be written "
                          f"({error.strerror})") from None
     before = log.stat().st_size if log.exists() else 0
     try:
         yield
     finally:
         if log.exists() and log.stat().st_size > before:
-            _say(f"tracebacks of what failed: {log}")
+            _say(f"tracebacks of failed processes: {log}")
         if made:
-            with contextlib.suppress(OSError):  # there is something in it
+            with contextlib.suppress(OSError):  # not empty
                 directory.rmdir()
 
 
 @contextlib.contextmanager
 def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
               ) -> Iterator[RecorderProcess | None]:
-    """Have what runs meanwhile recorded, if that is asked for, by a process of its own."""
+    """Record the run in a separate process, with --record."""
     if not options.record:
         yield None
         return
@@ -315,14 +315,14 @@ def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
 
 
 def _ends() -> list[signal.Signals]:
-    """Return the signals that end a run; under nohup the end of the terminal does not."""
+    """Return the signals that end a run: under nohup, not SIGHUP."""
     ends = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
     return [number for number in ends if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 @contextlib.contextmanager
 def _interruptible(run: VirtualRun, *ends: signal.Signals) -> Iterator[None]:
-    """Have signals end a run, the second one at once; those that are ignored stay so."""
+    """End a run on signals, the second time at once; ignored signals stay ignored."""
 
     def interrupt(number: int, _frame: object) -> None:
         if run.interrupted:
@@ -339,7 +339,7 @@ def _interruptible(run: VirtualRun, *ends: signal.Signals) -> Iterator[None]:
 
 
 def _in_child(run: Callable[[], Coroutine[Any, Any, int]]) -> int:
-    """Run what watches a run, in the root's child, and return the verdict."""
+    """Watch a run in the root's child `run`, and return the exit code."""
     try:
         return asyncio.run(run())
     except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
@@ -354,7 +354,7 @@ def _on_another_host(options: argparse.Namespace, plan: RunPlan, reports: Path) 
         host, root = HostRun(options, plan, directory), Root()
         code = root.run(lambda link: _in_child(lambda: host.run(link)))
         if code is None:
-            _say("the process that held this host's part of the run was killed: it was ended here")
+            _say("the process that watched this host was killed: its part of the run has ended")
             return EXIT_FAILED
         return code
 
@@ -364,9 +364,9 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
     """Parse the command line, run, and return the exit code.
 
     Args:
-        arguments: of the command line; None for those of this process.
-        program: as it is typed.
-        reports: folder for reports of runs that do not name theirs.
+        arguments: arguments of the command line; None for those of this process.
+        program: name of the command.
+        reports: folder of reports without --report.
     """
     PROGRAM.set(program)
     streams.secure()

@@ -1,4 +1,4 @@
-"""Options of the command line that starts a system, and the plan that follows from them.
+"""Options of `launch.py` and `rampart run`, and the plan of the run.
 
 Start a system from its specification, run it, and write a report with a verdict.
 `launch.py` takes the same options.
@@ -56,10 +56,10 @@ ERROR_LOG = "errors.log"
 HMI = "rampart.actors.operator.hmi:Hmi"
 
 LEAST_RATE, MOST_RATE = 0.1, 20
-"""Simulated seconds per second that can be asked for."""
+"""Bounds of --rate, simulated seconds per second."""
 
 SOON = dt.timedelta(days=1)
-"""Who starts a run is told of a certificate that expires sooner."""
+"""Time before the expiry of a certificate from which a run warns."""
 
 
 _EXAMPLES = (
@@ -124,35 +124,35 @@ _OPTIONS = (
 
 
 def parser(program: str = "", kind: type[Application] = Application,
-           said: Mapping[str, Any] | None = None) -> argparse.ArgumentParser:
+           chosen: Mapping[str, Any] | None = None) -> argparse.ArgumentParser:
     """Return the parser of the command line.
 
     Args:
-        program: as it is typed.
-        kind: the application of the system that is started, which adds options.
-        said: what the system's spec says of them.
+        program: name of the command.
+        kind: the application of the system, which adds options.
+        chosen: values of these options in the specification.
     """
     examples = "".join(f"  {program} {how:<40} # {what}\n" for how, what in (
         *_EXAMPLES, *kind.examples))
-    shown = help_of(__doc__)  # the examples themselves depend on program and system
+    shown = help_of(__doc__)  # the examples depend on program and system
     shown["epilog"] = shown["epilog"].replace("examples:\n", f"examples:\n{examples}\n", 1)
     p = argparse.ArgumentParser(prog=program, **shown)
     add_options(p, _OPTIONS)
-    application_options.add(p, kind, said or {})
+    application_options.add(p, kind, chosen or {})
     return p
 
 
 def parse(arguments: Sequence[str] | None, program: str
           ) -> tuple[argparse.Namespace, type[Application]]:
-    """Return the options, those of the system's application included, and its class.
+    """Return the options, with those of the application, and the class of the application.
 
     Args:
-        arguments: of the command line; None for those of this process.
-        program: as it is typed.
+        arguments: arguments of the command line; None for those of this process.
+        program: name of the command.
 
     Raises:
-        UsageError: there is no such system, or an option that it does not have.
-        ValueError: the system's spec is unsound.
+        UsageError: the system or an option is unknown.
+        ValueError: the specification is not sound.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--system", default=str(systems.DEFAULT))
@@ -161,20 +161,20 @@ def parse(arguments: Sequence[str] | None, program: str
     kind = application_class(spec)
     options, unknown = parser(program, kind, spec.application).parse_known_args(arguments)
     if unknown:
-        raise UsageError(f"{unknown[0]}: no option of the launcher or of {spec.name}; --system "
-                         f"{system} --help shows those there are")
+        raise UsageError(f"{unknown[0]}: not an option of the launcher or of {spec.name}; --system "
+                         f"{system} --help lists the options")
     return options, kind
 
 
 def of_one_process(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Return which run is to be resumed, and the arguments that hold for all parts of a run.
+    """Separate the arguments of this process from those of all parts of a resumed run.
 
     Args:
-        arguments: of the command line.
+        arguments: arguments of the command line.
 
     Returns:
-        The run, "" for the newest one, None for none; and the rest, without what is of this process
-        alone: recording, faults, place of the report.
+        The run to resume, "" for the newest, None without --resume; and the arguments except those
+        of recording, faults and report.
     """
     p = argparse.ArgumentParser(add_help=False)
     p.add_argument("--resume", nargs="?", const="")
@@ -190,24 +190,24 @@ def _system_file(system: str) -> Path:
     found = systems.find(system)
     if not found.is_file():
         what = "is a directory" if found.is_dir() else "no such file"
-        raise UsageError(f"--system {system}: {what}; a spec is right, or the name of a "
-                         f"shipped one: {systems.names()}")
+        raise UsageError(f"--system {system}: {what}; expected a system file, or the name of a "
+                         f"shipped system: {systems.names()}")
     working_folder.admit(found.parent)
     return found
 
 
 def plan_of(options: argparse.Namespace, kind: type[Application],
             note: Callable[[str], None] = warn) -> tuple[RunPlan, SystemSpec]:
-    """Return the plan that the options ask for, and the system they name.
+    """Return the plan of the run, and its system.
 
     Args:
-        options: of the command line.
+        options: options of the command line.
         kind: the application of the system.
-        note: is told what is odd, and no error.
+        note: called with each warning.
 
     Raises:
-        UsageError: an option makes no sense, or not in this system.
-        ValueError: the system's spec is unsound.
+        UsageError: an option does not fit another one, or the system.
+        ValueError: the specification is not sound.
     """
     _check(options)
     system_file = _system_file(options.system)
@@ -239,7 +239,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
 
 
 def _host(options: argparse.Namespace, spec: SystemSpec) -> str:
-    """Return which host this is, "" for the first."""
+    """Return the name of this host, "" for the first."""
     if options.host is None:
         return ""
     names = [host.name for host in spec.hosts]
@@ -248,29 +248,29 @@ def _host(options: argparse.Namespace, spec: SystemSpec) -> str:
             f"unknown; known: {', '.join(names)}" if names else
             f"{spec.name} has no [[host]]; it runs on one machine"))
     if options.virtual:
-        raise UsageError(f"--host {options.host}: virtual time is on one machine")
+        raise UsageError(f"--host {options.host}: not with --virtual, which runs on one machine")
     return "" if options.host == names[0] else str(options.host)
 
 
 def _check_network(options: argparse.Namespace, spec: SystemSpec) -> None:
-    """Refuse to open a port to a network by oversight."""
+    """Refuse to open a port to a network without credentials, unless asked."""
     if options.no_keys and (options.keys or not spec.hosts):
-        raise UsageError("--no-keys: " + ("either that or --keys" if options.keys else
+        raise UsageError("--no-keys: " + ("contradicts --keys" if options.keys else
                                           f"{spec.name} runs on one machine, and opens no port"))
     if spec.hosts and not (options.keys or options.no_keys or options.virtual):
-        raise UsageError(f"{spec.name} runs on {len(spec.hosts)} hosts: say --keys DIR (`rampart "
-                         "keys init` makes one), or --no-keys if whoever is on their network may "
-                         "do everything")
+        raise UsageError(f"{spec.name} runs on {len(spec.hosts)} hosts: expected --keys DIR "
+                         "(`rampart keys init` creates it), or --no-keys to give every client on "
+                         "the network full control")
 
 
 def _checked_keys(options: argparse.Namespace, layout: Layout) -> str:
-    """Return the folder of keys of a run, which has all that it needs.
+    """Return the folder of keys.
 
     Raises:
-        UsageError: it has not.
+        UsageError: it lacks a key or certificate of this host.
     """
     if options.virtual:
-        raise UsageError(f"--keys {options.keys}: in virtual time there are no links")
+        raise UsageError(f"--keys {options.keys}: not with --virtual, which has no links")
     extra("keys", "cryptography")
     from rampart.actors.access import key_folder  # noqa: PLC0415 of the extra
 
@@ -281,12 +281,12 @@ def _checked_keys(options: argparse.Namespace, layout: Layout) -> str:
     left = until - dt.datetime.now(dt.UTC)
     if left < SOON:
         warn(f"--keys {options.keys}: the first certificate expires at {until:%Y-%m-%d %H:%M} UTC; "
-             "whose has expired is cut off; `rampart keys rotate` renews it")
+             "its owner is then disconnected; `rampart keys rotate` renews certificates")
     return str(folder)
 
 
 def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
-    """Refuse options that would have no effect, each by its name and value as it is typed."""
+    """Refuse options that would have no effect."""
     for name in names:
         value = getattr(options, name)
         if value == parser().get_default(name):

@@ -1,6 +1,6 @@
-"""What a tool has heard of a run: the latest of everything, counts and rates. Pure.
+"""The messages of a run: the newest of each topic, counts and rates. Pure.
 
-`rampart top` shows it and `rampart live metrics` counts with it.
+`rampart top` and `rampart live metrics` use it.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from rampart.cli.robot_lines import SILENT, RobotLines
 DECODED: tuple[Topic[Any], ...] = (
     ftm_topics.MANAGER_STATUS, ftm_topics.DETECTION, ftm_topics.RECOVERY, ftm_topics.DECISION,
     ftm_topics.NODES, ftm_topics.PROCESS_EVENT)
-"""What is read besides what the lines of the robot need; all other messages are counted."""
+"""Topics that are decoded besides those of the robot's lines; others are only counted."""
 
 STALE_S = 2.0
-"""A state that was not heard for so long is silent (simulated seconds)."""
+"""Simulated seconds without a message after which a state is silent."""
 
 _KEPT = 50
 _SAMPLES = 13
@@ -31,7 +31,7 @@ _OTHERS = "others"
 
 
 def _count(counter: Counter[Any], key: Any) -> None:
-    """Count for a name, or for all others when there are too many names."""
+    """Count for a name, or for `others` beyond the greatest number of names."""
     if key not in counter and len(counter) >= _NAMES:
         key = (_OTHERS,) * len(key) if isinstance(key, tuple) else _OTHERS
     counter[key] += 1
@@ -47,18 +47,18 @@ def _report(module: str, report: Any, busy: StrEnum, newest: dict[str, Any],
 
 
 class RunPicture:
-    """One run as a tool has heard it.
+    """The messages of one run.
 
     Attributes:
-        lines: what is told of the robot.
-        messages: messages heard so far, by topic key as declared.
+        lines: the lines of the robot.
+        messages: number of messages by topic key, as declared.
         detections: newest report of each detection module.
         recoveries: newest report of each recovery module.
         decisions: the last decisions, each with its stamp, newest last.
-        decisions_total: decisions heard, by strategy.
-        detections_total: how often each module was seen to become active.
-        recoveries_total: how often each recovery was seen to become activated.
-        process_events_total: process events heard, by node and event.
+        decisions_total: number of decisions by strategy.
+        detections_total: number of times that each module became active.
+        recoveries_total: number of times that each recovery became activated.
+        process_events_total: number of process events by node and event.
     """
 
     def __init__(self, lines: RobotLines | None = None) -> None:
@@ -75,11 +75,11 @@ class RunPicture:
         self._samples: deque[tuple[float, Counter[str]]] = deque(maxlen=_SAMPLES)
 
     def count(self, topic: Topic[Any]) -> None:
-        """Count a message that is not read."""
+        """Count a message that is not decoded."""
         self.messages[topic.key] += 1
 
     def heard(self, topic: Topic[Any], header: Header, body: Any, now_s: float) -> None:
-        """Take a message that is read, heard at a simulated time."""
+        """Take a decoded message that arrived at a simulated time."""
         self.messages[topic.key] += 1
         if topic is ftm_topics.DETECTION:
             _report(header.source, body, m.DetectionState.ACTIVE, self.detections,
@@ -96,18 +96,18 @@ class RunPicture:
             self._latest[topic.key] = (body, now_s)
 
     def latest(self, topic: Topic[Any]) -> Any:
-        """Return the newest message of a topic, None if none was heard."""
+        """Return the newest message of a topic, None without any."""
         found = self._latest.get(topic.key)
         return found[0] if found else None
 
     def silence_s(self, topic: Topic[Any], now_s: float) -> float:
-        """Return for how long a state has been silent; 0 while it comes as it should."""
+        """Return for how many simulated seconds a state has been silent; 0 below `STALE_S`."""
         found = self._latest.get(topic.key)
         silent_s = now_s - found[1] if found else 0.0
         return silent_s if silent_s > STALE_S else 0.0
 
     def sample(self, now_s: float) -> None:
-        """Note how many messages there were until now; `rates` compares such notes."""
+        """Note the counts of now; `rates` compares them."""
         self._samples.append((now_s, self.messages.copy()))
 
     def rates(self) -> dict[str, float]:
@@ -121,7 +121,7 @@ class RunPicture:
 
 
 def manager_in_words(status: m.ManagerStatus | None) -> str:
-    """Return what the FTM Manager sees and does."""
+    """Return the state of the FTM Manager in words."""
     if status is None:
         return SILENT
     parts = [f"{status.strategy}, decision {status.decision}"]

@@ -1,4 +1,4 @@
-"""The system a tool talks about: a spec file, the one of the run, or the shipped one."""
+"""The system of a verb: a file, that of the run, or a shipped one."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ DEFAULT = systems.DEFAULT
 
 
 def choice(dest: str = "system", what: str = "", default: str = DEFAULT.stem) -> Option:
-    """Return what lets a verb be told its system with or without `--system`.
+    """Return an argument for a system, which may stand with or without `--system`.
 
     Args:
-        dest: where the choice is found in the options; None if there is none.
-        what: the verb takes besides a system.
-        default: in words, what it takes if it is not told.
+        dest: attribute of the options, None without a choice.
+        what: other values that the verb accepts.
+        default: the default in words.
     """
     return either(
         option(dest, nargs="?", metavar="SPEC", default=argparse.SUPPRESS,
@@ -45,16 +45,16 @@ def choice(dest: str = "system", what: str = "", default: str = DEFAULT.stem) ->
 
 @refusing(ValueError)
 def load(file: str | None) -> SystemSpec:
-    """Read a system spec.
+    """Read a specification.
 
-    Parameters are checked of the detection and recovery modules that ship. Others are imported when
-    they are started, and for no look at a file that somebody else may have written.
+    This checks the parameters of shipped detection and recovery modules. It does not import other
+    classes, because the file may be from a stranger.
 
     Args:
         file: path, or name of a shipped system; None for the shipped default.
 
     Raises:
-        UsageError: it cannot be read, or makes no sense.
+        UsageError: the file cannot be read, or is not sound.
     """
     path = DEFAULT if file is None else systems.find(file)
     working_folder.admit(path.parent)
@@ -64,22 +64,22 @@ def load(file: str | None) -> SystemSpec:
             if node.kind in REPORTS_ON and node.actor.startswith("rampart."):
                 load_member(node, spec, str(path))
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; a spec is right, or the name of a shipped "
-                         f"one: {systems.names()}") from None
+        raise UsageError(f"{path}: {error.strerror}; expected a system file, or the name of a "
+                         f"shipped system: {systems.names()}") from None
     except FileError as error:
         raise UsageError(f"{path}: {error}") from None
     return spec
 
 
 def at_hand(file: str | None, port: int | None = None) -> SystemSpec:
-    """Read the system that is meant: one that is named, else that of the run, else the shipped one.
+    """Read a named system, else that of the run, else the shipped default.
 
     Args:
-        file: as of `load`.
+        file: as in `load`.
         port: base port of the run, if there are several.
 
     Raises:
-        UsageError: the one that is named cannot be read, or makes no sense.
+        UsageError: as of `load`.
     """
     if file is None:
         with contextlib.suppress(NoRunError, UsageError):
@@ -89,16 +89,13 @@ def at_hand(file: str | None, port: int | None = None) -> SystemSpec:
 
 @refusing(ValueError, OSError)
 def check(file: str | None) -> Layout:
-    """Check all of a system that can be checked before it runs: everything it names is imported.
+    """Check a system as a start does, with all classes imported, and return its layout.
 
     Args:
-        file: path, or name of a shipped system; None for the shipped default.
-
-    Returns:
-        Its actors, as a run of it would have them.
+        file: as in `load`.
 
     Raises:
-        UsageError: something would not work; one line.
+        UsageError: the system is not sound; one line.
     """
     spec = load(file)
     plan = RunPlan(system_file=str(DEFAULT if file is None else systems.find(file)))
@@ -115,8 +112,6 @@ def check(file: str | None) -> Layout:
     return layout
 
 
-# Users are told what the actors or the application of a system lack.
-
 declared = refusing(ValueError)(declared_topics)
 """Returns the topics of the engine and of a system's application."""
 
@@ -124,10 +119,10 @@ topics_of = refusing(ValueError)(system_topics)
 """Returns all topics of a system."""
 
 own_topics_of = refusing(ValueError)(own_topics)
-"""Returns the topics that a system has beyond the declared ones."""
+"""Returns the topics of a system that are not declared."""
 
 
 @refusing(ValueError)
 def lines_of(spec: SystemSpec) -> RobotLines:
-    """Return what is told of a system's robot."""
+    """Return the lines of a system's robot."""
     return import_class(application_class(spec).lines, RobotLines, "lines")()

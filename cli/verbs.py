@@ -1,7 +1,7 @@
-"""How a verb is declared: by its function, whose docstring has the help text, and its options.
+"""Declaration of verbs: a function, whose docstring has the help text, and options.
 
-The first paragraph of such a docstring is for readers of the code. What follows is printed by
-`--help`: the description, and below `Examples:` what stands at the end.
+The first paragraph of such a docstring is for readers of the code. `--help` prints the rest as the
+description, and the part below `Examples:` as the epilogue.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from rampart.cli.output import UsageError
 FORMATTER = argparse.RawDescriptionHelpFormatter
 
 Run = Callable[[argparse.Namespace], int | Coroutine[Any, Any, int]]
-"""Does what a verb is for, and returns the exit code."""
+"""The function of a verb; it returns the exit code."""
 
 Completer = Callable[..., list[str]]
-"""Returns what can be typed; argcomplete calls it with the options so far, by name."""
+"""Returns the possible values; argcomplete calls it with the options so far, by name."""
 
 Option = Callable[[argparse._ActionsContainer], object]
 """Adds itself to a parser, or to a group of one."""
@@ -33,9 +33,9 @@ def option(*names: str, completer: Completer | None = None, **fields: Any) -> Op
     """Return an option or argument.
 
     Args:
-        names: as of `add_argument` of argparse.
-        completer: what the shell offers for it, see `rampart.cli.completion`.
-        fields: as of `add_argument`.
+        names: as in `add_argument` of argparse.
+        completer: see `rampart.cli.completion`.
+        fields: as in `add_argument`.
     """
     def add(parser: argparse._ActionsContainer) -> object:
         action: Any = parser.add_argument(*names, **fields)
@@ -73,12 +73,12 @@ def whole(name: str, metavar: str, text: str, default: int | None = None) -> Opt
 
 
 def group(title: str, *options: Option) -> Option:
-    """Return options that stand under a title of their own in the help."""
+    """Return options with a common title in the help."""
     return lambda parser: add_options(parser.add_argument_group(title), options)
 
 
 def either(*options: Option) -> Option:
-    """Return options of which one at most may be given."""
+    """Return mutually exclusive options."""
     return lambda parser: add_options(parser.add_mutually_exclusive_group(), options)
 
 
@@ -95,19 +95,19 @@ _WHICH_RUN = ("base port of the run, if this machine has several (default: the v
 
 
 def port_of_environment() -> int | None:
-    """Return the base port that the environment names, None if none.
+    """Return the base port of the environment, if any.
 
     Raises:
-        UsageError: it is none.
+        UsageError: it is not a port.
     """
-    said = os.environ.get(PORT_VARIABLE, "")
-    if said and not (said.isascii() and said.isdecimal() and len(said) <= _PORT_DIGITS):
-        raise UsageError(f"{PORT_VARIABLE}={said}: a whole number is right, the base port of a run")
-    return int(said) if said else None
+    port = os.environ.get(PORT_VARIABLE, "")
+    if port and not (port.isascii() and port.isdecimal() and len(port) <= _PORT_DIGITS):
+        raise UsageError(f"{PORT_VARIABLE}={port}: expected a whole number, the base port of a run")
+    return int(port) if port else None
 
 
 def port_option(name: str, text: str, otherwise: int | None = None, **fields: Any) -> Option:
-    """Return an option with a base port as its value; the default is what the environment says."""
+    """Return an option with a base port as its value; the default is that of the environment."""
     def add(parser: argparse._ActionsContainer) -> object:
         return parser.add_argument(name, type=int, help=text, **fields,
                                    default=port_of_environment() or otherwise)
@@ -122,11 +122,11 @@ JSON_FORMAT = option("--json", action="store_const", dest="format", const="json"
 
 
 def served(port: int, what: str) -> tuple[Option, ...]:
-    """Return the options of a verb that serves what it hears of a run.
+    """Return the options of a verb that serves data of a run.
 
     Args:
-        port: where it is served unless told otherwise.
-        what: can be done by whoever reaches it.
+        port: default port to serve on.
+        what: the right of every client that reaches the port.
     """
     return (
         whole("--port", "N", f"port to serve on (default: {port})", port),
@@ -141,12 +141,12 @@ def add_verb(verbs: Any, name: str, text: str, run: Run, *options: Option, doc: 
 
     Args:
         verbs: the subparsers of `rampart`, or of a family.
-        name: as it is typed.
-        text: in the list of verbs.
+        name: name of the verb.
+        text: line in the list of verbs.
         run: the verb's function, a coroutine function or not.
-        options: those of the verb, as the help lists them.
-        doc: with the help text; the function's docstring if it is empty.
-        hidden: not in the list of verbs: an old name.
+        options: options of the verb in the order of the help.
+        doc: docstring with the help text; that of the function if empty.
+        hidden: leave an old name out of the list of verbs.
     """
     def call(given: argparse.Namespace) -> int:
         done = run(given)
@@ -160,22 +160,22 @@ def add_verb(verbs: Any, name: str, text: str, run: Run, *options: Option, doc: 
 
 def add_family(verbs: Any, name: str, text: str, doc: str, *, dest: str = "subverb",
                metavar: str = "VERB") -> Any:
-    """Add a verb that has verbs of its own, and return its subparsers.
+    """Add a family of verbs, and return its subparsers.
 
     Args:
         verbs: the subparsers of `rampart`.
-        name: as it is typed.
-        text: in the list of verbs.
+        name: name of the family.
+        text: line in the list of verbs.
         doc: docstring with the help text.
-        dest: where the choice is found in the options.
-        metavar: stands for the choice in the help.
+        dest: option that holds the name of the chosen verb.
+        metavar: name of this choice in the help.
     """
     parser = verbs.add_parser(name, help=text, **help_of(doc))
     return parser.add_subparsers(dest=dest, required=True, metavar=metavar)
 
 
 def help_of(doc: str) -> dict[str, Any]:
-    """Return what a parser is told of the help in a docstring."""
+    """Return the arguments of a parser that print the help text of a docstring."""
     _, _, text = inspect.cleandoc(doc).partition("\n\n")
     description, _, examples = text.partition("\n\nExamples:\n")
     return {"formatter_class": FORMATTER, "description": description,
@@ -183,10 +183,10 @@ def help_of(doc: str) -> dict[str, Any]:
 
 
 def extra(name: str, module: str) -> ModuleType:
-    """Return a module of an extra, a library that is no part of the base install.
+    """Import a module of an extra, which the base install lacks.
 
     Raises:
-        UsageError: the extra is not installed; the line says how to.
+        UsageError: the extra is not installed.
     """
     try:
         return importlib.import_module(module)

@@ -1,4 +1,4 @@
-"""`rampart check` and `explain`: is a system sound, and what is it, before it is started."""
+"""`rampart check` and `rampart explain`: soundness and description of a system, without a run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ROOT = "root"
 
 
 class Process(msgspec.Struct, frozen=True):
-    """A process that is started: its actors by name and class, and who brings it back, if any."""
+    """A process: its actors by name and class, and which part restarts it, if any."""
 
     name: str
     nodes: dict[str, str]
@@ -34,7 +34,7 @@ class Process(msgspec.Struct, frozen=True):
 
 
 class Talk(msgspec.Struct, frozen=True):
-    """A topic of the system itself, and who talks on it."""
+    """A topic between nodes, with publishers and readers."""
 
     topic: str
     message: str
@@ -43,7 +43,7 @@ class Talk(msgspec.Struct, frozen=True):
 
 
 class Guard(msgspec.Struct, frozen=True):
-    """Who notices that something is dead, stopped or hung, and what it is."""
+    """A part that notices that others are dead, stopped or hung."""
 
     by: str
     of: tuple[str, ...]
@@ -51,18 +51,18 @@ class Guard(msgspec.Struct, frozen=True):
 
 
 class Consequence(msgspec.Struct, frozen=True):
-    """What a detection leads to when it alone is active.
+    """The consequence of a detection, if no other module detects anything.
 
     Attributes:
-        detection: The module.
-        title: What it detects.
-        within_s: How soon.
-        mechanisms: That listen to it.
-        active: Those of them that are active when nothing else is detected.
-        needs: For each of the others, what has to be detected.
-        decided: What the manager runs then, by the system's strategy.
-        rule: By which rule of the strategy.
-        escalation: For each of these, what follows while one after the other fails.
+        detection: the module.
+        title: the detected error.
+        within_s: latency of the detection, simulated seconds.
+        mechanisms: mechanisms that use the module.
+        active: those of them that are active.
+        needs: the gate of each other one.
+        decided: recoveries that the system's strategy chooses.
+        rule: rule of the strategy that applies.
+        escalation: for each recovery, those that follow as one after the other fails.
     """
 
     detection: str
@@ -77,7 +77,7 @@ class Consequence(msgspec.Struct, frozen=True):
 
 
 class Explanation(msgspec.Struct, frozen=True):
-    """What a system is."""
+    """The description of a system."""
 
     system: str
     title: str
@@ -120,7 +120,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def explain(layout: Layout) -> Explanation:
-    """Return what a system is."""
+    """Return the description of a system."""
     spec = layout.spec
     return Explanation(
         spec.name, spec.title, spec.strategy, tuple(_processes(layout)),
@@ -138,7 +138,7 @@ def _processes(layout: Layout) -> Iterator[Process]:
 
 
 def _respawner(layout: Layout, unit: Unit) -> str:
-    """Return who brings a process back; without the world it would be another run."""
+    """Return the part that restarts a process; the world is not restarted."""
     ours = unit.kind != Kind.WORLD.value and layout.spec.layers.supervisor_respawn
     return unit.respawn if unit.respawn != SUPERVISOR or ours else ""
 
@@ -148,7 +148,7 @@ def _talks(spec: SystemSpec) -> Iterator[Talk]:
         readers = tuple(name for name in use.readers if name != OBSERVER)
         publishers = use.publishers
         if publishers == ("tools",) and not use.topic.outside:
-            publishers = ()  # a node can do without
+            publishers = ()  # an optional input
         if readers in {(), (SUPERVISOR,)} or "every node" in (*publishers, *readers):
             continue
         yield Talk(use.topic.key, use.topic.type.__name__, publishers, readers)
@@ -162,11 +162,11 @@ def _guards(layout: Layout) -> Iterator[Guard]:
     by.pop("", None)
     for name, units in by.items():
         yield Guard(name, tuple(units), "restarts it" if name == SUPERVISOR
-                    else "has it restarted, when the manager decides so")
+                    else "requests its restart, if the manager activates it")
     for member in layout.members.values():
         if isinstance(member.parameters, Watchdog.Parameters):
             yield Guard(member.name, member.parameters.watch,
-                        "notices that it is dead, stopped or hung")
+                        "detects that it is dead, stopped or hung")
 
 
 def _consequences(spec: SystemSpec) -> Iterator[Consequence]:
@@ -194,22 +194,22 @@ def _show(found: Explanation) -> None:
     count = sum(len(process.nodes) for process in found.processes)
     say(f"{found.title} ({found.system}), strategy {found.strategy}")
     say()
-    say(f"What is started: {len(found.processes)} processes, {count} nodes")
-    print_table(("process", "kind", "brought back by", "nodes"), [
-        (p.name, p.kind, p.brought_back_by or "nobody", ", ".join(
+    say(f"{len(found.processes)} processes, {count} nodes")
+    print_table(("process", "kind", "restarted by", "nodes"), [
+        (p.name, p.kind, p.brought_back_by or "-", ", ".join(
             f"{name} ({actor.partition(':')[2]})" for name, actor in p.nodes.items()))
         for p in found.processes])
     say()
-    say(f"Who talks to whom: {len(found.talks)} topics")
+    say(f"{len(found.talks)} topics")
     print_table(("topic", "from", "to"), [
-        (talk.topic, ", ".join(talk.from_) or "nobody", ", ".join(talk.to))
+        (talk.topic, ", ".join(talk.from_) or "-", ", ".join(talk.to))
         for talk in found.talks])
     say()
-    say("Who guards whom")
+    say("Supervision")
     for guard in found.guards:
         say(f"  {guard.by}: {', '.join(guard.of)}: {guard.does}")
     say()
-    say("What a detection leads to, when nothing else is detected")
+    say("Consequence of each detection, if no other module detects anything")
     for each in found.consequences:
         say(f"  {each.detection} ({each.title}, within {each.within_s:g} s) -> "
             f"{', '.join(each.mechanisms)} -> {_decided(each)}")
@@ -217,18 +217,15 @@ def _show(found: Explanation) -> None:
 
 def _decided(found: Consequence) -> str:
     if not found.active:
-        return "nothing by itself: " + "; ".join(
+        return "none: " + "; ".join(
             f"{name} needs {gate}" for name, gate in found.needs.items())
-    told = []
-    for name in found.decided:
-        after = found.escalation[name]
-        told.append(f"{name}; if it fails: {' > '.join(after)}" if after
-                    else f"{name}, the last resort")
-    return ", ".join(told) or "no recovery"
+    return ", ".join(
+        f"{name}; if it fails: {' > '.join(after)}" if (after := found.escalation[name])
+        else f"{name}, the last resort" for name in found.decided) or "no recovery"
 
 
 def check(options: argparse.Namespace) -> int:
-    """Check a system, and say what is wrong with it, or how large it is.
+    """Check a system, and print its first problem, or its size.
 
     Check everything that can be checked before a run, as a start does:
     specification, time budgets, classes and parameters of all actors, application

@@ -1,4 +1,4 @@
-"""`rampart cut-sets`: which events together make the top occur, and what stands in their way."""
+"""`rampart cut-sets`: minimal sets of events that cause the top, and their barriers."""
 
 from __future__ import annotations
 
@@ -168,13 +168,13 @@ def _show_outlook(spec: SystemSpec, active: list[str], *, as_json: bool) -> int:
         return 0
     top = spec.build_fault_tree().top
     if not view.occurred:
-        say("no mechanism is active: nothing has occurred")
+        say("no mechanism is active: no event has occurred")
     for name, barriers in view.left.items():
         event = next(m.event for m in spec.mechanisms if m.name == name)
         say(f"{event} has occurred ({name} is active); left before {top}: "
             f"{', '.join(barriers) or 'nothing'}")
     say()
-    say(f"single events that would now lead to {top}, and the idle barriers left on the way:")
+    say(f"single events that would now lead to {top}, and the idle barriers between:")
     _print_barriers("event", view.next_events)
     return 0
 

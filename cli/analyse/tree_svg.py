@@ -1,8 +1,8 @@
-"""Diagrams as SVG: one file, nothing outside it, readable on white and on black.
+"""Diagrams as SVG: a self-contained file, readable on white and on black.
 
-Fault trees are drawn with the symbols of IEC 61025: rectangles for events, a circle below a basic
-event, the distinctive gate shapes, and in them the qualifier (≥1, &, ≥k). A mechanism is a barrier,
-two bars across the line above its event. What can be pointed at has a `<title>`.
+Fault trees have the symbols of IEC 61025: rectangles for events, a circle below a basic event, the
+distinctive gate shapes with their qualifier (≥1, &, ≥k). A mechanism is a barrier: two bars across
+the line above its event. Each box has a `<title>`.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def to_svg(diagrams: Sequence[Diagram]) -> str:
 
 
 def text_width(text: str) -> float:
-    """Return about how wide a text is at 12 px, rather too wide than too narrow."""
+    """Return the approximate width of a text at 12 px, rather too wide than too narrow."""
     return sum(FONT * (1.05 if unicodedata.east_asian_width(c) in "WF" else
                        0.36 if c in "ijlIft.,:;'|![]() " else
                        0.95 if c in "mwMW@%—" else
@@ -65,15 +65,15 @@ def text_width(text: str) -> float:
 
 
 class _Look(msgspec.Struct, frozen=True):
-    """A box as it is drawn: its lines of text, and the sizes that are the same for a diagram."""
+    """The lines of a box, and its sizes."""
 
     lines: tuple[str, ...]
     barrier: tuple[str, str]
-    """What stands left and right of the bars."""
+    """Texts left and right of the bars."""
     room: float
-    """Width that it needs, barrier included."""
+    """Width with the barrier."""
     width: float
-    """Of its rectangle."""
+    """Width of its rectangle."""
 
 
 def _looks(diagram: Diagram) -> dict[str, _Look]:
@@ -100,7 +100,7 @@ def _looks(diagram: Diagram) -> dict[str, _Look]:
 
 
 def _picture(diagram: Diagram) -> dict[str, Any]:
-    """Return what the template draws of a diagram, placed."""
+    """Return the values of the template for a diagram."""
     fault_tree = diagram.what == "fault-tree"
     looks = _looks(diagram)
     tall = LINE * max((len(look.lines) for look in looks.values()), default=1) + 14
@@ -109,7 +109,7 @@ def _picture(diagram: Diagram) -> dict[str, Any]:
     height = stem + tall + (SYMBOL if fault_tree else 0)
     placing = place({name: (look.room, height) for name, look in looks.items()}, diagram.edges,
                     square=diagram.what != "order")
-    leaving: dict[str, str] = {}  # one path, for what is painted twice looks thicker
+    leaving: dict[str, str] = {}  # one path per box: lines drawn twice would look thicker
     for (upper, _), line in zip(diagram.edges, placing.lines, strict=True):
         leaving[upper] = leaving.get(upper, "") + "M" + "L".join(f"{x:g} {y:g}" for x, y in line)
     return {"looks": looks, "tall": tall, "stem": stem, "placing": placing,
@@ -123,7 +123,7 @@ def _tooltip(box: Box, diagram: Diagram) -> str:
 
 
 def _in_words(diagram: Diagram) -> str:
-    """Describe a diagram for those who do not see it."""
+    """Describe a diagram for screen readers."""
     below: dict[str, list[str]] = {}
     for upper, lower in diagram.edges:
         below.setdefault(upper, []).append(lower)
@@ -141,7 +141,7 @@ def _cut(text: str) -> str:
 
 
 def _wrap(text: str, width: int, most: int) -> list[str]:
-    """Break a text into at most so many lines; a word too long for one is broken as well."""
+    """Break a text, and words that are too long, into at most `most` lines."""
     lines = textwrap.wrap(one_line(text), width, break_on_hyphens=False)
     if len(lines) > most:
         lines = [*lines[:most - 1], f"{lines[most - 1][:width - 1]}…"]

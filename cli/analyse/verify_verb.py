@@ -1,4 +1,4 @@
-"""`rampart verify`: is the arbitration of a system safe, in every case?"""
+"""`rampart verify`: exhaustive verification of a system's arbitration."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import UsageError, print_json, print_table, progress, refusing, say
+from rampart.cli.output import positive, print_json, print_table, progress, refusing, say
 from rampart.cli.verbs import JSON, add_verb, flag, several, whole
 from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, verify
 from rampart.manager.spec.schema import SystemSpec
@@ -24,13 +24,13 @@ def add(verbs: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Verify, and show what was found.
+    """Verify, and print the result.
 
     Check a system as `rampart check` does. Then explore its arbitration
     exhaustively: the decision of each strategy for every set of active mechanisms,
     and every state of the arbiter after it has received a report of each module.
     Each property holds, or the shortest counterexample is shown.
-    docs/explanation/arbitration.md explains the properties and what is left out.
+    docs/explanation/arbitration.md explains the properties and the limits.
 
     Examples:
       rampart verify
@@ -43,8 +43,7 @@ def run(options: argparse.Namespace) -> int:
     usage or unsound system
     """
     spec = systems.check(options.system).spec
-    if options.together < 1:
-        raise UsageError(f"--together {options.together}: a number from 1 up is right")
+    positive("--together", options.together)
     start = time.monotonic()
     with progress() as show, refusing(TooLargeError, UnknownStrategyError):
         report = verify(spec, options.strategy, options.together, show)
@@ -73,18 +72,18 @@ def _show(spec: SystemSpec, report: Report, seconds: float) -> None:
         rows.append((name, *cells, meaning))
     print_table(("property", *strategies, ""), rows)
     for words, counts in (
-            ("in which the robot must stop until somebody resets it", report.permissiveness),
-            ("in which a repair that is needed never runs while the last resort keeps the robot "
-             "stopped;\nit cannot be reset until somebody repairs by hand, and repairs-run exempts "
-             "them", report.stuck_behind_last_resort)):
+            ("in which the robot must stop until an operator resets it", report.permissiveness),
+            ("in which a necessary repair never runs while the last resort keeps the robot stopped;"
+             "\na reset needs a repair by hand, and repairs-run exempts them",
+             report.stuck_behind_last_resort)):
         say()
         for line in f"active sets {words}:".splitlines():
             say(line)
         for strategy, count in counts.items():
             say(f"  {strategy:<16} {count:>5} of {report.active_sets}")
     say()
-    say("not explored: the start of a manager, until it has heard every module or its grace has "
-        "passed")
+    say("not explored: the start of a manager, until each module has reported or its grace period "
+        "is over")
     for checked in report.properties:
         for trace in checked.counterexamples[:1]:
             say()

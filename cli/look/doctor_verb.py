@@ -1,4 +1,4 @@
-"""`rampart doctor`: what of this machine a run uses, and what it costs not to have it."""
+"""`rampart doctor`: the requirements of a run, and the consequence of each missing one."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from rampart.cli.output import print_json, print_table
 from rampart.cli.verbs import JSON, add_verb
 
 PROCESSES = 40
-"""Of the largest system that ships."""
+"""Processes of the largest shipped system."""
 
 LEAST_PYTHON = (3, 11)
 NEEDED_MB = 600
-"""Proportional memory of the largest system that ships, with room."""
+"""Proportional memory of the largest shipped system, with a margin."""
 
 EXTRAS = {
     "keys": ("cryptography", "no run with --keys"),
@@ -45,13 +45,13 @@ _SHOWN: dict[State, str] = {"ok": "ok", "without": "-", "missing": "NO"}
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """One thing that a run uses.
+    """One requirement of a run.
 
     Attributes:
-        what: its name.
-        state: *ok*; *without*: a run does without it, and something is worse; *missing*: no run.
-        found: what is there.
-        cost: what it costs not to have it; "" if it is there.
+        what: name of the requirement.
+        state: *ok*; *without*: a run is possible, with `cost`; *missing*: no run is possible.
+        found: version or value on this machine.
+        cost: consequence if it is missing, else "".
     """
 
     what: str
@@ -62,14 +62,15 @@ class Finding(msgspec.Struct, frozen=True):
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    add_verb(verbs, "doctor", "check this machine for what a run needs", doctor, JSON)
+    add_verb(verbs, "doctor", "check whether this machine can run a system", doctor, JSON)
 
 
 def doctor(options: argparse.Namespace) -> int:
-    """Look at the machine.
+    """Check the machine.
 
-    Check what a run uses of this machine: Python, kernel, processors, memory,
-    limits, libraries, Chromium, ROS 2. List what is missing, and the consequence.
+    Check the requirements of a run on this machine: Python, kernel, processors,
+    memory, limits, libraries, Chromium, ROS 2. List the consequence of each
+    missing one.
 
     Examples:
       rampart doctor
@@ -82,9 +83,9 @@ def doctor(options: argparse.Namespace) -> int:
         print_json(findings)
     else:
         print_table(("", "what", "found", "without it"), [
-            (_SHOWN[one.state], one.what, one.found, one.cost)
-            for one in findings])
-    return 1 if any(one.state == "missing" for one in findings) else 0
+            (_SHOWN[finding.state], finding.what, finding.found, finding.cost)
+            for finding in findings])
+    return 1 if any(finding.state == "missing" for finding in findings) else 0
 
 
 def _finding(what: str, found: str, *, there: bool, cost: str, needed: bool = False) -> Finding:
@@ -93,13 +94,13 @@ def _finding(what: str, found: str, *, there: bool, cost: str, needed: bool = Fa
 
 
 def python() -> Iterator[Finding]:
-    """Look at the interpreter."""
+    """Check the interpreter."""
     yield _finding("Python", platform.python_version(), there=sys.version_info >= LEAST_PYTHON,
                    cost=f"nothing runs; {'.'.join(map(str, LEAST_PYTHON))} or later", needed=True)
 
 
 def kernel() -> Iterator[Finding]:
-    """Look at the kernel."""
+    """Check the kernel."""
     is_linux, release = sys.platform == "linux", platform.release()
     number = tuple(int(part) for part in release.split("-")[0].split(".")[:2] if part.isdigit())
     yield _finding("Linux", f"{platform.system()} {release}", there=is_linux and number >= (5, 9),
@@ -107,7 +108,7 @@ def kernel() -> Iterator[Finding]:
 
 
 def processors() -> Iterator[Finding]:
-    """Look at processors and memory."""
+    """Check processors and memory."""
     count = len(os.sched_getaffinity(0))
     yield _finding("processors", f"{count}, load {os.getloadavg()[0]:.1f}", there=count >= 2,
                    cost="rate 1 may be too much: use --rate 0.5, or --virtual")
@@ -118,8 +119,8 @@ def processors() -> Iterator[Finding]:
 
 
 def folders() -> Iterator[Finding]:
-    """Look at the place of a run's folder, in memory."""
-    place = Path(os.environ.get("XDG_RUNTIME_DIR") or "/dev/shm")  # noqa: S108 looked at only
+    """Check the file system of a run's folder."""
+    place = Path(os.environ.get("XDG_RUNTIME_DIR") or "/dev/shm")  # noqa: S108 only checked
     can = os.access(place, os.W_OK)
     free = shutil.disk_usage(place).free / 1e6 if can else 0.0
     yield _finding("folder of a run", f"{place}, {free:,.0f} MB free" if can else f"{place}: no",
@@ -127,7 +128,7 @@ def folders() -> Iterator[Finding]:
 
 
 def limits() -> Iterator[Finding]:
-    """Look at what this user may do."""
+    """Check the limits of this user."""
     _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = needed_of(resource.RLIMIT_NOFILE, PROCESSES)
     yield _finding("open files", f"hard limit {files}", there=files >= needed, needed=True,
@@ -140,7 +141,7 @@ def limits() -> Iterator[Finding]:
 
 
 def libraries() -> Iterator[Finding]:
-    """Look at the libraries of extras."""
+    """Check the libraries of extras."""
     for extra, (module, cost) in EXTRAS.items():
         there = importlib.util.find_spec(module) is not None
         yield _finding(f"extra {extra}", module if there else "not installed", there=there,
@@ -148,7 +149,7 @@ def libraries() -> Iterator[Finding]:
 
 
 def programs() -> Iterator[Finding]:
-    """Look at other programs."""
+    """Check other programs."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
     yield _finding("Chromium", chromium or "not found", there=chromium is not None,
                    cost="tests of the operator's page are skipped")

@@ -1,8 +1,8 @@
-"""The server of `rampart live`: what viewers see that speak Foxglove's protocol, over its SDK.
+"""The server of `rampart live foxglove`, with the SDK of Foxglove.
 
-The server runs on threads of the SDK. A channel keeps no messages, and most of the scene changes
-hardly ever; so whoever subscribes to a channel is given its last message again, from the event
-loop. Nothing is encoded for a channel that nobody looks at, and clients can only read.
+The server runs on threads of the SDK. A channel keeps no messages, and most parts of the scene
+rarely change. So the event loop sends the last message of a channel again to each new subscriber.
+A message is encoded only if its channel has subscribers. Clients can only read.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from rampart.cli.session import Session, pause
 
 
 class FoxgloveViewer(ServerListener):
-    """A server; to be made on the event loop.
+    """A server, constructed on the event loop.
 
     Args:
         host: address to serve on.
-        port: port; 0 lets the system choose one.
+        port: port; with 0 the kernel chooses one.
 
     Raises:
-        RuntimeError: the address is taken, or there is none such.
+        RuntimeError: the address is in use, or not one of this machine.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -51,7 +51,7 @@ class FoxgloveViewer(ServerListener):
         self.port: int = self._server.port
 
     def begin(self, run: RunInfo, channels: Mapping[str, type[fg.Record]]) -> None:
-        """Have viewers forget an earlier run, and tell them of the channels of this one."""
+        """Clear the viewers, and announce the channels of a run."""
         self._loop = asyncio.get_running_loop()
         self._last.clear()
         self._server.clear_session(run.run_id)
@@ -64,7 +64,7 @@ class FoxgloveViewer(ServerListener):
                 self._names[made.id()] = name
 
     def show(self, channel: str, record: Any, at_ns: int) -> None:
-        """Send a view to those who look at its channel."""
+        """Send a view to the subscribers of its channel."""
         self._last[channel] = (record, at_ns)
         if self._channels[channel].has_sinks():
             self._channels[channel].log(encode(record), log_time=at_ns)
@@ -74,7 +74,7 @@ class FoxgloveViewer(ServerListener):
         self._server.stop()
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
-        """Somebody looks at a channel; called on a thread of the SDK."""
+        """Send the last message again; called on a thread of the SDK."""
         name = self._names.get(channel.id)
         if name is not None and self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._again, name)
@@ -109,7 +109,7 @@ async def live(options: argparse.Namespace) -> int:
         try:
             viewer.close()
         except RuntimeError as error:
-            warn(f"the viewer did not take everything: {' '.join(str(error).split())}")
+            warn(f"the viewer missed messages: {' '.join(str(error).split())}")
     return 0
 
 

@@ -1,9 +1,9 @@
 """A picture of the run as Prometheus metric families. Pure.
 
-Names follow Prometheus' practice: base units, `_total` for what only grows. Times are in simulated
-seconds, but for processor time. Messages, process events, decisions, detections and recoveries are
-counted since the exporter joined the run; the other counts are those of the run, or of a process's
-life. A scraper's `rate()` copes with the reset when the next run or life begins.
+Names follow Prometheus' practice: base units, and `_total` for counters. Times are simulated
+seconds, except processor time. Messages, process events, decisions, detections and recoveries count
+from the exporter's start; the other counters are those of the run or of an incarnation. The
+function `rate()` of Prometheus handles the reset at the next run or incarnation.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ Row = tuple[tuple[str, ...], float]
 
 @dataclass(frozen=True, slots=True)
 class Exposition:
-    """One run at the moment of a scrape.
+    """One run at the time of a scrape.
 
     Attributes:
-        run: which.
+        run: the run.
         time_s: simulated time.
-        picture: what was heard.
-        processes: what the kernel has counted, by process name.
+        picture: messages of the run.
+        processes: counts of the kernel by process name.
     """
 
     run: RunInfo
@@ -42,12 +42,12 @@ class Exposition:
 
 
 def families(now: Exposition | None) -> Iterator[Metric]:
-    """Yield all families; without a run only that there is none."""
+    """Yield all families; without a run only `rampart_up`."""
     yield gauge("up", "Whether there is a run.", (), [((), float(now is not None))])
     if now is None:
         return
     run = now.run
-    yield InfoMetricFamily("rampart_run", "What runs.", value={
+    yield InfoMetricFamily("rampart_run", "The run.", value={
         "run_id": run.run_id, "title": run.title, "port": str(run.base_port),
         "rate": f"{run.rate:g}"})
     if run.recording:
@@ -55,7 +55,7 @@ def families(now: Exposition | None) -> Iterator[Metric]:
                     (), [((), float(not run.recording_problem))])
     yield gauge("simulated_seconds", "Simulated time of the run.", (), [((), now.time_s)])
     if left := days_left(run):
-        yield gauge("certificate_days_left", "For how long the certificate of a process is valid.",
+        yield gauge("certificate_days_left", "Days until the certificate of a process expires.",
                     ("process",), [((name,), days) for name, (days, _) in sorted(left.items())])
     yield from _nodes(now)
     yield from _mechanisms(now.picture)
@@ -85,17 +85,17 @@ def _nodes(now: Exposition) -> Iterator[Metric]:
     beats = [n for n in nodes if n.heard_s]
     yield gauge("node_up", "Whether a node runs, as the supervisor sees it.", ("node", "kind"), [
         ((n.name, n.kind), float(n.state is fm.NodeState.RUNNING)) for n in nodes])
-    yield gauge("node_incarnation", "Which life of a node this is.", ("node",), [
+    yield gauge("node_incarnation", "Number of a node's present incarnation.", ("node",), [
         ((n.name,), n.incarnation) for n in nodes])
     yield counter("node_restarts", "How often a node was restarted in this run.", ("node",), [
         ((n.name,), n.restarts) for n in nodes])
     yield gauge("heartbeat_age_seconds", "Simulated seconds since a node's last heartbeat.",
                 ("node",), [((n.name,), max(0.0, now.time_s - n.heard_s)) for n in beats])
-    yield counter("rejected_payloads", "Payloads that a node refused, in this life.", ("node",), [
-        ((n.name,), n.rejected_payloads) for n in beats])
-    yield counter("overflowed_commands", "Commands that found a node's mailbox full, in this life.",
+    yield counter("rejected_payloads", "Payloads that this incarnation of a node refused.",
+                  ("node",), [((n.name,), n.rejected_payloads) for n in beats])
+    yield counter("overflowed_commands", "Commands lost because the mailbox of a node was full.",
                   ("node",), [((n.name,), n.overflowed) for n in beats])
-    yield counter("process_events", "What happened to processes.", ("node", "event"),
+    yield counter("process_events", "Events of processes.", ("node", "event"),
                   sorted(now.picture.process_events_total.items()))
 
 
@@ -115,7 +115,7 @@ def _mechanisms(picture: RunPicture) -> Iterator[Metric]:
     yield counter("decisions", "Decisions of the FTM Manager.", ("strategy",), [
         ((name,), count) for name, count in sorted(picture.decisions_total.items())])
     if manager is not None:
-        yield gauge("recovery_latched", "Recoveries that wait for the operator's reset.", (), [
+        yield gauge("recovery_latched", "Recoveries that stay in force until a reset.", (), [
             ((), len(manager.latched))])
         yield InfoMetricFamily("rampart_strategy", "Strategy in force.",
                                value={"strategy": manager.strategy})
@@ -123,9 +123,9 @@ def _mechanisms(picture: RunPicture) -> Iterator[Metric]:
 
 def _traffic_and_load(now: Exposition) -> Iterator[Metric]:
     found = sorted(now.processes.items())
-    yield counter("messages", "Messages heard, a family's members together.", ("topic",), [
+    yield counter("messages", "Messages by topic, with all members of a family.", ("topic",), [
         ((key,), count) for key, count in sorted(now.picture.messages.items())])
-    yield gauge("message_rate_hertz", "Messages a simulated second, over the last seconds.",
+    yield gauge("message_rate_hertz", "Messages per simulated second, over the last seconds.",
                 ("topic",), [((key,), hz) for key, hz in now.picture.rates().items()])
     yield counter("process_cpu_seconds", "Processor time, real seconds.", ("process",), [
         ((name,), count.cpu_s) for name, count in found])

@@ -1,6 +1,6 @@
-"""The server of `rampart live metrics`: follows runs, and answers each scrape with what there is.
+"""The server of `rampart live metrics`: it follows runs, and answers scrapes.
 
-All on one event loop, so that a scrape sees a picture that nobody is drawing at.
+Both happen on one event loop, so no message changes the picture during a scrape.
 """
 
 from __future__ import annotations
@@ -49,20 +49,20 @@ def listen(host: str, port: int) -> socket.socket:
     """Return a socket that listens on an address.
 
     Raises:
-        UsageError: there is no such address, or it is taken.
+        UsageError: the address is unknown, or in use.
     """
     between("--port", port, 0, 65535)
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family)
-    except (OSError, UnicodeError) as error:  # the latter from names that no host can have
+    except (OSError, UnicodeError) as error:  # the latter from invalid host names
         why = getattr(error, "strerror", None) or error
         raise UsageError(f"cannot serve on {host} port {port}: {why}; "
                          "choose another --port or --host") from None
 
 
 class Exporter:
-    """Follows runs, and tells `prometheus_client` at each scrape what there is then."""
+    """Follows runs; `prometheus_client` collects its families at each scrape."""
 
     def __init__(self) -> None:
         self._watch: Watch | None = None
@@ -78,12 +78,12 @@ class Exporter:
                 self._watch = None
 
     def look(self) -> Exposition | None:
-        """Return the exposition of this moment, None without a run."""
+        """Return the present exposition, None without a run."""
         if self._watch is None:
             return None
         session, picture = self._watch.session, self._watch.picture
         table = picture.latest(topics.NODES)
-        # Of a replay or another machine the numbers may be any process's here.
+        # The process numbers of a replay or another host may belong to other processes here.
         nodes = [node for node in table.nodes if node.host == session.run.host
                  ] if table and not session.run.replay_of else ()
         pids = {node.name: node.pid for node in nodes} | {
@@ -93,7 +93,7 @@ class Exporter:
             {name: count for name, pid in pids.items() if (count := read_count(pid)) is not None})
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the families of this moment."""
+        """Yield the present families."""
         return families(self.look())
 
 
@@ -103,6 +103,6 @@ def _app(exporter: Exporter) -> Starlette:
         return Response(encode(exporter), headers={"content-type": kind})
 
     async def front(_request: Request) -> Response:
-        return PlainTextResponse("Rampart's figures for Prometheus are at /metrics\n")
+        return PlainTextResponse("The metrics of Rampart are at /metrics\n")
 
     return Starlette(routes=[Route("/metrics", figures), Route("/", front)])

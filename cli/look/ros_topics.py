@@ -1,6 +1,6 @@
-"""`rampart topic … --ros` and `rampart ros2 check`: ROS 2 as a client without ROS sees it.
+"""`rampart topic … --ros` and `rampart ros2 check`: the graph of ROS 2, without ROS.
 
-It joins the graph as a session without a node: nobody there sees it, and it says nothing.
+They join the graph as a session without a node, which is invisible there, and publish nothing.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rampart.cli.output import NoEffectError, UsageError, print_json, print_tabl
 from rampart.manager.spec.schema import SystemSpec
 
 DOMAIN, DISTRIBUTION = "ROS_DOMAIN_ID", "ROS_DISTRO"
-"""Variables by which ROS 2 is told the same."""
+"""Variables of ROS 2."""
 
 _LINK_S = 3.0
 _GRAPH_S = 1.0
@@ -39,16 +39,16 @@ _TOPICS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
 
 
 class Onlooker:
-    """A session that hears the graph of a domain.
+    """A session that receives the graph of a domain.
 
     Args:
         side: the network.
-        domain: of ROS.
+        domain: domain of ROS.
 
     Attributes:
-        side: the same.
-        graph: what was heard.
-        odd: what was no token.
+        side: the network.
+        graph: nodes and endpoints.
+        odd: problems with tokens that cannot be read.
     """
 
     def __init__(self, side: ZenohSide, domain: int) -> None:
@@ -64,10 +64,10 @@ class Onlooker:
 
 @asynccontextmanager
 async def onlooker(connect: tuple[str, ...], domain: int) -> AsyncIterator[Onlooker]:
-    """Yield a session that has heard who is there.
+    """Yield a session that has received the graph.
 
     Raises:
-        UsageError: an endpoint makes no sense.
+        UsageError: an endpoint is invalid.
         NoEffectError: no router answers.
     """
     try:
@@ -88,33 +88,33 @@ async def onlooker(connect: tuple[str, ...], domain: int) -> AsyncIterator[Onloo
         side.close()
 
 
-def said_domain() -> int:
-    """Return the domain that the environment says, 0 if it says none.
+def domain_of_environment() -> int:
+    """Return the domain of the environment, 0 by default.
 
     Raises:
-        UsageError: it is none.
+        UsageError: it is not a domain.
     """
-    said = os.environ.get(DOMAIN, "0")
-    if not (said.isascii() and said.isdecimal() and len(said) < 4):
-        raise UsageError(f"{DOMAIN}={said}: a number from 0 to 232 is right")
-    return int(said)
+    domain = os.environ.get(DOMAIN, "0")
+    if not (domain.isascii() and domain.isdecimal() and len(domain) < 4):
+        raise UsageError(f"{DOMAIN}={domain}: expected a number from 0 to 232")
+    return int(domain)
 
 
-def said_types() -> Types:
-    """Return the types of the distribution that the environment says, those of Jazzy if none.
+def types_of_environment() -> Types:
+    """Return the types of the distribution of the environment, by default those of Jazzy.
 
     Raises:
-        UsageError: it is not known.
+        UsageError: the distribution is unknown.
     """
-    said = os.environ.get(DISTRIBUTION, "jazzy")
-    if said not in DISTRIBUTIONS:
-        raise UsageError(f"{DISTRIBUTION}={said}: known: {', '.join(DISTRIBUTIONS)}")
-    return Types(said)
+    name = os.environ.get(DISTRIBUTION, "jazzy")
+    if name not in DISTRIBUTIONS:
+        raise UsageError(f"{DISTRIBUTION}={name}: unknown; known: {', '.join(DISTRIBUTIONS)}")
+    return Types(name)
 
 
 async def list_topics(options: argparse.Namespace) -> int:
-    """Print the topics of ROS 2; options and exit code as of `rampart topic list`."""
-    async with onlooker((options.ros,), said_domain()) as there:
+    """Print the topics of ROS 2, as `rampart topic list` does."""
+    async with onlooker((options.ros,), domain_of_environment()) as there:
         found = [_described(topic, ends) for topic, ends in there.graph.topics().items()]
     if options.json:
         print_json(found)
@@ -132,7 +132,7 @@ def _described(topic: str, ends: list[Endpoint]) -> dict[str, Any]:
 
 
 async def echo(options: argparse.Namespace) -> int:
-    """Print messages of ROS 2 as they come, as `rampart topic echo` does."""
+    """Print messages of ROS 2, as `rampart topic echo` does."""
     done, seen = asyncio.Event(), 0
 
     def heard(message: Any, attachment: Attachment) -> None:
@@ -148,41 +148,41 @@ async def echo(options: argparse.Namespace) -> int:
         if options.count is not None and seen >= options.count:
             done.set()
 
-    await _hear(options, heard, done)
+    await _receive(options, heard, done)
     if not seen:
-        raise NoEffectError(f"nothing came on {options.key}")
+        raise NoEffectError(f"no message on {options.key}")
     return 0
 
 
 async def measure(options: argparse.Namespace) -> int:
-    """Measure how often messages of ROS 2 come, real time, as `rampart topic hz` does."""
+    """Measure rates of ROS 2 in real time, as `rampart topic hz` does."""
     times: list[float] = []
-    await _hear(options, lambda _message, _attachment: times.append(time.monotonic()),
+    await _receive(options, lambda _message, _attachment: times.append(time.monotonic()),
                 asyncio.Event(), times=None if options.json else times,
                 duration_s=options.duration or (3.0 if options.json else None))
     if options.json:
         print_json([{"topic": options.key, **rate_of(times[-500:])}])
     if not times:
-        raise NoEffectError(f"nothing came on {options.key}")
+        raise NoEffectError(f"no message on {options.key}")
     return 0
 
 
-async def _hear(options: argparse.Namespace, heard: Any, done: asyncio.Event, *,
-                times: list[float] | None = None, duration_s: float | None = None) -> None:
-    """Hear a topic until `done`, or the time is over, or it is interrupted."""
-    domain, types = said_domain(), said_types()
+async def _receive(options: argparse.Namespace, heard: Any, done: asyncio.Event, *,
+                   times: list[float] | None = None, duration_s: float | None = None) -> None:
+    """Receive a topic until `done`, the end of the duration, or an interruption."""
+    domain, types = domain_of_environment(), types_of_environment()
     duration_s = duration_s or options.duration
     async with onlooker((options.ros,), domain) as there:
         ends = there.graph.on(options.key, EndpointKind.PUBLISHER)
         if not ends:
             known = ", ".join(there.graph.topics()) or "none"
-            raise NoEffectError(f"nobody publishes {options.key}; topics: {known}")
+            raise NoEffectError(f"no node publishes {options.key}; topics: {known}")
         name = ros_name(ends[0].type)
         try:
             decode = types.decoder(name)
             if types.hash(name) != ends[0].hash:
                 warn(f"{ends[0].full_name} has another definition of {name} than "
-                     f"{types.distribution}; {DISTRIBUTION} says which one")
+                     f"{types.distribution}; set {DISTRIBUTION} to its distribution")
         except ValueError as error:
             raise UsageError(str(error)) from None
 
@@ -205,7 +205,7 @@ async def _hear(options: argparse.Namespace, heard: Any, done: asyncio.Event, *,
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """What a check has found of one link or node."""
+    """The result of the check of one link or node."""
 
     what: str
     well: bool
@@ -213,15 +213,15 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 async def check(options: argparse.Namespace) -> int:
-    """Check a system's gateways against the graph; 1 if something does not fit."""
+    """Check a system's gateways against the graph; return 1 if one does not fit."""
     spec = systems.load(options.system or str(systems.DEFAULT))
     if not spec.ros2:
-        raise UsageError(f"{spec.name} has no [[ros2]]: nothing is passed on")
+        raise UsageError(f"{spec.name}: expected [[ros2]], which a gateway passes on")
     found: list[Finding] = []
     for node in spec.nodes:
         if node.actor == GATEWAY:
-            said: Any = load_member(node, spec, spec.name).parameters
-            found += await _checked(node.name, said, spec)
+            gateway: Any = load_member(node, spec, spec.name).parameters
+            found += await _checked(node.name, gateway, spec)
     if options.json:
         print_json({"system": spec.name, "findings": found,
                     "well": all(one.well for one in found)})
@@ -231,17 +231,17 @@ async def check(options: argparse.Namespace) -> int:
     return 0 if all(one.well for one in found) else 1
 
 
-async def _checked(name: str, said: Gateway.Parameters, spec: SystemSpec) -> list[Finding]:
+async def _checked(name: str, gateway: Gateway.Parameters, spec: SystemSpec) -> list[Finding]:
     try:
-        async with onlooker(said.connect, said.domain) as there:
-            found = [Finding(f"router of {name}", True, ", ".join(said.connect))]
+        async with onlooker(gateway.connect, gateway.domain) as there:
+            found = [Finding(f"router of {name}", True, ", ".join(gateway.connect))]
             found += [Finding("graph", False, odd) for odd in sorted(there.odd)]
-            types = types_of(said.distribution, said.interfaces)
+            types = types_of(gateway.distribution, gateway.interfaces)
             found += [Finding(kind, True, note) for kind, note in types.notes.items()]
-            node = RosNode(NoSide(), types, said.node, wall_ns=lambda: 0, refuse=lambda *_: None,
-                           namespace=said.namespace, domain=said.domain)
-            unlinked = await _unlinked(there, said.connect) if said.mode == "peer" else set()
-            found += [_of_link(link, there.graph, node, unlinked) for link in said.ros2]
+            node = RosNode(NoSide(), types, gateway.node, wall_ns=lambda: 0, refuse=lambda *_: None,
+                           namespace=gateway.namespace, domain=gateway.domain)
+            unlinked = await _unlinked(there, gateway.connect) if gateway.mode == "peer" else set()
+            found += [_of_link(link, there.graph, node, unlinked) for link in gateway.ros2]
             known = there.graph.nodes()
     except NoEffectError as error:
         return [Finding(f"router of {name}", False, str(error))]
@@ -256,9 +256,9 @@ _OURS = {"subscribe": EndpointKind.SUBSCRIPTION, "publish": EndpointKind.PUBLISH
          "call": EndpointKind.CLIENT, "serve": EndpointKind.SERVICE}
 _THEIRS = {"subscribe": EndpointKind.PUBLISHER, "publish": EndpointKind.SUBSCRIPTION,
            "call": EndpointKind.SERVICE, "serve": EndpointKind.CLIENT}
-_NOBODY = {"subscribe": "nobody publishes it", "publish": "nobody subscribes to it",
-           "call": "nobody serves it", "serve": "nobody calls it yet",
-           "goal": "no server of this action"}
+_MISSING = {"subscribe": "no node publishes it", "publish": "no node subscribes to it",
+            "call": "no node serves it", "serve": "no node calls it yet",
+            "goal": "no server of this action"}
 
 
 async def _unlinked(there: Onlooker, connect: tuple[str, ...]) -> set[str]:
@@ -282,7 +282,7 @@ def _of_link(link: Ros2Link, graph: RosGraph, node: RosNode, unlinked: set[str])
     there = [one for one in graph.on(topic, _THEIRS[way])
              if one.full_name != node.full_name]
     if not there:
-        return Finding(what, way == "serve", _NOBODY[link.way])
+        return Finding(what, way == "serve", _MISSING[link.way])
     if problems := list(dict.fromkeys(misfits([mine], there))):
         return Finding(what, False, problems[0])
     if far := [one.full_name for one in there if one.session in unlinked]:

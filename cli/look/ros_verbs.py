@@ -1,4 +1,4 @@
-"""`rampart ros2`: whether a system and the ROS 2 beside it fit.
+"""`rampart ros2`: compare a system with a graph of ROS 2.
 
 Check a system against ROS 2. `rampart topic list`, `echo` and `hz` show topics of
 ROS 2 with --ros. These verbs need no installation of ROS, but the extra:
@@ -28,7 +28,7 @@ def add(verbs: Any) -> None:
 
 
 def check(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
-    """Check a system against the graph of ROS 2 that is there now.
+    """Check a system against the present graph of ROS 2.
 
     List for each [[ros2]] of a system the nodes on the other side, or the problem.
     Problems are: no router, no node, another type, another definition of the type,
@@ -39,7 +39,7 @@ def check(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
       rampart ros2 check --system warehouse.toml
       rampart ros2 check --system osmosis-ros2 --json
 
-    exit code: 0 all fit, 1 one does not, 2 bad usage
+    exit code: 0 no problem, 1 a problem, 2 bad usage
     """
     return look(options).check(options)  # type: ignore[no-any-return]
 

@@ -1,4 +1,4 @@
-"""`rampart live`: serve the run to other programs, while it goes on.
+"""`rampart live`: serve data of the run to other programs.
 
 Serve the run to viewers of Foxglove's protocol, or its figures to Prometheus. Wait
 for a run, and for the next one after each run.
@@ -17,10 +17,10 @@ from typing import Any
 from rampart.cli.verbs import add_family, add_verb, extra, served
 
 FOXGLOVE_PORT = 8765
-"""Where viewers look unless told otherwise."""
+"""The default of viewers."""
 
 METRICS_PORT = 9464
-"""The port that OpenTelemetry's Prometheus exporter has by convention, too."""
+"""The default of OpenTelemetry's Prometheus exporter."""
 
 
 def add(verbs: Any) -> None:

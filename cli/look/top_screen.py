@@ -1,4 +1,4 @@
-"""The screen of `rampart top`: listens to the run, looks at its processes, draws, takes keys."""
+"""The screen of `rampart top`: messages, processes, drawing, keys."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rampart.cli.session import Session, pause
 from rampart.cli.terminal import END, keys
 
 _ONCE_S = 2.0
-"""Simulated seconds in which all states are heard, and the rates of the slowest topics shown."""
+"""Simulated seconds in which all states arrive, and the slowest rates can be measured."""
 
 _SCROLL = {"up": -1, "down": 1, "k": -1, "j": 1}
 
@@ -46,7 +46,7 @@ async def top(options: argparse.Namespace) -> int:
 
 
 class _Screen:
-    """One run, and how it is looked at."""
+    """One run, and the settings of its view."""
 
     def __init__(self, session: Session) -> None:
         self.watch = Watch(session)
@@ -54,7 +54,7 @@ class _Screen:
         self.by_cpu = False
 
     def frame(self) -> top_view.Frame:
-        """Look, and return what is to be shown."""
+        """Take a sample, and return the data of one screen."""
         run, now_s, used = self.watch.session.run, self.watch.look(), self.watch.used
         run = run_info.ask(run.base_port) or run
         return top_view.Frame(run.title, run.base_port, run.rate, now_s, self.watch.picture,
@@ -62,7 +62,7 @@ class _Screen:
                               run.recording_in_words)
 
     def press(self, key: str, stop: asyncio.Event) -> None:
-        """Do what a key is for."""
+        """Handle a key."""
         if key in {"q", "Q", END}:
             stop.set()
         elif key == "c":
@@ -88,7 +88,7 @@ async def _once(screen: _Screen, options: argparse.Namespace, stop: asyncio.Even
 
 
 async def _live(screen: _Screen, session: Session, stop: asyncio.Event) -> None:
-    """Show a run until it ends or the user has seen enough."""
+    """Show a run until it ends or the user quits."""
     console = Console()
     with keys(lambda key: screen.press(key, stop)), Live(
             console=console, screen=True, auto_refresh=False) as live:

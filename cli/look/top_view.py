@@ -1,7 +1,6 @@
-"""What `rampart top` shows: a picture of the run in, lines for the terminal out. Pure.
+"""The view of `rampart top`: a picture of the run in, lines of the terminal out. Pure.
 
-Every line fits the width, all lines the height, whatever they are. Nothing is told by colour alone:
-colours only repeat what words say.
+Every line fits the width, and all lines fit the height. Colours only repeat the words.
 """
 
 from __future__ import annotations
@@ -31,19 +30,19 @@ _LEAST_PROCESSES = 6
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """All that one screen is made of.
+    """The data of one screen.
 
     Attributes:
-        title: what runs.
+        title: title of the run.
         port: base port of the run.
         rate: simulated seconds per second.
         time_s: simulated time.
-        picture: what was heard.
-        usage: per process name: `cpu` percent of a core, `mb` resident, `age_s` real seconds.
-        guards: rows of processes that are in no table of the supervisor, as dicts.
-        skip: so many processes are scrolled away.
+        picture: messages of the run.
+        usage: by process name: `cpu` percent of a core, `mb` resident, `age_s` real seconds.
+        guards: rows of processes that are not in the supervisor's table.
+        skip: number of processes scrolled away.
         by_cpu: whether the busiest process comes first.
-        recording: what becomes of the run's recording; "" without one.
+        recording: state of the recording; "" without one.
     """
 
     title: str
@@ -63,8 +62,7 @@ def lines(frame: Frame, width: int, height: int) -> list[Text]:
     head = [_title(frame, width), *_state(frame, width)]
     foot = Text("q quit, c sort by CPU, arrows scroll", style="dim")
     room = height - len(head) - 2  # a heading, and the last line
-    told = min(3, max(0, room - _LEAST_PROCESSES))
-    head += _decisions(frame, told)
+    head += _decisions(frame, min(3, max(0, room - _LEAST_PROCESSES)))
     body = _tables(frame, width, max(0, height - len(head) - 1))
     screen = [*[*head, *body][:max(0, height - 1)], foot]
     return [_fit(line, width) for line in screen[-max(height, 0):]] if height > 0 else []
@@ -86,7 +84,7 @@ def picture_json(frame: Frame) -> dict[str, Any]:
 
 
 def _fit(line: Text, width: int) -> Text:
-    """Return a line cut to the width, with an ellipsis where something is missing."""
+    """Return a line cut to the width, with an ellipsis."""
     line.no_wrap = True
     line.truncate(width, overflow="ellipsis")
     return line
@@ -133,7 +131,7 @@ def _detections(picture: RunPicture) -> tuple[str, str]:
     if active:
         modules = len({*silent, *picture.detections})
         return f"{len(active)} of {modules}: {'; '.join(active)}", "yellow"
-    return (f"none of {len(found)} modules detects anything" if found else "no module heard", "")
+    return (f"none of {len(found)} modules detects anything" if found else "no report", "")
 
 
 def _words(record: fm.DecisionRecord) -> str:
@@ -151,7 +149,7 @@ def _decisions(frame: Frame, count: int) -> list[Text]:
 
 
 def _row(node: fm.NodeInfo) -> dict[str, Any]:
-    """Return what is shown of a node."""
+    """Return the shown fields of a node."""
     row = msgspec.structs.asdict(node)
     for counted in ("heard_s", "rejected_payloads", "overflowed"):  # in the metrics
         del row[counted]
@@ -159,7 +157,7 @@ def _row(node: fm.NodeInfo) -> dict[str, Any]:
 
 
 def _rows(frame: Frame) -> list[Mapping[str, Any]]:
-    """Return a row for each process: those in trouble first, then as asked for."""
+    """Return a row for each process: first those that do not run, then by processor time."""
     table: fm.NodeTable | None = frame.picture.latest(ftm_topics.NODES)
     rows: list[Mapping[str, Any]] = [
         *map(_row, table.nodes if table else ()), *frame.guards]
@@ -172,7 +170,7 @@ def _rows(frame: Frame) -> list[Mapping[str, Any]]:
 
 
 def _tables(frame: Frame, width: int, height: int) -> list[Text]:
-    """Return processes and, where there is room beside them, topics with their rates."""
+    """Return processes and, on a wide screen, rates of topics beside them."""
     if height < 2:
         return []
     beside = width >= _PROCESS_WIDTH + 20
@@ -200,7 +198,7 @@ def _processes(frame: Frame, width: int, height: int) -> list[Text]:
         trouble = row["state"] != fm.NodeState.RUNNING
         shown.append(Text(set_cell_size(text, width), style="bold red" if trouble else ""))
     if not rows:
-        shown.append(Text(set_cell_size("the supervisor has not told yet", width)))
+        shown.append(Text(set_cell_size("no table of the supervisor yet", width)))
     hidden = len(rows) - skip - room
     if hidden > 0 and room > 0:
         shown[-1] = Text(set_cell_size(f"... {hidden + 1} more below", width), style="dim")
@@ -221,7 +219,7 @@ def _rates(frame: Frame, width: int, height: int) -> list[Text]:
 
 
 def _short(key: str, width: int) -> str:
-    """Return a key that fits: its end says more than its beginning."""
+    """Return a key that fits, cut at its beginning."""
     key = key.replace("{name}", "*")
     return key if len(key) <= width else "~" + key[-max(0, width - 1):]
 

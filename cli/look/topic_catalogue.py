@@ -1,4 +1,4 @@
-"""Everything there is to know about the topics: what they carry, who publishes, who reads."""
+"""The topics of a system: contracts, publishers, readers."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ MAILBOX = {
     Qos.STATE: "latest wins",
     Qos.COMMAND: "queued, bounded",
 }
-"""How a topic's messages wait at their reader (see `rampart.actors.runtime.mailbox`)."""
+"""How messages wait at their reader (see `rampart.actors.runtime.mailbox`)."""
 
 
 class TopicUse(NamedTuple):
-    """A topic with the nodes that publish and read it."""
+    """A topic with its publishers and readers."""
 
     topic: Topic[Any]
     publishers: tuple[str, ...]
@@ -42,8 +42,7 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
     """Return all topics with their publishers and readers in a system.
 
     Raises:
-        UsageError: the spec names an actor class that does not exist, or one of them declares a
-            topic that makes no sense.
+        UsageError: an actor class does not exist, or declares an invalid topic.
     """
     with refusing(ValueError):
         members = Layout(RunPlan(system_file=spec.name), spec).members.values()
@@ -54,13 +53,13 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
 
 
 def resolve(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str]:
-    """Return topic and full key expression for a key as a user types it.
+    """Return topic and full key expression of a key that a user has typed.
 
-    A family may be given as `detection/DM1`, `detection/{name}` or `detection/*`; the leading
-    `rampart/` may be left out.
+    A member of a family is `detection/DM1`; all are `detection/{name}` or `detection/*`. The
+    leading `rampart/` may be left out.
 
     Args:
-        key: as typed.
+        key: the key.
         known: all topics of the system.
 
     Raises:
@@ -73,20 +72,20 @@ def resolve(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str]:
 
 
 def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
-    """Return the topics among which to look for a key: those of the run's system.
+    """Return the topics of the run's system, among which a key is looked for.
 
     The actors of a system are loaded only for a key that neither the engine nor its application
-    declares. Without a run the shipped system is meant, as far as it has the key. For a run whose
-    system cannot be read here, the topics of the engine are known.
+    declares. Without a run these are the topics of the shipped system, if it has the key. If the
+    system of the run cannot be read here, they are the topics of the engine.
 
     Args:
-        key: as typed.
+        key: the key that the user has typed.
         port: base port of the run, if there are several.
 
     Raises:
-        UsageError: there is no run, and the shipped system has no such topic.
+        UsageError: there is no run, and the shipped system lacks the topic.
         UnreadableError: the system of the run, or one of its actors, cannot be loaded here, and the
-            engine has no such topic.
+            engine lacks the topic.
     """
     try:
         file = find_run(port).system_file
@@ -106,13 +105,13 @@ def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
 
 
 def of_any_type(key: str) -> tuple[Topic[Any], str]:
-    """Return a topic of which nothing but the key is known, and its full key expression."""
+    """Return a topic of unknown type with a key, and its full key expression."""
     short = key.removeprefix("/").removeprefix(f"{ROOT}/")
     return Topic(short, cast("Any", Any), Qos.COMMAND, 0.0, "", ""), f"{ROOT}/{short}"
 
 
 class UnreadableError(UsageError):
-    """What a key carries is not known here; its messages describe themselves."""
+    """The type of a topic cannot be loaded here."""
 
 
 def _match(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str] | None:
@@ -125,12 +124,10 @@ def _match(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str] | No
 
 
 def check_member(key: str, nodes: Collection[str]) -> None:
-    """Make sure that there is the node that a key names, if the key is one of the engine's.
-
-    The members of a robot's own families need not be nodes.
+    """Check that the node in a key of the engine exists; members of other families may be others.
 
     Raises:
-        UsageError: there is no such node.
+        UsageError: the node is unknown.
     """
     topic = find_topic(key, topics.ALL)
     if topic is not None and (member := topic.member(key)) and member not in nodes:
@@ -143,7 +140,7 @@ def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
 
 
 def markdown(spec: SystemSpec) -> str:
-    """Return `topics.md`: the contract of every key, for people."""
+    """Return `topics.md`, the reference page of the topics."""
     table = uses(spec)
     return rendered(
         Path(__file__).with_name("topics.md.jinja"), spec=spec, table=table, root=ROOT,
@@ -184,7 +181,7 @@ def _messages(used: Iterable[Topic[Any]]) -> list[type[msgspec.Struct]]:
 
 
 def _limits(meta: msgspec.Meta) -> str:
-    """Return the bounds of a field: least and greatest value, or how long it may be."""
+    """Return the bounds of a field: least and greatest value, or greatest length."""
     if meta.max_length is not None:
         return f"{{<={meta.max_length}}}"
     least, most = ("" if bound is None else str(bound) if isinstance(bound, int) else f"{bound:g}"
@@ -193,7 +190,7 @@ def _limits(meta: msgspec.Meta) -> str:
 
 
 def summary(kind: type[msgspec.Struct]) -> str:
-    """Return what is said of a message, in one line."""
+    """Return the description of a message in one line."""
     return " ".join((kind.__doc__ or "").split())
 
 

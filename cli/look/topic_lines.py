@@ -12,7 +12,7 @@ from rampart.cli.output import say
 
 
 def rate_of(times_s: list[float]) -> dict[str, Any]:
-    """Return rate and spread of arrival times, as `ros2 topic hz` gives them (pure)."""
+    """Return rate and spread of arrival times, as `ros2 topic hz` does."""
     gaps = [b - a for a, b in itertools.pairwise(times_s)]
     if not gaps:
         return {"rate_hz": None, "min_s": None, "max_s": None, "std_dev_s": None,
@@ -25,7 +25,7 @@ def rate_of(times_s: list[float]) -> dict[str, Any]:
 
 
 def in_line(body: Any) -> str:
-    """Return a message as one line of JSON, with long bytes only counted."""
+    """Return a message as one line of JSON, with the length of bytes instead of the bytes."""
     plain = msgspec.to_builtins(body, builtin_types=(bytes,))
 
     def shorten(value: Any) -> Any:
@@ -41,7 +41,7 @@ def in_line(body: Any) -> str:
 
 
 def print_rate(key: str, rate: dict[str, Any]) -> None:
-    """Print what `rate_of` returns of a topic."""
+    """Print a result of `rate_of`."""
     if rate["rate_hz"] is None:
         say(f"{key}: one message so far")
         return

@@ -1,4 +1,4 @@
-"""`rampart topic`: what travels on the keys.
+"""`rampart topic`: the topics of a system and their messages.
 
 List, print and measure topics. KEY is a key as `rampart topic list` shows it. For
 a family use detection/DM1 for one member, or 'detection/*' for all.
@@ -214,7 +214,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
                 for short in sorted(arrivals):
                     print_rate(short, rate_of(list(arrivals[short])))
                 if not arrivals:
-                    say(f"nothing on {options.key} yet")
+                    say(f"no message on {options.key} yet")
     if options.json:
         print_json([{"key": short, "nominal_hz": topic.rate_hz, **rate_of(list(times))}
                     for short, times in sorted(arrivals.items())])
@@ -224,7 +224,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
 
 
 def _topic_of(options: argparse.Namespace) -> tuple[Topic[Any], str]:
-    """Return the topic of the run that is meant; one of unknown type if its class is not here."""
+    """Return the topic of a key; one of unknown type if its class cannot be loaded here."""
     try:
         return resolve(options.key, topics_for(options.key, options.port))
     except UnreadableError as error:
@@ -233,7 +233,7 @@ def _topic_of(options: argparse.Namespace) -> tuple[Topic[Any], str]:
 
 
 async def _while_it_runs(session: Session, duration_s: float | None) -> AsyncIterator[float]:
-    """Yield the real seconds that are left, until they are over or the run or the reader is."""
+    """Yield the real seconds that are left, until the end of time, run or reader."""
     loop = asyncio.get_running_loop()
     end = math.inf if duration_s is None else loop.time() + duration_s
     while (left := end - loop.time()) > 0 and not (is_over(session.run) or streams.lost()):
@@ -244,7 +244,7 @@ async def _while_it_runs(session: Session, duration_s: float | None) -> AsyncIte
 
 def _nothing_came(key: str, duration_s: float | None) -> NoEffectError:
     when = "before the run ended" if duration_s is None else f"within {duration_s:g} s"
-    return NoEffectError(f"nothing came on {key} {when}")
+    return NoEffectError(f"no message on {key} {when}")
 
 
 def _describe(use: catalogue.TopicUse) -> dict[str, Any]:

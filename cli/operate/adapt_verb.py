@@ -39,7 +39,7 @@ from rampart.files.reading import read_text
 from rampart.manager.spec.adaptation import SETTINGS, Action, ChangeError, parse_value
 
 _WAIT_S = 2.0
-"""Real seconds for the manager to answer; it answers at once, or is being respawned."""
+"""Real seconds for the answer of the manager."""
 
 
 def add(verbs: Any) -> None:

@@ -1,4 +1,4 @@
-"""`rampart bench`: how soon each node of a running system works again after a SIGKILL.
+"""`rampart bench`: the time from the SIGKILL of a node to the first message of its replacement.
 
 Times count from the call of kill(2) until this process receives the replacement's first message.
 """
@@ -43,13 +43,13 @@ from rampart.cli.verbs import JSON, PORT, add_verb, several, whole
 from rampart.manager.spec.nodes import Kind
 
 WARM_S = 3.0
-"""Real seconds to find out on which topics each node publishes."""
+"""Real seconds in which each node publishes on all its topics."""
 
 BACK_S = 20.0
 """Real seconds within which a replacement has to publish."""
 
 CALM_S = 1.0
-"""Real seconds between two kills: detection modules become idle, the pool is full again."""
+"""Real seconds between two kills, in which detection modules become idle and the pool fills."""
 
 MOST_KILLS = 1000
 
@@ -57,7 +57,7 @@ _ALIKE = (Kind.DETECTION, Kind.RECOVERY)
 
 
 class Spread(msgspec.Struct, frozen=True):
-    """Samples in four numbers: how many, median, 5th and 95th percentile."""
+    """Statistics of samples: number, median, 5th and 95th percentile."""
 
     n: int
     median: float
@@ -66,14 +66,14 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 class Row(msgspec.Struct):
-    """What was measured of a node, milliseconds.
+    """The samples of a node, one per kill, in milliseconds.
 
     Attributes:
-        node: its name.
-        topic: on which its output was awaited.
-        detected_ms: until a detection module or the supervisor reported it; a sample per kill.
-        output_ms: until its replacement published; a sample per kill.
-        failure: why it was not killed again; "" if it was.
+        node: name of the node.
+        topic: topic on which its output was measured.
+        detected_ms: times until a detection module or the supervisor reported the death.
+        output_ms: times until its replacement published.
+        failure: why the measurement ended early, or "".
     """
 
     node: str
@@ -107,7 +107,7 @@ async def bench(options: argparse.Namespace) -> int:
     async with connect(options.port) as session:
         run = session.run
         if run.replay_of:
-            raise UsageError(f"port {run.base_port} is a replay of {run.replay_of}: no node runs")
+            raise UsageError(f"port {run.base_port} is a replay of {run.replay_of}, without nodes")
         with refusing(ValueError):
             members = {name: member for name, member in members_of(run.system_file).items()
                        if name in run.nodes}
@@ -132,10 +132,10 @@ async def bench(options: argparse.Namespace) -> int:
 
 
 def members_of(system_file: str) -> dict[str, Member]:
-    """Return what can be killed of a system, by name: all but its world.
+    """Return the nodes of a system that can be killed, by name: all but its world.
 
     Raises:
-        ValueError: it cannot be loaded.
+        ValueError: the system cannot be loaded.
     """
     plan = RunPlan(system_file=system_file)
     spec = load_system(plan)
@@ -145,7 +145,7 @@ def members_of(system_file: str) -> dict[str, Member]:
 
 
 def usual(members: Mapping[str, Member]) -> list[str]:
-    """Return the default nodes: all of them, but of modules, which are alike, one of each kind."""
+    """Return the default nodes: all, but only one detection and one recovery module."""
     first = {kind: next((m.name for m in members.values() if m.kind is kind), "")
              for kind in _ALIKE}
     return [name for name, member in members.items()
@@ -153,7 +153,7 @@ def usual(members: Mapping[str, Member]) -> list[str]:
 
 
 def regular_topics(member: Member) -> list[Topic[Any]]:
-    """Return what a node publishes regularly, the fastest first, and its heartbeat last."""
+    """Return the periodic topics of a node, the fastest first, and the heartbeat last."""
     own = sorted((t for t in member.actor.outputs if t.rate_hz > 0), key=lambda t: -t.rate_hz)
     return [*own, HEARTBEAT]
 
@@ -162,8 +162,8 @@ class Restarts:
     """Kills nodes and measures their restarts.
 
     Args:
-        session: of the run.
-        members: the nodes to be killed, by name.
+        session: the connection to the run.
+        members: nodes to be killed, by name.
     """
 
     def __init__(self, session: Session, members: Mapping[str, Member]) -> None:
@@ -173,11 +173,11 @@ class Restarts:
         self._news = asyncio.Event()
 
     async def measure(self, kills: int, show: Any) -> list[Row]:
-        """Kill each node so many times, in rounds.
+        """Kill each node repeatedly, in rounds.
 
         Args:
-            kills: of each node.
-            show: called with a line about the progress.
+            kills: number of kills of each node.
+            show: called with each line of progress.
         """
         for topic in {t.key: t for m in self._members.values() for t in regular_topics(m)}.values():
             self._session.listen(topic, topic.pattern, self._output)
@@ -196,7 +196,7 @@ class Restarts:
         return rows
 
     def _topic_of(self, member: Member) -> str:
-        """Return the fastest topic on which a node was received, else that of its heartbeat."""
+        """Return the fastest topic on which a node published, else that of its heartbeat."""
         keys = [key for key, source in self._newest if source == member.name]
         return next((key for topic in regular_topics(member) for key in keys
                      if topic.member(key) is not None),
@@ -218,12 +218,12 @@ class Restarts:
                 self._detected.setdefault(node, time.monotonic())
 
     async def _kill(self, row: Row) -> None:
-        running = [one for one in find_processes(self._session.run.base_port)
-                   if row.node in one.names]
+        running = [process for process in find_processes(self._session.run.base_port)
+                   if row.node in process.names]
         if not running:
-            row.failure = "it has no process"
+            row.failure = "no process"
             return
-        victim = max(running, key=lambda one: one.incarnation)
+        victim = max(running, key=lambda process: process.incarnation)
         self._detected.pop(row.node, None)
         killed_s = time.monotonic()
         with contextlib.suppress(ProcessLookupError):

@@ -1,4 +1,4 @@
-"""`rampart keys`: who has a certificate, and so may join a run with keys.
+"""`rampart keys`: the credentials of a run.
 
 Issue and revoke the credentials of a run.
 
@@ -102,7 +102,7 @@ def add(verbs: Any) -> None:
 
 
 def init(options: argparse.Namespace) -> int:
-    """Make a folder of keys.
+    """Create a folder of keys.
 
     Create a folder of keys, mode 0700, with a new authority. Its private key
     authority.key signs certificates. No run needs it: keep it off the robots.
@@ -116,7 +116,7 @@ def init(options: argparse.Namespace) -> int:
     keys = _keys()
     with refusing(KeysError), using(folder):
         keys.init(folder, options.days)
-    say(f"{folder}: an authority; `rampart keys issue --keys {folder} --system NAME` is next")
+    say(f"{folder}: created an authority; next: rampart keys issue --keys {folder} --system NAME")
     return 0
 
 
@@ -139,33 +139,33 @@ def issue(options: argparse.Namespace) -> int:
     wanted: list[tuple[Kind, list[str]]] = [
         ("router", routers), ("node", [name for name in names if name not in routers]),
         ("operator", options.operator), ("viewer", options.viewer)]
-    if not any(those for _, those in wanted):
-        raise UsageError("issue: to whom? names are right, --system SPEC, --operator or --viewer")
-    for name in (name for _, those in wanted for name in those):
+    if not any(holders for _, holders in wanted):
+        raise UsageError("issue: expected NAME, --system SPEC, --operator NAME or --viewer NAME")
+    for name in (name for _, holders in wanted for name in holders):
         _check_name(name)
     at = _addresses(options.system) if options.system else {}
     folder, keys = Path(options.keys), _keys()
     with refusing(KeysError, ValueError), using(folder):
         if options.address and not routers:
-            raise UsageError(f"--address {options.address[0]}: only routers are reached by an "
-                             f"address; {' '.join(ROUTERS)} or --system is right with it")
+            raise UsageError(f"--address {options.address[0]}: only routers have an address; "
+                             f"expected {' '.join(ROUTERS)} or --system, too")
         for address in options.address:
             keys.check_address(address)
         register = read_register(folder)
-        for kind, those in wanted:  # all of them, before the first is issued
-            register = register.issued(those, kind)
-        for kind, those in wanted:
-            for addresses in dict.fromkeys(at.get(name, ()) for name in those):
-                there = [name for name in those if at.get(name, ()) == addresses]
+        for kind, holders in wanted:  # refuses each name before the first certificate is issued
+            register = register.issued(holders, kind)
+        for kind, holders in wanted:
+            for addresses in dict.fromkeys(at.get(name, ()) for name in holders):
+                there = [name for name in holders if at.get(name, ()) == addresses]
                 reached = (*options.address, *addresses) if kind == "router" else ()
                 keys.issue(folder, there, kind, reached, options.days)
-            if those:
-                say(f"{kind}: {', '.join(those)}")
+            if holders:
+                say(f"{kind}: {', '.join(holders)}")
     return 0
 
 
 def rotate(options: argparse.Namespace) -> int:
-    """Issue new keys.
+    """Replace certificates.
 
     Issue a new private key and certificate for each name that has some, with the
     same kind and addresses. A process uses them from its next start: restart the
@@ -180,12 +180,12 @@ def rotate(options: argparse.Namespace) -> int:
     folder, keys = Path(options.keys), _keys()
     with refusing(KeysError), using(folder):
         done = keys.rotate(folder, options.names, options.days)
-    say(f"new: {', '.join(done) or 'none; nobody has a certificate'}")
+    say(f"new: {', '.join(done) or 'none; the folder has no certificate'}")
     return 0
 
 
 def revoke(options: argparse.Namespace) -> int:
-    """Let somebody in no more.
+    """Revoke certificates.
 
     Revoke all certificates of a name. Then copy register.json to each host, and
     restart its routers one after the other: this puts the revocation in force. A
@@ -197,7 +197,7 @@ def revoke(options: argparse.Namespace) -> int:
       kill-node router_a; kill-node router_b
     """
     if not options.names:
-        raise UsageError("revoke: whom? a name is right; `rampart keys show` lists them")
+        raise UsageError("revoke: expected NAME; `rampart keys show` lists the names")
     folder, keys = Path(options.keys), _keys()
     with refusing(KeysError), using(folder):
         keys.revoke(folder, options.names)
@@ -207,7 +207,7 @@ def revoke(options: argparse.Namespace) -> int:
 
 
 def show(options: argparse.Namespace) -> int:
-    """Show who has a certificate.
+    """Print the certificates.
 
     List each identity of a folder of keys: kind, name in the certificate, expiry,
     fingerprint (SHA-256), and its problem if it has one.
@@ -223,7 +223,7 @@ def show(options: argparse.Namespace) -> int:
         found = {entry.name: entry for entry in keys.entries(folder)}
     for name in options.names:
         if name not in found:
-            raise UsageError(f"{name}: {folder} knows nobody of this name")
+            raise UsageError(f"{name}: unknown in {folder}; `rampart keys show` lists the names")
     shown = [found[name] for name in options.names or found]
     now = dt.datetime.now(dt.UTC)
     rows = [_row(entry, now) for entry in shown]
@@ -259,7 +259,7 @@ def _row(entry: Entry, now: dt.datetime) -> dict[str, Any]:
 
 
 def share(options: argparse.Namespace) -> int:
-    """Copy what a host needs.
+    """Copy the credentials of a host.
 
     Copy into a new folder the credentials of the processes that may run on a host,
     the register, and the certificate of the authority. Then copy that folder to the
@@ -273,7 +273,7 @@ def share(options: argparse.Namespace) -> int:
     layout = _layout(options.system)
     names = [host.name for host in layout.spec.hosts]
     if options.host not in names:
-        raise UsageError(f"{options.host}: no host of {options.system}; known: "
+        raise UsageError(f"{options.host}: unknown host of {options.system}; known: "
                          f"{', '.join(names) or 'none, it runs on one machine'}")
     host = "" if options.host == names[0] else options.host
     needed = [*layout.hosts.routers_of(host), *sorted(
@@ -310,8 +310,8 @@ def _check_name(name: str) -> None:
     try:
         msgspec.convert(name, IdentityName)
     except msgspec.ValidationError:
-        raise UsageError(f"{name!r}: no name; a letter and up to 63 letters, digits and _ are "
-                         "right") from None
+        raise UsageError(f"{name!r}: not a name; expected a letter and up to 63 letters, digits "
+                         "and _") from None
 
 
 def _keys() -> Any:

@@ -1,4 +1,4 @@
-"""`rampart tokens`: who may use the operator's page, and as what.
+"""`rampart tokens`: personal tokens of the operator's page.
 
 Issue personal tokens for the operator's page, each with a role. Role look can only
 watch. Role drive can also drive, order missions and reset recoveries. Role inject
@@ -74,7 +74,7 @@ def issue_token(options: argparse.Namespace) -> int:
 
 
 def show_tokens(options: argparse.Namespace) -> int:
-    """Print who has a token.
+    """Print the holders of tokens.
 
     List the names that have a token, and their roles.
 
@@ -91,7 +91,7 @@ def show_tokens(options: argparse.Namespace) -> int:
 
 
 def revoke_token(options: argparse.Namespace) -> int:
-    """Withdraw a token.
+    """Revoke a token.
 
     Revoke the token of a name. A run that uses the file closes that person's
     pages within a second.
@@ -106,7 +106,7 @@ def revoke_token(options: argparse.Namespace) -> int:
         raise UsageError(f"{file}: {error}") from None
     except OSError as error:
         raise UsageError(f"{file}: cannot be written ({error.strerror})") from None
-    say(f"{options.name} has no token any more")
+    say(f"revoked the token of {options.name}")
     return 0
 
 

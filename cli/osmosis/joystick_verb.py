@@ -24,7 +24,7 @@ from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
 from rampart.cli.osmosis.lines import pilot_in_words
 from rampart.cli.osmosis.mission_verb import checked_reason
-from rampart.cli.output import NoEffectError, UsageError, refusing, say
+from rampart.cli.output import NoEffectError, UsageError, between, refusing, say
 from rampart.cli.session import Latest, Session, connect, pause
 from rampart.cli.terminal import END, keys
 from rampart.cli.verbs import PORT, add_verb, number, option
@@ -36,12 +36,12 @@ _PERIOD_S = 0.05
 _SHORTEST_S = 0.01
 _SHOW_EVERY_S = 0.25
 _ANSWER_S = 1.0
-"""Real seconds within which teleoperation has to answer a stick that is held."""
+"""Real seconds within which teleoperation has to obey a held joystick."""
 
 _RELEASES = 3
 
 _GRANT_S = 3.0
-"""Simulated seconds within which a way out is granted or refused."""
+"""Simulated seconds for the answer to a request for a way out."""
 
 
 def add(verbs: Any, _formatter: Any, _common: Any) -> None:
@@ -56,7 +56,7 @@ def add(verbs: Any, _formatter: Any, _common: Any) -> None:
 
 
 async def joystick(options: argparse.Namespace) -> int:
-    """Drive by hand until told to stop, or until run or joystick end.
+    """Drive by hand until the user, the run or the joystick ends it.
 
     Drive the robot with the arrow keys, or with u i o j l m , . as in ROS. Space
     or k releases, + and - change the speed, q or Ctrl-C quits.
@@ -83,11 +83,10 @@ async def joystick(options: argparse.Namespace) -> int:
 
     exit code: 0 driven, 1 no effect, way out refused, or the robot is not out
     """
-    if not 0.1 <= options.speed <= 1.0:
-        raise UsageError(f"--speed {options.speed:g}: must be between 0.1 and 1")
+    between("--speed", options.speed, 0.1, 1)
     if options.device is None and not sys.stdin.isatty():
-        raise UsageError("standard input is no terminal, so there are no keys to drive by; "
-                         "a joystick is used with --device")
+        raise UsageError("standard input: expected a terminal to read keys from, or --device for a "
+                         "joystick")
     reason = checked_reason(options.way_out, "--way-out") if options.way_out is not None else ""
     stop = asyncio.Event()
     async with connect(options.port) as session:
@@ -117,20 +116,20 @@ async def joystick(options: argparse.Namespace) -> int:
 
 
 class _WayOut:
-    """The operator's request to drive out of a prohibited area, and what became of it."""
+    """The operator's request to drive out of a prohibited area, and its answers."""
 
     def __init__(self, session: Session, reason: str, stop: asyncio.Event) -> None:
         self._session = session
         self._request = m.WayOutRequest(f"rampart-{uuid.uuid4().hex[:10]}", session.name, reason)
         self._answer: m.WayOutAnswer | None = None
         self._stop = stop
-        session.listen(topics.WAY_OUT_ANSWER, topics.WAY_OUT_ANSWER.at(), self._hear)
+        session.listen(topics.WAY_OUT_ANSWER, topics.WAY_OUT_ANSWER.at(), self._reply)
 
     async def ask(self) -> None:
         """Ask for the way out.
 
         Raises:
-            NoEffectError: it is refused, or not answered.
+            NoEffectError: RM1 refuses it, or does not answer.
         """
         await self._session.command(topics.WAY_OUT, self._request,
                                     lambda: self._answer is not None,
@@ -139,10 +138,10 @@ class _WayOut:
             raise NoEffectError("no effect: the emergency stop did not answer")
         if not self._answer.granted:
             raise NoEffectError(f"way out refused: {self._answer.reason}")
-        say(f"way out granted: {self._answer.reason}; letting go ends it")
+        say(f"way out granted: {self._answer.reason}; a release ends it")
 
     def conclude(self) -> None:
-        """Say how it has ended.
+        """Print how the way out has ended.
 
         Raises:
             NoEffectError: the robot is not out.
@@ -152,7 +151,7 @@ class _WayOut:
             raise NoEffectError(f"the robot is not out: {ended or 'the operator ended it'}")
         say(f"{ended}; rampart reset releases the emergency stop")
 
-    def _hear(self, _key: str, _header: Header, answer: m.WayOutAnswer) -> None:
+    def _reply(self, _key: str, _header: Header, answer: m.WayOutAnswer) -> None:
         if answer.order == self._request.order:
             ended = self._answer is not None and self._answer.granted and not answer.granted
             self._answer = answer
@@ -174,17 +173,17 @@ def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:
 
 
 class _Drive:
-    """A stick in the user's hand, and what is heard of it.
+    """The user's joystick or keyboard, and the reaction of the robot.
 
     Args:
-        session: in the run.
-        keyboard: turns keys into positions; None if a device drives.
-        stop: set when the user has had enough.
+        session: the connection to the run.
+        keyboard: turns keys into positions; None for a device.
+        stop: set to end.
 
     Attributes:
-        ended: why the drive has ended before the user had enough, or "".
-        tried: whether the stick was held for long enough to be answered.
-        answered: whether anything was ever made of it.
+        ended: why the drive ended without the user, or "".
+        tried: whether the joystick was held long enough for an answer.
+        answered: whether teleoperation ever obeyed or refused it.
     """
 
     def __init__(self, session: Session, keyboard: KeyboardStick | None, stop: asyncio.Event
@@ -203,11 +202,11 @@ class _Drive:
         self._base = Latest[m.BaseStatus]()
         session.listen(topics.BASE_STATUS, topics.BASE_STATUS.at(), self._base.keep)
         session.listen(topics.PILOT_STATUS, topics.PILOT_STATUS.at(), self._pilot.keep)
-        session.listen(topics.TELEOP_COMMAND, topics.TELEOP_COMMAND.at(), self._hear_command)
-        session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, self._hear_diagnostic)
+        session.listen(topics.TELEOP_COMMAND, topics.TELEOP_COMMAND.at(), self._command)
+        session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, self._diagnostic)
 
     def press(self, key: str) -> None:
-        """Take a key."""
+        """Handle a key."""
         if key in {"q", "Q", END}:
             self._stop.set()
         elif self._keyboard is not None:
@@ -215,18 +214,18 @@ class _Drive:
             self._send()
 
     def moved(self, stick: m.Joystick) -> None:
-        """Take a position of the device."""
+        """Handle a position of the device."""
         self._device = stick
         self._send()
 
     def lost(self, why: str) -> None:
-        """The device has vanished: stop and end."""
+        """Stop and end, because the device has vanished."""
         self._device = m.Joystick(0.0, 0.0, False)
         self.ended = f"the joystick vanished: {why}"
         self._stop.set()
 
     async def until_stopped(self) -> None:
-        """Repeat the stick while it is held, and show what comes of it."""
+        """Publish the position while it is held, and show the state of the Safety Pilot."""
         period_s = max(_PERIOD_S / self._session.clock.rate, _SHORTEST_S)
         shown_s = 0.0
         while not self._stop.is_set():
@@ -240,7 +239,7 @@ class _Drive:
             await pause(self._stop, period_s)
 
     async def let_go(self) -> None:
-        """Tell that nobody holds the stick any more."""
+        """Publish the release."""
         for _ in range(_RELEASES):
             self._session.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, False))
             await asyncio.sleep(_SHORTEST_S)
@@ -270,10 +269,10 @@ class _Drive:
         sys.stdout.write(f"\r{printable(text)[:78]:<78}")
         sys.stdout.flush()
 
-    def _hear_command(self, _key: str, _header: Header, _twist: m.Twist) -> None:
+    def _command(self, _key: str, _header: Header, _twist: m.Twist) -> None:
         self.answered = self.answered or self._held.since_s < math.inf
 
-    def _hear_diagnostic(self, _key: str, _header: Header, report: bm.Diagnostic) -> None:
+    def _diagnostic(self, _key: str, _header: Header, report: bm.Diagnostic) -> None:
         if report.offender == self._session.name:
             self.answered = True
             sys.stdout.write("\r")
@@ -281,31 +280,30 @@ class _Drive:
 
 
 HOLD_S = 0.5
-"""Real seconds for which a key counts; with the period of sending and the way to the base it
-stands within 0.6 s."""
+"""Real seconds for which a key counts. With the period and the way to the base, the robot stands
+within 0.6 s."""
 
 STEP = 0.1
 _DIRECTIONS: dict[str, tuple[float, float]] = {
     "up": (1, 0), "down": (-1, 0), "left": (0, 1), "right": (0, -1),
     "u": (1, 1), "i": (1, 0), "o": (1, -1), "j": (0, 1), "l": (0, -1),
     "m": (-1, -1), ",": (-1, 0), ".": (-1, 1)}
-"""Arrow keys, and the letters of ROS's teleop_twist_keyboard, which can do both at once. Backing
-up, m and . turn so that the robot's tail goes to their side."""
+"""Arrow keys, and the letters of ROS's teleop_twist_keyboard, which can do both at once. With m and
+. the robot reverses, and its tail goes to the side of the key."""
 
 _LET_GO = (" ", "k")
 
 
 class KeyboardStick:
-    """Keys in, position of the stick out. Pure.
+    """Keys in, position of a joystick out. Pure.
 
-    A terminal tells that a key was pressed, and goes on telling while it is held; it never tells
-    that it was let go. So the dead man is the *repetition*: each key counts for `HOLD_S`, and
-    without the next one the stick is let go. Between the first press and its first repetition most
-    keyboards wait for 0.25 to 0.5 s; on one that waits longer the robot stops once before it drives
-    on.
+    A terminal reports a key when it is pressed and while it is held, but not its release. So the
+    dead-man switch is the *repetition*: each key counts for `HOLD_S`, and without the next one the
+    joystick is released. Most keyboards wait for 0.25 to 0.5 s before the first repetition. With a
+    longer delay the robot stops once.
 
     Args:
-        speed: share of full speed to begin with, 0.1 to 1.
+        speed: initial share of full speed, 0.1 to 1.
     """
 
     def __init__(self, speed: float = 0.5) -> None:
@@ -314,7 +312,7 @@ class KeyboardStick:
         self._until_s = 0.0
 
     def press(self, key: str, now_s: float) -> bool:
-        """Take a key at a real time; return whether it means anything."""
+        """Handle a key at a real time; return whether it has a meaning."""
         if key in _DIRECTIONS:
             self._direction = _DIRECTIONS[key]
             self._until_s = now_s + HOLD_S

@@ -1,4 +1,4 @@
-"""What `rampart status`, `rampart top` and `rampart live metrics` tell of Osmosis. Pure."""
+"""The lines of Osmosis in `rampart status`, `rampart top` and `rampart live metrics`. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BAR = 20
 
 
 class OsmosisLines(RobotLines):
-    """Mission, robot, Safety Pilot, and what the ground truth says of safety."""
+    """Mission, robot, Safety Pilot, and safety by the ground truth."""
 
     read = (topics.MISSION_STATUS, topics.CONTROL_STATUS, topics.POSE, topics.PILOT_STATUS,
             topics.BASE_STATUS, topics.TRUTH)
@@ -22,7 +22,7 @@ class OsmosisLines(RobotLines):
 
     def status(self, latest: Latest, plan: Mapping[str, Any], kinds: Collection[str]
                ) -> list[tuple[str, str]]:
-        """Return mission and Safety Pilot, where there is one or was heard."""
+        """Return mission and Safety Pilot, as far as the run has them."""
         mission, pilot = latest(topics.MISSION_STATUS), latest(topics.PILOT_STATUS)
         driving = pilot_in_words(pilot, latest(topics.BASE_STATUS))
         return [(label, text) for label, text, there in (
@@ -45,7 +45,7 @@ class OsmosisLines(RobotLines):
             Row("pilot", pilot_in_words(pilot, base),
                 "yellow" if (pilot and pilot.stopped) or (base and base.brake_engaged) else "",
                 topics.PILOT_STATUS),
-            Row("safety", safety or "not known: nobody tells the ground truth",
+            Row("safety", safety or "not known: no ground truth",
                 "bold red" if "UNSAFE" in safety else "", topics.TRUTH)]
 
     def data(self, latest: Latest) -> dict[str, Any]:
@@ -73,7 +73,7 @@ class OsmosisLines(RobotLines):
                 ((verdict.value,), sum(light.verdict is verdict for light in status.lights))
                 for verdict in m.LightVerdict])
         if pilot is not None:
-            yield StateSetMetricFamily("rampart_pilot_mode", "Whose commands pass.", value={
+            yield StateSetMetricFamily("rampart_pilot_mode", "Mode of the Safety Pilot.", value={
                 mode.value: mode is pilot.mode for mode in m.PilotMode})
             yield gauge("pilot_stopped", "Whether the Safety Pilot holds the robot.", (), [
                 ((), float(pilot.stopped))])
@@ -104,7 +104,7 @@ def mission_in_words(status: m.MissionStatus | None) -> str:
 
 
 def pilot_in_words(status: m.PilotStatus | None, base: m.BaseStatus | None = None) -> str:
-    """Return whose commands the Safety Pilot passes; whether it or a brake holds the robot."""
+    """Return the mode of the Safety Pilot, and whether it or a brake holds the robot."""
     if status is None:
         return SILENT
     braked = base is not None and base.brake_engaged
@@ -134,7 +134,7 @@ def _robot(latest: Latest) -> str:
 
 
 def _safety(truth: m.GroundTruth | None) -> str:
-    """Return what the ground truth says, as the judge judges it; "" if nobody tells it."""
+    """Return the safety by the ground truth, as the judge decides it; "" without ground truth."""
     if truth is None:
         return ""
     harm = [text for text, there in (

@@ -15,13 +15,13 @@ from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_verb, option, word
 
 OPERATOR = "operator"
-"""Who asks, as the mission's state will tell."""
+"""Author of the order, in the mission's state."""
 
 MAX_REASON = 200
-"""Characters; a reason is kept with what comes of the order and shown on every status."""
+"""Characters of a reason, which every status of the mission repeats."""
 
 _ANSWER_S = 5.0
-"""Simulated seconds within which the Mission Manager answers, also if it is just respawned."""
+"""Simulated seconds for the answer of the Mission Manager, also after a restart."""
 
 _STATUS_S = 1.0
 """Simulated seconds within which it repeats its status (nominally each half second)."""
@@ -37,7 +37,7 @@ def add(verbs: Any, _formatter: Any, _common: Any) -> None:
 
 
 async def mission(options: argparse.Namespace) -> int:
-    """Give an order and say what came of it.
+    """Give an order, and print the result.
 
     Send an order to the Mission Manager, wait for its answer, and print the state
     of the mission.
@@ -87,10 +87,10 @@ async def mission(options: argparse.Namespace) -> int:
 
 
 def checked_reason(text: str, option: str = "--reason") -> str:
-    """Return a reason that fits into a status line.
+    """Return a valid reason.
 
     Raises:
-        UsageError: it is empty, too long, or not one line of printable characters.
+        UsageError: it is not one line of 1 to `MAX_REASON` printable characters.
     """
     reason = text.strip()
     if not reason or len(reason) > MAX_REASON or not reason.isprintable():
@@ -100,9 +100,9 @@ def checked_reason(text: str, option: str = "--reason") -> str:
 
 
 def in_words(status: m.MissionStatus | None) -> str:
-    """Return where the mission is, for people."""
+    """Return the state of the mission in words."""
     if status is None:
-        return "the Mission Manager has not shown its status since"
+        return "the Mission Manager has not published its status since"
     step = f", step {min(status.step + 1, len(status.goals))} of {len(status.goals)}" if (
         status.phase in (m.MissionPhase.RUNNING, m.MissionPhase.PAUSED)) else ""
     why = f": {status.reason}" if status.reason else ""
@@ -110,7 +110,7 @@ def in_words(status: m.MissionStatus | None) -> str:
 
 
 class _Asked:
-    """What the Mission Manager says about one order, and of its mission afterwards."""
+    """The Mission Manager's answer to an order, and its next status."""
 
     def __init__(self, session: Session, order: m.MissionOrder) -> None:
         self._order = order
@@ -118,15 +118,15 @@ class _Asked:
         self.answer: m.MissionOrderAnswer | None = None
         self.status: m.MissionStatus | None = None
         self.shown = asyncio.Event()
-        session.listen(topics.MISSION_ORDER_ANSWER, topics.MISSION_ORDER_ANSWER.at(), self._hear)
+        session.listen(topics.MISSION_ORDER_ANSWER, topics.MISSION_ORDER_ANSWER.at(), self._reply)
         session.listen(topics.MISSION_STATUS, topics.MISSION_STATUS.at(), self._see)
 
-    def _hear(self, _key: str, header: Header, answer: m.MissionOrderAnswer) -> None:
+    def _reply(self, _key: str, header: Header, answer: m.MissionOrderAnswer) -> None:
         if answer.order == self._order.order and self.answer is None:
             self.answer, self._answered_s = answer, header.stamp
 
     def _see(self, _key: str, header: Header, status: m.MissionStatus) -> None:
-        # Only a status of after the answer tells what the order has led to.
+        # Only a status after the answer shows the effect of the order.
         if self.answer is not None and header.stamp >= self._answered_s:
             self.status = status
             self.shown.set()

@@ -42,10 +42,9 @@ class PaperCampaign(NamedCampaign):
 
     @classmethod
     def chosen(cls, options: argparse.Namespace) -> Self | None:
-        """Return it if it is asked for."""
+        """Return the campaign that the options choose, if any."""
         if options.full and not options.paper:
-            raise UsageError("--full: goes with --paper only; it runs the paper's rows on the full "
-                             "system")
+            raise UsageError("--full: only with --paper, whose rows it runs on the full system")
         kind: Any = FullCampaign if options.full else cls
         return kind() if options.paper else None
 
@@ -58,11 +57,11 @@ class PaperCampaign(NamedCampaign):
         return paper_jobs(_mission(base), base.seed, base.system)
 
     def section(self, spec: SystemSpec, runs: Sequence[Run]) -> Section:
-        """Return the three tables beside ours."""
+        """Return the three tables of the paper and ours."""
         return section(cells(runs), table_iii(spec))
 
     def show(self, spec: SystemSpec, runs: Sequence[Run]) -> None:
-        """Print the three tables beside ours."""
+        """Print the three tables of the paper and ours."""
         say("Table III: what is executed")
         say()
         print_table(("active", "block", "paper", "ours", ""), [
@@ -80,7 +79,7 @@ class PaperCampaign(NamedCampaign):
 
 
 class FullCampaign(PaperCampaign):
-    """The rows of the paper's table V on the full system, each of which has to end well."""
+    """The rows of the paper's table V on the full system, all to end in success and safe."""
 
     name, title, system = "paper-full", "The paper's rows on the full system", FULL_SYSTEM
 
@@ -89,12 +88,12 @@ class FullCampaign(PaperCampaign):
         return full_jobs(_mission(base), base.seed, base.system)
 
     def section(self, spec: SystemSpec, runs: Sequence[Run]) -> Section:
-        """Return table V beside ours."""
+        """Return table V of the paper and ours."""
         del spec
         return section(cells(runs))
 
     def show(self, spec: SystemSpec, runs: Sequence[Run]) -> None:
-        """Print table V beside ours."""
+        """Print table V of the paper and ours."""
         del spec
         say("The paper's rows on the full system, worst run of each row; expected in each: "
             "success, safe\n")
@@ -109,13 +108,13 @@ class FullCampaign(PaperCampaign):
                      if (c.fault, c.obstacles) == (row.fault, row.options.get("obstacles", 0))), {})
 
     def failed(self, runs: Sequence[Run]) -> bool:
-        """Tell whether a row did not end as expected."""
+        """Return whether a row differs from the expectation."""
         return not all(cell.agrees for cell in cells(runs))
 
 
 def _mission(base: Job) -> str:
     if "mission" not in base.options:
-        raise UsageError(f"--system {base.system}: it has no missions as those of the paper")
+        raise UsageError(f"--system {base.system}: expected a system with the paper's missions")
     return str(base.options["mission"])
 
 

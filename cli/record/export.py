@@ -1,7 +1,7 @@
 """A recording as tables for spreadsheets and pandas: one file per topic, one row per message.
 
-The first column is `time_s`, simulated seconds; wall-clock seconds in files of other tools. The
-others are the fields of the message, nested ones with dots: `body.x_m`. A list is one cell: JSON in
+The first column is `time_s`: simulated seconds, or wall-clock seconds in files of other tools. The
+others are the fields of the message, with dots if nested: `body.x_m`. A list is one cell: JSON in
 CSV, a list in Parquet, which needs the extra `export`.
 """
 
@@ -22,7 +22,7 @@ from rampart.actors.recording.bag_writer import BagError, complete
 from rampart.cli.verbs import extra
 
 _BATCH = 20_000
-"""Rows that wait as Python objects before they become a part of a Parquet table."""
+"""Rows that are collected as Python objects before they become part of a table."""
 
 Row = dict[str, Any]
 
@@ -31,13 +31,13 @@ class Export:
     """Writes the tables of one recording. Use: `write`, once.
 
     Args:
-        reader: of the recording.
+        reader: reader of the recording.
         wants: whether a channel is exported; None exports the topics of a recording without its
             views, and all channels of other files.
 
     Attributes:
-        counts: messages by topic.
-        left_out: topic → how often it was left out, and why the first time.
+        counts: number of messages by topic.
+        left_out: topic → number of omitted messages, and the first reason.
     """
 
     def __init__(self, reader: BagReader, wants: Callable[[str], bool] | None = None) -> None:
@@ -47,7 +47,7 @@ class Export:
         self._wants = wants
 
     def write(self, folder: Path, kind: str) -> None:
-        """Write the tables into a new folder; an incomplete one is not left behind.
+        """Write the tables into a new folder, or no folder.
 
         Args:
             folder: must not exist.
@@ -142,7 +142,7 @@ def _flat(name: str, value: Any) -> Row:
 
 
 def _paths(folder: Path, topics: Any, suffix: str) -> dict[str, Path]:
-    """Return the file of each topic, `localization-pose.csv`; no two topics have the same."""
+    """Return a different file for each topic, such as `localization-pose.csv`."""
     paths: dict[str, Path] = {}
     for topic in topics:
         name = stem = re.sub(r"[^A-Za-z0-9_]+", "-", topic).strip("-")[:200] or "topic"

@@ -36,7 +36,7 @@ class Stage:
         run: the recording.
 
     Attributes:
-        robot: as the messages so far have it.
+        robot: state of the robot after the messages so far.
 
     Raises:
         UsageError: the robot has no model, or it cannot be built.
@@ -46,8 +46,8 @@ class Stage:
         summary, known = run.summary, run.known
         path = known.kind.model
         if not path:
-            raise UsageError(f"{summary.reader.path}: the robot has no model for MuJoCo; its "
-                             "application names a class as `model`")
+            raise UsageError(f"{summary.reader.path}: the robot has no model for MuJoCo; expected "
+                             "a class as `model` of its application")
         if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             os.environ.setdefault("MUJOCO_GL", "egl")  # renders without a screen
         try:
@@ -63,7 +63,7 @@ class Stage:
         self._forms = run.forms
 
     def take(self, key: str, payload: bytes) -> None:
-        """Move the robot as a message says."""
+        """Apply a message to the robot."""
         topic = self._forms.of(key).topic
         if topic is not None:
             with contextlib.suppress(*UNREADABLE):
@@ -134,7 +134,7 @@ def _picture(renderer: Any, robot: RobotModel) -> bytes:
 
 
 class Viewer:
-    """MuJoCo's viewer, in a window of its own, beside a replay.
+    """MuJoCo's viewer in a window, beside a replay.
 
     Args:
         stage: of the robot.

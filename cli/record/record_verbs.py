@@ -1,4 +1,4 @@
-"""`rampart record`, `rampart replay` and `rampart bag`: recordings, and how to mend a torn one.
+"""`rampart record`, `rampart replay` and `rampart bag`: recordings.
 
 Inspect recordings: MCAP files of `rampart run --record`, of `rampart record`, or
 of other programs.
@@ -146,7 +146,7 @@ def record(options: argparse.Namespace) -> int:
         raise NoEffectError(str(error)) from None
     say(f"{told(recorder)}; it ends because {why}")
     if recorder.writer is None or not recorder.writer.messages:
-        raise NoEffectError("nothing was sent meanwhile")
+        raise NoEffectError("no message arrived")
     return 0
 
 
@@ -176,9 +176,9 @@ async def replay(options: argparse.Namespace) -> int:
         if options.video:
             return await _film(RecordedRun(path, **chosen), options, stop)
         player = Replay(path, port=options.port, rate=options.rate, hmi_port=options.hmi_port,
-                        said=say, **chosen)
+                        report=say, **chosen)
         if player.summary.reader.damage:
-            say(f"{options.file}: damaged ({player.summary.reader.damage}); playing what is left")
+            say(f"{options.file}: damaged ({player.summary.reader.damage}); playing the rest")
         with contextlib.ExitStack() as stack:
             if options.viewer:
                 viewer = stack.enter_context(contextlib.closing(Viewer(Stage(player))))
@@ -190,7 +190,7 @@ async def replay(options: argparse.Namespace) -> int:
     refused = f", {player.refused} of another version left out" if player.refused else ""
     say(f"played {player.played} messages{refused}")
     if not player.played:
-        raise NoEffectError("nothing was played")
+        raise NoEffectError("no message was played")
     return 0
 
 
@@ -210,17 +210,17 @@ async def _film(run: RecordedRun, options: argparse.Namespace, stop: asyncio.Eve
 
 
 def matcher(globs: list[str], known: Iterable[str]) -> Callable[[str], bool]:
-    """Return whether a full key is wanted, by patterns as users type them; all if there is none.
+    """Return a filter of full keys for the patterns of --topics; without patterns all pass.
 
     Raises:
-        UsageError: a pattern matches nothing that is known.
+        UsageError: a pattern matches no known key.
     """
     keys = [key.removeprefix(f"{ROOT}/") for key in known]
     patterns = [g.removeprefix("/").removeprefix(f"{ROOT}/") for g in globs]
     for pattern in patterns:
         if not any(fnmatch.fnmatchcase(key, pattern) for key in keys):
             families = sorted({key.split("/")[0] for key in keys})
-            raise UsageError(f"--topics {pattern}: matches no topic; there are "
+            raise UsageError(f"--topics {pattern}: matches no topic; known: "
                              f"{', '.join(f'{name}/…' for name in families)} "
                              "(`rampart topic list`, `rampart bag info`)")
     if not patterns:
@@ -230,10 +230,10 @@ def matcher(globs: list[str], known: Iterable[str]) -> Callable[[str], bool]:
 
 
 def _others(run: RunInfo) -> OtherHosts | None:
-    """Return what there is to be heard of other hosts of a run.
+    """Return the other hosts of a run, of which messages arrive here.
 
     Raises:
-        UsageError: the system's specification, or the folder of keys, cannot be used.
+        UsageError: the specification or the folder of keys cannot be used.
     """
     if not run.hosts:
         return None
@@ -245,7 +245,7 @@ def _others(run: RunInfo) -> OtherHosts | None:
 
 
 def _wanted(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
-    """Return whether a key is wanted; all actors are loaded only if the declared ones do not do."""
+    """Return a filter of full keys; actors are loaded only for keys that are not declared."""
     if not globs:
         return matcher(globs, ())
     spec = systems.load(run.system_file)
@@ -256,7 +256,7 @@ def _wanted(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
 
 
 def keys_of(run: RunInfo, known: Iterable[Topic[Any]]) -> list[str]:
-    """Return all full keys that may be used in a run, of the known topics."""
+    """Return all full keys of the known topics in a run."""
     return [key for topic in known
             for key in ([topic.at(n) for n in run.nodes] if topic.is_family else [topic.at()])]
 
@@ -268,7 +268,7 @@ def _check(options: argparse.Namespace) -> None:
     if options.start is not None and not -1e9 < options.start < 1e9:
         raise UsageError(f"--start {options.start:g}: must be a time of the run in seconds")
     if options.video and (options.loop or options.viewer or options.hmi_port):
-        raise UsageError(f"--video {options.video}: plays nothing; expected no --loop, --viewer or "
+        raise UsageError(f"--video {options.video}: plays nothing; not with --loop, --viewer or "
                          "--hmi-port")
     between("--port", options.port, *_PORTS)
     between("--hmi-port", options.hmi_port or _PORTS[0], *_PORTS)
@@ -317,7 +317,7 @@ def _lines(summary: Summary) -> Iterator[tuple[str, str]]:
         duration += f", from {first_s:.1f} s of simulated time"
     else:
         profile = f", profile {reader.profile!r}" if reader.profile else ""
-        yield "run", f"none: not a recording of a run{profile}"
+        yield "run", f"none: not a recording of Rampart{profile}"
     yield "duration", duration
     yield "messages", f"{summary.messages} on {len(reader.channels)} channels"
     losses = _losses(summary)
@@ -329,11 +329,11 @@ def _lines(summary: Summary) -> Iterator[tuple[str, str]]:
         yield "unheard", (", ".join(spans)
                           or f"no host: {' and '.join(summary.unheard)} all the time")
     if not reader.closed:
-        closing = "no: its writer did not come to the end"
+        closing = "no: its writer was interrupted"
     elif reader.damage:
         closing = "yes"
     else:
-        closing = f"properly, because {summary.end.get('ended', 'its writer came to the end')}"
+        closing = f"properly, because {summary.end.get('ended', 'its writer had finished')}"
     yield "closed", closing + (f"; damaged: {reader.damage}" if reader.damage else "")
     for line in left_behind(reader):
         yield "gone", line
@@ -412,10 +412,10 @@ def bag_ros2(options: argparse.Namespace) -> int:
 
 def _copied(options: argparse.Namespace, folder: Path, counts: Counter[str],
             left_out: Mapping[str, tuple[int, str]], reader: BagReader) -> int:
-    """Report what of a recording is in a folder and what is not, and return the exit code.
+    """Report the written and the omitted messages, and return the exit code.
 
     Raises:
-        NoEffectError: nothing is in it.
+        NoEffectError: no message was written.
     """
     if not counts:
         shutil.rmtree(folder)
@@ -435,7 +435,7 @@ def _copied(options: argparse.Namespace, folder: Path, counts: Counter[str],
 
 
 def described(summary: Summary) -> dict[str, Any]:
-    """Return everything as plain data; scripts rely on these names."""
+    """Return the data of `--json`."""
     reader = summary.reader
     return {
         "file": str(reader.path), "size_bytes": reader.size_bytes, "profile": reader.profile,
@@ -447,7 +447,7 @@ def described(summary: Summary) -> dict[str, Any]:
 
 
 def gone(reader: BagReader) -> list[dict[str, Any]]:
-    """Return what could not be read, as plain data; times are simulated seconds, or null."""
+    """Return the unreadable parts as plain data, with times in simulated seconds or null."""
     def seconds(at_ns: int | None) -> float | None:
         return None if at_ns is None else round(at_ns / 1e9 + time_zero_s(reader), 3)
 
@@ -456,10 +456,10 @@ def gone(reader: BagReader) -> list[dict[str, Any]]:
 
 
 def left_behind(reader: BagReader) -> list[str]:
-    """Return the same in words, one for each gap."""
-    return [f"bytes {one['from_byte']} to {one['to_byte']}" + (
-        f", {one['from_s']:.2f} to {one['to_s']:.2f} s" if one["from_s"] is not None else "")
-        + f": {one['what']}" for one in gone(reader)]
+    """Return the unreadable parts in words."""
+    return [f"bytes {gap['from_byte']} to {gap['to_byte']}" + (
+        f", {gap['from_s']:.2f} to {gap['to_s']:.2f} s" if gap["from_s"] is not None else "")
+        + f": {gap['what']}" for gap in gone(reader)]
 
 
 def _losses(summary: Summary) -> dict[str, int] | None:

@@ -1,8 +1,8 @@
-"""Plays a recording back onto a bus of its own, where tools and an operator's page can read it.
+"""Plays a recording onto a separate bus, for tools and an operator's page.
 
-A replay must never reach a robot. It is a router of its own, on a socket in a folder of its own;
-nodes of a run know only the routers in the folder of their run. Tools find it as they find a run,
-and are told that it is none: they give it no orders, and prefer a run to it.
+A replay must never reach a robot. It is a router with a socket in a separate folder; the nodes of a
+run know only the routers in the folder of their run. Tools find a replay as they find a run, and
+its description names the recording: they give it no orders, and prefer a run to it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from rampart.manager.spec.specification import check_document, read_document
 
 DEFAULT_PORT = 7400
 PAGE = "replay_page"
-"""Name of the operator's page of a replay: not that of the page of which there is a recording."""
+"""Name of the operator's page of a replay, different from that of the recorded page."""
 
 GAP_S = 0.1
 """Simulated seconds between two laps."""
@@ -60,7 +60,7 @@ _LINGER_S = 0.3
 
 
 class Due(NamedTuple):
-    """A message to be played: in which lap, at which simulated time, and as it was recorded."""
+    """A message to be played: lap, simulated time, key and recorded payload."""
 
     lap: int
     at_s: float
@@ -69,32 +69,32 @@ class Due(NamedTuple):
 
 
 class ReplayPage(Hmi):
-    """The operator's page on a replay: it shows everything, and nothing can be asked of it."""
+    """The operator's page of a replay: it shows everything, and refuses all orders."""
 
     badge = "replay"
-    refuses = "This is a replay: there is no robot to obey"
+    refuses = "This is a replay: no robot can obey"
 
     def _look(self) -> None:
-        """Measure nothing: the recorded process numbers may be anybody's today."""
+        """Measure nothing: the recorded process numbers may belong to other processes today."""
 
 
 class RecordedRun:
-    """A recording of a run, as far as it is to be played.
+    """The messages of a recording that are to be played.
 
     Args:
-        path: of the recording.
+        path: file of the recording.
         loop: begin again at the end.
         start_s: simulated time at which to begin; None for the beginning.
         wants: whether a full key is played.
 
     Attributes:
-        summary: of the recording.
-        known: its system.
-        refused: messages of another version, which are not played.
+        summary: summary of the recording.
+        known: system of the recording.
+        refused: number of messages of another version, which are not played.
 
     Raises:
         BagError: the file cannot be read.
-        UsageError: it is not a recording of a run, or there is nothing to play.
+        UsageError: it is not a recording of a run, or it has no message to play.
     """
 
     def __init__(self, path: Path, *, loop: bool = False, start_s: float | None = None,
@@ -107,8 +107,8 @@ class RecordedRun:
         self._loop = loop
         self._wants = wants
         if not summary.reader.is_recording:
-            raise UsageError(f"{path}: an MCAP file of {summary.reader.library or 'others'}, not a "
-                             "recording of a run: nothing in it can be played onto the bus")
+            raise UsageError(f"{path}: an MCAP file of {summary.reader.library or 'others'}; "
+                             "expected a recording of a run")
         if not any(wants(key) for key in summary.keys) or summary.first_ns is None:
             raise UsageError(f"{path}: no message to play")
         first_s = summary.first_ns / 1e9 + summary.time_zero_s
@@ -120,9 +120,9 @@ class RecordedRun:
                              f"{last_s:.1f} simulated seconds")
 
     def messages(self) -> Iterator[Due | None]:
-        """Yield what is to be played, lap by lap; None for each message that is not."""
+        """Yield the messages to be played, lap by lap, and None for each other message."""
         zero_s = self.summary.time_zero_s
-        reader = BagReader(self._path)  # the summary's is asked for its channels meanwhile
+        reader = BagReader(self._path)  # the summary uses its own at the same time
         for lap in count() if self._loop else range(1):
             is_empty = True
             for channel, message in reader.messages():
@@ -135,39 +135,39 @@ class RecordedRun:
                         self.refused += 1
                 is_empty &= payload is None
                 yield None if key is None or payload is None else Due(lap, at_s, key, payload)
-            if lap and is_empty:  # in the first lap all may lie before the start
+            if lap and is_empty:  # in the first lap, all may be before the start
                 return
 
 
 class Replay(RecordedRun):
-    """A recorded run that is played back onto a bus. Use: `run`, once.
+    """A recorded run that is played onto a bus. Use: `run`, once.
 
     Args:
-        path: of the recording.
-        port: number under which tools find it.
+        path: file of the recording.
+        port: base port by which tools find it.
         rate: simulated seconds per second.
         hmi_port: port of an operator's page; 0 for none.
-        said: told, in a line, what happens.
-        chosen: as of `RecordedRun`.
+        report: called with each line for the user.
+        chosen: as in `RecordedRun`.
 
     Attributes:
-        viewer: takes key and payload of what is played, and returns whether to go on.
+        viewer: called with key and payload of each message; returns whether to continue.
 
     Raises:
         BagError: as of `RecordedRun`.
-        UsageError: as of `RecordedRun`, or a port is taken.
+        UsageError: as of `RecordedRun`, or a port is in use.
     """
 
     def __init__(self, path: Path, *, port: int = DEFAULT_PORT, rate: float = 1.0,
                  hmi_port: int = 0,
-                 said: Callable[[str], None] = lambda _line: None, **chosen: Any) -> None:
+                 report: Callable[[str], None] = lambda _line: None, **chosen: Any) -> None:
         super().__init__(path, **chosen)
         self.played = 0
         self._port = port
         self._rate = rate
         self._hmi_port = hmi_port
         self.viewer: Callable[[str, bytes], bool] = lambda _key, _payload: True
-        self._said = said
+        self._report = report
         self._sockets = ""
         self._lives: dict[str, int] = {}
         claim_port(port)
@@ -179,17 +179,17 @@ class Replay(RecordedRun):
                                  ) from None
 
     async def run(self, stop: asyncio.Event, delay_s: float = 0.0) -> None:
-        """Play to the end, or until `stop` is set; with a page or in a loop there is no end.
+        """Play to the end, or until `stop` is set; a page or a loop plays until then.
 
         Args:
-            stop: ends it.
-            delay_s: real seconds before the first message, for readers to come.
+            stop: ends the replay.
+            delay_s: real seconds before the first message, in which readers can connect.
 
         Raises:
-            UsageError: the number is taken, or there is no place for a socket.
+            UsageError: the base port is in use, or the folder cannot be created.
         """
         async with contextlib.aclosing(self._until_stopped(stop)) as messages:
-            due = await anext(messages, None)  # may lie deep in the file: no clock runs yet
+            due = await anext(messages, None)  # before the clock starts: it may take long
             clock = Clock(time.monotonic() + delay_s - self._start_s / self._rate, self._rate)
             async with self._on_the_bus(clock) as (bus, page):
                 while due and await _until(clock.source_time(due.at_s), stop):
@@ -198,21 +198,21 @@ class Replay(RecordedRun):
                         stop.set()
                     due = await anext(messages, None)
                 if page and not page.done() and not stop.is_set():
-                    self._said("the recording is over; the page stays, ctrl-C ends it")
+                    self._report("the recording is over; the page stays until Ctrl-C")
                     stopped = asyncio.create_task(stop.wait())
                     await asyncio.wait((page, stopped), return_when=asyncio.FIRST_COMPLETED)
                     stopped.cancel()
-                await asyncio.sleep(_LINGER_S)  # what was sent last is still under way
+                await asyncio.sleep(_LINGER_S)  # the last messages are still on their way
 
     @contextlib.asynccontextmanager
     async def _on_the_bus(self, clock: Clock
                           ) -> AsyncIterator[tuple[ZenohBus, asyncio.Task[None] | None]]:
-        """Have a bus that tools find, and the page's task if there is a page."""
+        """Open a bus that tools find; yield it, and the page's task if there is a page."""
         with contextlib.ExitStack() as stack:
             try:
                 self._sockets = run_folder.make(self._port, os.getpid())
             except OSError as error:
-                raise UsageError(f"no folder for a socket: {error}") from None
+                raise UsageError(f"cannot create the folder of a socket: {error}") from None
             stack.callback(run_folder.remove, self._sockets)
             folder = Path(stack.enter_context(
                 tempfile.TemporaryDirectory(prefix="rampart-replay-")))
@@ -236,7 +236,7 @@ class Replay(RecordedRun):
     # -- playing --------------------------------------------------------------------------------
 
     async def _until_stopped(self, stop: asyncio.Event) -> AsyncGenerator[Due, None]:
-        """Yield what is to be played, until `stop`; other tasks get their turn meanwhile."""
+        """Yield the messages to be played, until `stop`, and let other tasks run."""
         for number, due in enumerate(self.messages()):
             if number % _YIELD_EVERY == 0:
                 await asyncio.sleep(0)
@@ -246,7 +246,7 @@ class Replay(RecordedRun):
                 yield due
 
     def _send(self, bus: ZenohBus, due: Due) -> None:
-        """Send a message; in later laps as of later incarnations, or readers drop it as a copy."""
+        """Send a message; in later laps with later incarnations, or readers drop it as a copy."""
         payload = due.payload
         header = header_of(payload) if self._loop else None
         if header is not None and due.lap == 0:
@@ -261,13 +261,13 @@ class Replay(RecordedRun):
     def _page_ended(self, page: asyncio.Task[None]) -> None:
         if not page.cancelled() and (error := page.exception()) is not None:
             words = " ".join(str(error).split())
-            self._said(f"the page has ended: {type(error).__name__}: {words}")
+            self._report(f"the page has ended: {type(error).__name__}: {words}")
 
-    # -- being found ----------------------------------------------------------------------------
+    # -- discovery ------------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def _answering(self, clock: Clock, folder: Path) -> Iterator[None]:
-        """Tell tools of this replay, as a launcher tells them of its run."""
+        """Answer tools that look for a run, as a launcher does."""
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         loop = asyncio.get_running_loop()
         try:
@@ -293,13 +293,13 @@ class Replay(RecordedRun):
         if self.document:
             system.write_text(tomli_w.dumps(self.document), encoding="utf-8")
         page = f"http://127.0.0.1:{self._hmi_port}/" if self._hmi_port else ""
-        told = {name: value for name, value in run.items() if name not in NOT_CHOSEN}
+        plan = {name: value for name, value in run.items() if name not in NOT_CHOSEN}
         return run_info.RunInfo(
             os.getpid(), self._port, self._rate, clock.source_time(0.0),
             str(system) if system.exists() else "", self._sockets, tuple(nodes or ["replay"]),
             run.get("run_id", ""), self._hmi_port,
             f"replay of {self._path.name}: {run.get('title', '')}", page,
-            {**told, "system_file": str(system)}, str(self._path))
+            {**plan, "system_file": str(system)}, str(self._path))
 
     def _page(self, bus: ZenohBus, clock: Clock, folder: Path) -> Hmi | None:
         if not self._hmi_port:
@@ -321,7 +321,7 @@ class Replay(RecordedRun):
 
 
 def recorded_system(summary: Summary) -> tuple[dict[str, Any], Known]:
-    """Return the system of a recording, as TOML and read; what cannot be read is left out."""
+    """Return the specification of a recording and its system, as far as they can be read."""
     document: dict[str, Any] = {}
     found = NO_SYSTEM
     with contextlib.suppress(StopIteration, ValueError):
@@ -344,20 +344,20 @@ def page_of(known: Known) -> type[Hmi]:
 
 
 def claim_port(port: int) -> None:
-    """Make sure that a replay is not taken for a run that lives.
+    """Refuse the base port of a run to a replay.
 
     Raises:
-        UsageError: a run has that number.
+        UsageError: a run has this base port.
     """
-    living = {process.port for process in find_processes()} | {  # either may be dead just now
+    living = {process.port for process in find_processes()} | {  # one of both may be restarting
         run.base_port for run in run_info.find_runs() if not run.replay_of}
     if port in living:
-        raise UsageError(f"--port {port}: belongs to a run; a replay must never be taken for a "
-                         "living robot, choose another --port")
+        raise UsageError(f"--port {port}: belongs to a run; choose another --port, so that no tool "
+                         "takes the replay for a robot")
 
 
 async def _until(due: float, stop: asyncio.Event) -> bool:
-    """Wait until a reading of the monotonic clock; False if it is to stop."""
+    """Wait until a time of the monotonic clock; return False if `stop` comes first."""
     left_s = due - time.monotonic()
     if left_s > 0.001:
         await pause(stop, left_s)

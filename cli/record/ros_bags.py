@@ -1,4 +1,4 @@
-"""Which types and topics a recording has as a bag of ROS 2. Needs the extra `ros2`."""
+"""A recording as a bag of ROS 2. Needs the extra `ros2`."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
     """Write a recording as a bag of ROS 2.
 
     Args:
-        file: the recording.
-        folder: of the bag; must not exist.
-        system: whose actors and definitions count; None for what the recording has.
-        distribution: of ROS 2; None for that of the system's gateway.
+        file: file of the recording.
+        folder: folder of the bag; must not exist.
+        system: system with actors and definitions; None for that of the recording.
+        distribution: distribution of ROS 2; None for that of the system's gateway.
 
     Returns:
-        What was written and what was not, and the reader of the recording.
+        The bag, with counts, and the reader of the recording.
 
     Raises:
-        UsageError: a file cannot be read or written, or a word is wrong.
+        UsageError: a file cannot be read or written, or an option is wrong.
     """
     with refusing(BagError, ValueError):
         reader = BagReader(file)
         summary = Summary(reader)
         if not reader.is_recording:
-            raise UsageError(f"{file}: an MCAP file of {reader.library or 'others'}, not a "
+            raise UsageError(f"{file}: an MCAP file of {reader.library or 'others'}; expected a "
                              "recording of a run")
         if system is None:
             _, known = recorded_system(summary)
@@ -52,13 +52,13 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
 
 
 def _types(spec: SystemSpec, distribution: str | None) -> Types:
-    """Return the types that the gateway of a system has, without what is not there any more."""
-    said = Gateway.Parameters()
+    """Return the types of a system's gateway, without those of folders that do not exist here."""
+    gateway = Gateway.Parameters()
     for node in spec.nodes:
         if node.actor == GATEWAY:
-            said = msgspec.convert(node.parameters, Gateway.Parameters, strict=False)
-    folders = [path for path in map(Path, said.interfaces) if path.is_dir()]
+            gateway = msgspec.convert(node.parameters, Gateway.Parameters, strict=False)
+    folders = [path for path in map(Path, gateway.interfaces) if path.is_dir()]
     try:
-        return Types(distribution or said.distribution, folders)
+        return Types(distribution or gateway.distribution, folders)
     except ValueError as error:
         raise UsageError(f"--{error}" if distribution else str(error)) from None

@@ -42,7 +42,7 @@ def test_the_environment_names_the_run(capsys, monkeypatch):
     assert refused(capsys, "status", "--port", "31998").startswith("rampart: --port 31998: ")
     monkeypatch.setenv("RAMPART_PORT", "74x0")
     assert refused(capsys, "status") == (
-        "rampart: RAMPART_PORT=74x0: a whole number is right, the base port of a run\n")
+        "rampart: RAMPART_PORT=74x0: expected a whole number, the base port of a run\n")
 
 
 def test_a_name_among_many_is_answered_by_the_nearest_three(capsys):
@@ -50,7 +50,7 @@ def test_a_name_among_many_is_answered_by_the_nearest_three(capsys):
     assert told.startswith("rampart: unknown topic 'control/comand'; the nearest of ")
     assert told.endswith(": control/command, control/standby_command, control/status\n")
     assert str(output.unknown("topic", "?", map(str, range(20)))) == (
-        "unknown topic '?'; none of 20 is like it")
+        "unknown topic '?'; none of 20 is similar")
     assert str(output.unknown("order", "x", ["a", "b"])) == "unknown order 'x'; known: a, b"
 
 

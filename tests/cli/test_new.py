@@ -38,7 +38,7 @@ def made(folder: Path, monkeypatch, name: str = "courier") -> Path:
 @pytest.mark.slow
 def test_what_it_makes_is_tested_typed_and_clean(tmp_path, monkeypatch, capsys):
     robot = made(tmp_path, monkeypatch)
-    assert capsys.readouterr().out.startswith("courier/ is a robot that runs: cd courier, then ")
+    assert capsys.readouterr().out.startswith("courier/ contains a robot that runs: cd courier")
     assert {Path(name).name for name in contents(robot)} == {
         "courier.toml", "topics.py", "nodes.py", "world.py", "judge.py", "__init__.py",
         "test_courier.py", "Makefile", "README.md", "pyproject.toml", ".gitignore"}
@@ -79,8 +79,8 @@ def test_a_name_that_no_package_can_have_is_refused_in_one_line(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     assert main(["new", name]) == 2
     assert capsys.readouterr().err == (
-        f"rampart: NAME {name!r}: must be small letters, digits and _, a letter first, at most 31 "
-        "of them, and no word of Python's: it is the name of a package\n")
+        f"rampart: NAME {name!r}: expected at most 31 small letters, digits and _, a letter first, "
+        "not a keyword of Python: it becomes the name of a package\n")
     assert contents(tmp_path) == {}
 
 
@@ -108,7 +108,7 @@ def test_what_is_there_is_never_overwritten(tmp_path, monkeypatch, capsys, there
     monkeypatch.chdir(tmp_path)
     assert main(["new", "courier"]) == 2
     assert capsys.readouterr().err == (
-        "rampart: courier: is there already; nothing was changed\n")
+        "rampart: courier: exists already; nothing was changed\n")
     assert contents(tmp_path) == before
     assert not (tmp_path / "gone").exists()
 

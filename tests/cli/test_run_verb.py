@@ -69,7 +69,7 @@ def test_launch_py_writes_its_report_into_its_checkout(tmp_path):
     assert not (tmp_path / "reports").exists()
 
 
-NO_OPTION = "no option of the launcher or of tank; --system tank.toml --help shows those there are"
+NO_OPTION = "not an option of the launcher or of tank; --system tank.toml --help lists the options"
 OF_TANK, TWO = ["--system", "tank.toml"], ["--system", "two.toml"]
 GROUND = [*TWO, "--host", "ground"]
 REFUSED = [
@@ -88,12 +88,12 @@ REFUSED = [
     (["--port", "80"], "--port 80"),
     (["--patience", "nan"], "nan"),
     (["--duration", "5"], "--duration 5: a mission ends by itself"),
-    (["--report", "/proc/x"], "--report /proc/x: no directory that can be written"),
-    (["--report", __file__], f"--report {__file__}: no directory that can be written"),
+    (["--report", "/proc/x"], "--report /proc/x: expected a directory that can be written"),
+    (["--report", __file__], f"--report {__file__}: expected a directory that can be written"),
     (["--fault", "gps-bias@goal99"], "--fault gps-bias@goal99: mission AB has 5 goals"),
     (["--host", "ground"], "--host ground: osmosis has no [[host]]; it runs on one machine"),
     (["--no-keys"], "--no-keys: osmosis runs on one machine"),
-    ([*OF_TANK, "--virtual"], "--virtual: in virtual time a run has to end: give --duration S"),
+    ([*OF_TANK, "--virtual"], "--virtual: expected --duration S"),
     ([*OF_TANK, "--fault", "kill:nobody"], "no node 'nobody'; there are: supervisor, pump_contr"),
     ([*OF_TANK, "--patience", "7"], "--patience 7: tank has no mission"),
     ([*OF_TANK, "--obstacles", "1"], f"--obstacles: {NO_OPTION}"),
@@ -101,12 +101,12 @@ REFUSED = [
     *(([*OF_TANK, *page], "no node of tank serves an operator's page")
       for page in (["--wait"], ["--hmi-port", "9000"], ["--hmi-host", "0.0.0.0"])),
     ([*TWO, "--host", "moon", "--no-keys"], "--host moon: unknown; known: robot, ground"),
-    (GROUND, "osmosis runs on 2 hosts: say --keys DIR"),
-    (TWO, "osmosis runs on 2 hosts: say --keys DIR"),
-    ([*TWO, "--no-keys", "--keys", "keys"], "--no-keys: either that or --keys"),
-    ([*GROUND, "--virtual"], "--host ground: virtual time is on one machine"),
-    *(([*GROUND, "--no-keys", option, value], f"{option} {value}: on host ground the first host's "
-       "command line decides that")
+    (GROUND, "osmosis runs on 2 hosts: expected --keys DIR"),
+    (TWO, "osmosis runs on 2 hosts: expected --keys DIR"),
+    ([*TWO, "--no-keys", "--keys", "keys"], "--no-keys: contradicts --keys"),
+    ([*GROUND, "--virtual"], "--host ground: not with --virtual"),
+    *(([*GROUND, "--no-keys", option, value], f"{option} {value}: on host ground, the "
+       "command line of the first host decides this")
       for option, value in (("--seed", "7"), ("--mission", "A"), ("--record", "x.mcap"))),
     ([*TWO, "--no-keys", "--hmi-port", "9000"],
      "--hmi-port 9000: no node of osmosis on host the first serves an operator's page"),

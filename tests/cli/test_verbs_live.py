@@ -232,7 +232,7 @@ async def test_echo_shows_garbage_as_such_with_the_reason(run, capsys, garbage):
 async def test_a_silent_topic_is_said_to_be_silent(run, capsys):
     code, out, err = await run.call(capsys, "topic", "echo", "plan/route", "--duration", "0.2")
     assert (code, out) == (1, "")
-    assert err == "rampart: nothing came on plan/route within 0.2 s\n"
+    assert err == "rampart: no message on plan/route within 0.2 s\n"
     code, _, _ = await run.call(capsys, "topic", "hz", "plan/route", "--duration", "0.2", "--json")
     assert code == 1
 
@@ -306,7 +306,7 @@ async def test_a_run_whose_actors_are_not_here_is_shown_all_the_same(
     assert picture.rates()[topics.POSE.key] > 0
     err = capsys.readouterr().err
     assert "elsewhere.porter" in err
-    assert err.endswith("; topics of its own are not counted\n")
+    assert err.endswith("; only topics of the engine are counted\n")
     assert len(err.splitlines()) == 1
 
 

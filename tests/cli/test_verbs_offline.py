@@ -93,7 +93,7 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["table", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
     (["table", "--differing"], ["--differing", "--strategy"]),
     (["table", "--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
-    (["verify", "no.toml"], ["rampart: no.toml: No such file", "name of a shipped one: os"]),
+    (["verify", "no.toml"], ["rampart: no.toml: No such file", "name of a shipped system: os"]),
     (["inject", "gremlins"], ["'gremlins'", "`rampart inject --list`"]),
     (["inject", "laser-drift"], ["'laser-drift'", "quartz"]),
     (["inject", "drop:no/such"], ["no run found"]),
@@ -308,7 +308,7 @@ def test_a_file_comes_before_a_system_that_ships_for_all_who_look_for_one(tmp_pa
     asked = ("paper", "osmosis", "nowhere", "x" * 300)
     assert [shipped.find(name) for name in asked] == [
         shipped.SHIPPED / "paper.toml", Path("osmosis"), Path("nowhere"), Path("x" * 300)]
-    with pytest.raises(UsageError, match="name too long; a spec is right"):
+    with pytest.raises(UsageError, match="name too long; expected a system file"):
         systems.load("x" * 300)
     assert systems.load("paper").name == "paper"
     (tmp_path / "paper").rmdir()

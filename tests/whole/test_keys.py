@@ -139,4 +139,4 @@ def test_a_run_is_not_started_with_keys_that_are_no_good(keys, capsys, spoil, wo
 
 def test_there_are_no_links_in_virtual_time(keys, capsys):
     assert main(["run", "--virtual", "--keys", str(keys)]) == 2
-    assert "in virtual time there are no links" in capsys.readouterr().err
+    assert "not with --virtual, which has no links" in capsys.readouterr().err

@@ -135,7 +135,7 @@ def test_actors_beside_the_caller_are_found_in_virtual_time_and_tell_where_they_
     done = launched(tmp_path, "--system", "own.toml", "--virtual", "--patience", "2", "--report",
                     str(report))
     assert done.returncode == 4, done.stderr
-    assert f"launch.py: tracebacks of what failed: {report / 'errors.log'}" in done.stderr
+    assert f"launch.py: tracebacks of failed processes: {report / 'errors.log'}" in done.stderr
     assert "own failed: KeyError: 'speed_mps'" in done.stderr
     assert f'File "{tmp_path}/own.py", line 8, in fail' in (report / "errors.log").read_text()
 
@@ -159,5 +159,5 @@ def test_a_run_without_a_mission_tells_where_its_tracebacks_are(tmp_path):
     report = tmp_path / "report"
     done = launched(tmp_path, "--system", "own.toml", "--duration", "1", "--port",
                     str(free_base_port()), "--report", str(report))
-    assert f"launch.py: tracebacks of what failed: {report / 'errors.log'}" in done.stderr
+    assert f"launch.py: tracebacks of failed processes: {report / 'errors.log'}" in done.stderr
     assert f'File "{tmp_path}/own.py", line 8, in fail' in (report / "errors.log").read_text()

@@ -184,7 +184,7 @@ def test_tracebacks_that_cannot_be_kept_cost_no_verdict(tmp_path, monkeypatch, c
     assert launch.main(unsafe(tmp_path)[2:]) == UNSAFE
     told = capsys.readouterr()
     assert result_of(told.out)["safety"] == "unsafe"
-    assert "errors.log: tracebacks are lost: Not a directory" in told.err
+    assert "errors.log: cannot write tracebacks: Not a directory" in told.err
 
 
 # -- recordings ----------------------------------------------------------------------------------

@@ -213,7 +213,7 @@ async def test_a_page_that_fails_is_said_to_have_ended(tmp_path, port, monkeypat
     monkeypatch.setattr(OsmosisState, "pose", fail)
     said = []
     player = Replay(tmp_path / "run.mcap", port=port, hmi_port=port + 30, rate=4.0,
-                    said=said.append)
+                    report=said.append)
     async with asyncio.timeout(60):
         await player.run(asyncio.Event(), 0.5)
     assert said[-1] == "the page has ended: RuntimeError: it is broken"
@@ -306,7 +306,7 @@ async def test_a_second_replay_on_the_same_port_is_refused(tmp_path, port):
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["--topics", "nothing"], "--topics nothing: matches no topic; there are detection/…"),
+    (["--topics", "nothing"], "--topics nothing: matches no topic; known: detection/…"),
     (["--rate", "0"], "--rate 0: must be between"), (["--rate", "nan"], "--rate nan"),
     (["--start", "1000"], "--start 1000: the recording goes from 0.0 to 0.9"),
     (["--delay", "-1"], "--delay -1: must not be negative"),
@@ -420,6 +420,6 @@ async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
                     told = text
                 else:
                     seen += text if isinstance(text, str) else text.decode()
-        assert "there is no robot to obey" in told
+        assert "no robot can obey" in told
         assert airport
         assert heard == []

@@ -80,7 +80,7 @@ def test_a_token_on_the_command_line_is_refused_and_not_repeated(tmp_path, argum
     done = launched(*arguments, "--hmi-host", "0.0.0.0", cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
-    assert done.stderr.startswith("launch.py: --hmi-token: a command line is read by every user")
+    assert done.stderr.startswith("launch.py: --hmi-token: every user of this machine can read")
     assert "--hmi-token-file FILE" in done.stderr
     assert "RAMPART_HMI_TOKEN" in done.stderr
     assert TOKEN not in done.stdout + done.stderr

@@ -127,7 +127,7 @@ def test_the_verbs_issue_show_and_revoke(tmp_path, capsys):
     assert main(["tokens", "show", "--file", str(file)]) == 0
     assert capsys.readouterr().out.split() == ["name", "role", "anna", "drive"]
     assert main(["tokens", "revoke", "anna", "--file", str(file)]) == 0
-    assert capsys.readouterr().out == "anna has no token any more\n"
+    assert capsys.readouterr().out == "revoked the token of anna\n"
     assert read_visitors(file) == {}
 
 

@@ -135,7 +135,7 @@ def test_topics_are_listed_shown_and_measured(capsys):
         measured, = json.loads(capsys.readouterr().out)
         assert 5 < measured["rate_hz"] < 25
         assert main(["topic", "echo", "/imu", "--ros", robot.where, "-n", "1"]) == 1
-        assert "nobody publishes /imu; topics: /cmd_vel, /odom" in capsys.readouterr().err
+        assert "no node publishes /imu; topics: /cmd_vel, /odom" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("name", "value", "why"), [

@@ -321,7 +321,7 @@ def large(count: int):
 
 def test_nonsense_is_refused_in_one_line(capsys, monkeypatch):
     for arguments, words in ((("--strategy", "bold"), "unknown strategy 'bold'; known: guarded-re"),
-                             (("--together", "0"), "--together 0: a number from 1 up is right"),
+                             (("--together", "0"), "--together 0: must be above 0"),
                              ((), "at most 16 mechanisms can be verified")):
         if not arguments:
             monkeypatch.setattr("rampart.cli.systems.load", lambda name: large(17))
