@@ -9,18 +9,11 @@ import argparse
 import contextlib
 from typing import Any
 
-import argcomplete
-
 from rampart.actors.bus.run_info import find_runs
 from rampart.actors.system.layout import published_keys
 from rampart.cli import systems
 from rampart.cli.output import UsageError
 from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
-
-
-def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer the shell and end, if the shell has started this program for completion."""
-    argcomplete.autocomplete(parser)
 
 
 def nodes(**_: Any) -> list[str]:

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from importlib.metadata import entry_points, version
 from typing import Any
 
-from rampart.cli import completion, new
+import argcomplete
+
+from rampart.cli import new
 from rampart.cli.analyse import (
     check_verbs,
     cut_set_verbs,
@@ -152,7 +154,7 @@ def _run(arguments: Sequence[str]) -> int:
             options = campaign_verb.parse(arguments[1:])
         else:
             parser = build_parser()
-            completion.complete(parser)
+            argcomplete.autocomplete(parser)
             if not arguments:
                 say_text(parser.format_help())
                 return 0

@@ -7,6 +7,7 @@ strangers, is refused in one line.
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import secrets
 import socket
@@ -169,17 +170,15 @@ def _shown(host: str, certificate: Certificate | None) -> str:
 def _check_address(host: str, port: int) -> None:
     """Refuse an address of another machine, and a port that is in use."""
     try:
-        family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        family, kind, number, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, number) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
     except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or str(error)
+        if getattr(error, "errno", None) in {errno.EADDRINUSE, errno.EACCES}:
+            raise UsageError(f"--hmi-port {port}: {why}; choose another --hmi-port, or "
+                             "--no-hmi") from None
         raise UsageError(f"--hmi-host {host}: expected an address of this machine, or 0.0.0.0 for "
                          f"all ({why})") from None
-    with socket.socket(family, kind, number) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((address[0], port, *address[2:]))
-        except OSError as error:
-            raise UsageError(f"--hmi-port {port}: {error.strerror}; choose another --hmi-port, or "
-                             "--no-hmi") from None

@@ -210,7 +210,7 @@ class Run:
             raise TypeError("expected a console")
         console.banner(self._trial.about, self._plan, self._trial.run.system, virtual=True)
         try:
-            with _interruptible(run, *_ends()):
+            with _interruptible(run):
                 result = run.run()
         finally:
             console.close()
@@ -314,14 +314,8 @@ def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
         recorder.end()
 
 
-def _ends() -> list[signal.Signals]:
-    """Return the signals that end a run: under nohup, not SIGHUP."""
-    ends = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-    return [number for number in ends if signal.getsignal(number) is not signal.SIG_IGN]
-
-
 @contextlib.contextmanager
-def _interruptible(run: VirtualRun, *ends: signal.Signals) -> Iterator[None]:
+def _interruptible(run: VirtualRun) -> Iterator[None]:
     """End a run on signals, the second time at once; ignored signals stay ignored."""
 
     def interrupt(number: int, _frame: object) -> None:
@@ -329,8 +323,9 @@ def _interruptible(run: VirtualRun, *ends: signal.Signals) -> Iterator[None]:
             raise KeyboardInterrupt
         run.interrupted = f"interrupted by {signal.Signals(number).name}"
 
-    before = {number: signal.signal(number, interrupt) for number in ends
-              if signal.getsignal(number) is not signal.SIG_IGN}
+    before = {number: signal.signal(number, interrupt)
+              for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+              if signal.getsignal(number) is not signal.SIG_IGN}  # as SIGHUP is under nohup
     try:
         yield
     finally:

@@ -26,7 +26,7 @@ from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
 from rampart.actors.ros2.wire import ADMIN, Attachment, Endpoint, EndpointKind, Qos, ros_name
 from rampart.actors.system.members import load_member
 from rampart.cli import systems
-from rampart.cli.look.topic_lines import in_line, print_rate, rate_of
+from rampart.cli.look.topic_verbs import in_line, print_rate, rate_of
 from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say, warn
 from rampart.manager.spec.schema import SystemSpec
 
@@ -216,7 +216,7 @@ async def check(options: argparse.Namespace) -> int:
     """Check a system's gateways against the graph; return 1 if one does not fit."""
     spec = systems.load(options.system or str(systems.DEFAULT))
     if not spec.ros2:
-        raise UsageError(f"{spec.name}: expected [[ros2]], which a gateway passes on")
+        raise UsageError(f"{spec.name} has no [[ros2]]: a gateway has nothing to pass on")
     found: list[Finding] = []
     for node in spec.nodes:
         if node.actor == GATEWAY:

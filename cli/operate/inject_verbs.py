@@ -33,7 +33,7 @@ _DEFAULT_DURATION_S = 5.0
 TRIGGER = "trigger:"
 _SECONDS = "must be seconds above 0"
 _DETAILS = {"delay": "delay", "stamp": "restamp", "set": "corrupt", "add": "corrupt",
-            "ramp": "corrupt", "noise": "corrupt", "keep_ends": "corrupt"}
+            "ramp": "corrupt", "noise": "corrupt"}
 """Option → the mode that it details."""
 
 
@@ -68,14 +68,12 @@ def add(verbs: Any) -> None:
               several("--ramp", "FIELD=RATE", "corrupt: add RATE per simulated second"),
               several("--noise", "FIELD=SIGMA",
                       "corrupt: add Gaussian noise of this standard deviation"),
-              several("--keep-ends", "FIELD",
-                      "corrupt: keep only the first and last element of a list"),
               option("--topic", help=argparse.SUPPRESS),  # old: --mode MODE --topic TOPIC
               option("--mode", help=argparse.SUPPRESS)))
 
 
 def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
-    r"""List the catalogue, or inject a fault.
+    """List the catalogue, or inject a fault.
 
     Inject a fault by name, or disturb any topic, for some time. The node that
     publishes the topic carries the fault out; the world carries out faults of the
@@ -87,17 +85,12 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
       rampart inject --list                           # the faults of the system
       rampart inject FAULT --duration 3
       rampart inject stuck:TOPIC --duration inf       # until the node's process ends
-      rampart inject drop:TOPIC --on 1 --off 4 --duration 30
-                                                      # 1 s without messages, 4 s with
-      rampart inject corrupt:TOPIC --seed 7           # odd seed: one number; even: all
       rampart inject drop:TOPIC --share 0.3           # lose three messages in ten
-      rampart inject kill:NODE                        # end a process
+      rampart inject corrupt:TOPIC --seed 7           # odd seed: one number; even: all
+      rampart inject corrupt:TOPIC --set pose.x_m=2.5
+      rampart inject restamp:TOPIC --stamp=-0.2       # stamps 0.2 s too early
       rampart inject stop:NODE --duration 2           # freeze a process for 2 s
       rampart inject trigger:MODULE                   # a stand-in detection module detects
-      rampart inject delay:TOPIC --delay 0.8
-      rampart inject restamp:TOPIC --stamp=-0.2       # stamps 0.2 s too early
-      rampart inject corrupt:TOPIC --set pose.x_m=2.5
-      rampart inject corrupt:TOPIC --add ranges_f32=0.4 --noise ranges_f32=0.2
 
     `rampart topic info TOPIC` lists the fields.
 
@@ -162,8 +155,8 @@ def choose(options: argparse.Namespace) -> Fault:
     detailed = [name for name in _DETAILS if getattr(options, name) not in (None, [])]
     for name in detailed:
         if not colon or mode != _DETAILS[name]:
-            raise UsageError(f"--{name.replace('_', '-')}: only with {_DETAILS[name]}:TOPIC, not "
-                             f"with {options.fault}")
+            raise UsageError(f"--{name}: only with {_DETAILS[name]}:TOPIC, not with "
+                             f"{options.fault}")
     known = topics_for(key, options.port) if colon else ()
     if detailed:
         fault = _detailed(mode, key, known, options)
@@ -184,7 +177,7 @@ def _detailed(mode: str, name: str, known: Sequence[Topic[Any]], options: argpar
         add_fields=dict(_amount("--add", text, topic) for text in options.add),
         ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
         noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
-        keep_ends=tuple(options.keep_ends), seed=options.seed or 0, stamp_s=options.stamp or 0.0)
+        seed=options.seed or 0, stamp_s=options.stamp or 0.0)
     if reason := flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type):
         raise UsageError(f"{options.fault}: {reason}")
     return Fault(f"{mode}:{disturbance.topic}", "", (disturbance,), (), _DEFAULT_DURATION_S)

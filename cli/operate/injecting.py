@@ -25,8 +25,7 @@ STOPPED_S = 5.0
 _TAKE_HOLD_S = 1.5
 """Real seconds within which a publisher answers, also during its restart."""
 
-_OF_TOPICS = ("share", "on", "off", "seed", "delay", "stamp", "set", "add", "ramp", "noise",
-              "keep_ends")
+_OF_TOPICS = ("share", "on", "off", "seed", "delay", "stamp", "set", "add", "ramp", "noise")
 """Options of a fault of a topic."""
 
 
@@ -34,8 +33,7 @@ def refuse_details(options: argparse.Namespace) -> None:
     """Refuse the options of a fault of a topic with any other fault."""
     for name in _OF_TOPICS:
         if getattr(options, name) not in (None, []):
-            raise UsageError(f"--{name.replace('_', '-')}: only with a fault of a topic, not with "
-                             f"{options.fault}")
+            raise UsageError(f"--{name}: only with a fault of a topic, not with {options.fault}")
 
 
 def _refused(watch: FaultWatch) -> str:

@@ -14,6 +14,8 @@ import sys
 import uuid
 from typing import Any, NamedTuple
 
+import argcomplete
+
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.run_info import RunInfo, find_runs
 from rampart.actors.ftm import messages as fm
@@ -89,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
     streams.secure()
     parser = build_parser()
-    completion.complete(parser)
+    argcomplete.autocomplete(parser)
     options = parser.parse_args(arguments)
     act = _list_nodes if options.list else _signal_node
     try:

@@ -317,7 +317,7 @@ def _lines(summary: Summary) -> Iterator[tuple[str, str]]:
         duration += f", from {first_s:.1f} s of simulated time"
     else:
         profile = f", profile {reader.profile!r}" if reader.profile else ""
-        yield "run", f"none: not a recording of Rampart{profile}"
+        yield "run", f"none: not a recording of a run{profile}"
     yield "duration", duration
     yield "messages", f"{summary.messages} on {len(reader.channels)} channels"
     losses = _losses(summary)

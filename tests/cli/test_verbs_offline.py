@@ -123,7 +123,6 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["inject", "corrupt:plan/route", "--ramp", "step=1"], ["float"]),
     (["inject", "corrupt:localization/pose", "--noise", "x_m=-1"],
      ["'x_m' = -1", "0 or more"]),
-    (["inject", "corrupt:plan/route", "--keep-ends", "step"], ["list"]),
     (["topic", "info", "plan/rout"], ["'plan/rout'", "the nearest of", "plan/route"]),
     (["topic", "echo", "localization/pose/x"], ["no run found"]),
     (["topic", "echo", "localization/pose", "--duration", "0"], ["--duration 0"]),
@@ -173,9 +172,7 @@ NOISE = SENSOR_FAULTS["gps-noise"].disturbances[0]
           "set_fields": {"range_max_m": 9.0}, "add_fields": {"ranges_f32": 0.4},
           "noise_fields": {"ranges_f32": 0.2}}),
     (["corrupt:rampart/plan/route", "--set", "reason=why not", "--set",
-      "step=3", "--keep-ends", "waypoints"], {
-          "topic": "plan/route", "set_fields": {"reason": "why not", "step": 3},
-          "keep_ends": ("waypoints",)}),
+      "step=3"], {"topic": "plan/route", "set_fields": {"reason": "why not", "step": 3}}),
     (["corrupt:summit_xl/odom", "--ramp", "pose.x_m=0.5"], {
         "ramp_fields": {"pose.x_m": 0.5}}),
 ])

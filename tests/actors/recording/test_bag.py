@@ -383,7 +383,7 @@ def test_mcap_files_of_others_can_be_looked_at_and_not_replayed(tmp_path, capsys
     assert main(["bag", "info", str(path)]) == 0
     assert "not a recording of a run, profile 'ros2'" in capsys.readouterr().out
     assert main(["replay", str(path)]) == 2
-    assert "not a recording of a run" in capsys.readouterr().err
+    assert "expected a recording of a run" in capsys.readouterr().err
 
 
 def test_a_file_compressed_in_a_way_that_nobody_here_knows_is_refused(tmp_path, capsys):

@@ -139,8 +139,8 @@ def test_topics_are_listed_shown_and_measured(capsys):
 
 
 @pytest.mark.parametrize(("name", "value", "why"), [
-    ("ROS_DOMAIN_ID", "x", "ROS_DOMAIN_ID=x: a number"),
-    ("ROS_DISTRO", "melodic", "ROS_DISTRO=melodic: known: humble")])
+    ("ROS_DOMAIN_ID", "x", "ROS_DOMAIN_ID=x: expected a number"),
+    ("ROS_DISTRO", "melodic", "ROS_DISTRO=melodic: unknown; known: humble")])
 def test_an_environment_that_makes_no_sense_is_refused(capsys, monkeypatch, name, value, why):
     monkeypatch.setenv(name, value)
     assert main(["topic", "echo", "/odom", "--ros", "tcp/127.0.0.1:1"]) == 2
