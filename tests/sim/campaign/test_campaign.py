@@ -452,7 +452,7 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
     (("--runs", "3", "--strategy", "hope"), "unknown strategy 'hope'"),
     (("--runs", "3", "--network", "wet"), "unknown network 'wet'"),
     (("--runs", "3", "--patience", "0"), "--patience 0"),
-    (("--replay", "ab"), "--out DIR is missing"),
+    (("--replay", "ab"), "expected --out DIR"),
     (("--replay", "ab", "--out", "/nowhere"), "no such directory"),
     (("--system", str(CELL), "--paper"), "--system .*cell.toml: expected a system with"),
 ])
