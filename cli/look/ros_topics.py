@@ -26,7 +26,7 @@ from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
 from rampart.actors.ros2.wire import ADMIN, Attachment, Endpoint, EndpointKind, Qos, ros_name
 from rampart.actors.system.members import load_member
 from rampart.cli import systems
-from rampart.cli.look.topic_verbs import in_line, print_rate, rate_of
+from rampart.cli.look.topic_lines import in_line, print_rate, rate_of
 from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say, warn
 from rampart.manager.spec.schema import SystemSpec
 

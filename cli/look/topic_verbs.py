@@ -14,14 +14,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import itertools
 import math
-import statistics
 from collections import deque
 from collections.abc import AsyncIterator, Coroutine
 from typing import Any
-
-import msgspec
 
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
@@ -39,6 +35,7 @@ from rampart.cli.look.topic_catalogue import (
     resolve,
     topics_for,
 )
+from rampart.cli.look.topic_lines import in_line, print_rate, rate_of
 from rampart.cli.output import NoEffectError, positive, print_json, print_table, say, say_text, warn
 from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
@@ -255,44 +252,3 @@ def _describe(use: catalogue.TopicUse) -> dict[str, Any]:
     return {"key": topic.key, "message": topic.type.__name__, "qos": topic.qos.value,
             "rate_hz": topic.rate_hz, "frame": topic.frame, "mailbox": catalogue.MAILBOX[topic.qos],
             "publishers": use.publishers, "readers": use.readers, "doc": topic.doc}
-
-
-# -- messages and rates as text -----------------------------------------------------------------
-
-
-def rate_of(times_s: list[float]) -> dict[str, Any]:
-    """Return rate and spread of arrival times, as `ros2 topic hz` does."""
-    gaps = [b - a for a, b in itertools.pairwise(times_s)]
-    if not gaps:
-        return {"rate_hz": None, "min_s": None, "max_s": None, "std_dev_s": None,
-                "window": len(times_s)}
-    mean = statistics.fmean(gaps)
-    return {
-        "rate_hz": 1 / mean if mean > 0 else None, "min_s": min(gaps), "max_s": max(gaps),
-        "std_dev_s": statistics.pstdev(gaps), "window": len(times_s),
-    }
-
-
-def in_line(body: Any) -> str:
-    """Return a message as one line of JSON, with the length of bytes instead of the bytes."""
-    plain = msgspec.to_builtins(body, builtin_types=(bytes,))
-
-    def shorten(value: Any) -> Any:
-        if isinstance(value, bytes):
-            return f"<{len(value)} bytes>"
-        if isinstance(value, dict):
-            return {k: shorten(v) for k, v in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [shorten(v) for v in value]
-        return value
-
-    return msgspec.json.encode(shorten(plain)).decode()
-
-
-def print_rate(key: str, rate: dict[str, Any]) -> None:
-    """Print a result of `rate_of`."""
-    if rate["rate_hz"] is None:
-        say(f"{key}: one message so far")
-        return
-    say(f"{key}: average rate: {rate['rate_hz']:.3f} min: {rate['min_s']:.3f}s "
-        f"max: {rate['max_s']:.3f}s std dev: {rate['std_dev_s']:.5f}s window: {rate['window']}")
