@@ -1,1 +1,1 @@
-"""Recording: everything that was sent in a run, in one MCAP file, and the way back."""
+"""Recordings of everything that is sent in a run, as MCAP files: writing, reading, repair."""

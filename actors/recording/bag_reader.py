@@ -1,10 +1,10 @@
 """Reads and repairs recordings, and the MCAP and rosbag2 files of other tools.
 
-The records, the index and the chunks are parsed by the `mcap` library. Its own readers stop at the
-first damaged byte; this one goes on. A closed file has an index, under its own checksum, with the
-place and the times of every chunk: damage in one chunk costs that chunk alone. A file without an
-end, as a killed recorder leaves it, is read from its beginning, record by record. A chunk counts
-only if its checksum holds, so damage never makes a message.
+The `mcap` library parses records, index and chunks. Its readers stop at the first damaged byte;
+this one goes on. A closed file has an index with its own checksum, and with the place and times of
+every chunk. So damage in a chunk costs that chunk only. A file without an end, as a killed recorder
+leaves it, is read record by record from its beginning. A chunk with a wrong checksum is dropped, so
+damage never creates a message.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from rampart.actors.recording.bag_writer import (
     KEY,
     PROFILE,
     RUN,
-    UNHEARD,
+    SILENT,
     BagError,
     complete,
     open_target,
@@ -46,7 +46,7 @@ from rampart.actors.recording.run_documents import MAX_FILE_BYTES
 from rampart.files.plain_text import shown
 
 MAX_RECORD_BYTES = (64 << 20) + (64 << 10)
-"""Largest record: an attached file of 64 MB, its name and its times."""
+"""Largest record: an attached file of 64 MB with its name and times."""
 
 MAX_CHUNK_BYTES = 64 << 20
 """Largest chunk, uncompressed. Writers close a chunk at 1 MB or 4 MB."""
@@ -54,7 +54,7 @@ MAX_CHUNK_BYTES = 64 << 20
 _MAGIC, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"SQLite f", b"\x28\xb5\x2f\xfd"
 _HEAD = struct.Struct("<BQ")
 _PRIVATE = 0x80
-"""First opcode that the standard leaves to applications."""
+"""First opcode for applications."""
 
 _COMPRESSIONS = ("", "lz4", "zstd")
 _RECORDS: dict[int, Any] = {
@@ -63,14 +63,14 @@ _RECORDS: dict[int, Any] = {
     Opcode.METADATA: rec.Metadata}
 _TORN = (McapError, struct.error, EOFError, RuntimeError, MemoryError, OverflowError, ValueError,
          zstandard.ZstdError)
-"""What parsing a damaged record raises; lz4 raises RuntimeError."""
+"""Raised for damaged records; lz4 raises RuntimeError."""
 
 
 class Gap(msgspec.Struct, frozen=True):
     """Bytes of a file whose content is lost.
 
     Attributes:
-        what: the kind of the record, and why it cannot be read.
+        what: kind of the record, and the reason.
         from_byte: first byte.
         to_byte: first byte after it.
         from_ns: `log_time` of the first lost message; None if unknown.
@@ -85,25 +85,23 @@ class Gap(msgspec.Struct, frozen=True):
 
 
 class BagReader:
-    """One file. Use: iterate over `records`, as often as needed.
-
-    The attributes describe the latest iteration.
+    """One file. Iterate over `records` as often as needed; the attributes are of the latest time.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Attributes:
-        profile: kind of the file, as its writer specifies it.
-        library: its writer.
+        profile: kind of the file, as its writer names it.
+        library: name of its writer.
         closed: whether the writer finished the file.
-        gaps: what could not be read.
-        faults: damage without a loss.
+        gaps: parts that could not be read.
+        faults: damage without loss.
         schemas: by number.
         channels: by number.
         metadata: by name.
 
     Raises:
-        BagError: there is no such file, or its format is not known.
+        BagError: the file does not exist, or its format is not known.
     """
 
     def __init__(self, path: Path) -> None:
@@ -119,7 +117,7 @@ class BagReader:
         except OSError as error:
             raise BagError(f"{path}: cannot be read: {error.strerror}") from None
         if not start:
-            raise BagError(f"{path}: is empty: no recording")
+            raise BagError(f"{path}: is empty; expected a recording")
         if start.startswith(_ZSTD):
             raise BagError(f"{path}: compressed as a whole; decompress it first (zstd -d)")
         if start not in {_MAGIC, _SQLITE}:
@@ -137,11 +135,10 @@ class BagReader:
         self.metadata: dict[str, dict[str, str]] = {}
 
     def records(self) -> Iterator[rec.McapRecord]:
-        """Return metadata, attachments and messages in the order of the file.
+        """Yield metadata, attachments and messages in the order of the file.
 
         Raises:
-            BagError: its compression is not known, a chunk is too large, or the file cannot be read
-                any more.
+            BagError: the compression is not known, a chunk is too large, or reading fails.
         """
         self._reset()
         try:
@@ -157,24 +154,24 @@ class BagReader:
             raise BagError(f"{self.path}: cannot be read: {error.strerror}") from None
 
     def messages(self) -> Iterator[tuple[rec.Channel, rec.Message]]:
-        """Return the messages with their channels, in the order of the file."""
+        """Yield the messages with their channels in the order of the file."""
         for record in self.records():
             if isinstance(record, rec.Message):
                 yield self.channels[record.channel_id], record
 
     @property
     def is_recording(self) -> bool:
-        """Whether it was written by this program, as far as was read."""
+        """Whether this program wrote the file; known once its beginning was read."""
         return RUN in self.metadata
 
     @property
     def damage(self) -> str:
-        """The damage in words; empty if there is none."""
+        """Description of the damage; empty if there is none."""
         return ", ".join([*self.faults, *(f"{gap.what} (bytes {gap.from_byte} to {gap.to_byte})"
                                           for gap in self.gaps)])
 
     def _walk(self, file: BinaryIO) -> Iterator[rec.McapRecord]:
-        """Return what can be read; after damage go on at the next record of the index."""
+        """Yield the readable records; after damage go on at the next record of the index."""
         index = self._index(file)
         places, stop = index or ({}, self.size_bytes)
         starts = [*sorted(places), stop]
@@ -198,10 +195,10 @@ class BagReader:
     def _index(self, file: BinaryIO) -> tuple[dict[int, _Place], int] | None:
         """Return the records in the index by their first byte, and the first byte of the summary.
 
-        None if the file has no undamaged end. Schemas and channels of the summary are kept.
+        None if the end of the file is damaged or missing. Schemas and channels are kept.
 
         Raises:
-            BagError: a chunk cannot be read even if it is undamaged.
+            BagError: a chunk has an unsupported compression or size.
         """
         places: dict[int, _Place] = {}
         footer_at = max(len(_MAGIC), self.size_bytes - FOOTER_SIZE - len(_MAGIC))
@@ -233,20 +230,19 @@ class BagReader:
         return places, start
 
     def _read(self, file: BinaryIO, at: int, place: _Place) -> Iterator[rec.McapRecord]:
-        """Return the content of one record."""
         if place.kind not in _RECORDS:
             return
         name = _RECORDS[place.kind].__name__.lower()
         orphans = 0
         try:
             if place.end - at > MAX_RECORD_BYTES:
-                raise ValueError(f"a record of {place.end - at} bytes, at most {MAX_RECORD_BYTES} "
+                raise ValueError(f"a record of {place.end - at} bytes; at most {MAX_RECORD_BYTES} "
                                  "are read")
             file.seek(at + _HEAD.size)
             content = _parsed(place.kind, file.read(place.end - at - _HEAD.size))
             if place.kind in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE} and (
                     self.profile == PROFILE):
-                raise ValueError("outside a chunk, where a recording has none")
+                raise ValueError("outside a chunk; recordings have none there")
         except _TORN as error:
             why = " ".join(str(error).split()) or type(error).__name__
             self._lose(f"{name} ({why})", at, place.end, *place.times)
@@ -266,7 +262,7 @@ class BagReader:
             self._lose(f"{orphans} messages of a lost channel", at, place.end, *place.times)
 
     def _rows(self) -> Iterator[rec.McapRecord]:
-        """Return the messages of a bag of rosbag2 in SQLite."""
+        """Yield the messages of a rosbag2 file in SQLite."""
         self.profile, self.library, self.closed = "ros2", "rosbag2 (SQLite)", True
         try:
             with contextlib.closing(sqlite3.connect(
@@ -287,7 +283,7 @@ class BagReader:
 
 
 class _Place(NamedTuple):
-    """Where a record ends, where the next one begins, and the times of its messages, ns."""
+    """End of a record, beginning of the next one, and the times of its messages, ns."""
 
     kind: int
     end: int
@@ -296,7 +292,7 @@ class _Place(NamedTuple):
 
 
 def _place_at(file: BinaryIO, at: int) -> _Place | None:
-    """Return the record that begins at a byte, by its own length; None if none does."""
+    """Return the place of the record that begins at a byte, None if none does."""
     file.seek(at)
     head = file.read(_HEAD.size)
     kind, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
@@ -307,7 +303,7 @@ def _place_at(file: BinaryIO, at: int) -> _Place | None:
 
 def _indexed(record: rec.ChunkIndex | rec.AttachmentIndex | rec.MetadataIndex
              ) -> tuple[int, _Place]:
-    """Return the first byte of a record in the index, and the rest of its place."""
+    """Return the first byte of a record in the index, and its place."""
     if isinstance(record, rec.ChunkIndex):
         end = record.chunk_start_offset + record.chunk_length
         has_messages = record.message_end_time or record.message_index_length
@@ -320,21 +316,17 @@ def _indexed(record: rec.ChunkIndex | rec.AttachmentIndex | rec.MetadataIndex
 
 
 def _unsupported(chunk: rec.Chunk | rec.ChunkIndex) -> str:
-    """Return why no chunk like this one is read; empty if it is."""
+    """Return why a chunk cannot be read; empty if it can."""
     if chunk.compression not in _COMPRESSIONS:
-        return f"compressed by {shown(chunk.compression)}; known are lz4, zstd and none"
+        return f"compressed by {shown(chunk.compression)}; expected lz4, zstd or none"
     if chunk.uncompressed_size > MAX_CHUNK_BYTES:
-        return (f"a chunk of {chunk.uncompressed_size} bytes, unpacked; at most "
+        return (f"a chunk of {chunk.uncompressed_size} bytes uncompressed; at most "
                 f"{MAX_CHUNK_BYTES} are read")
     return ""
 
 
 def _parsed(kind: int, data: bytes) -> list[rec.McapRecord]:
-    """Return a record, or those in a chunk.
-
-    Raises:
-        ValueError: it is damaged; like the other errors of `_TORN`.
-    """
+    """Return a record, or those of a chunk; raises one of `_TORN` if it is damaged."""
     stream = ReadDataStream(BytesIO(data))
     if kind == Opcode.MESSAGE:
         return [rec.Message.read(stream, len(data))]
@@ -352,12 +344,12 @@ def _parsed(kind: int, data: bytes) -> list[rec.McapRecord]:
 
 
 def key_of(channel: rec.Channel) -> str | None:
-    """Return the full key of a channel of the bus; None for views and channels of others."""
+    """Return the full key of a channel of the bus; None for views and files of other tools."""
     return channel.metadata.get(KEY)
 
 
 def time_zero_s(reader: BagReader) -> float:
-    """Return the simulated time at `log_time` 0 of a file that was read; 0 in files of others."""
+    """Return the simulated time at `log_time` 0 of a file that was read; 0 if it has none."""
     try:
         zero_s = float(reader.metadata.get(RUN, {}).get("time_zero_s", "0"))
     except ValueError:
@@ -366,14 +358,14 @@ def time_zero_s(reader: BagReader) -> float:
 
 
 class Summary:
-    """The content of a file: counts, times, and its metadata.
+    """Content of a file: counts, times and metadata.
 
     Args:
         reader: of the file, which is read once.
 
     Attributes:
-        files: names, media types and content of the attachments; without the content of those
-            beyond the size that a recording attaches.
+        files: names, media types and content of the attachments; content beyond the size that a
+            recording attaches is empty.
     """
 
     def __init__(self, reader: BagReader) -> None:
@@ -398,12 +390,12 @@ class Summary:
 
     @property
     def messages(self) -> int:
-        """How many, of all channels."""
+        """Number of messages of all channels."""
         return self.counts.total()
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last."""
+        """Seconds from the first message to the last."""
         return (self.last_ns - (self.first_ns or 0)) / 1e9
 
     @property
@@ -413,14 +405,14 @@ class Summary:
         Malformed spans are left out.
         """
         found = {}
-        for host, text in self.reader.metadata.get(UNHEARD, {}).items():
+        for host, text in self.reader.metadata.get(SILENT, {}).items():
             with contextlib.suppress(ValueError, RecursionError):
                 found[host] = msgspec.json.decode(text, type=list[tuple[float, float | None]])
         return found
 
     @property
     def keys(self) -> dict[str, int]:
-        """Full key → messages, of the channels of the bus."""
+        """Full key → number of messages, of the channels of the bus."""
         return {key: self.counts[number] for number, channel in self.reader.channels.items()
                 if (key := key_of(channel)) is not None}
 
@@ -438,14 +430,14 @@ class Summary:
 def repair(reader: BagReader, target: Path, *, overwrite: bool = False) -> int:
     """Copy everything that can be read, and return the number of messages.
 
-    An incomplete copy is not left behind.
+    An incomplete copy is deleted.
 
     Raises:
-        BagError: the target exists, is the source, or cannot be written; or the source cannot be
+        BagError: the target exists, is the source, or cannot be written, or the source cannot be
             read.
     """
     if target.exists() and target.samefile(reader.path):
-        raise BagError(f"{target}: is the file to be repaired; give another name")
+        raise BagError(f"{target}: is the file to repair; choose another name")
     records = reader.records()
     first = next(records, None)  # the header is read by now
     copied = 0

@@ -1,12 +1,11 @@
-"""Writes a recording: MCAP, one channel per key, and one per view (see `views`).
+"""Writes a recording: MCAP with one channel per key and one per view (see `views`).
 
-`log_time` is the simulated time of sending, in nanoseconds from `time_zero_s`, which is in the
+`log_time` is the simulated time of sending, in nanoseconds from `time_zero_s`. That is in the
 metadata: 0 or, if the recording began before simulated time 0, a whole negative number of seconds.
-`publish_time` is the message's stamp on the same scale, or `log_time` if the stamp is none.
+`publish_time` is the message's stamp on the same scale, or `log_time` if the stamp is not finite.
 
-What was written before the last `flush` survives this process's SIGKILL: chunks are closed and
-handed to the kernel. A file without its end is still a recording, for `bag_reader` and for other
-readers of MCAP alike.
+`flush` closes the chunk and hands it to the kernel, where it survives a SIGKILL of this process.
+`bag_reader` and other readers of MCAP can read a file without its end.
 """
 
 from __future__ import annotations
@@ -37,23 +36,23 @@ from rampart.actors.system.topics import find_topic
 PROFILE = "rampart"
 RUN = "rampart.run"
 END = "rampart.end"
-"""Names of the metadata records: what was run, and what came of the recording."""
+"""Names of the metadata records about the run, and about the end of the recording."""
 
-UNHEARD = "rampart.unheard"
-"""Name of the metadata record that tells, host by host, from when to when it was not heard: a JSON
-list of pairs of simulated seconds, the last open (null) if it is not heard now. It is written anew
-with each change; the last one counts. Of a run on one machine there is none."""
+SILENT = "rampart.unheard"
+"""Name of the metadata record with the silences of each other host: a JSON list of pairs of
+simulated seconds; the last pair ends with null if the host is silent now. It is written at each
+change, and the last one counts. A recording of one host has none."""
 
 KEY = "key"
-"""Channel metadata that only channels of the bus have: the full key."""
+"""Channel metadata with the full key; only channels of the bus have it."""
 
 _MAX_NS = (1 << 64) - 1
 
 RESERVE_BYTES = 256 << 20
-"""Of a disk, left free for checkpoints and reports: a twentieth of it, at most so much."""
+"""Space of a disk that is left for checkpoints and reports: at most so much, or a twentieth."""
 
 _LATE = 1024
-"""So many missing messages may still come."""
+"""Most missing messages that are expected to come late."""
 
 
 class BagError(Exception):
@@ -61,19 +60,19 @@ class BagError(Exception):
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
-    """Make sure, before anything is started, that a recording can be made at a path.
+    """Check before a run that a recording can be written at a path.
 
     Raises:
-        BagError: it exists, or there is no place for it.
+        BagError: the file exists, or cannot be written.
     """
     open_target(path, overwrite=overwrite, probe=True).close()
 
 
 def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO:
-    """Open the file of a new recording; one that is only probed for is not left behind.
+    """Open the file of a new recording; `probe` leaves no file behind.
 
     Raises:
-        BagError: it exists, or cannot be made.
+        BagError: the file exists, or cannot be written.
     """
     existed = path.exists()
     if existed and not overwrite:
@@ -83,7 +82,7 @@ def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO
         if probe and not existed:
             path.unlink()
     except FileNotFoundError:
-        raise BagError(f"{path}: cannot be written: there is no such directory") from None
+        raise BagError(f"{path}: cannot be written: no such directory") from None
     except OSError as error:
         raise BagError(f"{path}: cannot be written: {error.strerror or error}") from None
     return file
@@ -91,7 +90,7 @@ def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO
 
 @contextlib.contextmanager
 def complete(path: Path) -> Iterator[None]:
-    """Have a new file or folder written; an incomplete one is not left behind.
+    """Delete a new file or folder if writing it fails.
 
     Raises:
         BagError: it cannot be written.
@@ -109,11 +108,11 @@ def complete(path: Path) -> Iterator[None]:
 
 
 class SequenceGaps:
-    """What a recording has missed: each node numbers what it sends, without gaps. Pure.
+    """Counts lost messages by their sequence numbers, which have no gaps. Pure.
 
     Args:
-        from_start: whether every node is heard from its first message on; else only incarnations
-            that begin later are.
+        from_start: whether the recording has the first message of every node; otherwise only
+            incarnations that begin later start with their first one.
     """
 
     def __init__(self, *, from_start: bool = False) -> None:
@@ -123,13 +122,13 @@ class SequenceGaps:
         self._lost = Counter[str]()
         self._missing: Remembered[tuple[str, int, int], None] = Remembered(_LATE)
 
-    def hear(self, header: Header) -> None:
-        """Note one message; copies have the same number.
+    def add(self, header: Header) -> None:
+        """Count one message; copies have the same number.
 
-        What comes from another host may be overtaken by what is more urgent: that is not lost.
+        A more urgent message can overtake one from another host, which is late and not lost.
         """
-        one = (header.source, header.incarnation)
-        last = self._last.get(one)
+        process = (header.source, header.incarnation)
+        last = self._last.get(process)
         if last is None:
             first = self._first.setdefault(header.source, header.incarnation)
             new = self._from_start or header.incarnation > first
@@ -137,14 +136,14 @@ class SequenceGaps:
         if header.sequence > last + 1:
             self._lost[header.source] += header.sequence - last - 1
             for number in range(max(last + 1, header.sequence - _LATE), header.sequence):
-                self._missing[*one, number] = None
-        elif (late := (*one, header.sequence)) in self._missing:
+                self._missing[*process, number] = None
+        elif (late := (*process, header.sequence)) in self._missing:
             del self._missing[late]
             self._lost[header.source] -= 1
-        self._last[one] = max(last, header.sequence)
+        self._last[process] = max(last, header.sequence)
 
     def lost(self) -> dict[str, int]:
-        """Return source → messages that were sent and not recorded."""
+        """Return source → number of messages that are not in the recording."""
         return {source: count for source, count in self._lost.items() if count}
 
 
@@ -152,14 +151,13 @@ class BagWriter:
     """One recording, from the first message to the last.
 
     Args:
-        file: where it goes; closed at the end.
-        documents: what was run.
+        file: open file, closed at the end.
+        documents: description of the run.
         time_zero_s: simulated time at `log_time` 0.
         begin_s: simulated time at which the recording begins; that of `time_zero_s` if None.
         views: translation for viewers; None writes none.
-        wants: says of a full key whether it is recorded.
-        from_start: whether it begins with the first message of every node, so that a missing one
-            can be told.
+        wants: returns whether a full key is recorded.
+        from_start: whether it begins with the first message of every node.
     """
 
     def __init__(self, file: BinaryIO, documents: Documents, *, time_zero_s: float = 0.0,
@@ -169,7 +167,7 @@ class BagWriter:
         self.messages = 0
         self.garbage = 0
         self.untranslated = 0
-        self.unheard: dict[str, str] = {}
+        self.silences: dict[str, str] = {}
         self.gaps = SequenceGaps(from_start=from_start)
         self._file = file
         self._zero_s = time_zero_s
@@ -196,15 +194,15 @@ class BagWriter:
         Args:
             at_s: simulated time of sending.
             key: full key.
-            payload: as it was sent.
+            payload: bytes that were sent.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         form = self._forms.of(key)
         text, header, body = form.recorded(payload)
         if header is not None:
-            self.gaps.hear(header)
+            self.gaps.add(header)
         if key not in self._channels:
             self._channels[key] = self._channel(key, form.topic) if self._wants(key) else None
         number = self._channels[key]
@@ -225,21 +223,21 @@ class BagWriter:
         except (ValueError, TypeError, OverflowError):  # the message itself is recorded
             self.untranslated += 1
 
-    def tell_unheard(self, record: dict[str, str]) -> None:
-        """Have the file tell of hosts that were not heard, if that is news; see `UNHEARD`.
+    def write_silences(self, record: dict[str, str]) -> None:
+        """Write the silences of other hosts if they have changed; see `SILENT`.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
-        if record != self.unheard:
-            self.unheard = record
-            self._writer.add_metadata(UNHEARD, record)
+        if record != self.silences:
+            self.silences = record
+            self._writer.add_metadata(SILENT, record)
 
     def flush(self) -> None:
         """Close the chunk and hand everything to the kernel, which keeps it if this process dies.
 
         Raises:
-            OSError: it cannot be written, or the disk has no more room than others need.
+            OSError: the file cannot be written, or only `RESERVE_BYTES` of the disk are free.
         """
         self._writer.flush()
         disk = os.fstatvfs(self._file.fileno())
@@ -249,14 +247,14 @@ class BagWriter:
 
     @property
     def written_bytes(self) -> int:
-        """How large the file is by now."""
+        """Size of the file."""
         return self._file.tell()
 
     def close(self, end: Mapping[str, str] | None = None) -> None:
-        """Write the end, with what came of the recording, and close the file.
+        """Write counts and `end` as metadata, and close the file.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         self._writer.add_metadata(END, {
             "messages": str(self.messages), "garbage": str(self.garbage),

@@ -1,8 +1,8 @@
-"""Messages in the schemas that Foxglove-compatible viewers know by name, as they stand in JSON.
+"""Messages in the JSON schemas of Foxglove-compatible viewers.
 
 Field names, enumerations and frames follow the published lists
-(https://docs.foxglove.dev/docs/sdk/schemas); only primitives that are drawn here are listed, the
-others may be left out of a scene entity. The schema of a type named `Log` is `foxglove.Log`.
+(https://docs.foxglove.dev/docs/sdk/schemas). Primitives that nothing draws here are left out, which
+the schema of a scene entity permits. The schema of the type `Log` is named `foxglove.Log`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ PREFIX = "foxglove."
 
 
 class Record(msgspec.Struct, frozen=True, gc=False):
-    """Base of all of them."""
+    """Base class of all messages."""
 
 
 class Time(Record, frozen=True):
@@ -27,7 +27,7 @@ class Time(Record, frozen=True):
 
 
 class Vector3(Record, frozen=True):
-    """A vector, or a point (the public lists have both, with the same fields), m."""
+    """A vector or point, m; the published lists have both, with the same fields."""
 
     x: float
     y: float
@@ -60,7 +60,7 @@ class Color(Record, frozen=True):
 
 
 class Stamped(Record, frozen=True):
-    """Base of what is true at a time, in some frame."""
+    """Base class of messages with a time and a frame."""
 
     timestamp: Time
     frame_id: str
@@ -73,7 +73,7 @@ class PoseInFrame(Stamped, frozen=True):
 
 
 class FrameTransform(Record, frozen=True):
-    """Where a child frame is in its parent."""
+    """Pose of a child frame in its parent."""
 
     timestamp: Time
     parent_frame_id: str
@@ -89,7 +89,7 @@ class FrameTransforms(Record, frozen=True):
 
 
 class LaserScan(Stamped, frozen=True):
-    """A sweep of a planar laser, m and rad; null is no range."""
+    """A sweep of a planar laser, m and rad; null is a lost echo."""
 
     pose: Pose
     start_angle: float
@@ -99,7 +99,7 @@ class LaserScan(Stamped, frozen=True):
 
 
 class LogLevel(IntEnum):
-    """How bad it is."""
+    """Severity of a line."""
 
     UNKNOWN = 0
     DEBUG = 1
@@ -110,7 +110,7 @@ class LogLevel(IntEnum):
 
 
 class Log(Record, frozen=True):
-    """A line of a log; `file` and `line` are not used here."""
+    """A line of a log; `file` and `line` stay empty here."""
 
     timestamp: Time
     level: LogLevel
@@ -129,7 +129,7 @@ class LineType(IntEnum):
 
 
 class LinePrimitive(Record, frozen=True):
-    """Points joined by lines; the thickness is in pixels if `scale_invariant`, else in metres."""
+    """Points joined by lines; the thickness is in pixels if `scale_invariant`, otherwise in m."""
 
     type: LineType
     pose: Pose
@@ -192,7 +192,7 @@ class TextPrimitive(Record, frozen=True):
 
 
 class SceneEntity(Stamped, frozen=True):
-    """A thing in the scene, which replaces the one with the same id on the same channel."""
+    """An object of the scene; it replaces the one with the same id on the same channel."""
 
     id: str
     lifetime: Time
@@ -206,14 +206,14 @@ class SceneEntity(Stamped, frozen=True):
 
 
 class DeletionType(IntEnum):
-    """Which entities go."""
+    """Entities to delete."""
 
     MATCHING_ID = 0
     ALL = 1
 
 
 class SceneEntityDeletion(Record, frozen=True):
-    """Takes entities away."""
+    """Deletes entities."""
 
     timestamp: Time
     type: DeletionType
@@ -228,7 +228,7 @@ class SceneUpdate(Record, frozen=True):
 
 
 def schema_name(kind: type[Record]) -> str:
-    """Return the name by which viewers know a type."""
+    """Return the name of a type's schema."""
     return PREFIX + kind.__name__
 
 
@@ -238,11 +238,11 @@ def time_of(nanoseconds: int) -> Time:
 
 
 def pose_at(x_m: float, y_m: float, z_m: float = 0.0, yaw_rad: float = 0.0) -> Pose:
-    """Return a pose that is turned about the z axis."""
+    """Return a pose that is rotated about the z axis."""
     return Pose(Vector3(x_m, y_m, z_m), turned(yaw_rad))
 
 
 def turned(yaw_rad: float) -> Quaternion:
-    """Return a rotation about the z axis; counter-clockwise."""
+    """Return a counter-clockwise rotation about the z axis."""
     half = yaw_rad / 2 if math.isfinite(yaw_rad) else 0.0
     return Quaternion(0.0, 0.0, math.sin(half), math.cos(half))

@@ -1,8 +1,8 @@
-"""JSON schemas as viewers take them: one object, without references and without unions.
+"""JSON schemas for viewers: one object without references and unions.
 
-Viewers read a schema to find out what can be plotted, and many support only the plain parts of the
+Viewers read a schema to find out what can be plotted. Many support only the basic parts of the
 standard: `type`, `properties`, `items`, `enum`. A number whose field name ends in a unit (`x_m`,
-`yaw_rad`) has it as `unit`.
+`yaw_rad`) gets it as `unit`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ UNITS = {"m": "m", "mm": "mm", "s": "s", "ms": "ms", "us": "µs", "hz": "Hz", "k
          "nm": "N m", "pa": "Pa", "j": "J", "w": "W", "v": "V", "a": "A", "lux": "lx",
          "mps": "m/s", "mps2": "m/s²", "deg": "°", "rad": "rad", "radps": "rad/s",
          "radps2": "rad/s²", "bytes": "B", "mb": "MB", "celsius": "°C", "percent": "%"}
-"""Last word of a field name, and the unit that it stands for."""
+"""Last word of a field name → unit."""
 
 _KEPT = ("title", "description", "enum", "contentEncoding", "required", "default")
 

@@ -1,8 +1,8 @@
-"""A message as a recording holds it: JSON for people and viewers, and the payload back, exactly.
+"""The form of a message in a recording: JSON that people read and that gives the payload back.
 
-JSON has no NaN and no infinity, and garbage that was injected is no message at all. So whatever
-does not come back from its JSON byte for byte has its payload beside it, in base64. Whether it does
-is not guessed: it is tried, unless the message is of a kind that cannot go wrong.
+JSON has no NaN and no infinity, and injected garbage is not a message. So a message whose JSON does
+not give its payload byte for byte also has the payload, in base64. That is tried with each message,
+except for types where it cannot fail.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ class Recorded(msgspec.Struct, Generic[B], frozen=True, omit_defaults=True):
 
     Attributes:
         source: node that sent it; empty for garbage.
-        incarnation: of the node, counted from 1; 0 for garbage.
-        sequence: how many-th message of that incarnation, over all keys; 0 for garbage.
-        stamp: simulated seconds at which the content was true; null if that is no finite number.
-        body: the message; numbers that are not finite are null here. None for garbage.
-        raw: the payload as it was sent, if it cannot be made anew from the rest.
-        error: why it is no message, of garbage.
+        incarnation: incarnation of the node, from 1; 0 for garbage.
+        sequence: number of the message in that incarnation, over all keys; 0 for garbage.
+        stamp: simulated seconds at which the content was true; null if it is not finite.
+        body: the message, with null for numbers that are not finite; absent for garbage.
+        raw: payload that was sent, if the other fields do not give it.
+        error: why garbage is not a message.
     """
 
     source: str
@@ -50,9 +50,9 @@ class MessageForm:
     """The form of one topic's messages.
 
     Args:
-        topic: the contract of the key; None for a key without one: there each payload that has a
-            header is a message.
-        foreign: whether it is a key of nodes of ROS 2, whose messages have no header.
+        topic: topic of the key; None for a key without one, where each payload with a header is a
+            message.
+        foreign: whether it is a key of ROS 2, whose messages have no header.
     """
 
     def __init__(self, topic: Topic[Any] | None, *, foreign: bool = False) -> None:
@@ -63,7 +63,7 @@ class MessageForm:
         self._is_plain = topic is not None and _is_plain(topic.type)
 
     def recorded(self, payload: bytes) -> tuple[bytes, Header | None, Any]:
-        """Return JSON, header and body of a payload; for garbage the latter are None."""
+        """Return JSON, header and body of a payload; header and body of garbage are None."""
         if self.is_foreign:
             return _encode(Recorded("", 0, 0, None, raw=payload)), None, None
         header: Header
@@ -84,14 +84,14 @@ class MessageForm:
                 return text, header, body
             return _encode(Recorded(*parts, body, payload)), header, body
         except (TypeError, ValueError, RecursionError, OverflowError):
-            # What msgpack can say and JSON cannot, in a field that takes anything.
+            # A field of any type has a value that MessagePack can hold and JSON cannot.
             return _encode(Recorded(*parts, raw=payload)), header, body
 
     def payload(self, text: bytes) -> bytes:
         """Return the payload that was sent.
 
         Raises:
-            ValueError: it is no message of a recording, or of another version of this topic.
+            ValueError: it is not a message of a recording, or of another version of this topic.
         """
         if b'"raw":' in text:
             with_raw = _raw_only.decode(text)
@@ -107,8 +107,8 @@ class MessageForm:
 
     def _is_exact(self, text: bytes, parts: tuple[str, int, int, float], body: Any,
                   payload: bytes) -> bool:
-        """Whether the JSON gives the payload again."""
-        if self._is_plain:  # nothing but null for a number that is not finite can go wrong in JSON
+        """Return whether the JSON gives the payload."""
+        if self._is_plain:  # fails only with null for a number that is not finite
             return b"null" not in text and pack((*parts, body)) == payload
         try:
             return self.payload(text) == payload
@@ -117,18 +117,18 @@ class MessageForm:
 
 
 def renumbered(payload: bytes, restarts: int, later_s: float) -> bytes:
-    """Return a payload as of a later incarnation, stamped later; garbage stays as it is.
+    """Return a payload with a later incarnation and stamp; garbage stays as it is.
 
     Args:
-        payload: as it was sent.
-        restarts: how many incarnations later.
-        later_s: simulated seconds later.
+        payload: bytes that were sent.
+        restarts: added to the incarnation.
+        later_s: added to the stamp, simulated seconds.
     """
     try:
         message = _any_message.decode(payload)
         return _encode_msgpack((message.source, message.incarnation + restarts, message.sequence,
                                 message.stamp + later_s, message.body))
-    except (*UNREADABLE, OverflowError):  # no incarnation comes after the last number there is
+    except (*UNREADABLE, OverflowError):  # the incarnation is the largest number already
         return payload
 
 
@@ -153,7 +153,7 @@ class Forms:
     """The forms of the messages of a system.
 
     Args:
-        topics: that are known.
+        topics: known topics.
     """
 
     def __init__(self, topics: Sequence[Topic[Any]]) -> None:
@@ -169,7 +169,7 @@ class Forms:
 
 
 def _is_plain(kind: Any) -> bool:
-    """Whether a type leaves no choice of what may stand in a field."""
+    """Return whether no field of a type, nested ones included, takes values of any type."""
     if kind is Any:
         return False
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):

@@ -1,4 +1,4 @@
-"""What a recording keeps of its run, so that a replay needs nothing else: plan, system, files."""
+"""Plan, system and files of a run in its recording, so that a replay needs nothing else."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ File = tuple[str, str, bytes]
 """Name in the recording, media type, content."""
 
 
-class Known(msgspec.Struct, frozen=True):
-    """What could be loaded of a run: a viewer or recorder makes do without the rest.
+class RunContents(msgspec.Struct, frozen=True):
+    """System and application of a run, as far as they can be loaded.
 
     Attributes:
-        system: its spec.
-        kind: class of its application.
-        application: of the run; None if an option of it cannot be had.
+        system: the specification.
+        kind: class of the application.
+        application: of the run; None if it cannot be loaded.
     """
 
     system: SystemSpec = NO_SYSTEM
@@ -53,24 +53,24 @@ class Known(msgspec.Struct, frozen=True):
         return (*topics.ALL, *self.kind.topics)
 
     def views(self) -> Views:
-        """Return what translates the run for viewers."""
+        """Return the translation of the run for viewers."""
         return import_class(self.kind.views, Views, "views")(self.application, self.system)
 
 
 class Documents(msgspec.Struct, frozen=True):
-    """What was run.
+    """Description of a run in its recording.
 
     Attributes:
         run_id: unique name of the run.
-        title: for people.
-        rate: simulated seconds per second.
+        title: title for people.
+        rate: simulated seconds per real second.
         nodes: names of the nodes.
-        plan: the run's plan (`RunPlan.description`), as plain data.
+        plan: plan of the run (`RunPlan.description`), as plain data.
         started: wall time at which the recording began, ISO 8601; empty in virtual time.
-        files: system, and what the application names, as files.
-        version: of the program.
+        files: the system, and files that the application names.
+        version: version of this program.
         known: system and application.
-        own: topics that the system's actors declare themselves.
+        own: topics that the system's actors declare.
     """
 
     run_id: str
@@ -81,33 +81,31 @@ class Documents(msgspec.Struct, frozen=True):
     started: str
     files: tuple[File, ...] = ()
     version: str = ""
-    known: Known = Known()
+    known: RunContents = RunContents()
     own: tuple[Topic[Any], ...] = ()
 
     def metadata(self) -> dict[str, str]:
-        """Return what stands in the metadata record; of a file that was chosen its name."""
+        """Return the metadata record; an option with a path has the name of the file only."""
         chosen = self.known.application.options if self.known.application else None
         options = {**self.plan, **(msgspec.structs.asdict(chosen) if chosen else {})}
-        told = {name: PurePosixPath(str(value)).name or str(value)
-                for name, value in options.items() if name != "system_file"}
-        return {**told, "format": FORMAT, "run_id": self.run_id, "title": self.title,
+        names = {name: PurePosixPath(str(value)).name or str(value)
+                 for name, value in options.items() if name != "system_file"}
+        return {**names, "format": FORMAT, "run_id": self.run_id, "title": self.title,
                 "rate": f"{self.rate:g}", "started": self.started,
                 "rampart_version": self.version, "nodes": json.dumps(self.nodes)}
 
 
 NOT_CHOSEN = ("format", "run_id", "title", "rate", "started", "rampart_version", "nodes",
               "time_zero_s")
-"""What stands in the metadata record besides the choices of the plan."""
+"""Fields of the metadata record that are not options of the plan."""
 
 
 def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
-    """Return the documents of a run, with the files that belong to it.
-
-    A file that cannot be read is left out: the messages are what counts.
+    """Return the documents of a run with its files; files that cannot be read are left out.
 
     Args:
-        plan: as plain data.
-        described: the other attributes of `Documents`.
+        plan: plan of the run, as plain data.
+        described: other attributes of `Documents`.
     """
     system_file = Path(str(plan.get("system_file", "")))
     working_folder.admit(system_file.parent)
@@ -133,11 +131,11 @@ def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
                      **described)
 
 
-def known_of(plan: Mapping[str, Any]) -> Known:
+def known_of(plan: Mapping[str, Any]) -> RunContents:
     """Return system and application of a run, as far as they can be loaded.
 
     Args:
-        plan: as plain data.
+        plan: plan of the run, as plain data.
     """
     system, kind = NO_SYSTEM, Application
     try:
@@ -147,16 +145,16 @@ def known_of(plan: Mapping[str, Any]) -> Known:
         options = {field.name: msgspec.convert(plan[field.name], field.type, strict=False)
                    for field in msgspec.structs.fields(kind.Options)
                    if plan.get(field.name, "") != ""}
-        return Known(system, kind, load_application(
+        return RunContents(system, kind, load_application(
             msgspec.structs.replace(run, options=options), system))
     except (OSError, ValueError):
-        return Known(system, kind)
+        return RunContents(system, kind)
 
 
 def restore(files: Sequence[File], directory: Path) -> None:
-    """Write the files of a run's application into a directory, each into a folder there.
+    """Write the files of a run's application into folders of a directory.
 
-    Names that would lead out of the directory are not followed.
+    A name that would lead out of the directory is ignored.
     """
     for name, _media, data in files:
         parts = PurePosixPath(name).parts

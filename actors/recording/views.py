@@ -1,8 +1,8 @@
-"""What viewers get to see: a run's own messages translated, channel by channel.
+"""Translation of a run's messages for viewers, channel by channel.
 
-The messages are recorded as they are, whatever becomes of their translation here. A scene
-has one channel per subject, and each message on it holds all of it: a viewer that jumps to a time
-is given the last message of each channel before it.
+The messages themselves are recorded even if their translation fails. A scene has one channel per
+subject, and each message on it is complete: a viewer that jumps to a time receives the last message
+of each channel before it.
 """
 
 from __future__ import annotations
@@ -27,33 +27,34 @@ from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.manager.spec.schema import SystemSpec
 
 View = tuple[str, fg.Record]
-"""Channel and what is to be seen on it."""
+"""Channel and message."""
 
 LEVELS: Mapping[Level, fg.LogLevel] = {
     "fault": fg.LogLevel.WARNING, "clear": fg.LogLevel.INFO, "note": fg.LogLevel.ERROR}
 """A note is an error report of a node."""
 
-_TOLD = (ftm_topics.DECISION, ftm_topics.PROCESS_EVENT, bus_topics.DIAGNOSTIC, ftm_topics.DETECTION,
-         ftm_topics.MANAGER_STATUS, bus_topics.INJECT, bus_topics.INJECTION_REPORT)
+_LOGGED = (
+    ftm_topics.DECISION, ftm_topics.PROCESS_EVENT, bus_topics.DIAGNOSTIC, ftm_topics.DETECTION,
+    ftm_topics.MANAGER_STATUS, bus_topics.INJECT, bus_topics.INJECTION_REPORT)
 _ONCE = (fm.ProcessEvent, bm.Diagnostic)
-"""Events, of which a recording of several hosts may have copies."""
+"""Events of which a recording of several hosts may have copies."""
 
 Translator = Callable[[str, Header, Any, int], list[View]]
-"""Makes views of key, header and body of a message, and the time of the recording."""
+"""Returns the views of a message from its key, header, body and time in the recording."""
 
 
 class Views:
-    """Translates one run, message by message; an application may name a class derived from this.
+    """Translates the messages of a run; an application may name a derived class.
 
     Class attributes:
         channels: all channels, with the type of their messages.
 
     Args:
-        application: of the run; None if it cannot be had.
+        application: of the run; None if it cannot be loaded.
         system: of the run.
 
     Attributes:
-        translators: what makes views of a topic's messages.
+        translators: topic → function that translates its messages.
     """
 
     channels: ClassVar[Mapping[str, type[fg.Record]]] = {"view/log": fg.Log}
@@ -63,22 +64,22 @@ class Views:
         del application
         self._narrator = Narrator(system.titles)
         self._seen: dict[str, Any] = Remembered(MANY)
-        self.translators: dict[Topic[Any], Translator] = dict.fromkeys(_TOLD, self._log)
+        self.translators: dict[Topic[Any], Translator] = dict.fromkeys(_LOGGED, self._log)
 
     def start(self, at_ns: int) -> list[View]:
-        """Return what does not depend on any message."""
+        """Return the views at the beginning of the recording."""
         del at_ns
         return []
 
     def of(self, topic: Topic[Any], key: str, header: Header, body: Any, at_ns: int) -> list[View]:
-        """Return what a message makes visible.
+        """Return the views of a message.
 
         Args:
-            topic: which.
+            topic: of the message.
             key: full key.
             header: of the message.
             body: of the message.
-            at_ns: time of the recording.
+            at_ns: time in the recording.
         """
         translate = self.translators.get(topic)
         return translate(key, header, body, at_ns) if translate else []
@@ -86,15 +87,15 @@ class Views:
     # -- the log --------------------------------------------------------------------------------
 
     def _log(self, key: str, header: Header, body: Any, at_ns: int) -> list[View]:
-        """Return the lines for a message, once for all its copies."""
+        """Return the lines of a message, once for all its copies."""
         if isinstance(body, _ONCE) and not self.is_new(
                 key, (header.source, header.incarnation, header.sequence)):
             return []
-        return [line(at_ns, LEVELS[told.level], header.source, told.text)
-                for told in self._narrator.describe(body, header)]
+        return [line(at_ns, LEVELS[found.level], header.source, found.text)
+                for found in self._narrator.describe(body, header)]
 
     def is_new(self, what: str, value: Any) -> bool:
-        """Take note of what was last said of something; tell whether it is another thing."""
+        """Keep the latest value under a name; return whether it has changed."""
         if what in self._seen and self._seen[what] == value:
             return False
         self._seen[what] = value
@@ -107,4 +108,4 @@ def line(at_ns: int, level: fg.LogLevel, name: str, text: str) -> View:
 
 
 encode: Callable[[fg.Record], bytes] = msgspec.json.Encoder().encode
-"""Returns what stands in the file."""
+"""Returns a view as JSON."""

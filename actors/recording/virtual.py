@@ -1,4 +1,4 @@
-"""The recording of a run in virtual time, in the same process: the same run, the same file."""
+"""Recording of a run in virtual time, in the same process; the same run gives the same file."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
 from rampart.actors.recording.run_documents import collect
 
 FLUSH_S = 10.0
-"""Simulated seconds between two hand-overs of the file: some tenths of a real one."""
+"""Simulated seconds between two flushes: some tenths of a real second."""
 
 
 class VirtualRecording:
-    """One recording. Use: `take` for each message, then `close`.
+    """One recording. Call `take` for each message, then `close`.
 
-    When the file cannot be written any more, the recording ends and the run goes on.
+    If the file cannot be written any more, the recording ends and the run goes on.
 
     Args:
-        path: of the file.
-        plan: what is run (`RunPlan.description`).
-        title: for people.
+        path: path of the file.
+        plan: plan of the run (`RunPlan.description`).
+        title: title for people.
         nodes: names of the nodes.
-        lead_s: simulated seconds before simulated time 0 in which the run starts; a whole number.
-        overwrite: the file may exist.
+        lead_s: whole simulated seconds from the start of the run to simulated time 0.
+        overwrite: whether the file may exist.
 
     Raises:
-        BagError: the file cannot be made.
+        BagError: the file cannot be written.
     """
 
     def __init__(self, path: Path, plan: Mapping[str, Any], title: str, *,
@@ -47,11 +47,11 @@ class VirtualRecording:
 
     @property
     def problem(self) -> str:
-        """Why it does not reach to the end of the run; "" if it does."""
+        """Why the recording has ended before the run; "" if it has not."""
         return self._failed
 
     def take(self, at_s: float, key: str, payload: bytes) -> None:
-        """Write a message down, sent at a simulated time."""
+        """Record a message that was sent at a simulated time."""
         if self._failed:
             return
         try:
@@ -59,18 +59,18 @@ class VirtualRecording:
             if at_s >= self._next_flush_s:
                 self._next_flush_s = at_s + FLUSH_S
                 self._writer.flush()
-        except Exception as error:  # whatever it is: the run goes on
+        except Exception as error:  # the run goes on in any case
             self._fail(error)
 
     def close(self) -> str:
-        """Write the end of the file, and return one line on what came of it."""
+        """Write the end of the file, and return one line about the recording."""
         if not self._failed:
             try:
                 self._writer.close({"ended": "the run has ended"})
             except Exception as error:
                 self._fail(error)
         if not self._failed and not self._path.exists():
-            return f"{self._path}: was taken away while it was written: nothing is recorded"
+            return f"{self._path}: was removed while it was written: nothing is recorded"
         return self._failed or f"recorded {self._writer.messages} messages in {self._path}"
 
     def _fail(self, error: Exception) -> None:

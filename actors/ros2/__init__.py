@@ -1,1 +1,1 @@
-"""ROS 2 through `rmw_zenoh`: hearing, commanding and guarding nodes that are not ours."""
+"""ROS 2 through `rmw_zenoh`: topics, services and supervision of nodes that are not ours."""

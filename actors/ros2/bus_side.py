@@ -1,7 +1,7 @@
-"""The side of ROS 2 in virtual time: what passes there passes over the virtual bus.
+"""The network of ROS 2 in virtual time, over the virtual bus.
 
-The nodes of ROS 2 are actors that stand in for them (`rampart.actors.ros2.stand_in`). Tokens go
-when the process does that declared them, as those of a real session.
+Actors stand in for the nodes of ROS 2 (`rampart.actors.ros2.stand_in`). As with a real session, a
+token goes when the process ends that declared it.
 """
 
 from __future__ import annotations
@@ -17,28 +17,36 @@ import xxhash
 from rampart.actors.bus import topic as bus_topic
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.topic import ROS_SIDE, Topic
-from rampart.actors.ros2.side import Answered, Deliver, Reply, chunk_of, packed, recorded_key
+from rampart.actors.ros2.side import (
+    NO_ANSWER,
+    Answered,
+    Deliver,
+    Reply,
+    chunk_of,
+    packed,
+    recorded_key,
+)
 from rampart.actors.ros2.wire import Qos
 
-_KEPT = Topic("", msgspec.Struct, bus_topic.Qos.STATE, 0.0, "", "What newcomers are told.")
-_PASSING = Topic("", msgspec.Struct, bus_topic.Qos.COMMAND, 0.0, "", "What they are not.")
+_KEPT = Topic("", msgspec.Struct, bus_topic.Qos.STATE, 0.0, "", "Kept for new subscribers.")
+_PASSING = Topic("", msgspec.Struct, bus_topic.Qos.COMMAND, 0.0, "", "Not kept.")
 
 _pack, _unpack = msgspec.msgpack.encode, msgspec.msgpack.decode
 
 
 class WatchedBus(Bus, Protocol):
-    """A bus that knows which nodes are there, as that of virtual time does."""
+    """A bus that knows which nodes are there, as the virtual bus does."""
 
     @property
     def is_open(self) -> bool:
         """Whether it has joined, and not been cut off."""
 
     def watch(self, node: str, changed: Callable[[str, int, bool], None]) -> None:
-        """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
+        """Call `changed` now if the node is there, and whenever it appears or vanishes."""
 
 
 class BusSide:
-    """What a node of ROS 2 has of the network, over the bus of an actor.
+    """The network of ROS 2 over the bus of an actor; the methods are those of `Side`.
 
     Args:
         bus: of the actor, open.
@@ -62,10 +70,10 @@ class BusSide:
                           _pack((self._name, self._incarnation, self._tokens)))
 
     def tokens(self, pattern: str, changed: Callable[[str, bool], None]) -> None:
-        """See `Side.tokens`; all of one domain are told, whatever the pattern."""
+        """See `Side.tokens`; the pattern has to end in `**`."""
         above = pattern.removesuffix("**")
 
-        def heard(_key: str, payload: bytes) -> None:
+        def declared(_key: str, payload: bytes) -> None:
             name, incarnation, tokens = _unpack(payload)
             before, there = self._seen.get(name, (0, set()))
             if incarnation < before:
@@ -73,26 +81,26 @@ class BusSide:
             if not before:
                 self._bus.watch(name, lambda *what: gone(name, *what[1:]))
             if incarnation > before:
-                tell(there, alive=False)
+                report(there, alive=False)
                 there = set()
             new = {token for token in tokens if token.startswith(above)}
-            tell(new - there, alive=True)
+            report(new - there, alive=True)
             self._seen[name] = incarnation, new
 
         def gone(name: str, incarnation: int, alive: bool) -> None:
             before, there = self._seen[name]
             if not alive and incarnation == before:
-                tell(there, alive=False)
+                report(there, alive=False)
                 self._seen[name] = before, set()
 
-        def tell(tokens: set[str], *, alive: bool) -> None:
+        def report(tokens: set[str], *, alive: bool) -> None:
             for token in sorted(tokens):
                 changed(token, alive)
 
         where = f"{ROS_SIDE}/tokens/*"
-        self._bus.subscribe(where, heard)
-        self._bus.latest(where, heard, lambda: None)
-        tell({token for token in self._tokens if token.startswith(above)}, alive=True)
+        self._bus.subscribe(where, declared)
+        self._bus.latest(where, declared, lambda: None)
+        report({token for token in self._tokens if token.startswith(above)}, alive=True)
 
     def publisher(self, key: str, qos: Qos) -> Callable[[bytes, bytes], None]:
         """See `Side.publisher`."""
@@ -112,12 +120,12 @@ class BusSide:
     def serve(self, key: str, asked: Callable[[bytes, bytes | None, Reply], None]) -> None:
         """See `Side.serve`."""
 
-        def heard(_key: str, whole: bytes) -> None:
-            who, number, payload, attachment = _unpack(whole)
+        def arrived(_key: str, whole: bytes) -> None:
+            client, number, payload, attachment = _unpack(whole)
             asked(payload, attachment, lambda answer, attached: self._bus.publish(
-                _PASSING, f"{ROS_SIDE}/answer/{who}", _pack((number, answer, attached))))
+                _PASSING, f"{ROS_SIDE}/answer/{client}", _pack((number, answer, attached))))
 
-        self._bus.subscribe(f"{ROS_SIDE}/ask/{chunk_of(key)}", heard)
+        self._bus.subscribe(f"{ROS_SIDE}/ask/{chunk_of(key)}", arrived)
 
     def ask(self, key: str, payload: bytes, attachment: bytes, timeout_s: float,
             answered: Answered) -> None:
@@ -128,7 +136,7 @@ class BusSide:
         def over() -> None:
             late = self._asked.pop(number, None)
             if late is not None and self._bus.is_open:
-                late(None, None, "nobody answers")
+                late(None, None, NO_ANSWER)
 
         asyncio.get_running_loop().call_later(timeout_s, over)
         self._bus.publish(_PASSING, f"{ROS_SIDE}/ask/{chunk_of(key)}",

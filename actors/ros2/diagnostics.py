@@ -1,4 +1,4 @@
-"""What ROS 2 is told of fault tolerance: `/diagnostics` (REP-107), and each decision."""
+"""Reports of fault tolerance to ROS 2: `/diagnostics` (REP-107), and each decision."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of diagnostic_msgs/msg/DiagnosticStatus."""
 
 _STALE_S = 1.5
-"""So long, simulated seconds, a module may be silent: it reports once a second at least."""
+"""Simulated seconds of silence after which a module is stale; modules report every second."""
 
 
 class Diagnostics:
-    """Tells ROS 2 which faults are detected and what is done.
+    """Reports detections, recoveries and decisions to ROS 2.
 
     Args:
-        node: in ROS 2 that says it.
-        titles: of all detection and recovery modules, by their names.
-        hardware: what `hardware_id` is to be, the system's name.
-        stamp_ns: returns what time it is to ROS 2.
+        node: that publishes the reports.
+        titles: of all detection and recovery modules, by name.
+        hardware: value of `hardware_id`, the system's name.
+        stamp_ns: returns the time of ROS 2, ns.
     """
 
     def __init__(self, node: RosNode, titles: Mapping[str, str], hardware: str,
@@ -42,17 +42,17 @@ class Diagnostics:
         self._types, self._titles, self._hardware = node.types, titles, hardware
         self._stamp_ns = stamp_ns
         self._reports: dict[str, tuple[DetectionReport | RecoveryReport, float]] = {}
-        self._publish = node.publisher(DIAGNOSTICS, DIAGNOSTICS_TYPE, Qos(depth=1))
+        self._put = node.publisher(DIAGNOSTICS, DIAGNOSTICS_TYPE, Qos(depth=1))
         self._decide = node.publisher(
             DECISION, DECISION_TYPE, Qos(transient_local=True, depth=10))
 
-    def heard(self, name: str, report: DetectionReport | RecoveryReport, now_s: float) -> bool:
-        """Take note of a report; return whether it is news."""
+    def take(self, name: str, report: DetectionReport | RecoveryReport, now_s: float) -> bool:
+        """Keep a module's report; return whether its level has changed."""
         before = self._reports.get(name)
         self._reports[name] = report, now_s
         return before is None or _level(before[0]) != _level(report)
 
-    def tell(self, now_s: float) -> None:
+    def publish(self, now_s: float) -> None:
         """Publish the state of all modules."""
         types = self._types
         array = types.blank(DIAGNOSTICS_TYPE)
@@ -64,12 +64,12 @@ class Diagnostics:
             status.hardware_id = self._hardware
             stale = report is None or now_s - at_s > _STALE_S
             status.level = STALE if stale or report is None else _level(report)
-            status.message = "not heard" if report is None else (
-                "not heard lately" if stale else report.reason or report.state.value)
+            status.message = "no report" if report is None else (
+                "no recent report" if stale else report.reason or report.state.value)
             if report is not None:
                 status.values = [self._pair(key, value) for key, value in _values(report).items()]
             array.status.append(status)
-        self._publish(types.encode(DIAGNOSTICS_TYPE, array))
+        self._put(types.encode(DIAGNOSTICS_TYPE, array))
 
     def decided(self, record: DecisionRecord) -> None:
         """Publish a decision with its certificate."""

@@ -1,13 +1,13 @@
-"""The gateway to ROS 2: an actor with a session of its own among those of `rmw_zenoh`.
+"""The gateway to ROS 2: an actor with a second Zenoh session, among those of `rmw_zenoh`.
 
-It passes on what the tables `[[ros2]]` of the system say, and nothing else; each is an endpoint of
-a node in the graph of ROS 2, where `ros2 node info` shows it. It hears the graph, tells the system
-who is there, and tells ROS 2 on `/diagnostics` and `/rampart/decision` what is detected and what is
-decided.
+It passes on what the tables `[[ros2]]` of the system list, and nothing else. Each row is an
+endpoint of a node in the graph of ROS 2, where `ros2 node info` shows it. The gateway watches the
+graph and reports its nodes to the system. It reports detections to ROS 2 on `/diagnostics`, and
+decisions on `/rampart/decision`.
 
-What is wrong is told in one line on `diagnostic/GATEWAY` and not passed on: what is no message of
-its type, in another frame, of another publisher, or of a time that cannot be. So nothing that is
-wrong moves the robot, and what watches the topic sees it fall silent.
+It refuses a message that does not decode, is in another frame, comes from a second publisher, or
+has an impossible stamp, and reports it in one line on `diagnostic/GATEWAY`. So a wrong message
+does not move the robot, and a detection module sees the topic fall silent.
 """
 
 from __future__ import annotations
@@ -26,20 +26,22 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DecisionRecord, DetectionReport, RecoveryReport
 from rampart.actors.ros2.calls import (
-    Called,
-    Goal,
-    Served,
+    ActionCall,
+    OfferedService,
+    ServiceCall,
     answer_topic,
+    check_call,
     request_topic,
 )
 from rampart.actors.ros2.diagnostics import Diagnostics
 from rampart.actors.ros2.graph import RosGraph, misfits
-from rampart.actors.ros2.links import HeardTopic, SaidTopic
+from rampart.actors.ros2.links import Publication, Subscription
 from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import NS, RosClock
-from rampart.actors.ros2.side import Mode, NoSide, Side
+from rampart.actors.ros2.side import Mode, Side
 from rampart.actors.ros2.stand_in import side_of, wall_ns
+from rampart.actors.ros2.translation.mapping import Inward, Outward
 from rampart.actors.ros2.translation.mirror import topic_of
 from rampart.actors.ros2.translation.tables import ROUTER, Ros2Link, read_links
 from rampart.actors.ros2.translation.types import Distribution, Types
@@ -53,14 +55,9 @@ _SETTLE_S = 0.05
 _PROBLEMS = 50
 
 
-
 @cache
 def types_of(distribution: str, folders: tuple[str, ...]) -> Types:
-    """Return the types of a distribution and of folders, which are read once.
-
-    Raises:
-        ValueError: see `Types`.
-    """
+    """Return the types of a distribution and of folders, which are read once; raises as `Types`."""
     return Types(distribution, map(Path, folders))
 
 
@@ -68,20 +65,20 @@ class Gateway(Actor):
     """Passes topics, services and actions on between ROS 2 and the system."""
 
     class Parameters(Actor.Parameters, frozen=True, kw_only=True):
-        """Where ROS 2 is, and what it is called there.
+        """Address of ROS 2, and the gateway's name there.
 
         Attributes:
-            connect: endpoints of its routers.
-            mode: "client", which works from any machine, or "peer", which on the machine of ROS 2
-                goes on when its router ends.
+            connect: endpoints of the routers of ROS 2.
+            mode: "client", which works from any machine, or "peer", which works on the machine of
+                ROS 2 only and survives its router.
             domain: ROS_DOMAIN_ID.
-            distribution: by name.
+            distribution: name of the distribution.
             node: name of the gateway's node.
-            namespace: of that node.
-            interfaces: folders with definitions of the robot's own, relative to the system's file.
+            namespace: namespace of that node.
+            interfaces: folders with the robot's definitions, relative to the system's file.
             clock: "wall", or "ros" where nodes have use_sim_time.
-            diagnostics: whether ROS 2 is told what is detected and decided.
-            ros2: the tables of the system, given.
+            diagnostics: whether detections and decisions are reported to ROS 2.
+            ros2: rows `[[ros2]]` of the system, filled in by `given`.
         """
 
         connect: tuple[str, ...] = (ROUTER,)
@@ -102,26 +99,26 @@ class Gateway(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        said = self.parameters
+        given = self.parameters
         self.graph = RosGraph()
-        self.time = RosClock(said.clock, self.clock.now, self.clock.rate, partial(wall_ns, self))
-        self._types = _types(said)
+        self.time = RosClock(given.clock, self.clock.now, self.clock.rate, partial(wall_ns, self))
+        self._types = _types(given)
         self._side: Side | None = None
-        self._links: dict[tuple[str, str], SaidTopic | Called | Goal] = {}
+        self._links: dict[tuple[str, str], Publication | ServiceCall | ActionCall] = {}
         self._graph_due = False
         self._was_linked = False
         self._diagnostics: Diagnostics | None = None
         self._newest: dict[str, tuple[msgspec.Struct, float] | None] = {
-            link.beside: None for link in said.ros2 if link.beside}
-        for link in said.ros2:
+            link.beside: None for link in given.ros2 if link.beside}
+        for link in given.ros2:
             if link.from_:
-                self.hear_topic(link.from_, self._passed_on(link))
+                self.hear_topic(link.from_, self._taker(link))
 
-    # -- what its class says before a run ---------------------------------------------------------
+    # -- before a run ----------------------------------------------------------------------------
 
     @classmethod
     def given(cls, name: str, spec: SystemSpec, file: str) -> dict[str, Any]:
-        """Return the links that it passes on; raises as that of its base."""
+        """Return the rows of this gateway; raises as the base class."""
         own = next(node.actor for node in spec.nodes if node.name == name)
         gateways = [node.name for node in spec.nodes if node.actor == own]
         return {"ros2": tuple(link for link in read_links(spec, gateways, file)
@@ -129,7 +126,7 @@ class Gateway(Actor):
 
     @classmethod
     def named(cls, parameters: Parameters) -> dict[str, list[Named]]:
-        """Return what its links take and make, besides what its parameters name."""
+        """Return the topics of its links and of its parameters."""
         found = super().named(parameters)
         for link in parameters.ros2:
             for way, key, name in (("heard", link.from_, "from"), ("published", link.to, "to")):
@@ -139,10 +136,10 @@ class Gateway(Actor):
 
     @classmethod
     def own_topics(cls, parameters: Parameters) -> tuple[Topic[Any], ...]:
-        """Return the topics that are made of types of ROS 2.
+        """Return the topics whose types are made from types of ROS 2.
 
         Raises:
-            ValueError: one of them is not known; table and field are named.
+            ValueError: a type is not known; the text names row and field.
         """
         types, found = _types(parameters), []
         for link in parameters.ros2:
@@ -157,54 +154,55 @@ class Gateway(Actor):
 
     @classmethod
     def check_topics(cls, parameters: Parameters, topics: Mapping[str, Topic[Any]]) -> None:
-        """Refuse links that cannot be.
+        """Refuse links that cannot be translated.
 
         Raises:
-            ValueError: a field or type does not exist; table and field are named.
+            ValueError: a field or type does not exist; the text names row and field.
         """
         types = _types(parameters)
         for link in parameters.ros2:
+            asks, answers, beside = (topics[key].type if key else None
+                                     for key in (link.from_, link.to, link.beside))
             with _named(link):
-                cls._check(link, types, topics)
-
-    @staticmethod
-    def _check(link: Ros2Link, types: Types, topics: Mapping[str, Topic[Any]]) -> None:
-        made: Any = {"subscribe": HeardTopic, "publish": SaidTopic, "call": Called,
-                     "serve": Served, "goal": Goal}[link.way]
-        made(_Nobody(types), link,
-             *(topics[key] for key in (link.from_, link.to, link.beside) if key))
+                if link.way == "subscribe":
+                    types.decoder(link.type)
+                    Inward(link, types, answers, beside)
+                elif link.way == "publish":
+                    Outward(link, types, asks)
+                else:
+                    check_call(link, types, asks, answers)
 
     # -- a run ------------------------------------------------------------------------------------
 
     def on_start(self) -> None:
-        """Enter the graph of ROS 2, and declare everything there."""
-        said, run = self.parameters, self.context.run
+        """Join the graph of ROS 2, and declare all endpoints."""
+        given, run = self.parameters, self.context.run
         self._recorder = RecorderConnection(run.plan.base_port)
-        self._side = side_of(self, self._bus, said.connect, said.mode, self._recorder.take)
-        self.node = RosNode(self._side, self._types, said.node, wall_ns=partial(wall_ns, self),
-                            refuse=self.refuse, namespace=said.namespace, domain=said.domain)
-        if said.clock == "ros":
-            tell = self._types.decoder(_CLOCK_TYPE)
+        self._side = side_of(self, self._bus, given.connect, given.mode, self._recorder.take)
+        self.node = RosNode(self._side, self._types, given.node, wall_ns=partial(wall_ns, self),
+                            refuse=self.refuse, namespace=given.namespace, domain=given.domain)
+        if given.clock == "ros":
+            decode = self._types.decoder(_CLOCK_TYPE)
             self.node.subscribe(_CLOCK, _CLOCK_TYPE, Qos(reliable=False, depth=1),
-                                lambda payload, _attachment: self._clock(tell, payload))
-        for link in said.ros2:
-            to, heard = (self.chosen_topic(key) if key else None for key in (link.to, link.from_))
+                                lambda payload, _attachment: self._clock(decode, payload))
+        for link in given.ros2:
+            to, from_ = (self.chosen_topic(key) if key else None for key in (link.to, link.from_))
             if link.way == "subscribe" and to is not None:
-                HeardTopic(self, link, to,
-                           self.chosen_topic(link.beside) if link.beside else None)
+                Subscription(self, link, to,
+                             self.chosen_topic(link.beside) if link.beside else None)
             elif link.way == "serve" and to is not None:
-                Served(self, link, to)
-            elif link.way == "publish" and heard is not None:
-                self._links[link.way, link.name] = SaidTopic(self, link, heard)
-            elif heard is not None and to is not None:
-                self._links[link.way, link.name] = (Called if link.way == "call" else Goal)(
-                    self, link, heard, to)
-        if said.diagnostics:
+                OfferedService(self, link, to)
+            elif link.way == "publish" and from_ is not None:
+                self._links[link.way, link.name] = Publication(self, link, from_)
+            elif from_ is not None and to is not None:
+                self._links[link.way, link.name] = (
+                    ServiceCall if link.way == "call" else ActionCall)(self, link, from_, to)
+        if given.diagnostics:
             system = run.system
             titles = {d.name: d.title for d in system.detections} | {
                 r.name: r.title for r in system.recoveries}
             self._diagnostics = Diagnostics(self.node, titles, system.name, self.time.ros_ns)
-        self._side.tokens(f"{ADMIN}/{said.domain}/**", self._token)
+        self._side.tokens(f"{ADMIN}/{given.domain}/**", self._token)
         for name, note in self._types.notes.items():
             self._note(name, note)
 
@@ -214,56 +212,48 @@ class Gateway(Actor):
             self._side.close()
             self._recorder.close()
 
-    def _passed_on(self, link: Ros2Link) -> Callable[[Any, Header], None]:
-        def heard(message: Any, header: Header) -> None:
-            self._links[link.way, link.name].heard(message, header)
+    def _taker(self, link: Ros2Link) -> Callable[[Any, Header], None]:
+        def take(message: Any, header: Header) -> None:
+            self._links[link.way, link.name].take(message, header)
 
-        return heard
+        return take
 
-    # -- what links need --------------------------------------------------------------------------
-
-    def now_s(self) -> float:
-        """Return simulated time."""
-        return self.clock.now()
+    # -- for the links ---------------------------------------------------------------------------
 
     def newest(self, key: str) -> tuple[msgspec.Struct, float] | None:
-        """Return what was said last on a topic of the system, and its stamp."""
+        """Return the newest message on a topic that a link names as `beside`, and its stamp."""
         return self._newest.get(key)
 
-    def say(self, topic: Topic[Any], body: msgspec.Struct, stamp_s: float | None) -> None:
-        """Publish to the system."""
+    def emit(self, topic: Topic[Any], body: msgspec.Struct, stamp_s: float | None) -> None:
+        """Publish a message to the system; None stamps it now."""
         if topic.key in self._newest:
             self._newest[topic.key] = body, self.clock.now() if stamp_s is None else stamp_s
         self.publish(topic, body, stamp_s)
 
     def refuse(self, where: str, why: str) -> None:
-        """Tell that a message was not passed on, and count it."""
+        """Report and count a message that is not passed on."""
         self._rejected += 1
         self._note(where, why)
 
     def _note(self, where: str, why: str) -> None:
         self.report_diagnostic("ros2", why, clip(where, NAME_CHARS))
 
-    def handle(self, slot: str | None, call: Callable[[], None]) -> None:
-        """Have a call made in turn; of those with the same slot the latest counts."""
+    def enqueue(self, slot: str | None, call: Callable[[], None]) -> None:
+        """Put a call into the mailbox; it replaces one in the same slot that still waits."""
         self._dispatcher.put_message(slot, call)
-
-    def later(self, delay_s: float, call: Callable[[], None]) -> None:
-        """Have a call made after so many simulated seconds."""
-        self.call_later(delay_s, call)
 
     def _clock(self, decode: Callable[[bytes], Any], payload: bytes) -> None:
         try:
-            told = decode(payload).clock
+            clock = decode(payload).clock
         except ValueError as error:
             self.refuse(_CLOCK, str(error))
             return
-        self.time.tell(told.sec * NS + told.nanosec)
+        self.time.set(clock.sec * NS + clock.nanosec)
 
     # -- the graph --------------------------------------------------------------------------------
 
     def _token(self, token: str, alive: bool) -> None:
-        self.handle(None, lambda: self._graph_changed(token, alive))
+        self.enqueue(None, lambda: self._graph_changed(token, alive))
 
     def _graph_changed(self, token: str, alive: bool) -> None:
         try:
@@ -272,18 +262,18 @@ class Gateway(Actor):
         except ValueError as error:
             self._note("graph", str(error))
             return
-        if not self._graph_due:  # what comes together is told together
+        if not self._graph_due:  # one report for changes that come together
             self._graph_due = True
-            self.call_later(_SETTLE_S, self._tell_graph)
+            self.call_later(_SETTLE_S, self._report_graph)
 
     @every(1.0)
     def look(self) -> None:
-        """Say what the graph is, and how the modules are."""
-        self._tell_graph()
+        """Report the graph to the system, and the modules to ROS 2."""
+        self._report_graph()
         if self._diagnostics is not None and self.time.is_known:
-            self._diagnostics.tell(self.clock.now())
+            self._diagnostics.publish(self.clock.now())
 
-    def _tell_graph(self) -> None:
+    def _report_graph(self) -> None:
         self._graph_due = False
         if self._side is None:
             return
@@ -301,82 +291,55 @@ class Gateway(Actor):
             len(bypassed), tuple(map(clip, problems[:_PROBLEMS])), self._rejected))
 
     def _bypassed(self) -> list[tuple[str, str]]:
-        """Return who else publishes on the topics on which the gateway does, by topic."""
+        """Return topics of the gateway with another publisher, each with that publisher."""
         mine = {link.publish for link in self.parameters.ros2 if link.publish}
         return [(one.topic, one.full_name) for one in self.graph.of(EndpointKind.PUBLISHER)
                 if one.topic in mine and not self._is_mine(one.session)]
 
     def _misfits(self) -> list[str]:
-        everybody = self.graph.of(*EndpointKind)
-        here = [one for one in everybody if self._is_mine(one.session)]
-        there = [one for one in everybody if not self._is_mine(one.session)]
+        endpoints = self.graph.of(*EndpointKind)
+        here = [one for one in endpoints if self._is_mine(one.session)]
+        there = [one for one in endpoints if not self._is_mine(one.session)]
         return list(dict.fromkeys(misfits(here, there)))
 
     def _is_mine(self, session: str) -> bool:
         return self._side is not None and session == self._side.id
 
-    # -- what ROS 2 is told -----------------------------------------------------------------------
+    # -- reports to ROS 2 ------------------------------------------------------------------------
 
     @on(topics.DETECTION)
     def detection(self, report: DetectionReport, header: Header) -> None:
-        """Tell a detection at once."""
+        """Report a change of a detection at once."""
         self._reported(header.source, report)
 
     @on(topics.RECOVERY)
     def recovery(self, report: RecoveryReport, header: Header) -> None:
-        """Tell a recovery at once."""
+        """Report a change of a recovery at once."""
         self._reported(header.source, report)
 
     def _reported(self, name: str, report: DetectionReport | RecoveryReport) -> None:
-        told, now_s = self._diagnostics, self.clock.now()
-        if told is not None and told.heard(name, report, now_s) and self.time.is_known:
-            told.tell(now_s)
+        diagnostics, now_s = self._diagnostics, self.clock.now()
+        if (diagnostics is not None and diagnostics.take(name, report, now_s)
+                and self.time.is_known):
+            diagnostics.publish(now_s)
 
     @on(topics.DECISION)
     def decision(self, record: DecisionRecord, _header: Header) -> None:
-        """Tell a decision."""
+        """Report a decision."""
         if self._diagnostics is not None:
             self._diagnostics.decided(record)
 
 
-class _Nobody:
-    """A gateway that is not there, to which links are made to see whether they can be."""
-
-    def __init__(self, types: Types) -> None:
-        self.node = RosNode(NoSide(), types, "nobody", wall_ns=lambda: 0, refuse=self.refuse)
-        self.graph = RosGraph()
-        self.time = RosClock("wall", self.now_s, 1.0, lambda: 0)
-
-    def now_s(self) -> float:
-        """Return that no time passes."""
-        return 0.0
-
-    def refuse(self, where: str, why: str) -> None:
-        """Nobody is told."""
-
-    def newest(self, key: str) -> tuple[msgspec.Struct, float] | None:
-        """Return that nothing was said."""
-
-    def say(self, topic: Topic[Any], body: msgspec.Struct, stamp_s: float | None) -> None:
-        """Nobody hears."""
-
-    def handle(self, slot: str | None, call: Callable[[], None]) -> None:
-        """Nothing arrives."""
-
-    def later(self, delay_s: float, call: Callable[[], None]) -> None:
-        """No time passes."""
-
-
-def _types(said: Gateway.Parameters) -> Types:
+def _types(parameters: Gateway.Parameters) -> Types:
     try:
-        return types_of(said.distribution, said.interfaces)
+        return types_of(parameters.distribution, parameters.interfaces)
     except ValueError as error:
         raise ValueError(f"parameters.interfaces: {error}") from None
 
 
 @contextlib.contextmanager
 def _named(link: Ros2Link) -> Iterator[None]:
-    """Name the table in what is wrong with a link."""
+    """Put the name of the row before the text of an error."""
     try:
         yield
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""The graph of ROS 2 as its tokens show it: who is there, and what cannot meet. Pure."""
+"""The graph of ROS 2 from its liveliness tokens, and endpoints that do not match. Pure."""
 
 from __future__ import annotations
 
@@ -7,23 +7,24 @@ from collections.abc import Iterable, Iterator
 from rampart.actors.ros2.wire import Endpoint, EndpointKind, ros_name
 
 MOST = 20_000
-"""Tokens that are kept; a robot has some hundred."""
+"""Most tokens that are kept; a robot has some hundred."""
 
 _OF_TOPICS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
+_PAIRS = ({*_OF_TOPICS}, {EndpointKind.SERVICE, EndpointKind.CLIENT})
 
 
 class RosGraph:
-    """Nodes and endpoints, by their tokens."""
+    """Nodes and endpoints by their tokens."""
 
     def __init__(self) -> None:
         self._endpoints: dict[str, Endpoint] = {}
         self._by_gid: dict[bytes, Endpoint] = {}
 
     def changed(self, token: str, alive: bool) -> Endpoint | None:
-        """Note that a token has come or gone; return whose it is, None if that is no news.
+        """Add or remove a token; return its endpoint, None if nothing has changed.
 
         Raises:
-            ValueError: it is none of ROS 2; one line.
+            ValueError: it is not a token of ROS 2, or there are too many; one line.
         """
         if not alive:
             gone = self._endpoints.pop(token, None)
@@ -33,18 +34,18 @@ class RosGraph:
         if token in self._endpoints:
             return None
         if len(self._endpoints) >= MOST:
-            raise ValueError(f"more than {MOST} tokens; this one is left out")
+            raise ValueError(f"more than {MOST} tokens; the others are ignored")
         found = Endpoint.parse(token)
         self._endpoints[token] = found
         self._by_gid[found.gid] = found
         return found
 
     def of(self, *kinds: EndpointKind) -> list[Endpoint]:
-        """Return the endpoints of some kinds, in the order in which they came."""
+        """Return the endpoints of some kinds, the oldest first."""
         return [one for one in self._endpoints.values() if one.kind in kinds]
 
     def nodes(self) -> dict[str, int]:
-        """Return the full names of all nodes, each with how many there are of it."""
+        """Return the full names of all nodes, each with the number of its nodes."""
         found: dict[str, int] = {}
         for one in self.of(EndpointKind.NODE):
             found[one.full_name] = found.get(one.full_name, 0) + 1
@@ -54,8 +55,8 @@ class RosGraph:
         """Return the endpoints of a topic or service."""
         return [one for one in self.of(*kinds) if one.topic == topic]
 
-    def who(self, gid: bytes) -> Endpoint | None:
-        """Return whose gid it is; None if there is no such endpoint."""
+    def endpoint(self, gid: bytes) -> Endpoint | None:
+        """Return the endpoint with a gid, None if the graph has none."""
         return self._by_gid.get(gid)
 
     def topics(self) -> dict[str, list[Endpoint]]:
@@ -67,32 +68,28 @@ class RosGraph:
 
 
 def misfits(here: Iterable[Endpoint], there: Iterable[Endpoint]) -> Iterator[str]:
-    """Yield why endpoints do not hear each other, or less than they ask.
+    """Yield why endpoints exchange nothing, or less than they request.
 
     Args:
-        here: what we declare.
-        there: what others do.
+        here: our endpoints.
+        there: those of others.
     """
     for mine in here:
         for other in there:
-            if mine.topic != other.topic or not _meet(mine.kind, other.kind):
+            if mine.topic != other.topic or {mine.kind, other.kind} not in _PAIRS:
                 continue
             who = f"{mine.topic}: {other.full_name}"
             if mine.type != other.type:
-                yield f"{who} has the type {ros_name(other.type)}, and not {ros_name(mine.type)}"
+                yield f"{who} has the type {ros_name(other.type)}; expected {ros_name(mine.type)}"
             elif mine.hash != other.hash:
                 yield (f"{who} has another definition of {ros_name(mine.type)} ({other.hash}, here "
-                       f"{mine.hash}): neither hears the other; another distribution?")
+                       f"{mine.hash}): they exchange nothing; another distribution?")
             elif mine.kind in _OF_TOPICS:
-                said, heard = ((mine, other) if mine.kind is EndpointKind.PUBLISHER
-                               else (other, mine))
-                if heard.qos.transient_local and not said.qos.transient_local:
-                    yield (f"{who}: {heard.full_name} asks for what was said before "
-                           f"(transient local), and {said.full_name} does not keep it (volatile)")
-                if heard.qos.reliable and not said.qos.reliable:
-                    yield (f"{who}: {heard.full_name} asks for a reliable topic, and "
-                           f"{said.full_name} offers best effort")
-
-
-def _meet(one: EndpointKind, other: EndpointKind) -> bool:
-    return {one, other} in (set(_OF_TOPICS), {EndpointKind.SERVICE, EndpointKind.CLIENT})
+                source, reader = ((mine, other) if mine.kind is EndpointKind.PUBLISHER
+                                  else (other, mine))
+                if reader.qos.transient_local and not source.qos.transient_local:
+                    yield (f"{who}: {reader.full_name} requests earlier messages (transient "
+                           f"local), but {source.full_name} keeps none (volatile)")
+                if reader.qos.reliable and not source.qos.reliable:
+                    yield (f"{who}: {reader.full_name} requests a reliable topic, but "
+                           f"{source.full_name} offers best effort")

@@ -1,4 +1,4 @@
-"""What the gateway says of ROS 2 by itself."""
+"""The gateway's report on the graph of ROS 2."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from rampart.actors.bus.topic import Qos, Topic
 
 
 class RosGraphReport(Message, frozen=True, omit_defaults=True):
-    """Who is there in ROS 2: full names of nodes, those of which there are several, and problems.
+    """Nodes of ROS 2 by full name, names that several nodes have, and problems.
 
-    `bypassed` counts publishers of others on topics that the gateway publishes: what they say
-    reaches the robot past every check. `refused` counts messages that were not passed on.
+    `bypassed` counts other publishers on the gateway's topics: their messages reach the robot
+    without any check. `refused` counts messages that were not passed on.
     """
 
     linked: bool
@@ -23,4 +23,4 @@ class RosGraphReport(Message, frozen=True, omit_defaults=True):
 
 
 GRAPH = Topic("ros2/{name}/graph", RosGraphReport, Qos.STATE, 1, "",
-              "What gateway {name} sees of ROS 2; at once when it changes.")
+              "Nodes of ROS 2 that gateway {name} sees; at once when they change.")

@@ -1,8 +1,8 @@
-"""`RosNodes`: nodes of ROS 2 that have to be there are not, or somebody publishes past the gateway.
+"""`RosNodes`: detects missing nodes of ROS 2, and publishers that bypass the gateway.
 
-A node of ROS 2 that ends takes its liveliness token with it, which the gateway sees within some
-milliseconds; one that hangs keeps it, and falls silent: that is the subject of `Freshness` on a
-topic of it.
+When a node of ROS 2 ends, its liveliness token goes, which the gateway sees within some
+milliseconds. A node that hangs keeps its token and falls silent: `Freshness` on one of its topics
+detects that.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ _GRACE_S = 5.0
 class RosNodes(DetectionModule):
     """Active while a node of ROS 2 is missing, or the gateway is bypassed, for long enough.
 
-    Nothing is missed before the gateway was linked once, and a node that was never there not
-    before the system has had time to start.
+    No node is missing before the gateway has been linked once. A node that was never there is
+    missing only after the system has had time to start.
     """
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
-        """Which nodes, and whom to suspect.
+        """Required nodes, and suspects.
 
         Attributes:
             gateway: node that sees the graph.
-            nodes: full names of nodes of ROS 2 that have to be there, e.g. "/controller_server".
-            alone: whether nobody but the gateway may publish on the topics that it publishes.
-            for_s: how long it has to be so, s.
-            clear_s: how long all has to be well before the module is idle again, s.
-            suspects: names of nodes to be respawned when it is active: the commands that run what
-                is missing. With as many as there are `nodes`, each stands for one.
+            nodes: full names of the required nodes of ROS 2, e.g. "/controller_server".
+            alone: whether only the gateway may publish on the topics that it publishes.
+            for_s: how long an error has to last, s.
+            clear_s: how long there has to be no error before the module is idle again, s.
+            suspects: nodes to restart when the module is active: the commands that run the missing
+                nodes. If there are as many as `nodes`, each one runs the node in its place.
         """
 
         gateway: NodeName
@@ -54,39 +54,39 @@ class RosNodes(DetectionModule):
         def __post_init__(self) -> None:
             """Refuse a module that watches nothing."""
             if not (self.nodes or self.alone):
-                raise ValueError("nodes: missing; say nodes, or alone = true")
+                raise ValueError("nodes: missing; expected nodes, or alone = true")
 
     parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        said = self.parameters
+        given = self.parameters
         self.monitor = self.judged_by(Sustained(
-            said.for_s, said.clear_s, self.known_after_s(said.for_s + said.clear_s)))
+            given.for_s, given.clear_s, self.known_after_s(given.for_s + given.clear_s)))
         self._seen: set[str] = set()
         self._all_due_s = math.inf
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:
-        """Hear its gateway."""
+        """Subscribe to the report of its gateway only."""
         return (parameters.gateway,) if topic is GRAPH else super().names(topic, name, parameters)
 
     @on(GRAPH)
     def graph(self, report: RosGraphReport, _header: Header) -> None:
-        """See who is missing."""
-        said, now_s = self.parameters, self.clock.now()
+        """Look for missing nodes and other publishers."""
+        given, now_s = self.parameters, self.clock.now()
         if report.linked and self._all_due_s == math.inf:
             self._all_due_s = now_s + self.grace_s(_GRACE_S)
         self._seen.update(report.nodes)
-        missing = [node for node in said.nodes if node not in report.nodes
+        missing = [node for node in given.nodes if node not in report.nodes
                    and (node in self._seen or now_s >= self._all_due_s)]
         why = f"{', '.join(missing)}: not in the graph of ROS 2" if missing else ""
-        if said.alone and report.bypassed:
+        if given.alone and report.bypassed:
             why = "; ".join(filter(None, (why, next(
                 (one for one in report.problems if "publishes besides" in one), "bypassed"))))
         self.monitor.accused = tuple(
-            suspect for node, suspect in zip(said.nodes, said.suspects, strict=True)
-            if node in missing) if len(said.nodes) == len(said.suspects) else (
-                said.suspects if missing else ())
+            suspect for node, suspect in zip(given.nodes, given.suspects, strict=True)
+            if node in missing) if len(given.nodes) == len(given.suspects) else (
+                given.suspects if missing else ())
         self.monitor.note(why, now_s)
         self.follow()

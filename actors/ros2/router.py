@@ -1,6 +1,6 @@
-"""The router of ROS 2, where `rmw_zenohd` is not installed: nodes find each other by it.
+"""A router of ROS 2 for machines without `rmw_zenohd`; nodes find each other through it.
 
-With the real one running leave this node out: `ros2 run rmw_zenoh_cpp rmw_zenohd`.
+Leave this node out where the real one runs: `ros2 run rmw_zenoh_cpp rmw_zenohd`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class RosRouter(Actor):
     """Listens where nodes of ROS 2 look for their router, and does nothing else."""
 
     class Parameters(Actor.Parameters, frozen=True, kw_only=True):
-        """Where it listens.
+        """Endpoint of the router.
 
         Attributes:
             listen: its endpoint.
@@ -32,18 +32,18 @@ class RosRouter(Actor):
     _session: zenoh.Session | None = None
 
     def on_start(self) -> None:
-        """Open the router; nothing in virtual time.
+        """Open the router; in virtual time there is nothing to open.
 
         Raises:
-            ValueError: there is one already, or the endpoint makes no sense; one line.
+            ValueError: a router is there already, or the endpoint is not valid; one line.
         """
         if self.context.run.plan.virtual:
             return
         try:
             self._session = zenoh.open(_configured(self.parameters.listen))
         except zenoh.ZError as error:
-            raise ValueError(f"listen = {self.parameters.listen!r}: another router may be there "
-                             f"already; {' '.join(str(error).split())}") from None
+            raise ValueError(f"listen = {self.parameters.listen!r}: cannot listen; another router "
+                             f"may be running; {' '.join(str(error).split())}") from None
 
     def on_stop(self) -> None:
         """Close it."""

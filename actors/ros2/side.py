@@ -1,12 +1,11 @@
-"""The side of ROS 2: a session of its own among those of `rmw_zenoh`, beside that of the system.
+"""The network of ROS 2: a Zenoh session among those of `rmw_zenoh`, separate from the system's bus.
 
-It dials the router that the robot's own nodes have, in the background and again and again, so that
-neither has to be there first; nothing of the system's own bus is reachable by it. What arrives
-is handed over to the event loop.
+It dials the router of the robot's nodes in the background until it answers, so either may start
+first. Messages are handed to the event loop.
 
-As a *client* it exchanges everything through the router, from any machine. As a *peer* it needs a
-direct link to each node: the nodes of ROS 2 listen on their own machine alone, and a router passes
-nothing on between two peers. There it goes on without the router.
+A *client* exchanges everything through the router, from any machine. A *peer* needs a direct link
+to each node, because a router passes nothing on between two peers. The nodes of ROS 2 listen on
+their own machine only; there a peer goes on without the router.
 """
 
 from __future__ import annotations
@@ -30,8 +29,9 @@ from rampart.actors.bus.topic import ROS_SIDE
 from rampart.actors.ros2.wire import Qos
 
 Mode = Literal["client", "peer"]
-"""What a session of Zenoh is beside the router."""
+"""Mode of a session of Zenoh that is not a router."""
 
+NO_ANSWER = "no server answers"
 _AGAIN_S = 1.0
 
 Deliver = Callable[[bytes, bytes | None], None]
@@ -41,15 +41,14 @@ Reply = Callable[[bytes, bytes], None]
 """Answers a request, with payload and attachment."""
 
 Answered = Callable[[bytes | None, bytes | None, str], None]
-"""Called with payload and attachment of an answer, or with None, None, and why there is none."""
-
+"""Called with payload and attachment of an answer, or with None, None and the reason."""
 
 Record = Callable[[str, bytes], None]
-"""Takes key and payload of what a recording is to have."""
+"""Takes key and payload of a message for the recording."""
 
 
 class Side(Protocol):
-    """What a node of ROS 2 needs of the network.
+    """The network as a node of ROS 2 uses it.
 
     Attributes:
         id: of the session, hexadecimal.
@@ -58,75 +57,42 @@ class Side(Protocol):
     id: str
 
     def token(self, key: str) -> None:
-        """Declare a liveliness token, which is there as long as the session."""
+        """Declare a liveliness token, which lasts as long as the session."""
 
     def tokens(self, pattern: str, changed: Callable[[str, bool], None]) -> None:
-        """Have the tokens told that match, those that are there first."""
+        """Call `changed` with each matching token, present ones first, and whether it is there."""
 
     def publisher(self, key: str, qos: Qos) -> Callable[[bytes, bytes], None]:
-        """Return what publishes a payload and its attachment on a key."""
+        """Return a function that publishes a payload and its attachment on a key."""
 
     def subscribe(self, key: str, qos: Qos, deliver: Deliver) -> None:
-        """Have all messages on a key delivered."""
+        """Deliver all messages on a key."""
 
     def serve(self, key: str, asked: Callable[[bytes, bytes | None, Reply], None]) -> None:
-        """Have requests on a key delivered, each with what answers it."""
+        """Deliver requests on a key, each with a function that answers it."""
 
     def ask(self, key: str, payload: bytes, attachment: bytes, timeout_s: float,
             answered: Answered) -> None:
-        """Send a request, and have each answer told; `timeout_s` in real seconds."""
+        """Send a request and call `answered` for each answer; `timeout_s` in real seconds."""
 
     def is_linked(self) -> bool:
-        """Whether there is a router, or another session."""
+        """Return whether a router or another session is connected."""
 
     def close(self) -> None:
         """Leave the network."""
 
 
-class NoSide:
-    """A network with nobody in it, which hears nothing: for what is only to be checked."""
-
-    id = "0"
-
-    def token(self, key: str) -> None:
-        """See `Side.token`."""
-
-    def tokens(self, pattern: str, changed: Callable[[str, bool], None]) -> None:
-        """See `Side.tokens`."""
-
-    def publisher(self, key: str, qos: Qos) -> Callable[[bytes, bytes], None]:  # noqa: ARG002
-        """See `Side.publisher`."""
-        return lambda _payload, _attachment: None
-
-    def subscribe(self, key: str, qos: Qos, deliver: Deliver) -> None:
-        """See `Side.subscribe`."""
-
-    def serve(self, key: str, asked: Callable[[bytes, bytes | None, Reply], None]) -> None:
-        """See `Side.serve`."""
-
-    def ask(self, key: str, payload: bytes, attachment: bytes, timeout_s: float,
-            answered: Answered) -> None:
-        """See `Side.ask`."""
-
-    def is_linked(self) -> bool:
-        """See `Side.is_linked`."""
-        return False
-
-    def close(self) -> None:
-        """See `Side.close`."""
-
-
 class ZenohSide:
-    """A session of Zenoh beside those of ROS 2 nodes.
+    """A session of Zenoh among those of ROS 2 nodes; the methods are those of `Side`.
 
     Args:
         dial: endpoints of the routers of ROS 2, e.g. "tcp/localhost:7447".
-        loop: on which everything is told.
-        record: takes each message that is published or heard; None for no one.
-        mode: "client", by which everything passes the router, or "peer", with direct links.
+        loop: runs all callbacks.
+        record: takes each message that is published or received, if given.
+        mode: "client", with everything through the router, or "peer", with direct links.
 
     Raises:
-        ValueError: an endpoint makes no sense; one line.
+        ValueError: an endpoint is not valid; one line.
     """
 
     def __init__(self, dial: Sequence[str], loop: asyncio.AbstractEventLoop,
@@ -142,14 +108,14 @@ class ZenohSide:
         self._is_closed = False
         self._waiting: list[Callable[[zenoh.Session], Any]] = []
         self._held: list[Any] = []
-        # A client's session opens when its router is there, which the loop does not wait for.
+        # A client's session opens when its router is there; the loop must not wait for that.
         threading.Thread(target=self._open, args=(config,), daemon=True).start()
 
     def _open(self, config: zenoh.Config) -> None:
         while not self._is_closed:
             try:
                 session = zenoh.open(config)
-            except zenoh.ZError:  # a host without address, say, which may get one
+            except zenoh.ZError:  # e.g. a host without address, which may get one
                 time.sleep(_AGAIN_S)
                 continue
             self._tell(self._opened, session)
@@ -165,7 +131,7 @@ class ZenohSide:
         self._waiting.clear()
 
     def _declare(self, declare: Callable[[zenoh.Session], Any]) -> None:
-        """Declare something now, or when the session is open."""
+        """Declare something as soon as the session is open."""
         if self._session is None:
             self._waiting.append(declare)
         else:
@@ -187,7 +153,7 @@ class ZenohSide:
 
     def publisher(self, key: str, qos: Qos) -> Callable[[bytes, bytes], None]:
         """See `Side.publisher`."""
-        # Of all that is to be reliable `rmw_zenoh` waits with keep-all only.
+        # Even with reliable topics, `rmw_zenoh` waits for slow readers with keep-all only.
         waits = qos.reliable and qos.keep_all
         control = zenoh.CongestionControl.BLOCK if waits else zenoh.CongestionControl.DROP
         reliability = (zenoh.Reliability.RELIABLE if qos.reliable
@@ -230,11 +196,11 @@ class ZenohSide:
 
         def arrived(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
             payload, attached = sample.payload.to_bytes(), sample.attachment
-            self._tell(heard, payload, None if attached is None else attached.to_bytes())
+            self._tell(received, payload, None if attached is None else attached.to_bytes())
 
         where = recorded_key(key)
 
-        def heard(payload: bytes, attachment: bytes | None) -> None:
+        def received(payload: bytes, attachment: bytes | None) -> None:
             deliver(payload, attachment)
             if self._record is not None:
                 self._record(where, packed(payload, attachment))
@@ -270,11 +236,11 @@ class ZenohSide:
         if self._session is None:
             self._loop.call_soon(answered, None, None, "no router")
             return
-        heard = False
+        has_reply = False
 
         def arrived(reply: zenoh.Reply) -> None:  # runs on a Zenoh thread
-            nonlocal heard
-            heard = True
+            nonlocal has_reply
+            has_reply = True
             if reply.ok is not None:
                 attached = reply.ok.attachment
                 self._tell(answered, reply.ok.payload.to_bytes(),
@@ -284,8 +250,8 @@ class ZenohSide:
                 self._tell(answered, None, None, text or "an error")
 
         def over() -> None:
-            if not heard:
-                self._tell(answered, None, None, "nobody answers")
+            if not has_reply:
+                self._tell(answered, None, None, NO_ANSWER)
 
         self._session.get(
             key, Callback(arrived, over, indirect=False), payload=payload, attachment=attachment,
@@ -297,7 +263,7 @@ class ZenohSide:
         return bool(self.links())
 
     def links(self) -> set[str]:
-        """Return the ids of the sessions with a direct link, routers among them."""
+        """Return the ids of the sessions and routers with a direct link."""
         if self._session is None:
             return set()
         info = self._session.info
@@ -316,27 +282,27 @@ class ZenohSide:
 
 
 def chunk_of(key: str) -> str:
-    """Return a key of ROS 2 as one chunk of another."""
+    """Return a key of ROS 2 as one chunk of another key."""
     return key.replace("/", "|")
 
 
 def recorded_key(key: str) -> str:
-    """Return the key under which messages on a key of ROS 2 stand in a recording."""
+    """Return the key that messages on a key of ROS 2 have in a recording."""
     return f"{ROS_SIDE}/data/{chunk_of(key)}"
 
 
 def packed(payload: bytes, attachment: bytes | None) -> bytes:
-    """Return a message of ROS 2 as it stands there."""
+    """Return a message of ROS 2 in the form of a recording."""
     return msgspec.msgpack.encode((payload, attachment))
 
 
 def _direct(call: Callable[[Any], None]) -> Callback[Any]:
-    """Return a handler that is called on the thread that reads."""
+    """Return a handler that Zenoh calls on the thread that reads."""
     return Callback(call, indirect=False)
 
 
 def _configured(dial: Sequence[str], mode: Mode, own_id: str) -> zenoh.Config:
-    """Return what `rmw_zenoh` sets by default, with routers that need not be there yet."""
+    """Return the default configuration of `rmw_zenoh`, except that routers may start later."""
     config = zenoh.Config()
     for name, value in {
             "mode": mode, "id": own_id, "connect/endpoints": list(dial), "connect/timeout_ms": -1,

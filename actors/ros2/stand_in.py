@@ -1,8 +1,8 @@
-"""A node of ROS 2 that is an actor: what stands in for a robot's own nodes.
+"""An actor that stands in for a node of ROS 2.
 
-Derive a class from `StandIn`, and name it as the `stand_in` of the node whose `command` starts the
-real one, or as its `actor` where there is none to be started. It speaks as that does: in messages
-of ROS 2, on topics of ROS 2, over Zenoh or, in virtual time, over the virtual bus.
+Derive a class from `StandIn`. Name it as the `stand_in` of the node whose `command` starts the real
+one, or as its `actor` if there is no program to start. It exchanges messages of ROS 2 on topics of
+ROS 2, over Zenoh or, in virtual time, over the virtual bus.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from rampart.actors.runtime.actor import Actor, Context
 
 def side_of(actor: Actor, bus: Bus, connect: Sequence[str], mode: Mode,
             record: Record | None = None) -> Side:
-    """Return the side of ROS 2 for an actor: over Zenoh, or in virtual time over its bus.
+    """Return the network of ROS 2 for an actor: over Zenoh, or in virtual time over its bus.
 
     Args:
-        actor: whose it is.
+        actor: that uses it.
         bus: of the actor.
         connect: endpoints of the routers of ROS 2.
         mode: of the session of Zenoh.
-        record: takes each message, over Zenoh; in virtual time the bus has a recorder of its own.
+        record: takes each message over Zenoh; the virtual bus is recorded anyway.
     """
     context = actor.context
     if context.run.plan.virtual:
@@ -44,7 +44,7 @@ def side_of(actor: Actor, bus: Bus, connect: Sequence[str], mode: Mode,
 
 
 def wall_ns(actor: Actor) -> int:
-    """Return what time it is to nodes without use_sim_time, nanoseconds since 1970."""
+    """Return the time of nodes without use_sim_time, nanoseconds since 1970."""
     if actor.context.run.plan.virtual:
         return EPOCH_NS + int(actor.clock.now() * NS)
     return time.time_ns()
@@ -54,17 +54,17 @@ class StandIn(Actor):
     """Base of the stand-ins for nodes of ROS 2.
 
     Class attributes:
-        node_name: of the node in ROS 2.
-        namespace: likewise.
-        interfaces: folder with definitions of the robot's own; None for none.
+        node_name: name of the node in ROS 2.
+        namespace: namespace of the node.
+        interfaces: folder with the robot's definitions; None for none.
     """
 
     class Parameters(Actor.Parameters, frozen=True, kw_only=True):
-        """Where in ROS 2 it is.
+        """Address of ROS 2.
 
         Attributes:
             domain: ROS_DOMAIN_ID.
-            distribution: by name.
+            distribution: name of the distribution.
             connect: endpoints of the routers of ROS 2.
         """
 
@@ -84,7 +84,7 @@ class StandIn(Actor):
         self.types = Types(self.parameters.distribution, [folder] if folder else [])
 
     def on_start(self) -> None:
-        """Enter the graph; a subclass declares its endpoints in `declare`."""
+        """Join the graph; a subclass declares its endpoints in `declare`."""
         self._side = side = side_of(self, self._bus, self.parameters.connect, "peer")
         self.ros = RosNode(
             side, self.types, self.node_name or self.name, wall_ns=self.wall_ns,
@@ -100,34 +100,34 @@ class StandIn(Actor):
         """Declare publishers, subscriptions and services, by the three methods below."""
 
     def wall_ns(self) -> int:
-        """Return what time it is to ROS 2."""
+        """Return the time of ROS 2, nanoseconds since 1970."""
         return wall_ns(self)
 
     def publisher(self, topic: str, ros_type: str, qos: Qos = Qos(depth=10)  # noqa: B008 frozen
                   ) -> Callable[[Any], None]:
-        """Return what publishes messages of a type; one with a header is stamped now."""
+        """Return a function that publishes messages of a type; a header is stamped now."""
         publish, types = self.ros.publisher(topic, ros_type, qos), self.types
 
-        def say(message: Any) -> None:
+        def stamped(message: Any) -> None:
             header = getattr(message, "header", None)
             if header is not None:
                 header.stamp.sec, header.stamp.nanosec = divmod(self.wall_ns(), NS)
             publish(types.encode(ros_type, message))
 
-        return say
+        return stamped
 
-    def subscribe(self, topic: str, ros_type: str, heard: Callable[[Any], None],
+    def subscribe(self, topic: str, ros_type: str, handle: Callable[[Any], None],
                   qos: Qos = Qos(depth=10)) -> None:  # noqa: B008 frozen
-        """Hear messages of a type."""
+        """Call `handle` with each message of a topic."""
         decode = self.types.decoder(ros_type)
 
         def arrived(payload: bytes, _attachment: Attachment) -> None:
-            self._dispatcher.put_message(f"ros2 {topic}", lambda: heard(decode(payload)))
+            self._dispatcher.put_message(f"ros2 {topic}", lambda: handle(decode(payload)))
 
         self.ros.subscribe(topic, ros_type, qos, arrived)
 
     def serve(self, service: str, ros_type: str, answer: Callable[[Any, Any], None]) -> None:
-        """Serve: `answer` is given the request, and a blank response to be filled."""
+        """Offer a service: `answer` takes the request, and a blank response to fill in."""
         types = self.types
         decode = types.decoder(f"{ros_type}_Request")
 

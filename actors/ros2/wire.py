@@ -1,4 +1,4 @@
-"""ROS 2 on Zenoh as `rmw_zenoh` has it: keys, liveliness tokens, QoS, attachments. Pure.
+"""The wire format of `rmw_zenoh`: keys, liveliness tokens, QoS, attachments. Pure.
 
 Source: `docs/design.md`, `liveliness_utils.cpp` and `attachment_helpers.cpp` of
 github.com/ros2/rmw_zenoh.
@@ -16,14 +16,14 @@ ADMIN = "@ros2_lv"
 """First chunk of every liveliness token."""
 
 DEFAULT_DEPTH = 42
-"""Of a queue, as far as a token does not say another."""
+"""Depth of a queue, unless a token has another one."""
 
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
 
 
 class EndpointKind(StrEnum):
-    """What a token stands for."""
+    """Kinds of endpoints."""
 
     NODE = "NN"
     PUBLISHER = "MP"
@@ -33,13 +33,13 @@ class EndpointKind(StrEnum):
 
 
 class Qos(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Quality of service of an endpoint, as far as `rmw_zenoh` heeds it.
+    """Quality of service of an endpoint, as far as `rmw_zenoh` uses it.
 
     Attributes:
         reliable: reliable, or best effort.
-        transient_local: who joins late gets what was published before, or only what comes.
-        keep_all: all samples wait, or the last `depth`.
-        depth: how many wait.
+        transient_local: a late subscriber receives earlier messages, or only new ones.
+        keep_all: all samples are queued, or the last `depth`.
+        depth: length of the queue.
     """
 
     reliable: bool = True
@@ -48,44 +48,44 @@ class Qos(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth: int = DEFAULT_DEPTH
 
     def token(self) -> str:
-        """Return it as a token says it: empty where it is as by default."""
+        """Return its form in a token, where defaults are empty."""
         depth = "" if self.depth == DEFAULT_DEPTH else self.depth
         return (f"{'' if self.reliable else 2}:{1 if self.transient_local else ''}:"
                 f"{2 if self.keep_all else ''},{depth}:,:,:,,")
 
     @classmethod
     def parse(cls, text: str) -> Qos:
-        """Return what a token says; what is not known counts as the default.
+        """Return the QoS in a token; unknown values count as the defaults.
 
         Raises:
-            ValueError: it is no such text.
+            ValueError: the text is not a QoS.
         """
         parts = text.split(":")
         if len(parts) < 3:
-            raise ValueError(f"QoS {text[:60]!r}: reliability:durability:history,depth:… is right")
+            raise ValueError(f"QoS {text[:60]!r}: expected reliability:durability:history,depth:…")
         history, _, depth = parts[2].partition(",")
         if depth and not (depth.isascii() and depth.isdecimal() and len(depth) < 20):
-            raise ValueError(f"QoS {text[:60]!r}: depth {depth[:20]!r} is no number")
+            raise ValueError(f"QoS {text[:60]!r}: depth {depth[:20]!r}: expected a number")
         return cls(parts[0] != "2", parts[1] == "1", history == "2",
                    int(depth) if depth else DEFAULT_DEPTH)
 
 
 class Endpoint(msgspec.Struct, frozen=True):
-    """A node, or what a node publishes, hears, serves or calls; one token of the graph.
+    """A node, publisher, subscription, service or client; it has one token in the graph.
 
     Attributes:
         domain: ROS domain.
         session: id of the Zenoh session, hexadecimal.
-        node_id: of the node in its session.
-        id: of the endpoint there; of a node its `node_id`.
-        kind: what it is.
-        enclave: of its security, "/" for none.
-        namespace: of the node, "/" for none.
-        node: its name.
-        topic: name of the topic or service with all namespaces; "" of a node, as all that follows.
-        type: of its messages as DDS has it, e.g. "std_msgs::msg::dds_::String_".
-        hash: of the type.
-        qos: of the endpoint.
+        node_id: id of the node in its session.
+        id: id of the endpoint in its session; the `node_id` of a node.
+        kind: kind of the endpoint.
+        enclave: security enclave, "/" for none.
+        namespace: namespace of the node, "/" for none.
+        node: name of the node.
+        topic: full name of the topic or service; empty for a node, as are the next three.
+        type: DDS name of the type, e.g. "std_msgs::msg::dds_::String_".
+        hash: hash of the type.
+        qos: QoS of the endpoint.
     """
 
     domain: int
@@ -117,50 +117,50 @@ class Endpoint(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> str:
-        """Key of what it publishes, hears, serves or calls."""
+        """Key of its topic or service."""
         return data_key(self.domain, self.topic, self.type, self.hash)
 
     @property
     def gid(self) -> bytes:
-        """By what its messages name it, 16 bytes."""
+        """Id of the endpoint in its messages, 16 bytes."""
         return xxhash.xxh3_128_intdigest(self.token.encode()).to_bytes(_GID_BYTES, "little")
 
     @classmethod
     def parse(cls, token: str) -> Endpoint:
-        """Return what a token stands for; what newer versions add at its end is left out.
+        """Return the endpoint of a token; parts that newer versions append are ignored.
 
         Raises:
-            ValueError: it is no token of ROS 2; one line.
+            ValueError: it is not a token of ROS 2; one line.
         """
         parts = token.split("/")
         if len(parts) < 9 or parts[0] != ADMIN or not all(parts):
-            raise ValueError(f"{token[:200]!r} is no liveliness token of ROS 2")
-        _, domain, session, node_id, own_id, kind, enclave, namespace, node = parts[:9]
+            raise ValueError(f"{token[:200]!r}: not a liveliness token of ROS 2")
+        _, domain, session, node_id, own_id, kind_name, enclave, namespace, node = parts[:9]
         if not (domain.isascii() and domain.isdecimal() and len(domain) < 10):
-            raise ValueError(f"token: domain {domain[:20]!r} is no number")
+            raise ValueError(f"token: domain {domain[:20]!r}: expected a number")
         try:
-            is_what = EndpointKind(kind)
+            kind = EndpointKind(kind_name)
         except ValueError:
-            raise ValueError(f"token: {kind[:20]!r} is no kind of an endpoint") from None
-        found = cls(int(domain), session, node_id, own_id, is_what, _demangled(node),
+            raise ValueError(f"token: unknown kind of endpoint {kind_name[:20]!r}") from None
+        found = cls(int(domain), session, node_id, own_id, kind, _demangled(node),
                     _demangled(namespace), enclave=_demangled(enclave))
-        if is_what is EndpointKind.NODE:
+        if kind is EndpointKind.NODE:
             return found
         if len(parts) < 13:
             raise ValueError(f"{token[:200]!r}: topic, type, hash and QoS are missing")
-        topic, kind_of, digest, qos = parts[9:13]
+        topic, type_name, digest, qos = parts[9:13]
         return msgspec.structs.replace(
-            found, topic=_demangled(topic), type=_demangled(kind_of), hash=_demangled(digest),
+            found, topic=_demangled(topic), type=_demangled(type_name), hash=_demangled(digest),
             qos=Qos.parse(qos))
 
 
 class Attachment(msgspec.Struct, frozen=True):
-    """What goes with each message, request and answer.
+    """Attachment of each message, request and answer.
 
     Attributes:
         sequence: number of the message among those of its sender, from 1.
-        stamp_ns: wall time at which it was sent, nanoseconds since 1970.
-        gid: of the sender's endpoint; of an answer, that of who asked.
+        stamp_ns: wall time of sending, nanoseconds since 1970.
+        gid: id of the sender's endpoint; in an answer that of the client.
     """
 
     sequence: int
@@ -168,37 +168,38 @@ class Attachment(msgspec.Struct, frozen=True):
     gid: bytes
 
     def pack(self) -> bytes:
-        """Return it as it travels, 33 bytes."""
+        """Return its 33 bytes."""
         return _ATTACHMENT.pack(self.sequence, self.stamp_ns, _GID_BYTES, self.gid)
 
     @classmethod
     def unpack(cls, data: bytes | None) -> Attachment:
-        """Return what came with a message.
+        """Return the attachment of a message.
 
         Raises:
-            ValueError: nothing did, or it is no attachment of ROS 2.
+            ValueError: there is none, or it is not an attachment of ROS 2.
         """
         if data is None:
             raise ValueError("no attachment; rmw_zenoh sends one with each message")
         if len(data) != _ATTACHMENT.size or data[16] != _GID_BYTES:
-            raise ValueError(f"an attachment of {len(data)} bytes; {_ATTACHMENT.size} are right")
+            raise ValueError(f"attachment of {len(data)} bytes; expected {_ATTACHMENT.size} bytes "
+                             f"with a gid of {_GID_BYTES}")
         sequence, stamp_ns, _, gid = _ATTACHMENT.unpack(data)
         return cls(sequence, stamp_ns, gid)
 
 
 def data_key(domain: int, topic: str, dds_type: str, digest: str) -> str:
-    """Return the key on which a topic's messages travel, or a service is asked."""
+    """Return the key of a topic or service."""
     return f"{domain}/{topic.strip('/')}/{dds_type}/{digest}"
 
 
 def dds_name(ros_type: str) -> str:
-    """Return the name in keys of a type, e.g. of "std_msgs/msg/String"."""
+    """Return the DDS name of a type, e.g. of "std_msgs/msg/String"."""
     package, kind, name = ros_type.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
 
 def ros_name(dds_type: str) -> str:
-    """Return the name of a type that keys call so; as it is, if it is none of ROS 2."""
+    """Return the ROS name of a DDS type; the name itself if it is not a type of ROS 2."""
     parts = dds_type.split("::")
     if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
         return dds_type

@@ -17,13 +17,20 @@ import msgspec
 
 from rampart.actors.ros2.gateway import Gateway, types_of
 from rampart.actors.ros2.graph import RosGraph, misfits
-from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_nodes import RosNodes
-from rampart.actors.ros2.side import NoSide, ZenohSide
+from rampart.actors.ros2.side import ZenohSide
 from rampart.actors.ros2.translation.fields import plain
 from rampart.actors.ros2.translation.tables import GATEWAY, Ros2Link
 from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
-from rampart.actors.ros2.wire import ADMIN, Attachment, Endpoint, EndpointKind, Qos, ros_name
+from rampart.actors.ros2.wire import (
+    ADMIN,
+    Attachment,
+    Endpoint,
+    EndpointKind,
+    Qos,
+    dds_name,
+    ros_name,
+)
 from rampart.actors.system.members import load_member
 from rampart.cli import systems
 from rampart.cli.look.topic_lines import in_line, print_rate, rate_of
@@ -238,10 +245,11 @@ async def _checked(name: str, gateway: Gateway.Parameters, spec: SystemSpec) -> 
             found += [Finding("graph", False, odd) for odd in sorted(there.odd)]
             types = types_of(gateway.distribution, gateway.interfaces)
             found += [Finding(kind, True, note) for kind, note in types.notes.items()]
-            node = RosNode(NoSide(), types, gateway.node, wall_ns=lambda: 0, refuse=lambda *_: None,
-                           namespace=gateway.namespace, domain=gateway.domain)
+            node = Endpoint(gateway.domain, "0", "0", "0", EndpointKind.NODE, gateway.node,
+                            gateway.namespace)
             unlinked = await _unlinked(there, gateway.connect) if gateway.mode == "peer" else set()
-            found += [_of_link(link, there.graph, node, unlinked) for link in gateway.ros2]
+            found += [_of_link(link, there.graph, node, types, unlinked)
+                      for link in gateway.ros2]
             known = there.graph.nodes()
     except NoEffectError as error:
         return [Finding(f"router of {name}", False, str(error))]
@@ -271,14 +279,16 @@ async def _unlinked(there: Onlooker, connect: tuple[str, ...]) -> set[str]:
         side.close()
 
 
-def _of_link(link: Ros2Link, graph: RosGraph, node: RosNode, unlinked: set[str]) -> Finding:
+def _of_link(link: Ros2Link, graph: RosGraph, node: Endpoint, types: Types, unlinked: set[str]
+             ) -> Finding:
     way = link.way
     what = f"{way} {link.name}"
     topic, kind = link.name, link.type
     if way == "goal":
         topic, kind, way = f"{link.name}/_action/send_goal", f"{link.type}_SendGoal", "call"
-    mine = node.endpoint(_OURS[way], topic, kind, Qos(
-        link.reliable, link.transient_local, depth=link.depth))
+    mine = msgspec.structs.replace(
+        node, kind=_OURS[way], topic=topic, type=dds_name(kind), hash=types.hash(kind),
+        qos=Qos(link.reliable, link.transient_local, depth=link.depth))
     there = [one for one in graph.on(topic, _THEIRS[way])
              if one.full_name != node.full_name]
     if not there:

@@ -34,7 +34,7 @@ from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.panels import Panel
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import Forms, header_of, renumbered
-from rampart.actors.recording.run_documents import NOT_CHOSEN, SYSTEM, Known, restore
+from rampart.actors.recording.run_documents import NOT_CHOSEN, SYSTEM, RunContents, restore
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import NO_SYSTEM, RunContext
@@ -320,7 +320,7 @@ class Replay(RecordedRun):
             topics={topic.key: topic for topic in self.known.topics}))
 
 
-def recorded_system(summary: Summary) -> tuple[dict[str, Any], Known]:
+def recorded_system(summary: Summary) -> tuple[dict[str, Any], RunContents]:
     """Return the specification of a recording and its system, as far as they can be read."""
     document: dict[str, Any] = {}
     found = NO_SYSTEM
@@ -329,12 +329,12 @@ def recorded_system(summary: Summary) -> tuple[dict[str, Any], Known]:
         document = read_document(text, SYSTEM)
         found = check_document(document, SYSTEM)
     try:
-        return document, Known(found, application_class(found))
+        return document, RunContents(found, application_class(found))
     except ValueError:  # an application that is not installed here
-        return document, Known(found)
+        return document, RunContents(found)
 
 
-def page_of(known: Known) -> type[Hmi]:
+def page_of(known: RunContents) -> type[Hmi]:
     """Return the class of the operator's page of a system."""
     for node in known.system.nodes:
         with contextlib.suppress(ValueError):

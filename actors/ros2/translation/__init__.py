@@ -1,1 +1,1 @@
-"""Messages of ROS 2 and of the system, each made of the other as tables say. Pure."""
+"""Translation between messages of ROS 2 and of the system. Pure."""

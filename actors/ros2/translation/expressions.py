@@ -1,16 +1,16 @@
-"""How a field is read of a message: a path, a function of paths, a factor. Pure.
+"""Expressions that read a value from a message: a path, a function of paths, a factor. Pure.
 
 twist.twist.linear.x            a field of a field
 axes[1]                         an item of a list; the last is [-1]
 angle_deg * 0.017453292519943295
 yaw(pose.pose.orientation)      heading of a quaternion, rad, in (-pi, pi]
 quaternion(yaw_rad)             the quaternion of a heading
-sqrt(position_covariance[0])    of what is not negative; NaN of what is
-least(ranges), greatest(ranges) of a list, of which NaN does not count; NaN of none
-east(latitude, longitude)       m east of the datum, on a plane that touches the ellipsoid there
-north(latitude, longitude)      m north of it
-latitude(x_m, y_m), longitude(x_m, y_m)     the way back, degrees
-count(status)                   how many items a list has
+sqrt(position_covariance[0])    square root; NaN of a negative number
+least(ranges), greatest(ranges) of a list without its NaNs; NaN of an empty one
+east(latitude, longitude)       m east of the datum, on the plane that touches the ellipsoid there
+north(latitude, longitude)      m north of the datum
+latitude(x_m, y_m), longitude(x_m, y_m)     the inverse, degrees
+count(status)                   number of items of a list
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _PATH = re.compile(r"\s*([A-Za-z_][A-Za-z0-9_.\[\]\-]*)\s*")
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[-?\d{1,6}\])*)\Z")
 
 SEMI_MAJOR_M = 6_378_137.0
-"""Of the ellipsoid WGS 84, and its eccentricity squared (NIMA TR8350.2)."""
+"""Of the ellipsoid WGS 84, with its eccentricity squared (NIMA TR8350.2)."""
 ECCENTRICITY_2 = 6.694379990141316e-3
 
 
 class Quaternion(NamedTuple):
-    """A rotation, as messages have it."""
+    """A rotation with the fields of geometry_msgs/msg/Quaternion."""
 
     x: float
     y: float
@@ -42,7 +42,7 @@ class Quaternion(NamedTuple):
 
 
 def yaw(rotation: Any) -> float:
-    """Return the heading of a quaternion, rad; NaN if it is none (REP-103)."""
+    """Return the heading of a quaternion, rad; NaN if its norm is not 1 (REP-103)."""
     x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
     norm = x * x + y * y + z * z + w * w
     if not 0.9 < norm < 1.1:
@@ -56,17 +56,17 @@ def quaternion(yaw_rad: float) -> Quaternion:
 
 
 def sqrt(value: float) -> float:
-    """Return the square root; NaN of what is negative."""
+    """Return the square root; NaN of a negative number."""
     return math.sqrt(value) if value >= 0 else math.nan
 
 
 def least(values: Sequence[float]) -> float:
-    """Return the least number of a list, NaN if it has none."""
+    """Return the least number of a list, NaN if it is empty."""
     return min((float(v) for v in values if not math.isnan(v)), default=math.nan)
 
 
 def greatest(values: Sequence[float]) -> float:
-    """Return the greatest number of a list, NaN if it has none."""
+    """Return the greatest number of a list, NaN if it is empty."""
     return max((float(v) for v in values if not math.isnan(v)), default=math.nan)
 
 
@@ -74,7 +74,7 @@ class Plane:
     """The plane that touches the ellipsoid at a point.
 
     Args:
-        datum: latitude and longitude of the point, degrees.
+        datum: latitude and longitude of that point, degrees.
     """
 
     def __init__(self, datum: tuple[float, float]) -> None:
@@ -87,11 +87,11 @@ class Plane:
             math.radians(self._latitude_deg)))
 
     def east(self, _latitude_deg: float, longitude_deg: float) -> float:
-        """Return how far east a point is, m."""
+        """Return the distance of a point to the east, m."""
         return (longitude_deg - self._longitude_deg) * self._east_m
 
     def north(self, latitude_deg: float, _longitude_deg: float) -> float:
-        """Return how far north a point is, m."""
+        """Return the distance of a point to the north, m."""
         return (latitude_deg - self._latitude_deg) * self._north_m
 
     def latitude(self, _east_m: float, north_m: float) -> float:
@@ -111,18 +111,18 @@ FUNCTIONS = (*_FUNCTIONS, *_ON_PLANE)
 
 
 class Expression:
-    """What is said of a field that is written, read once.
+    """A parsed expression.
 
     Args:
-        text: as above.
-        plane: for what needs one; None for none.
+        text: as in the description of this module.
+        plane: for functions of latitude and longitude; None if the link has no datum.
 
     Attributes:
-        paths: that it reads.
-        read: returns its value of a message.
+        paths: fields that it reads.
+        read: returns its value for a message.
 
     Raises:
-        ValueError: it makes no sense; one line.
+        ValueError: the text is not an expression; one line.
     """
 
     def __init__(self, text: str, plane: Plane | None = None) -> None:
@@ -133,9 +133,9 @@ class Expression:
             return
         body, star, factor = text.partition("*")
         try:
-            self._factor = float(factor) if star else None
+            scale = float(factor) if star else None
         except ValueError:
-            raise ValueError(f"{text!r}: a number is right behind *") from None
+            raise ValueError(f"{text!r}: expected a number after *") from None
         called = _CALL.fullmatch(body)
         if called:
             name, inside = called.groups()
@@ -149,9 +149,8 @@ class Expression:
             self.paths = (found[1],)
             whole = reader(found[1], text)
         else:
-            raise ValueError(f"{text!r}: a field such as pose.position.x is right, or one of the "
-                             f"functions {', '.join(FUNCTIONS)} of one")
-        scale = self._factor
+            raise ValueError(f"{text!r}: expected a field, e.g. pose.position.x, or a function of "
+                             f"one: {', '.join(FUNCTIONS)}")
         self.read = whole if scale is None else lambda message: whole(message) * scale
 
     @staticmethod
@@ -168,7 +167,7 @@ class Expression:
 
 
 def _called(function: Callable[..., Any], reads: Sequence[Read]) -> Read:
-    """Return what calls a function with what one or two others read."""
+    """Return a function that applies another one to one or two values of a message."""
     one, two = reads[0], reads[-1]
     if len(reads) == 1:
         return lambda message: function(one(message))
@@ -176,26 +175,26 @@ def _called(function: Callable[..., Any], reads: Sequence[Read]) -> Read:
 
 
 def steps(path: str, text: str = "") -> list[str | int]:
-    """Return a path in steps: names, and places in a list.
+    """Return the steps of a path: names, and indices of lists.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not a path.
     """
     found: list[str | int] = []
     for part in path.split("."):
         step = _STEP.match(part)
         if step is None:
-            raise ValueError(f"{text or path!r}: {path!r} is no field, such as pose.position.x")
+            raise ValueError(f"{text or path!r}: {path!r} is not a field, e.g. pose.position.x")
         found.append(step[1])
         found += [int(number) for number in re.findall(r"-?\d+", step[2])]
     return found
 
 
 def reader(path: str, text: str = "") -> Read:
-    """Return what reads a path of a message; an item that a list does not have is an error.
+    """Return a function that reads a path; it raises ValueError for an index out of range.
 
     Raises:
-        ValueError: it is no path.
+        ValueError: it is not a path.
     """
     way = steps(path, text)
 
@@ -204,7 +203,7 @@ def reader(path: str, text: str = "") -> Read:
         for step in way:
             if isinstance(step, int):
                 if not -len(value) <= step < len(value):
-                    raise ValueError(f"{path}: has {len(value)} items")
+                    raise ValueError(f"{path}: the list has {len(value)} items")
                 value = value[step]
             else:
                 value = getattr(value, step)

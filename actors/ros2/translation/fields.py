@@ -1,4 +1,4 @@
-"""The fields of a type of ROS 2, and values of them. Pure."""
+"""Fields of types of ROS 2, and their values. Pure."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from rampart.actors.ros2.translation.expressions import steps
 from rampart.actors.ros2.translation.types import Types
 
 BULK = ("uint8", "int8", "byte", "char")
-"""A list of these is an image, a point cloud or a map: how long it is is kept, no more."""
+"""A list of these is an image, a point cloud or a map; the system gets its length only."""
 
 LEN = "_len"
-"""Behind the name of such a list."""
+"""Suffix of the field with that length."""
 
 
 class TypeFields:
-    """The fields of a type of ROS 2, to be checked by path.
+    """The fields of a type of ROS 2, by path.
 
     Args:
         types: of ROS 2.
-        name: of the type.
+        name: name of the type.
 
     Raises:
-        ValueError: it is not known.
+        ValueError: the type is not known.
     """
 
     def __init__(self, types: Types, name: str) -> None:
@@ -36,23 +36,25 @@ class TypeFields:
         self.names = [field for field, _ in types.fields(name)]
 
     def kind(self, path: str, said: str = "") -> str:
-        """Return the type of a field: of a message or number its name, of a list "[]" behind it.
+        """Return the name of a field's type, with "[]" for a list; "" for a missing `header`.
 
-        "" if there is no such field at the top.
+        Args:
+            path: of the field.
+            said: expression that contains the path, for messages.
 
         Raises:
-            ValueError: there is none further down.
+            ValueError: there is no such field.
         """
         what: Any = (Nodetype.NAME, self._name)
         for step in steps(path, said):
             kind, detail = what
             if isinstance(step, int):
                 if kind not in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
-                    raise ValueError(f"{said or path!r}: [{step}] of what is no list")
+                    raise ValueError(f"{said or path!r}: cannot index [{step}]: not a list")
                 what = detail[0]
                 continue
             if kind != Nodetype.NAME:
-                raise ValueError(f"{said or path!r}: {step} of what has no fields")
+                raise ValueError(f"{said or path!r}: no field {step}: not a message")
             name = detail
             known = dict(self._types.fields(name))
             if step not in known:
@@ -66,19 +68,11 @@ class TypeFields:
             return f"{detail[0][1] if detail[0][0] == Nodetype.NAME else detail[0][1][0]}[]"
         return str(detail if kind == Nodetype.NAME else detail[0])
 
-    def check(self, path: str, said: str) -> None:
-        """Refuse a path that does not exist.
-
-        Raises:
-            ValueError: it does not.
-        """
-        self.kind(path, said)
-
     def writer(self, where: str) -> Callable[[Any], Any]:
-        """Return what makes a value fit for a field.
+        """Return a function that converts a value to the type of a field.
 
         Raises:
-            ValueError: there is no such field, or nothing is written into it.
+            ValueError: there is no such field, or it is a message.
         """
         kind = self.kind(where)
         if kind == "geometry_msgs/msg/Quaternion":
@@ -88,7 +82,7 @@ class TypeFields:
             return list if "/" in element or element == "string" else (
                 lambda value: np.asarray(value, _NUMPY_OF.get(element, element)))
         if "/" in kind:
-            raise ValueError(f"fields: {where} is a {kind}; one of its fields is right")
+            raise ValueError(f"fields: {where} is a {kind}; expected one of its fields")
         if kind.startswith("float"):
             return _finite
         return _ENCODED.get(kind, int)
@@ -99,13 +93,13 @@ _ENCODED: Mapping[str, Callable[[Any], Any]] = {"string": str, "bool": bool}
 
 
 def near(name: str, known: Any) -> str:
-    """Return what names are meant or known, as the end of a message."""
+    """Return the end of an error text: a similar name, or all known names."""
     found = difflib.get_close_matches(name, list(known), 1)
     return f"; did you mean {found[0]}?" if found else f"; known: {', '.join(known) or 'none'}"
 
 
 def plain(value: Any) -> Any:
-    """Return a value of ROS 2 as one that messages of the system are made of."""
+    """Return a value of ROS 2 as numbers, texts, lists and dictionaries."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list):
@@ -124,13 +118,9 @@ def plain(value: Any) -> Any:
 
 
 def _finite(value: float) -> float:
-    """Return a number that ROS 2 is told; what is none moves no wheel.
-
-    Raises:
-        ValueError: it is not finite.
-    """
+    """Return a number; raises ValueError if it is not finite, so that it moves no wheel."""
     if not math.isfinite(value):
-        raise ValueError(f"{value} is no number")
+        raise ValueError(f"{value}: expected a finite number")
     return float(value)
 
 
@@ -138,7 +128,7 @@ _ONE_BYTE = (np.uint8, np.int8)
 
 
 def reads_of(name: str, types: Types, above: str = "") -> dict[str, str]:
-    """Return field → expression by which a message is read field by field, its parts included."""
+    """Return the fields of a type, nested ones included, each with the expression that reads it."""
     found: dict[str, str] = {}
     for field, (kind, detail) in types.fields(name):
         path = f"{above}{field}"

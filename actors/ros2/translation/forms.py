@@ -1,8 +1,8 @@
-"""Common types of ROS 2, ready to be passed on: which quantities are in them, and where. Data.
+"""Ready translations of common types of ROS 2: their quantities, and where they are. Data.
 
-A quantity is called as fields of messages are called here, by what it is and its unit, so that a
-message with a field `yaw_rad` is filled from an odometry without a word. Angles and axes are those
-of REP-103 on either side; a message that stands for the robot in the plane has no z.
+Quantities have the names that fields of messages have here, with the unit, so a message with a
+field `yaw_rad` is filled from an odometry without a table `fields`. Angles and axes follow REP-103
+on both sides. Messages about the robot in the plane have no z.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def _at(path: str, quantities: Mapping[str, str]) -> dict[str, str]:
 
 
 ON_PLANE = {"x_m": "east(latitude, longitude)", "y_m": "north(latitude, longitude)"}
-"""Of a position on the globe, where there is a datum."""
+"""Quantities of a position on the globe, if the link has a datum."""
 
 READY: Mapping[str, Mapping[str, str]] = {
     "geometry_msgs/msg/Twist": _at("", _TWIST),
@@ -51,7 +51,7 @@ READY: Mapping[str, Mapping[str, str]] = {
         "x_m": "transform.translation.x", "y_m": "transform.translation.y",
         "yaw_rad": "yaw(transform.rotation)"},
 }
-"""Quantity → how it is read. Of a transform it is read of the one that is meant."""
+"""Type → quantity → expression that reads it; in a TFMessage from the transform of the link."""
 
 UNKNOWN: Mapping[str, Mapping[str, tuple[str, float]]] = {
     "sensor_msgs/msg/Imu": {
@@ -61,26 +61,26 @@ UNKNOWN: Mapping[str, Mapping[str, tuple[str, float]]] = {
     "sensor_msgs/msg/NavSatFix": {"position_covariance": ("position_covariance_type", 0)},
     "sensor_msgs/msg/BatteryState": {"current": ("current", math.nan),
                                      "percentage": ("percentage", math.nan)}}
-"""Type → field that its sensor may not know → the field and value by which it says so."""
+"""Type → field that a sensor may not know → field and value that mark it as unknown."""
 
 UNBOUNDED = ("sensor_msgs/msg/LaserScan",)
-"""Ready types in which infinity is a value: no echo (REP-117)."""
+"""Ready types in which infinity is a valid value: no echo (REP-117)."""
 
 _TEXTS_AND_TRUTHS = {"dead_man": bool, "ranges_f32": bytes, "status": int}
 
 
 def kind_of(quantity: str) -> type:
-    """Return the type of a quantity."""
+    """Return the Python type of a quantity."""
     return _TEXTS_AND_TRUTHS.get(quantity, float)
 
 
 def may_be_unknown(kind: str, text: str) -> bool:
-    """Whether the sensor may say by convention that it does not know what an expression reads."""
+    """Return whether a sensor may mark what an expression reads as unknown."""
     return any(field in re.findall(r"[a-z_]+", text) for field in UNKNOWN.get(kind, ()))
 
 
 def _written(quantity: str, text: str) -> tuple[str, str] | None:
-    """Return field and expression by which a quantity is written, None if it cannot be."""
+    """Return field of ROS 2 and expression that write a quantity, None if it cannot be written."""
     if text.startswith("yaw("):
         return text[len("yaw("):-1], f"quaternion({quantity})"
     return None if "(" in text else (text, quantity)
@@ -90,4 +90,4 @@ WRITTEN: Mapping[str, Mapping[str, tuple[str, str]]] = {
     kind: {name: written for name, text in quantities.items()
            if (written := _written(name, text)) is not None}
     for kind, quantities in READY.items()}
-"""Quantity → the field of ROS 2 that says it, and how that is read of a message of ours."""
+"""Type → quantity → field of ROS 2, and the expression that reads it from our message."""

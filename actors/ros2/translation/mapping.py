@@ -1,7 +1,6 @@
-"""From messages of ROS 2 to messages of the system, and back, as a link says. Pure.
+"""Translation of messages of ROS 2 to messages of the system and back, as a link declares. Pure.
 
-Everything is looked up when a link is read, so that a field that does not exist is refused before
-a run; what is left for a message is to read and to write.
+Fields are looked up when a link is read, so a field that does not exist is refused before a run.
 """
 
 from __future__ import annotations
@@ -28,29 +27,29 @@ _F32 = "_f32"
 BESIDE = "beside."
 
 
-class Said(Protocol):
-    """Where a message of the system comes from: its header."""
+class HasSource(Protocol):
+    """The header of a message of the system."""
 
     @property
     def source(self) -> str:
-        """Node that has published it."""
+        """Node that has published the message."""
 
 
 class NotMeantError(Exception):
-    """A message that is none of a link's business, as a transform of another frame is."""
+    """A message that the link does not concern, e.g. a transform of another frame."""
 
 
 class Inward:
-    """Makes messages of the system of those of ROS 2.
+    """Translates messages of ROS 2 into messages of the system.
 
     Args:
-        link: what is heard, and what becomes of it.
+        link: row of the specification.
         types: of ROS 2.
         made: type of the messages of the system.
-        beside: type of the messages that are read beside; None for none.
+        beside: type of the messages of the link's `beside`; None for none.
 
     Raises:
-        ValueError: a field does not exist, or nothing says what it is to be; one line.
+        ValueError: a field does not exist, or a required one has no value; one line.
     """
 
     def __init__(self, link: Ros2Link, types: Types, made: type[msgspec.Struct],
@@ -60,7 +59,7 @@ class Inward:
         self._picks = link.type == TF
         read = _TRANSFORM if self._picks else link.type
         if self._picks and not (link.frame and link.child):
-            raise ValueError("frame and child are missing: which transform is meant")
+            raise ValueError("frame and child are missing: expected the frames of the transform")
         fields = TypeFields(types, read)
         self.has_stamp = fields.kind("header") == _HEADER
         plane = Plane(link.datum) if link.datum else None
@@ -78,8 +77,8 @@ class Inward:
             said = link.fields.get(path, ready.get(path, ready.get(path.rpartition(".")[2])))
             if said is None:
                 if field.required:
-                    raise ValueError(f"fields: nothing says what {path} of {made.__name__} is; "
-                                     f"{link.type} has {', '.join(fields.names)}")
+                    raise ValueError(f"fields: {path} of {made.__name__} has no value; expected a "
+                                     f"field of {link.type}: {', '.join(fields.names)}")
                 continue
             if isinstance(said, str) and said.startswith(BESIDE) and beside is not None:
                 self._reads_beside.append((path.split("."), _read_of(
@@ -93,13 +92,13 @@ class Inward:
             return lambda _message: said
         expression = Expression(said, plane)
         for one in expression.paths:
-            fields.check(one, said)
+            fields.kind(one, said)
         if path.endswith(_F32):
             return lambda message: np.asarray(expression.read(message), "<f4").tobytes()
         return self._checked(path, said, expression)
 
     def _checked(self, path: str, said: str, expression: Expression) -> Read:
-        """Return what reads a value that means something; None of one that may be missing."""
+        """Return a function that reads a known, finite value; None for an unknown optional one."""
         kind, is_optional = self._link.type, path in self._optional
         parts = [(text, reader(text)) for text in expression.paths]
         marks = [(text, reader(text), value) for field, (text, value) in
@@ -118,22 +117,22 @@ class Inward:
             if isinstance(found, float) and (
                     math.isnan(found) or (is_bounded and math.isinf(found))):
                 values = ", ".join(f"{text} = {_shown(part(message))}" for text, part in parts)
-                raise ValueError(f"{path}: {said} is {found:g}, a number is right; {values}")
+                raise ValueError(f"{path}: {said} is {found:g}; expected a finite number; {values}")
             return found
 
         return read
 
     def __call__(self, message: Any, beside: Any = None) -> tuple[msgspec.Struct, int | None]:
-        """Return the message of the system, and the stamp of the other's header, nanoseconds.
+        """Return the message of the system, and the stamp of the message of ROS 2, nanoseconds.
 
         Args:
             message: of ROS 2.
-            beside: message of the system that is read beside.
+            beside: newest message of the link's `beside`.
 
         Raises:
-            NotMeantError: it is none of the link's business.
-            ValueError: it has a value that the message of the system does not take, or is in
-                another frame; one line.
+            NotMeantError: the link does not concern it.
+            ValueError: a value is beyond the bounds of the message of the system, or the frame is
+                another one; one line.
         """
         if self._picks:
             message = self._picked(message)
@@ -143,7 +142,7 @@ class Inward:
             stamp_ns = header.stamp.sec * NS + header.stamp.nanosec
             if self._link.frame and header.frame_id.lstrip("/") != self._link.frame:
                 raise ValueError(f"its frame is {header.frame_id[:60]!r}; "
-                                 f"{self._link.frame!r} is right")
+                                 f"expected {self._link.frame!r}")
         found: dict[str, Any] = {}
         for source, reads in ((message, self._reads), (beside, self._reads_beside)):
             for path, read in reads:
@@ -165,7 +164,6 @@ class Inward:
 
 
 def _shown(value: Any) -> str:
-    """Return a value in few characters."""
     found = plain(value)
     if isinstance(found, dict):
         return "(" + ", ".join(f"{name} {_shown(part)}" for name, part in found.items()) + ")"
@@ -173,7 +171,7 @@ def _shown(value: Any) -> str:
 
 
 def _read_of(said: str, beside: type[msgspec.Struct]) -> Read:
-    """Return what reads an expression of a message of the system."""
+    """Return a function that reads an expression from a message of the system."""
     expression = Expression(said)
     known = [path for path, _ in _leaves(beside)]
     for path in expression.paths:
@@ -184,28 +182,28 @@ def _read_of(said: str, beside: type[msgspec.Struct]) -> Read:
 
 
 class Outward:
-    """Makes messages of ROS 2 of those of the system.
+    """Translates messages of the system into messages of ROS 2.
 
     Args:
-        link: what is said, and what of.
+        link: row of the specification.
         types: of ROS 2.
-        heard: type of the messages of the system.
-        lenient: whether it may be that nothing is said, as in a request without fields.
+        source: type of the messages of the system.
+        lenient: whether no field need be written, as in a request without fields.
 
     Raises:
-        ValueError: a field does not exist, or nothing would be said; one line.
+        ValueError: a field does not exist, or no field would be written; one line.
     """
 
-    def __init__(self, link: Ros2Link, types: Types, heard: type[msgspec.Struct], *,
+    def __init__(self, link: Ros2Link, types: Types, source: type[msgspec.Struct], *,
                  lenient: bool = False) -> None:
         self._link, self._types = link, types
         self._wraps = link.type == TF
         self._name = _TRANSFORM if self._wraps else link.type
         if self._wraps and not (link.frame and link.child):
-            raise ValueError("frame and child are missing: which transform is said")
+            raise ValueError("frame and child are missing: expected the frames of the transform")
         fields = TypeFields(types, self._name)
         self._has_header = fields.kind("header") == _HEADER
-        leaves = [path for path, _ in _leaves(heard)]
+        leaves = [path for path, _ in _leaves(source)]
         there = {path.rpartition(".")[2]: path for path in leaves}
         said: dict[str, str | float | bool] = {} if link.type in WRITTEN else {
             path: path for path, read in reads_of(self._name, types).items()
@@ -215,46 +213,46 @@ class Outward:
                 said[where] = text.replace(quantity, there[quantity])
         said |= link.fields
         if not (said or lenient):
-            raise ValueError(f"fields: nothing says what {link.type} is to be; {heard.__name__} "
+            raise ValueError(f"fields: no field of {link.type} has a value; {source.__name__} "
                              f"has {', '.join(there.values()) or 'no fields'}")
         plane = Plane(link.datum) if link.datum else None
-        self._heard, self._leaves = heard.__name__, leaves
+        self._source, self._leaves = source.__name__, leaves
         self._writes = [(*_place(fields, where), self._read(where, one, plane, fields))
                         for where, one in said.items()]
 
     def _read(self, where: str, said: str | float | bool, plane: Plane | None, fields: TypeFields
-              ) -> Callable[[Any, Said | None], Any]:
+              ) -> Callable[[Any, HasSource | None], Any]:
         if not isinstance(said, str):
-            return lambda _message, _said: said
+            return lambda _message, _header: said
         if said == "@source":
-            return lambda _message, said: said.source if said else ""
+            return lambda _message, header: header.source if header else ""
         expression = Expression(said, plane)
         for path in expression.paths:
             if path not in self._leaves:
-                raise ValueError(f"fields: {said!r}: {self._heard} has no field {path!r}"
+                raise ValueError(f"fields: {said!r}: {self._source} has no field {path!r}"
                                  f"{near(path, self._leaves)}")
         read, write = expression.read, fields.writer(where)
         if "".join(expression.paths).endswith(_F32):
-            return lambda message, _said: np.frombuffer(read(message), "<f4")
-        return lambda message, _said: write(read(message))
+            return lambda message, _header: np.frombuffer(read(message), "<f4")
+        return lambda message, _header: write(read(message))
 
-    def __call__(self, message: Any, stamp_ns: int, said: Said | None = None) -> bytes:
-        """Return the message of ROS 2 as it travels.
+    def __call__(self, message: Any, stamp_ns: int, header: HasSource | None = None) -> bytes:
+        """Return the encoded message of ROS 2.
 
         Args:
             message: of the system.
-            stamp_ns: when its content was true, nanoseconds of the clock that ROS 2 has.
-            said: where it comes from.
+            stamp_ns: stamp of the message, nanoseconds of the clock of ROS 2.
+            header: of the message of the system.
 
         Raises:
-            ValueError: it has a value that ROS 2 cannot say; one line.
+            ValueError: a value does not fit its field in ROS 2; one line.
         """
         made = self._types.blank(self._name)
         for way, last, read in self._writes:
             inner = made
             for step in way:
                 inner = getattr(inner, step)
-            value = read(message, said)
+            value = read(message, header)
             if isinstance(last, int):
                 inner[last] = value
             else:
@@ -262,7 +260,7 @@ class Outward:
         return self._finish(made, stamp_ns)
 
     def zero(self, stamp_ns: int) -> bytes:
-        """Return the message with all fields 0, as it travels."""
+        """Return the encoded message with all fields 0."""
         return self._finish(self._types.blank(self._name), stamp_ns)
 
     def _finish(self, made: Any, stamp_ns: int) -> bytes:
@@ -279,17 +277,17 @@ class Outward:
 
 
 def _place(fields: TypeFields, where: str) -> tuple[list[str], str | int]:
-    """Return the way to a field that is written, and its last step."""
-    fields.check(where, where)
+    """Return the path of a field that is written without its last step, and that step."""
+    fields.kind(where, where)
     way = steps(where)
     if any(isinstance(step, int) for step in way[:-1]):
-        raise ValueError(f"fields: {where}: an item of a list that has fields is not written")
+        raise ValueError(f"fields: {where}: cannot write into the messages of a list")
     return [str(step) for step in way[:-1]], way[-1]
 
 
 def _leaves(made: type[msgspec.Struct], above: str = ""
             ) -> Iterator[tuple[str, msgspec.structs.FieldInfo]]:
-    """Yield the paths of the fields of a struct, each with its field."""
+    """Yield path and description of each field of a struct, nested ones included."""
     for field in msgspec.structs.fields(made):
         kind = field.type
         path = f"{above}{field.name}"

@@ -1,7 +1,7 @@
-"""Topics of the system that are made of topics of ROS 2. Pure.
+"""Topics of the system that are generated from topics of ROS 2. Pure.
 
-A common type becomes its quantities (`forms`), any other what it is, field by field: so that a
-module which takes a topic's field takes one of a robot that nobody has described yet.
+A common type becomes its quantities (`forms`), any other type is copied field by field. So a ready
+module can use any field of a robot without a message type for it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,14 @@ from rampart.actors.ros2.translation.mapping import BESIDE, TF
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
 
-_BOUNDED: dict[Any, Any] = {
-    bytes: Floats32, str: Text, float: float, bool: bool,
-    int: Whole}
+_BOUNDED: dict[Any, Any] = {bytes: Floats32, str: Text, float: float, bool: bool, int: Whole}
+
 
 def topic_of(link: Ros2Link, types: Types) -> Topic[Any]:
-    """Return the topic of the system that a link's `to` is, if nobody else declares it.
+    """Return the topic of a link's `to`, for a system that does not declare it.
 
     Raises:
-        ValueError: its type is not known, or a field makes no sense; one line.
+        ValueError: the type is not known, or a field is wrong; one line.
     """
     qos = Qos.STATE if link.transient_local else Qos.SENSOR
     return Topic(link.to, message_of(link, types), qos, link.rate_hz or 0.0, link.frame,
@@ -37,7 +36,7 @@ def topic_of(link: Ros2Link, types: Types) -> Topic[Any]:
 
 
 def message_of(link: Ros2Link, types: Types) -> type[msgspec.Struct]:
-    """Return the type of its messages; arguments and errors as of `topic_of`."""
+    """Return the type of the messages of `topic_of`; raises as it does."""
     ready = dict(READY.get(link.type, {}))
     if link.datum and link.type == "sensor_msgs/msg/NavSatFix":
         ready |= ON_PLANE
@@ -51,7 +50,7 @@ def message_of(link: Ros2Link, types: Types) -> type[msgspec.Struct]:
         kinds = dict.fromkeys(link.fields, float)
     for name in kinds:
         if not name.isidentifier():
-            raise ValueError(f"fields: {name!r}: a name such as speed_mps is right")
+            raise ValueError(f"fields: {name!r}: expected a name, e.g. speed_mps")
     kinds = {name: kind_of(name) for name in ready} | kinds
     made: list[Any] = []
     for name, kind in kinds.items():
@@ -63,7 +62,7 @@ def message_of(link: Ros2Link, types: Types) -> type[msgspec.Struct]:
 
 
 def _kind_of(said: str | float | bool, fields: TypeFields, plane: Plane | None) -> Any:
-    """Return of which type an expression is."""
+    """Return the Python type of an expression's value."""
     if not isinstance(said, str):
         return type(said)
     if said.startswith(BESIDE):
@@ -76,7 +75,7 @@ def _kind_of(said: str | float | bool, fields: TypeFields, plane: Plane | None) 
     kind = fields.kind(said.strip(), said)
     found = _base(kind.removesuffix("[]"))
     if found is None:
-        raise ValueError(f"fields: {said!r} is a {kind}; one of its fields is right")
+        raise ValueError(f"fields: {said!r} is a {kind}; expected one of its fields")
     return _listed(found) if kind.endswith("[]") else found
 
 

@@ -1,4 +1,4 @@
-"""What passes between ROS 2 and the system: tables `[[ros2]]`, and what is refused there. Pure."""
+"""Rows `[[ros2]]` of a specification: what passes between ROS 2 and the system. Pure."""
 
 from __future__ import annotations
 
@@ -35,44 +35,45 @@ ROUTER = "tcp/localhost:7447"
 
 WAYS = {"subscribe": ("to",), "publish": ("from",), "call": ("from", "to"), "serve": ("to",),
          "goal": ("from", "to")}
-"""What can be had of ROS 2, each with the keys of the topics of the system that it takes."""
+"""The five kinds of links, each with the keys of its topics of the system."""
 
 
 class Ros2Link(Table, frozen=True, kw_only=True):
-    """Something of ROS 2 and topics of the system that it is passed on to, or made of.
+    """A topic, service or action of ROS 2, and the topics of the system that it is linked to.
 
-    One of `subscribe`, `publish`, `call`, `serve` and `goal` says what.
+    One of `subscribe`, `publish`, `call`, `serve` and `goal` names it.
 
     Attributes:
-        subscribe: Topic of ROS 2 that is heard, and published on `to`.
-        publish: Topic of ROS 2 on which is said what the system says on `from`.
-        call: Service of ROS 2 that is called with each message on `from`; the answer is on `to`.
-        serve: Service that is offered to ROS 2: what it is asked is published on `to`.
-        goal: Action of ROS 2 that is given each message on `from` as its goal; how it goes is on
-            `to`.
-        type: Of its messages in ROS 2; of a service or action its own.
-        to: Key of the topic of the system; if none has it, it is made of the fields of `type`.
-        from_: `from` in the file, likewise; that of `publish` has to be there.
+        subscribe: Topic of ROS 2 whose messages are published on `to`.
+        publish: Topic of ROS 2 on which the messages of `from` are published.
+        call: Service of ROS 2 that is called with each message of `from`; the answer is on `to`.
+        serve: Service that is offered to ROS 2; its requests are published on `to`.
+        goal: Action of ROS 2 that receives each message of `from` as its goal; the goal's state is
+            on `to`.
+        type: Type of the messages in ROS 2, or of the service or action.
+        to: Key of the topic of the system; if no class declares it, it gets the fields of `type`.
+        from_: `from` in the file, in the same way; with `publish` a class has to declare it.
         fields: Field that is written → how it is read: a field of the other side, a number, a truth
-            value, or a function of fields (`rampart.actors.ros2.translation.expressions`). What is
-            not said is as the ready form of `type` has it.
-        answer: The same of the answer: that of a call or goal, on `to`, or that of `serve`, where
-            it says numbers, truth values and texts only.
-        frame: That messages to ROS 2 are in, and those from there have to be; "" for any.
-        child: Frame whose transform is meant, of a message of `tf`.
-        beside: Key of a topic of the system whose newest message may be read too, as
-            `beside.FIELD`, if it is not older than `max_age_s`: of what comes in two topics.
+            value, or a function of fields (`rampart.actors.ros2.translation.expressions`). Other
+            fields follow the ready form of `type`.
+        answer: The same for the answer: of a call or goal, on `to`; or of `serve`, with numbers,
+            truth values and texts only.
+        frame: Frame of messages to ROS 2, and required of messages from there; "" for any.
+        child: Child frame of the transform that is meant, in a message of `tf`.
+        beside: Key of a topic of the system whose newest message can be read too, as
+            `beside.FIELD`, if it is not older than `max_age_s`.
         datum: Latitude and longitude, degrees, of the origin of `map`: for `east` and `north`.
-        rate_hz: No more messages pass in a second; None for all.
-        max_age_s: What is older is not said to ROS 2, nor read beside.
-        stop_after_s: When the system has been silent for so long, ROS 2 is told zeros; None for
-            never. Its own loss is not told: a driver has to stop by itself when commands cease.
+        rate_hz: Greatest number of messages per second; None for all.
+        max_age_s: Older messages are not published to ROS 2, nor read as `beside`.
+        stop_after_s: After so much silence of the system, zeros are published to ROS 2; None for
+            never. Nothing stops the robot if the gateway is lost: a driver has to stop by itself
+            when commands cease.
         within_s: How long the answer of a call may take, real seconds.
-        stamp: Where the time of what is heard is from: its header, or when it arrived.
+        stamp: Time of messages from ROS 2: of their header, or of their arrival.
         publishers: Whether a second publisher is refused.
-        reliable: Whether it is asked for, or offered, reliably.
-        transient_local: Whether who joins late gets what was said last.
-        depth: How many messages wait.
+        reliable: Whether messages are requested, or offered, reliably.
+        transient_local: Whether a late subscriber receives earlier messages.
+        depth: Length of the queue.
         gateway: Node that passes it on; "" for the only one.
     """
 
@@ -103,7 +104,7 @@ class Ros2Link(Table, frozen=True, kw_only=True):
 
     @property
     def way(self) -> str:
-        """Which of the five it is."""
+        """Kind of the link, a key of `WAYS`."""
         return next(way for way in WAYS if getattr(self, way))
 
     @property
@@ -117,11 +118,11 @@ def read_links(spec: SystemSpec, gateways: Collection[str], file: str) -> tuple[
 
     Args:
         spec: the system.
-        gateways: names of the nodes that pass something on.
+        gateways: names of the gateways.
         file: name of the specification, for messages.
 
     Raises:
-        SpecificationError: one says too little, too much, or the same as another.
+        SpecificationError: a row is incomplete, contradictory, or repeats another one.
     """
     links = read_rows(spec.ros2, Ros2Link, "ros2", file)
     for number in range(len(links)):
@@ -132,25 +133,25 @@ def read_links(spec: SystemSpec, gateways: Collection[str], file: str) -> tuple[
 
 def _find_wrong(number: int, links: Sequence[Ros2Link],
                 gateways: Collection[str]) -> Iterator[Finding]:
-    """Find what is wrong with a link, with its path in the row."""
+    """Yield the errors of a link, each with its path in the row."""
     link = links[number]
     ways = [way for way in WAYS if getattr(link, way)]
     if len(ways) != 1:
-        yield Finding("", f"one of {', '.join(WAYS)} is right, and it has "
+        yield Finding("", f"expected one of {', '.join(WAYS)}; found "
                           f"{' and '.join(ways) or 'none'}")
         return
     way, = ways
     yield from _wrong_keys(way, link)
     kind = {"call": "srv", "serve": "srv", "goal": "action"}.get(way)
     if kind is not None and link.type.split("/")[1] not in {kind, "action"}:
-        yield Finding(".type", f"with {way}, package/{kind}/Name is right", (link.type,))
+        yield Finding(".type", f"with {way}, expected package/{kind}/Name", (link.type,))
     if link.stop_after_s and way != "publish":
         yield Finding(".stop_after_s", "is for publish", (link.stop_after_s,))
     if link.answer and way not in {"call", "serve", "goal"}:
         yield Finding(".answer", "is for call, serve or goal", (link.answer,))
-    heard = {one.to for one in links if one.subscribe}
-    if link.beside and (way != "subscribe" or link.beside not in heard):
-        yield Finding(".beside", "the `to` of another subscription is right", (link.beside,))
+    subscribed = {one.to for one in links if one.subscribe}
+    if link.beside and (way != "subscribe" or link.beside not in subscribed):
+        yield Finding(".beside", "expected the `to` of another subscription", (link.beside,))
     if link.gateway and link.gateway not in gateways:
         yield unknown(".gateway", link.gateway, "gateway", gateways)
     for place, other in enumerate(links[:number]):
@@ -164,5 +165,5 @@ def _wrong_keys(way: str, link: Ros2Link) -> Iterator[Finding]:
     for field, key in (("to", link.to), ("from", link.from_)):
         if (field in WAYS[way]) != bool(key):
             wanted = " and ".join(f"{one} = 'key'" for one in WAYS[way])
-            yield Finding(f".{field}", f"with {way}, {wanted} of a topic of the system is right",
+            yield Finding(f".{field}", f"with {way}, expected {wanted} of a topic of the system",
                           (key,))

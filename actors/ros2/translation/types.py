@@ -1,9 +1,9 @@
-"""ROS 2 types: their definitions, hashes, and messages as bytes (CDR). Pure.
+"""Types of ROS 2: definitions, hashes, and the encoding of messages (CDR). Pure.
 
-`rosbags` knows the common types of each distribution and does the encoding. What it does not know
-is beside this module, in `interfaces/common` and `interfaces/DISTRIBUTION`, as
-`package/msg/Name.msg`, `package/srv/Name.srv` and `package/action/Name.action`; a robot's own lie
-in folders of the same shape.
+`rosbags` knows the common types of each distribution and does the encoding. The folders
+`interfaces/common` and `interfaces/DISTRIBUTION` add types that it lacks, as
+`package/msg/Name.msg`, `package/srv/Name.srv` and `package/action/Name.action`. A robot's own
+folders have the same layout.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DISTRIBUTIONS: Final = {"humble": Stores.ROS2_HUMBLE, "iron": Stores.ROS2_IRON,
 SHIPPED = Path(__file__).with_name("interfaces")
 
 NO_HASH = "TypeHashNotSupported"
-"""In the place of a type's hash, on Humble."""
+"""Stands in place of a type's hash on Humble."""
 
 MOST_BYTES = 8 << 20
 """Longest message that is decoded."""
@@ -46,7 +46,7 @@ _UNHASHED = ("humble",)
 
 _UNREADABLE = (SerdeError, struct.error, ValueError, TypeError, AttributeError, IndexError,
                AssertionError, OverflowError, MemoryError)
-"""What `rosbags` raises when bytes are no message, or values do not fit; found by fuzzing."""
+"""Raised by `rosbags` for bytes that do not decode and values that do not fit; from fuzzing."""
 
 _EMPTY = [("structure_needs_at_least_one_member", (Nodetype.BASE, ("uint8", 0)))]
 _UNSUPPORTED = ("wstring", "float128", "wchar")
@@ -59,26 +59,27 @@ Fields = list[tuple[str, Any]]
 
 
 class Types:
-    """The types of a distribution, and those of a robot.
+    """The types of a distribution and of a robot.
 
     Args:
-        distribution: name of the distribution, one of `DISTRIBUTIONS`.
-        folders: with a robot's own definitions, which replace those that ship.
+        distribution: one of `DISTRIBUTIONS`.
+        folders: with a robot's definitions, which replace shipped ones.
 
     Attributes:
-        left_out: name of each type of a folder that cannot be used → why, one line.
+        left_out: type of a folder that cannot be used → the reason, one line.
 
     Raises:
-        ValueError: there is no such distribution or folder, or a file does not parse; one line
-            that names the file.
+        ValueError: the distribution or a folder does not exist, or a file does not parse; one line
+            with the name of the file.
     """
 
     def __init__(self, distribution: str, folders: Iterable[Path] = ()) -> None:
         if distribution not in DISTRIBUTIONS:
-            raise ValueError(f"distribution = {distribution!r}: known: {', '.join(DISTRIBUTIONS)}")
+            raise ValueError(f"distribution = {distribution!r}: unknown; known: "
+                             f"{', '.join(DISTRIBUTIONS)}")
         self.distribution = distribution
         self._store = get_typestore(DISTRIBUTIONS[distribution])
-        self._described = Typestore()  # of it the hashes are made
+        self._described = Typestore()  # for hashes
         for name, (constants, fields) in self._store.fielddefs.items():
             self._described.fielddefs[name] = constants, _read_as_uint8(fields, "char")
             self._store.fielddefs[name] = constants, _read_as_uint8(fields, "char", "byte")
@@ -100,24 +101,24 @@ class Types:
 
     @property
     def notes(self) -> dict[str, str]:
-        """What the folders do beyond new types: name of the type → one line."""
+        """Types that the folders replace or leave out → one line about it."""
         replaces = f"its definition replaces the one of {self.distribution}"
         return dict.fromkeys(self._replaced, replaces) | {
             name: f"left out: {why}" for name, why in self.left_out.items()}
 
     def fields(self, name: str) -> Fields:
-        """Return the fields of a message, each with the description that `rosbags` has of it.
+        """Return the fields of a message, each with its type as `rosbags` describes it.
 
         Raises:
-            ValueError: it is not known.
+            ValueError: the type is not known.
         """
         return [(field, what) for field, what in self._definition(name) if field != _EMPTY[0][0]]
 
     def hash(self, name: str) -> str:
-        """Return the hash of a type as keys have it (REP-2016).
+        """Return the hash of a type (REP-2016), as it is in keys.
 
         Raises:
-            ValueError: it is not known.
+            ValueError: the type is not known.
         """
         if self.distribution in _UNHASHED:
             return NO_HASH
@@ -127,24 +128,21 @@ class Types:
         return self._hashes[name]
 
     def blank(self, name: str) -> Any:
-        """Return a message as ROS 2 makes it: all fields 0, empty or false, no rotation."""
+        """Return a message with default values: fields are 0, empty or false, w of a rotation 1."""
         if name == _QUATERNION:
             return self._store.types[name](x=0.0, y=0.0, z=0.0, w=1.0)
-        store = self._store
-        made: dict[str, Any] = {}
-        for field, what in self._definition(name):
-            made[field] = self._blank_field(what)
-        return store.types[name](**made)
+        fields = {field: self._blank_field(what) for field, what in self._definition(name)}
+        return self._store.types[name](**fields)
 
     @staticmethod
     def numbers(values: Sequence[float], kind: str = "float32") -> Any:
-        """Return a list of numbers as messages have it."""
+        """Return numbers as an array for a message."""
         import numpy as np  # noqa: PLC0415 with the first message
 
         return np.asarray(values, np.dtype(kind))
 
     def like(self, name: str, value: Any) -> Any:
-        """Return a message whose fields are the attributes of a value."""
+        """Return a message with the attributes of a value as its fields."""
         return self._store.types[name](
             **{field: getattr(value, field) for field, _ in self._definition(name)})
 
@@ -153,18 +151,18 @@ class Types:
         return self._store.types[name](**values)
 
     def define(self, definitions: Mapping[str, Fields]) -> None:
-        """Make types known that are in no file: name of a message → its fields.
+        """Add types that are in no file: name of a message → its fields.
 
         Raises:
-            ValueError: they make no sense; one line.
+            ValueError: a definition is not valid; one line.
         """
         self._add({name: ([], fields) for name, fields in definitions.items()})
 
     def definition(self, name: str) -> tuple[str, str]:
-        """Return the text that defines a message, with all that it is made of, and its hash.
+        """Return the definition of a message and of the types in it as text, and its hash.
 
         Raises:
-            ValueError: it is not known.
+            ValueError: the type is not known.
         """
         self._definition(name)
         text, _ = self._described.generate_msgdef(name, ros_version=2)
@@ -185,10 +183,10 @@ class Types:
                 ] if kind == Nodetype.ARRAY else []
 
     def encode(self, name: str, message: Any) -> bytes:
-        """Return a message as it travels.
+        """Return the encoded message.
 
         Raises:
-            ValueError: a field has a value that its type does not take; one line.
+            ValueError: a value does not fit its field; one line.
         """
         try:
             return bytes(self._store.serialize_cdr(message, name, little_endian=True))
@@ -196,18 +194,14 @@ class Types:
             raise ValueError(f"{name}: {_line(error)}") from None
 
     def decode(self, name: str, data: bytes) -> Any:
-        """Return the message that travelled so.
-
-        Raises:
-            ValueError: it is none of this type; one line.
-        """
+        """Return the decoded message; raises as the function of `decoder`."""
         return self.decoder(name)(data)
 
     def decoder(self, name: str) -> Callable[[bytes], Any]:
-        """Return a function that does so for one type.
+        """Return a function that decodes messages of one type, or raises ValueError; one line.
 
         Raises:
-            ValueError: it is not known.
+            ValueError: the type is not known.
         """
         self._definition(name)
         try:
@@ -220,17 +214,17 @@ class Types:
         def decode(data: bytes) -> Any:
             way = ways.get(data[:2])
             if way is None or len(data) < _HEADER_BYTES:
-                raise ValueError(f"{name}: begins with {data[:4].hex(' ') or 'nothing'}; CDR with "
-                                 "00 01 00 00 is right")
+                raise ValueError(f"{name}: begins with {data[:4].hex(' ') or 'nothing'}; expected "
+                                 "CDR, which begins with 00 01 00 00")
             if len(data) > MOST_BYTES:
-                raise ValueError(f"{name}: {len(data)} bytes; at most {MOST_BYTES} are right")
+                raise ValueError(f"{name}: {len(data)} bytes; expected at most {MOST_BYTES}")
             try:
                 message, end = way(memoryview(data)[_HEADER_BYTES:], 0, kind, store)
             except _UNREADABLE as error:
-                raise ValueError(f"{name}: {len(data)} bytes are no such message: "
+                raise ValueError(f"{name}: cannot decode {len(data)} bytes: "
                                  f"{_line(error)}") from None
             few = end - (len(data) - _HEADER_BYTES)
-            if few > 0:  # more is a message serialized beforehand, whose tail ROS 2 ignores
+            if few > 0:  # ROS 2 ignores a tail
                 raise ValueError(f"{name}: {few} bytes too few")
             return message
 
@@ -244,12 +238,13 @@ class Types:
         except KeyError:
             if name in self.left_out:
                 raise ValueError(f"type {name!r}: {self.left_out[name]}") from None
-            raise ValueError(f"type {name!r} is not known to {self.distribution}; a file "
-                             f"{name}.{name.split('/')[1] if name.count('/') == 2 else 'msg'} in "
-                             "a folder that the gateway's interfaces name makes it known") from None
+            raise ValueError(f"type {name!r} is not known to {self.distribution}; to add it, put a "
+                             f"file {name}."
+                             f"{name.split('/')[1] if name.count('/') == 2 else 'msg'} into a "
+                             "folder of the gateway's interfaces") from None
 
     def _read(self, folder: Path) -> bool:
-        """Make the definitions in a folder known; return whether there are any."""
+        """Add the definitions in a folder; return whether there are any."""
         if not folder.is_dir():
             raise ValueError(f"interfaces: {folder}: no such folder")
         found = [file for kind in ("msg", "srv", "action")
@@ -274,7 +269,7 @@ class Types:
         return bool(found)
 
     def _usable(self, definitions: Mapping[str, tuple[Any, Fields]]) -> dict[str, Any]:
-        """Return the definitions that are made of known types alone."""
+        """Return the definitions that contain only known types."""
         usable: dict[str, Any] = {}
         rest = dict(definitions)
         while True:
@@ -289,19 +284,18 @@ class Types:
 
     def _why_not(self, name: str, definitions: Mapping[str, tuple[Any, Fields]],
                  usable: Mapping[str, Any]) -> str:
-        """Return why a definition cannot be used: by what it is made of, one after the other."""
+        """Return why a definition cannot be used, following its types to the first unknown one."""
         way = [name]
         while way[-1] in definitions and way.count(way[-1]) == 1:
             way += [next(part for part in _parts(definitions[way[-1]][1]) if part not in usable
                          and (part in definitions or part not in self._store.fielddefs))]
         if way[-1] in definitions:
-            return f"it contains itself, {' -> '.join(way)}"
+            return f"contains itself, {' -> '.join(way)}"
         what = way[-1].rpartition("/")[2]
         return (f"{way[-2]} has a {what}, which is not supported" if what in _UNSUPPORTED
                 else f"{way[-2]}: type {way[-1]!r} is not known")
 
     def _add(self, definitions: Mapping[str, tuple[Any, Fields]]) -> None:
-        """Make types known, with their constants."""
         for name, (_, fields) in definitions.items():
             if name in self._store.fielddefs:
                 if self._store.fielddefs[name][1] != _read_as_uint8(fields, "char", "byte"):
@@ -327,7 +321,7 @@ class Types:
                 parts[-1] += line + "\n"
         names = _PARTS[kind]
         if len(parts) != len(names):
-            raise ValueError(f"{len(parts)} parts; {len(names)} with --- between them are right")
+            raise ValueError(f"{len(parts)} parts; expected {len(names)} with --- between them")
         made: dict[str, Any] = {f"{name}{part}": ([], self._fields(f"{name}{part}", body) or _EMPTY)
                 for part, body in zip(names, parts, strict=True)}
         if kind == "srv":
@@ -348,7 +342,7 @@ class Types:
                 ("result", (Nodetype.NAME, f"{name}_Result"))]),
             f"{name}_FeedbackMessage": ([], [
                 goal_id, ("feedback", (Nodetype.NAME, f"{name}_Feedback"))])}
-        if self.distribution not in _UNHASHED:  # what the hash of the action is made of
+        if self.distribution not in _UNHASHED:  # parts of the action's hash
             made[name] = [], [(field, (Nodetype.NAME, f"{name}_{part}")) for field, part in (
                 ("goal", "Goal"), ("result", "Result"), ("feedback", "Feedback"),
                 ("send_goal_service", "SendGoal"), ("get_result_service", "GetResult"),
@@ -356,7 +350,7 @@ class Types:
         return made | self._service(sending) | self._service(result)
 
     def _service(self, name: str) -> dict[str, Any]:
-        """Return what a service's hash is made of: its parts, and the event that tells of it."""
+        """Return the types in a service's hash: its parts and its event."""
         if self.distribution in _UNHASHED:
             return {}
         request, response, event = (f"{name}_{part}" for part in ("Request", "Response", "Event"))
@@ -383,9 +377,9 @@ class Types:
 
 
 def _read_as_uint8(fields: Iterable[tuple[str, Any]], *names: str) -> Fields:
-    """Return fields with uint8 for others of a byte.
+    """Return fields with uint8 in place of the named types of one byte.
 
-    In ROS 2 `char` is uint8, also in hashes, and `byte` is not signed; `rosbags` has it otherwise.
+    In ROS 2 `char` is uint8, in hashes too, and `byte` is unsigned; for `rosbags` both are signed.
     """
     return [(field, _as_uint8(what, names)) for field, what in fields]
 
@@ -398,12 +392,12 @@ def _as_uint8(what: Any, names: Sequence[str]) -> Any:
 
 
 def _parts(fields: Fields) -> list[str]:
-    """Return the types that fields are of, or lists of them."""
+    """Return the messages in fields or their lists."""
     return [name for _, what in fields if (name := _named(what))]
 
 
 def _named(what: Any) -> str:
-    """Return the type that a field is of, or a list of it; "" if it is a number or a text."""
+    """Return the message in a field or its list; "" for a number or text."""
     kind, detail = what
     if kind == Nodetype.NAME:
         return str(detail)

@@ -255,7 +255,7 @@ def test_every_view_is_of_the_type_that_its_channel_announces(tmp_path):
 def test_what_is_missing_shows_in_the_numbers(from_start, heard, lost):
     gaps = SequenceGaps(from_start=from_start)
     for source, incarnation, sequence in heard:
-        gaps.hear(Header(source, incarnation, sequence, 0.0))
+        gaps.add(Header(source, incarnation, sequence, 0.0))
     assert gaps.lost() == lost
 
 

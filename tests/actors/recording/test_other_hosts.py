@@ -18,7 +18,7 @@ from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topics import HEARTBEAT
 from rampart.actors.bus.zenoh_session import endpoint, session_config
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of, repair
-from rampart.actors.recording.bag_writer import UNHEARD, BagWriter, SequenceGaps
+from rampart.actors.recording.bag_writer import SILENT, BagWriter, SequenceGaps
 from rampart.actors.recording.other_hosts import (
     MOST_SILENCES,
     EachOnce,
@@ -119,7 +119,7 @@ def test_a_node_that_was_taken_over_is_heard_here_and_the_one_that_goes_on_there
 def test_what_is_only_overtaken_on_its_way_is_not_lost(heard, lost):
     gaps = SequenceGaps(from_start=True)
     for number in heard:
-        gaps.hear(Header("a", 1, number, 0.0))
+        gaps.add(Header("a", 1, number, 0.0))
     assert gaps.lost() == lost
 
 
@@ -172,8 +172,8 @@ def test_the_file_tells_it_also_when_it_is_torn_and_repaired(tmp_path):
     path = tmp_path / "run.mcap"
     writer = BagWriter(path.open("wb"), documents(), from_start=True)
     for record in ({"ground": "[]"}, {"ground": "[[1.0,null]]"}, {"ground": "[[1.0,2.5]]"}):
-        writer.tell_unheard(record)
-        writer.tell_unheard(record)
+        writer.write_silences(record)
+        writer.write_silences(record)
         writer.take(*pose(1, 0.0))
     writer.flush()
     writer.abandon()  # it has no end
@@ -188,7 +188,7 @@ def test_the_file_tells_it_also_when_it_is_torn_and_repaired(tmp_path):
 def test_what_makes_no_sense_in_a_file_is_left_out(tmp_path, text):
     path = tmp_path / "run.mcap"
     writer = BagWriter(path.open("wb"), documents())
-    writer.tell_unheard({"ground": text, "moon": "[]"})
+    writer.write_silences({"ground": text, "moon": "[]"})
     writer.close()
     assert Summary(BagReader(path)).unheard == {"moon": []}
 
@@ -253,7 +253,7 @@ def test_the_recorder_writes_what_comes_by_the_bus_and_tells_when_nothing_does(t
     assert 0.6 < span[1] - span[0] < 5
     lost = json.loads(summary.end["lost"])
     assert set(lost) <= {"supervisor_ground"}  # what it sent before it was listened to
-    assert UNHEARD in summary.reader.metadata
+    assert SILENT in summary.reader.metadata
 
 
 def test_what_other_hosts_are_is_told_to_the_recorder_in_plain_data():

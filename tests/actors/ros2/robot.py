@@ -131,7 +131,7 @@ class Screen(Actor):
     def heard(self, name, message, header) -> None:
         """Count."""
         if name == "answers" and not message.done:  # it is not there yet
-            assert message.why == "nobody answers"
+            assert message.why == "no server answers"
             return
         self.counts[name] += 1
         if name == "odometry":

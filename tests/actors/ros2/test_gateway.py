@@ -219,7 +219,7 @@ async def test_a_service_is_called_and_its_answer_or_that_there_is_none_is_told(
     asked(system, gateway, "base/shut", data=True)
     await asyncio.sleep(0.6)
     last = answers[-1].message
-    assert (last.done, last.success, last.why) == (False, None, "nobody answers")
+    assert (last.done, last.success, last.why) == (False, None, "no server answers")
 
 
 GOAL = """
@@ -286,22 +286,22 @@ async def test_a_service_is_offered(system):
     base = system.start_node("base")
     stops = system.hear(gateway.chosen_topic("base/stop"))
     await asyncio.sleep(0.1)
-    client = base.ros.client("/rampart/stop", "std_srvs/srv/SetBool")
+    ask = base.ros.client("/rampart/stop", "std_srvs/srv/SetBool")
     request = base.types.blank("std_srvs/srv/SetBool_Request")
     request.data, answers = True, []
-    client.ask(base.types.encode("std_srvs/srv/SetBool_Request", request), 1.0,
-               lambda answer, why: answers.append(answer))
-    client.ask(b"nonsense", 0.2, lambda answer, why: answers.append(why))
+    ask(base.types.encode("std_srvs/srv/SetBool_Request", request), 1.0,
+        lambda answer, why: answers.append(answer))
+    ask(b"nonsense", 0.2, lambda answer, why: answers.append(why))
     await asyncio.sleep(0.5)
     assert [heard.message.data for heard in stops] == [True]
     response = base.types.decode("std_srvs/srv/SetBool_Response", answers[0])
     assert (response.success, response.message) == (True, "told")
-    assert answers[1] == "nobody answers"
+    assert answers[1] == "no server answers"
 
 
 @pytest.mark.parametrize(("offset_s", "words"), [
     (30.0, "its stamp is 30 s ahead of the wall clock"), (-7200.0, "is hours behind"),
-    (-1.7e9, "of simulated time? then the gateway needs clock = 'ros'")])
+    (-1.7e9, "if it is simulated time, the gateway needs clock = 'ros'")])
 @beside()
 async def test_a_stamp_that_cannot_be_true_is_refused_and_told(system, offset_s, words):
     gateway = system.start_node("gateway")
@@ -477,7 +477,7 @@ async def test_a_node_of_ros_2_whose_token_goes_is_detected_and_named(system):
     ('subscribe = "/a"\ntype = "std_msgs/msg/Bool"', "to = 'key' of a topic of the system"),
     ('type = "std_msgs/msg/Bool"\nto = "a"', "one of subscribe, publish, call, serve, goal"),
     ('subscribe = "/a"\npublish = "/b"\ntype = "std_msgs/msg/Bool"\nto = "a"',
-     "it has subscribe and publish"),
+     "found subscribe and publish"),
     ('subscribe = "a"\ntype = "std_msgs/msg/Bool"\nto = "a"', "ros2[2].subscribe"),
     ('subscribe = "/a"\ntype = "std_msgs/Bool"\nto = "a"', "ros2[2].type"),
     ('call = "/a"\ntype = "std_msgs/msg/Bool"\nfrom = "a"\nto = "b"', "package/srv/Name"),
@@ -488,7 +488,7 @@ async def test_a_node_of_ros_2_whose_token_goes_is_detected_and_named(system):
      "gateway: ros2 /a: type 'std_msgs/msg/Boole' is not known to jazzy"),
     ('publish = "/a"\ntype = "std_msgs/msg/Bool"\nfrom = "a"', "no actor has a topic 'a'"),
     ('publish = "/a"\ntype = "std_msgs/msg/Bool"\nfrom = "base/wanted"',
-     "ros2 /a: fields: nothing says what std_msgs/msg/Bool is to be"),
+     "ros2 /a: fields: no field of std_msgs/msg/Bool has a value"),
     ('serve = "/a"\ntype = "std_srvs/srv/Trigger"\nto = "a"\nanswer = { sucess = true }',
      "has no field 'sucess'"),
     ('subscribe = "/a"\ntype = "std_msgs/msg/Bool"\nto = "a"\nbeside = "b"', "ros2[2].beside"),

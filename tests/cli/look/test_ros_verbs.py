@@ -97,7 +97,7 @@ def test_a_robot_that_fits(capsys, system, mode):
 
 @pytest.mark.parametrize(("robot", "distribution", "why"), [
     ({"publishes": "std_msgs/msg/String"}, "jazzy",
-     "/odom: /base has the type std_msgs/msg/String, and not nav_msgs/msg/Odometry"),
+     "/odom: /base has the type std_msgs/msg/String; expected nav_msgs/msg/Odometry"),
     ({"distribution": "humble"}, "jazzy", "another definition of nav_msgs/msg/Odometry")])
 def test_a_robot_that_does_not_fit(capsys, system, robot, distribution, why):
     port = free_port()
