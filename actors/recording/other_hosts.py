@@ -1,10 +1,9 @@
-"""What processes of other hosts publish, for the recording that is made on one.
+"""Messages of other hosts, for the recording that one host makes.
 
 Processes of this machine hand their messages to the recorder (`recorder_connection`); those of
-other hosts cannot. So of what may be said elsewhere, and of that alone, the recorder is a
-subscriber on the bus: what crosses the link then is what is recorded. A key may be spoken on from
-both sides, so what comes by the bus is left out if its process hands over its messages here. And a
-partition is told: from when to when nothing was heard of a host stands in the file.
+other hosts cannot. So the recorder subscribes on the bus to the keys that other hosts may publish.
+Processes of both sides may publish on a key: a message from the bus is left out if its process
+hands over its messages here. The file also contains the spans in which a host was silent.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ from rampart.actors.recording.message_form import header_of
 from rampart.actors.system.layout import Layout
 
 MOST_SILENCES = 100
-"""Of a host, that are told one by one; with more the last one covers what follows."""
+"""Most silences of a host that are kept; after that the last one grows."""
 
 Frame = tuple[float, str, bytes]
-"""When, by the monotonic clock; full key; payload."""
+"""Monotonic time of sending, full key, payload."""
 
 _MOST_BYTES = 60_000
 _MOST_WAITING = 100_000
@@ -40,12 +39,12 @@ _RETRY_S = 0.2
 
 
 class OtherHosts(msgspec.Struct, frozen=True):
-    """What is to be heard of other hosts.
+    """The other hosts, and the keys to subscribe to.
 
     Attributes:
         keys: key expressions of all that may be published there; no key is in two of them.
-        guards: by host, whose messages show that it is heard: its supervisor and routers.
-        lost_after_s: a host of which nothing came for so many real seconds is not heard.
+        guards: by host, the supervisor and routers whose messages show that it is connected.
+        lost_after_s: real seconds without their messages after which a host counts as silent.
     """
 
     keys: tuple[str, ...]
@@ -54,7 +53,7 @@ class OtherHosts(msgspec.Struct, frozen=True):
 
 
 def others_of(layout: Layout) -> OtherHosts | None:
-    """Return what there is to be heard of other hosts; None in a system of one."""
+    """Return the other hosts of a system; None if it has one host."""
     hosts = layout.hosts
     if not hosts.several:
         return None
@@ -66,19 +65,19 @@ def others_of(layout: Layout) -> OtherHosts | None:
 
 
 def distinct(expressions: Collection[str]) -> tuple[str, ...]:
-    """Return the key expressions that no other one includes; everything, if they are too many."""
+    """Return the key expressions that no other one includes; `**` if they are too many."""
     if sum(map(len, expressions)) > _MOST_BYTES:
         return (EVERYTHING,)
-    wide = [zenoh.KeyExpr(one) for one in expressions if "*" in one]
+    wide = [zenoh.KeyExpr(expression) for expression in expressions if "*" in expression]
     return tuple(sorted(
-        one for one in expressions
-        if not any(str(other) != one and other.includes(one) for other in wide)))
+        expression for expression in expressions
+        if not any(str(other) != expression and other.includes(expression) for other in wide)))
 
 
 class EachOnce:
-    """Leaves out what came by the bus and was handed over here as well. Pure; bounded.
+    """Leaves out messages from the bus that were also handed over here. Pure; bounded.
 
-    What was handed over until a time is to be taken before what came by the bus until then.
+    Call `handed_over` with the messages up to a time before `from_elsewhere` with those of the bus.
     """
 
     def __init__(self) -> None:
@@ -86,7 +85,7 @@ class EachOnce:
         self._garbage: Remembered[tuple[str, bytes], None] = Remembered(_GARBAGE)
 
     def handed_over(self, frames: Iterable[Frame]) -> None:
-        """Note what processes of this machine have sent."""
+        """Take messages of processes of this machine."""
         for _, key, payload in frames:
             header = header_of(payload)
             if header is None:
@@ -95,7 +94,7 @@ class EachOnce:
                 self._here[header.source, header.incarnation] = None
 
     def from_elsewhere(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, str]]:
-        """Yield what was sent by processes of other hosts, with who did; "" of garbage."""
+        """Yield the messages of other hosts' processes, each with its source; "" for garbage."""
         for frame in frames:
             header = header_of(frame[2])
             if header is None:
@@ -107,90 +106,91 @@ class EachOnce:
 
 @dataclass(slots=True)
 class _Silence:
-    """Of a host: since when, and until when; None if it lasts. Monotonic seconds."""
+    """Begin and end of a host's silence, monotonic seconds; None if it lasts."""
 
     from_s: float
     to_s: float | None = None
 
 
 class Silences:
-    """From when to when nothing was heard of other hosts. Pure; times are monotonic seconds.
+    """Spans in which other hosts were silent. Pure; times are monotonic seconds.
 
     Args:
-        others: whom it is about.
-        begun_s: when hearing began.
+        others: the other hosts.
+        begun_s: begin of the subscription.
     """
 
     def __init__(self, others: OtherHosts, begun_s: float) -> None:
         self._host_of = {name: host for host, names in others.guards.items() for name in names}
         self._limit_s = others.lost_after_s
-        self._heard_s = dict.fromkeys(others.guards, begun_s)
-        self._told: dict[str, list[_Silence]] = {host: [] for host in others.guards}
+        self._newest_s = dict.fromkeys(others.guards, begun_s)
+        self._silences: dict[str, list[_Silence]] = {host: [] for host in others.guards}
 
-    def heard(self, source: str, at_s: float) -> None:
-        """Note that something of a process was heard."""
+    def received(self, source: str, at_s: float) -> None:
+        """Take the time of a message of a process."""
         host = self._host_of.get(source)
         if host is None:
             return
-        told, before_s = self._told[host], self._heard_s[host]
-        self._heard_s[host] = max(before_s, at_s)
-        if told and told[-1].to_s is None:
-            told[-1].to_s = at_s
+        silences, before_s = self._silences[host], self._newest_s[host]
+        self._newest_s[host] = max(before_s, at_s)
+        if silences and silences[-1].to_s is None:
+            silences[-1].to_s = at_s
         elif at_s - before_s > self._limit_s:
             self._add(host, _Silence(before_s, at_s))
 
     def look(self, now_s: float) -> None:
-        """Note who has not been heard for too long."""
-        for host, heard_s in self._heard_s.items():
-            told = self._told[host]
-            if now_s - heard_s > self._limit_s and not (told and told[-1].to_s is None):
-                self._add(host, _Silence(heard_s))
+        """Begin the silences of hosts without recent messages."""
+        for host, newest_s in self._newest_s.items():
+            silences = self._silences[host]
+            if now_s - newest_s > self._limit_s and not (silences and silences[-1].to_s is None):
+                self._add(host, _Silence(newest_s))
 
     def _add(self, host: str, silence: _Silence) -> None:
-        told = self._told[host]
-        if len(told) < MOST_SILENCES:
-            told.append(silence)
+        silences = self._silences[host]
+        if len(silences) < MOST_SILENCES:
+            silences.append(silence)
         else:
-            told[-1].to_s = silence.to_s
+            silences[-1].to_s = silence.to_s
 
     def record(self, simulated: Callable[[float], float]) -> dict[str, str]:
-        """Return what stands in the file, see `bag_writer.UNHEARD`.
+        """Return the metadata for the file, see `bag_writer.SILENT`.
 
         Args:
-            simulated: returns the simulated time of a monotonic one.
+            simulated: converts monotonic to simulated seconds.
         """
         return {host: json.dumps([
-            [round(simulated(one.from_s), 3),
-             None if one.to_s is None else round(simulated(one.to_s), 3)] for one in told])
-            for host, told in self._told.items()}
+            [round(simulated(silence.from_s), 3),
+             None if silence.to_s is None else round(simulated(silence.to_s), 3)]
+            for silence in silences]) for host, silences in self._silences.items()}
 
 
-class Ear:
-    """Hears on the bus what other hosts publish; opened as soon as a router answers.
+class BusListener:
+    """Subscribes to the messages of other hosts as soon as a router answers.
 
     Args:
-        others: what.
+        others: the other hosts.
         dial: endpoints of the routers of this host.
-        shown: by what it shows who it is; None in a run without keys.
+        credentials: of the recorder; None in a run without credentials.
     """
 
-    def __init__(self, others: OtherHosts, dial: list[str], shown: Credentials | None) -> None:
+    def __init__(self, others: OtherHosts, dial: list[str], credentials: Credentials | None
+                 ) -> None:
         self._others = others
         self._dial = dial
-        self._shown = shown
+        self._credentials = credentials
         self._session: zenoh.Session | None = None
         self._held: list[zenoh.Subscriber[None]] = []
         self._arrived: deque[Frame] = deque(maxlen=_MOST_WAITING)
         self._next_try_s = 0.0
 
     def take(self) -> list[Frame]:
-        """Return what has come since the last time."""
+        """Return the messages since the last call."""
         if self._session is None:
             self._open()
         return [self._arrived.popleft() for _ in range(len(self._arrived))]
 
     def close(self) -> None:
-        """Hear nothing more."""
+        """Close the session."""
         session, self._session = self._session, None
         self._held.clear()
         if session is not None:
@@ -202,13 +202,13 @@ class Ear:
         if now_s < self._next_try_s:
             return
         self._next_try_s = now_s + _RETRY_S
-        with contextlib.suppress(zenoh.ZError, OSError):  # it has ended in this moment
+        with contextlib.suppress(zenoh.ZError, OSError):  # the router has just ended
             if dial := answering_first(self._dial):
-                self._session = open_session(dial, self._shown)
+                self._session = open_session(dial, self._credentials)
                 self._held = [self._session.declare_subscriber(
-                    key, Callback(self._hear, lambda: None, indirect=False))
+                    key, Callback(self._receive, lambda: None, indirect=False))
                     for key in self._others.keys]
 
-    def _hear(self, sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
+    def _receive(self, sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
         self._arrived.append(
             (time.monotonic(), str(sample.key_expr), sample.payload.to_bytes()))

@@ -1,7 +1,7 @@
-"""The recorder as a process of its own: `python -m rampart.actors.recording.process ORDER`.
+"""The process of the recorder: `python -m rampart.actors.recording.process ORDER`.
 
-ORDER is a JSON object (`Order`). It says "ready" on stdout when nodes find it, or "error: …" and
-ends; on stderr it says what came of it.
+ORDER is a JSON object (`Order`). The process prints "ready" on stdout when nodes can find it, or
+"error: …" and ends. On stderr it prints the result.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _START_S, _END_S = 30.0, 10.0
 
 
 class Order(msgspec.Struct, frozen=True):
-    """What to record where; `launcher` is the pid of the run's launcher, `others` other hosts."""
+    """Order to record a run; `launcher` is the pid of its launcher, `others` the other hosts."""
 
     port: int
     path: str
@@ -42,10 +42,10 @@ class Order(msgspec.Struct, frozen=True):
 
 
 class RecorderProcess:
-    """A launcher's hold on its recorder. Use: `start`, and `end` when the run is over.
+    """The recorder of a launcher: `start` it, and `end` it when the run is over.
 
     Args:
-        order: what it is told.
+        order: for the recorder.
     """
 
     def __init__(self, order: Order) -> None:
@@ -55,17 +55,17 @@ class RecorderProcess:
 
     @property
     def path(self) -> str:
-        """Of the file."""
+        """Path of the file."""
         return self._order.path
 
     def problem(self) -> str:
-        """Return why nothing is recorded any more before it was told to end; "" if all is well."""
+        """Return why the recorder has ended too early; "" if it has not."""
         if self._process is not None and not self._problem and self._process.poll() is not None:
-            self._problem = self._last_words() or "the recorder has died"
+            self._problem = self._answer() or "the recorder has died"
         return self._problem
 
-    def _last_words(self) -> str:
-        """Return what the recorder says when it starts, or why it could not go on."""
+    def _answer(self) -> str:
+        """Return the next line of the recorder: that it is ready, or an error."""
         assert self._process is not None  # noqa: S101 for the type checker
         assert self._process.stdout is not None  # noqa: S101
         return self._process.stdout.readline().strip().removeprefix("error: ")
@@ -74,7 +74,7 @@ class RecorderProcess:
         """Start it and wait until nodes can find it.
 
         Raises:
-            BagError: it cannot begin.
+            BagError: it cannot start.
         """
         self._process = subprocess.Popen(  # noqa: S603 our own interpreter and module
             [sys.executable, "-P", "-m", "rampart.actors.recording.process",
@@ -86,13 +86,13 @@ class RecorderProcess:
             self._process.kill()
             self._let_go()
             raise BagError(f"the recorder did not start within {_START_S:g} s")
-        answer = self._last_words()
+        answer = self._answer()
         if answer != _READY:
             self._let_go()
             raise BagError(answer or "the recorder ended as it started")
 
     def end(self) -> None:
-        """Have it write the end of the file. Harmless when it has ended already."""
+        """Make it write the end of the file and exit; does nothing if it has ended already."""
         process = self._process
         if process is None:
             return
@@ -102,7 +102,7 @@ class RecorderProcess:
                     process.send_signal(number)
             try:
                 process.wait(_END_S)
-                self._problem = self._last_words()
+                self._problem = self._answer()
             except subprocess.TimeoutExpired:
                 process.kill()
                 self._problem = "the recorder did not end"
@@ -112,16 +112,16 @@ class RecorderProcess:
         process, self._process = self._process, None
         if process is None or process.stdout is None:
             return
-        with contextlib.suppress(subprocess.TimeoutExpired):  # as one that waits for its disk
+        with contextlib.suppress(subprocess.TimeoutExpired):  # it may wait for its disk
             process.wait(_END_S)
         process.stdout.close()
 
 
 def stop_pipe() -> int:
-    """Have SIGTERM, SIGINT and SIGHUP readable from a file descriptor, and return it."""
+    """Return a file descriptor from which SIGTERM, SIGINT and SIGHUP can be read."""
     read_end, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     numbers = [signal.SIGTERM, signal.SIGINT]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as it is under nohup
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # not under nohup
         numbers.append(signal.SIGHUP)
     for number in numbers:
         signal.signal(number, lambda *_: None)
@@ -131,16 +131,16 @@ def stop_pipe() -> int:
 
 def record(order: Order) -> int:
     """Record to the end of the run, and return the exit code."""
-    # Should it be stopped when the launcher dies, it must go on to see that and end.
+    # If this process is stopped when the launcher dies, it must continue to notice that and end.
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT, 0, 0, 0)
     path = Path(order.path)
     setproctitle.setproctitle(f"rampart-recorder[{order.port}/{order.launcher}] {path}")
     stop = stop_pipe()
-    for number in (signal.SIGINT, signal.SIGHUP):  # the launcher's to handle; we see its end
+    for number in (signal.SIGINT, signal.SIGHUP):  # the launcher handles them; we see its end
         signal.signal(number, signal.SIG_IGN)
     signal.signal(RUN_ENDED, lambda *_: None)
     recorder = Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher,
-                        others=order.others, shown=_launchers)
+                        others=order.others, credentials=_launchers)
     try:
         recorder.open()
     except BagError as error:
@@ -154,35 +154,34 @@ def record(order: Order) -> int:
         _answer(f"error: {error}")
         return 1
     if recorder.writer is not None:
-        streams.complain(told(recorder))
+        streams.complain(result_of(recorder))
     return 0
 
 
 def _launchers(run: RunInfo) -> Credentials | None:
-    """Return by what the launcher of a run shows who it is, and so does its recorder."""
+    """Return the credentials of the launcher of a run, which its recorder uses too."""
     return credentials_in(run.keys, OBSERVER, run.folder, run.ports)
 
 
-def told(recorder: Recorder) -> str:
-    """Return one line on what came of a recording."""
+def result_of(recorder: Recorder) -> str:
+    """Return one line about the result of a recording."""
     if recorder.writer is None:
         return f"{recorder.path}: nothing was recorded"
     if not recorder.path.exists():
-        return f"{recorder.path}: was taken away while it was written: nothing is recorded"
+        return f"{recorder.path}: was removed while it was written: nothing is recorded"
     files = recorder.files
     lost = sum(sum(file.gaps.lost().values()) for file in files)
     found = sum(file.garbage for file in files)
     garbage = f", {found} of them garbage" if found else ""
-    silent = "".join(f"; {host} could not be heard all the time, see `rampart bag info`"
-                     for host, spans in recorder.writer.unheard.items() if spans != "[]")
+    silent = "".join(f"; {host} was silent for a time, see `rampart bag info`"
+                     for host, spans in recorder.writer.silences.items() if spans != "[]")
     more = f" and {len(files) - 1} more files" if len(files) > 1 else ""
     return (f"recorded {sum(file.messages for file in files)} messages in {recorder.path}{more}"
-            f"{garbage}, "
-            f"{lost or 'none'} lost{silent}")
+            f"{garbage}, {lost or 'none'} lost{silent}")
 
 
 def _answer(text: str) -> None:
-    """Tell the launcher, if it is still there; past the buffer, which would be tried once more."""
+    """Write a line to the launcher, if it is still there; unbuffered, so nothing is retried."""
     with contextlib.suppress(OSError):
         os.write(sys.stdout.fileno(), f"{text}\n".encode())
 

@@ -1,13 +1,12 @@
-"""The recorder: takes what the nodes hand over, and writes it down.
+"""The recorder: writes the messages that nodes hand over.
 
-It is a process of its own, and neither a node nor on the bus: whatever becomes of it, no node waits
-for it, and the robot drives on. It sleeps most of the time: some twenty times a second it empties
-all sockets at once, puts what it found into order by time of sending, and writes; every 0.8 s it
-hands the file to the kernel. It ends when it is told to, or when the launcher of the run has ended,
-however that ended; then it takes what is still in the sockets and closes the file in order.
+It is a separate process, not a node, and not on the bus, so no node ever waits for it. Some twenty
+times a second it empties all sockets, sorts the messages by time of sending, and writes them. Every
+0.8 s it hands the file to the kernel. It ends on a signal, or when the launcher of the run has
+ended in whatever way. Then it takes what is still in the sockets, and closes the file.
 
-In a run on several hosts it also hears, on the bus, what the others publish (`other_hosts`). Then
-what has come is written one turn later: by then all that was sent here before has been handed over.
+In a run on several hosts it also subscribes to the messages of other hosts (`other_hosts`). It then
+writes one turn later, when all earlier messages of this machine have been handed over.
 """
 
 from __future__ import annotations
@@ -30,23 +29,29 @@ from rampart.actors.bus.run_info import RunInfo, ask
 from rampart.actors.bus.zenoh_session import Credentials
 from rampart.actors.machine.unix_peer import is_same_user
 from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
-from rampart.actors.recording.other_hosts import EachOnce, Ear, Frame, OtherHosts, Silences
+from rampart.actors.recording.other_hosts import (
+    BusListener,
+    EachOnce,
+    Frame,
+    OtherHosts,
+    Silences,
+)
 from rampart.actors.recording.run_documents import collect
 
 PERIOD_S = 0.05
 """Real seconds between two looks into the sockets."""
 
 FLUSH_S = 0.8
-"""Real seconds between two hand-overs of the file to the kernel: so much a crash may lose."""
+"""Real seconds between two flushes; a crash loses so much at most."""
 
 LAST_S = 2.0
-"""Real seconds that nodes have to end after their launcher, while their sockets are still read."""
+"""Real seconds for which sockets are read after the end of the launcher, until the nodes end."""
 
 FILE_BYTES = 1 << 30
-"""A recording that is larger goes on in another file: three to four hours of a robot."""
+"""Size at which a recording goes on in another file: three to four hours of a robot."""
 
 RUN_ENDED = signal.SIGUSR1
-"""What the launcher of a run sends its recorder when all nodes have ended."""
+"""Signal of the launcher to its recorder when all nodes have ended."""
 
 _RUN_ENDED = "the run has ended"
 _ASK_S = 0.2
@@ -54,22 +59,23 @@ _WAITING_FRAMES = 500_000
 
 
 class Recorder:
-    """One recording of one run. Use: `open`, then `run`, once.
+    """One recording of one run. Call `open`, then `run`, once.
 
     Args:
         port: base port of the run.
-        path: of the file, which must not exist.
-        overwrite: it may.
-        wants: says of a full key whether it is recorded.
-        launcher: pid of the run's launcher if it is about to start; None joins the run there is.
-        others: what there is to be heard of other hosts; None in a run on one.
-        shown: returns by what it shows who it is on the bus of a run, for that.
+        path: path of the file.
+        overwrite: whether the file may exist.
+        wants: returns whether a full key is recorded.
+        launcher: pid of the launcher of a run that is about to start; None joins a running one.
+        others: the other hosts; None in a run on one.
+        credentials: returns the recorder's credentials on the bus of a run, for other hosts.
     """
 
     def __init__(self, port: int, path: Path, *, overwrite: bool = False,
                  wants: Callable[[str], bool] = lambda _key: True,
                  launcher: int | None = None, others: OtherHosts | None = None,
-                 shown: Callable[[RunInfo], Credentials | None] = lambda _run: None) -> None:
+                 credentials: Callable[[RunInfo], Credentials | None] = lambda _run: None
+                 ) -> None:
         self.path = path
         self.writer: BagWriter | None = None
         self.earlier: list[BagWriter] = []
@@ -84,13 +90,13 @@ class Recorder:
         self._info: RunInfo | None = None
         self._waiting: list[Frame] = []
         self._others = others
-        self._shown = shown
+        self._credentials = credentials
         self._elsewhere: _Elsewhere | None = None
         self._next_ask_s = 0.0
         self._next_flush_s = 0.0
 
     def open(self) -> None:
-        """Take the place where nodes look for a recorder.
+        """Bind the socket where nodes look for a recorder.
 
         Raises:
             BagError: the run is being recorded already.
@@ -105,14 +111,14 @@ class Recorder:
         self._listener = listener
 
     def run(self, stop: int, duration_s: float | None = None) -> str:
-        """Record until a byte can be read from `stop`, or the run or its time is over; say why.
+        """Record until `stop` can be read, or the run or the duration is over; return the reason.
 
         Args:
-            stop: file descriptor; the byte is the number of a signal, `RUN_ENDED` or another.
+            stop: file descriptor; its byte is the number of a signal, `RUN_ENDED` or another.
             duration_s: real seconds.
 
         Raises:
-            BagError: the file cannot be written (any more); what is in it stays.
+            BagError: the file cannot be written; its content so far stays.
         """
         poller = select.poll()
         poller.register(stop, select.POLLIN)
@@ -149,11 +155,11 @@ class Recorder:
 
     @property
     def files(self) -> list[BagWriter]:
-        """What was written, file by file."""
+        """Writers of all files so far."""
         return [*self.earlier, *([self.writer] if self.writer else [])]
 
     def close(self) -> None:
-        """Let go of all sockets, and of the file as it is."""
+        """Close all sockets, and the file as it is."""
         if self._listener is not None:
             self._listener.close()
             self._listener = None
@@ -175,7 +181,7 @@ class Recorder:
             self._find_run()
             frames = self._waiting
         writer, info = self.writer, self._info
-        if writer is None or info is None:  # it is not known yet what runs
+        if writer is None or info is None:  # the run does not answer yet
             return
         self._waiting = []
         if self._elsewhere is not None:
@@ -183,7 +189,7 @@ class Recorder:
         for at_s, key, payload in sorted(frames, key=itemgetter(0)):
             writer.take((at_s - info.origin_s) * info.rate, key, payload)
         if self._elsewhere is not None:
-            writer.tell_unheard(self._elsewhere.silences.record(
+            writer.write_silences(self._elsewhere.silences.record(
                 lambda at_s: (at_s - info.origin_s) * info.rate))
         now_s = time.monotonic()
         if now_s >= self._next_flush_s:
@@ -202,13 +208,13 @@ class Recorder:
             self.writer.close({"ended": why, "stopped": _wall()})
 
     def _period_s(self) -> float:
-        """Return how long to sleep: at a high rate the sockets fill sooner."""
+        """Return the time to sleep; at a high rate sockets fill sooner."""
         return min(PERIOD_S, 0.4 / self._info.rate) if self._info else PERIOD_S
 
     # -- the run --------------------------------------------------------------------------------
 
     def _find_run(self) -> None:
-        """Begin the file as soon as it is known what runs."""
+        """Begin the file as soon as the run answers."""
         now_s = time.monotonic()
         if now_s < self._next_ask_s:
             return
@@ -221,10 +227,11 @@ class Recorder:
         self._begin_file(info, begun_s)
         if self._others is not None:
             self._elsewhere = _Elsewhere(
-                self._others, Ear(self._others, info.endpoints, self._shown(info)), begun_s)
+                self._others,
+                BusListener(self._others, info.endpoints, self._credentials(info)), begun_s)
 
     def _begin_file(self, info: RunInfo, begun_s: float) -> None:
-        """Begin the file; if there is one already, the next one, with a number in its name."""
+        """Begin the first file, or the next one with a number in its name."""
         path = self.path
         if self.writer is not None:
             path = path.with_stem(f"{path.stem}-{len(self.files) + 1}")
@@ -242,14 +249,14 @@ class Recorder:
     # -- sockets --------------------------------------------------------------------------------
 
     def _gather(self) -> list[Frame]:
-        """Return all that was handed over since the last time."""
+        """Return the messages that were handed over since the last call."""
         self._accept()
         frames: list[Frame] = []
         for key, _ in self._sockets.select(0):
             connection: socket.socket = key.fileobj  # type: ignore[assignment]
             try:
                 while (size := connection.recv_into(self._buffer)) > 0:
-                    with contextlib.suppress(ValueError):  # not a node's
+                    with contextlib.suppress(ValueError):  # not from a node
                         frames.append(recorder_connection.parse_frame(
                             memoryview(self._buffer)[:size]))
             except BlockingIOError:
@@ -277,46 +284,43 @@ class Recorder:
 
 
 class _Elsewhere:
-    """What comes of other hosts, put together with what was handed over here.
+    """Joins the messages of other hosts with those that were handed over here.
 
     Attributes:
-        silences: of theirs.
+        silences: of the other hosts.
     """
 
-    def __init__(self, others: OtherHosts, ear: Ear, now_s: float) -> None:
+    def __init__(self, others: OtherHosts, listener: BusListener, now_s: float) -> None:
         self.silences = Silences(others, now_s)
-        self._ear = ear
+        self._listener = listener
+        self.close = listener.close
         self._each_once = EachOnce()
-        self._held: list[Frame] = []
-        self._heard: list[Frame] = []
+        self._from_here: list[Frame] = []
+        self._from_bus: list[Frame] = []
         self._before_s = now_s
 
     def joined(self, frames: list[Frame], turn_s: float) -> list[Frame]:
-        """Return what is to be written now: what was sent before the turn before this one.
+        """Return the messages that were sent before the previous turn began.
 
         Args:
             frames: handed over in this turn.
-            turn_s: when it began; infinity has nothing held back.
+            turn_s: begin of this turn; infinity for the last one, which returns all messages.
         """
         self._each_once.handed_over(frames)
-        self._heard += self._ear.take()
-        self._held += frames
+        self._from_bus += self._listener.take()
+        self._from_here += frames
         until_s, self._before_s = (turn_s if turn_s == math.inf else self._before_s), turn_s
-        now, self._held = _split(self._held, until_s)
-        heard, self._heard = _split(self._heard, until_s)
-        for frame, source in self._each_once.from_elsewhere(heard):
+        now, self._from_here = _split(self._from_here, until_s)
+        from_bus, self._from_bus = _split(self._from_bus, until_s)
+        for frame, source in self._each_once.from_elsewhere(from_bus):
             now.append(frame)
-            self.silences.heard(source, frame[0])
+            self.silences.received(source, frame[0])
         self.silences.look(min(until_s, time.monotonic()))
         return now
 
-    def close(self) -> None:
-        """Hear nothing more."""
-        self._ear.close()
-
 
 def _split(frames: list[Frame], until_s: float) -> tuple[list[Frame], list[Frame]]:
-    """Return those that were sent until a time, and the others."""
+    """Return the messages that were sent up to a time, and the others."""
     return ([frame for frame in frames if frame[0] <= until_s],
             [frame for frame in frames if frame[0] > until_s])
 

@@ -1,8 +1,8 @@
-"""A recording as a bag of ROS 2: MCAP with `cdr` channels and `ros2msg` schemas, and metadata.
+"""Exports a recording as a bag of ROS 2: MCAP with `cdr` channels, `ros2msg` schemas and metadata.
 
-Three kinds of topics are in it: what passed the gateway, byte for byte under the names of ROS 2;
-each key of the bus below `/rampart`, in a type of its own (`ros_structs`); and what viewers see
-(`ros_views`). `rosbags` writes it, as `ros2 bag record` would.
+It has three kinds of topics: messages that passed the gateway, byte for byte under their names in
+ROS 2; each key of the bus below `/rampart` with a generated type (`ros_structs`); and the views
+(`ros_views`). `rosbags` writes the file as `ros2 bag record` would.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from rampart.actors.ros2.translation.types import NO_HASH, Types
 from rampart.actors.ros2.wire import ros_name
 
 _OLDER = ("humble", "iron")
-"""Distributions whose bags have a metadata of an older version."""
+"""Distributions with an older version of the metadata."""
 
 _NO_NAME = re.compile(r"[^A-Za-z0-9_/]")
 _FOREVER = QosTime(9_223_372_036, 854_775_807)
@@ -45,20 +45,20 @@ _PASSED = f"{ROS_SIDE}/data/"
 _LEAST_PARTS = 4  # domain, topic, type and hash
 _packed = msgspec.msgpack.Decoder(tuple[bytes, bytes | None])
 
-Makes = tuple[str, str, Callable[[Header, Any, int], bytes]]
-"""Topic of ROS 2, its type, and what makes a message of header, body and stamp in nanoseconds."""
+Encoder = tuple[str, str, Callable[[Header, Any, int], bytes]]
+"""Topic of ROS 2, its type, and a function that encodes header, body and stamp in nanoseconds."""
 
 
 class RosBag:
-    """Writes a recording as a bag of ROS 2. Use: `write`, once.
+    """Writes a recording as a bag of ROS 2. Call `write` once.
 
     Args:
         types: of ROS 2.
-        topics: that are known of the system.
+        topics: known topics of the system.
 
     Attributes:
         counts: messages by topic of ROS 2.
-        left_out: what is not in the bag → how often, and why the first time.
+        left_out: channel that is not in the bag → number of its messages, and the first reason.
     """
 
     def __init__(self, types: Types, topics: Sequence[Topic[Any]]) -> None:
@@ -68,15 +68,14 @@ class RosBag:
         self._structs = StructTypes(types)
         self._views = RosViews(types)
         self._forms = Forms(topics)
-        self._made: dict[str, Makes] = {}
+        self._encoders: dict[str, Encoder] = {}
         self._connections: dict[str, Any] = {}
 
     def write(self, reader: BagReader, folder: Path) -> None:
-        """Write the bag into a new folder; one that does not come to its end is not left behind.
+        """Write the bag into a new folder; an incomplete one is deleted.
 
         Raises:
-            BagError: there is such a folder already, it cannot be written, or the recording cannot
-                be read.
+            BagError: the folder exists or cannot be written, or the recording cannot be read.
         """
         version: Any = 8 if self._types.distribution in _OLDER else 9
         if folder.exists():
@@ -102,24 +101,24 @@ class RosBag:
     def _bus(self, writer: Writer, key: str, message: Any) -> None:
         form = self._forms.of(key)
         if form.topic is None:
-            self._leave_out(key.removeprefix(f"{ROOT}/"), "no actor that is known declares it")
+            self._leave_out(key.removeprefix(f"{ROOT}/"), "no known actor declares it")
             return
         header, body = decode(form.topic, form.payload(message.data))
-        if key not in self._made:
-            self._made[key] = f"/{_NO_NAME.sub('_', key)}", *self._structs.writer(form.topic)
-        topic, kind, make = self._made[key]
-        self._write(writer, topic, kind, make(header, body, message.publish_time),
+        if key not in self._encoders:
+            self._encoders[key] = f"/{_NO_NAME.sub('_', key)}", *self._structs.encoder(form.topic)
+        topic, kind, encode = self._encoders[key]
+        self._write(writer, topic, kind, encode(header, body, message.publish_time),
                     message.log_time, stays=form.topic.qos is BusQos.STATE)
 
     def _passed(self, writer: Writer, key: str, message: Any) -> None:
-        """Write what passed the gateway as it was; what services said is no topic's."""
+        """Write a message that passed the gateway; those of services belong to no topic."""
         parts = key.removeprefix(_PASSED).split("|")
         if not key.startswith(_PASSED) or len(parts) < _LEAST_PARTS:
             return
         kind, digest = ros_name(parts[-2]), parts[-1]
         if digest not in {NO_HASH, self._types.hash(kind)}:
-            raise ValueError(f"another definition of {kind} than {self._types.distribution} has; "
-                             "--distribution chooses it")
+            raise ValueError(f"{kind}: not the definition of {self._types.distribution}; choose "
+                             "another one with --distribution")
         data, _attachment = _packed.decode(self._forms.of(key).payload(message.data))
         self._write(writer, "/" + "/".join(parts[1:-2]), kind, data, message.log_time)
 

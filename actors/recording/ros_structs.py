@@ -1,8 +1,8 @@
-"""Types of ROS 2 that are made of the types of the system's messages, field by field. Pure.
+"""Generates types of ROS 2 from the types of the system's messages, field by field. Pure.
 
-A number becomes float64 or int64, a text or choice `string`, a struct a type of its own, a list a
-sequence. What may be missing is a sequence of none or one; what has keys a sequence of `key` and
-`value`; bytes of float32 numbers are float32[]. What ROS 2 has no type for is a `string` of JSON.
+A number becomes float64 or int64, a text or enumeration `string`, a struct a type, a list a
+sequence. An optional value becomes a sequence of at most one, a mapping a sequence of `key` and
+`value`, and bytes of float32 numbers float32[]. Anything else becomes a `string` of JSON.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rampart.actors.ros2.ros_clock import NS
 from rampart.actors.ros2.translation.types import Types
 
 PACKAGE = "rampart_bus"
-"""Package of all types that are made."""
+"""Package of all generated types."""
 
 _HEADER = "std_msgs/msg/Header"
 _NO_NAME = re.compile(r"[^a-z0-9]+")
@@ -30,11 +30,11 @@ _F32 = "_f32"
 
 
 class Made(NamedTuple):
-    """How a field is in ROS 2.
+    """A field in ROS 2.
 
     Attributes:
-        what: its description, as `rosbags` has it.
-        write: returns its value.
+        what: its type, as `rosbags` describes it.
+        write: converts a value.
     """
 
     what: Any
@@ -54,10 +54,10 @@ _TEXT, _JSON = _base("string", str), _base("string", _as_json)
 
 
 class StructTypes:
-    """Makes types of ROS 2, and messages of them.
+    """Generates types of ROS 2, and encodes messages of them.
 
     Args:
-        types: of ROS 2, to which they are added.
+        types: of ROS 2; generated types are added.
     """
 
     def __init__(self, types: Types) -> None:
@@ -67,12 +67,11 @@ class StructTypes:
         self._made: dict[type, Made | None] = {}
         self._defined: dict[str, list[tuple[str, Any]]] = {}
 
-    def writer(self, topic: Topic[Any]) -> tuple[str, Callable[[Header, Any, int], bytes]]:
-        """Return the type of a topic's messages in ROS 2, and what makes one as it travels.
+    def encoder(self, topic: Topic[Any]) -> tuple[str, Callable[[Header, Any, int], bytes]]:
+        """Return the type of a topic's messages in ROS 2, and a function that encodes them.
 
-        A message has `header`, `node`, `incarnation`, `sequence`, and what was said in `body`. What
-        makes it takes header, body and stamp in nanoseconds, and raises ValueError if there is a
-        value that ROS 2 cannot say.
+        The type has the fields `header`, `node`, `incarnation`, `sequence` and `body`. The function
+        takes header, body and stamp in nanoseconds, and raises ValueError if a value does not fit.
         """
         body = self._of(mi.type_info(topic.type))
         name = self._name(f"{topic.type.__name__}Message")
@@ -84,21 +83,21 @@ class StructTypes:
         self._types.define(self._defined)
         self._defined = {}
 
-        def write(header: Header, said: Any, stamp_ns: int) -> bytes:
+        def encode(header: Header, content: Any, stamp_ns: int) -> bytes:
             head = self._types.blank(_HEADER)
             head.stamp.sec, head.stamp.nanosec = divmod(max(stamp_ns, 0), NS)
             head.frame_id = topic.frame
             values = {"header": head, "node": header.source, "incarnation": header.incarnation,
                       "sequence": header.sequence}
             if body is not None:
-                values["body"] = body.write(said)
+                values["body"] = body.write(content)
             return self._types.encode(name, self._types.new(name, values))
 
-        return name, write
+        return name, encode
 
     def _of(  # noqa: PLR0911 one for each kind of type
             self, kind: mi.Type, name: str = "") -> Made | None:
-        """Return how a type is in ROS 2; None if it has nothing to be said."""
+        """Return the field for a type; None for a struct without fields."""
         match kind:
             case mi.Metadata(type=inner):
                 return self._of(inner, name)
@@ -128,7 +127,7 @@ class StructTypes:
 
     def _struct(self, cls: type, kind: mi.StructType) -> Made | None:
         if cls not in self._made:
-            self._made[cls] = _JSON  # within itself
+            self._made[cls] = _JSON  # for a struct that contains itself
             fields = [(field.name, made) for field in kind.fields
                       if (made := self._of(field.type, field.name)) is not None]
             self._made[cls] = self._message(self._name(cls.__name__), [
@@ -137,7 +136,7 @@ class StructTypes:
         return self._made[cls]
 
     def _message(self, name: str, parts: list[tuple[str, Any, Callable[[Any], Any]]]) -> Made:
-        """Return a type with parts, each with its name here, what it is, and what reads it."""
+        """Return a new message type from name, type and reader of each field."""
         fields: dict[str, tuple[Any, Callable[[Any], Any]]] = {}
         for part, what, read in parts:
             field = _field_name(part)
@@ -205,13 +204,13 @@ def _reader(name: str, write: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _camel(name: str) -> str:
-    """Return a name as types of ROS 2 have it."""
+    """Return a name in the form of ROS 2's types."""
     return "".join(part[:1].upper() + part[1:] for part in re.split(r"[^A-Za-z0-9]+", name)
                    ) or "Value"
 
 
 def _field_name(name: str) -> str:
-    """Return a name as fields of ROS 2 have it."""
+    """Return a name in the form of ROS 2's fields."""
     name = _NO_NAME.sub("_", name.lower()).strip("_") or "value"
     if not name[0].isalpha():
         name = f"n_{name}"

@@ -1,7 +1,7 @@
-"""What viewers see of a run, in the types that those of ROS 2 draw (RViz, PlotJuggler). Pure.
+"""Translates views to types that viewers of ROS 2 draw (RViz, PlotJuggler). Pure.
 
-A recording has its views in JSON (`foxglove`, `views`); each becomes one message, or with a scan
-two: where the laser is, and what it saw.
+A recording has its views in JSON (`foxglove`, `views`). Each becomes one message, except that a
+scan becomes two: the pose of the laser, and its ranges.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rampart.actors.recording import foxglove as fg
 from rampart.actors.ros2.translation.types import Types
 
 TF, ROSOUT = "/tf", "/rosout"
-"""Where ROS 2 expects transforms and the log."""
+"""Topics of transforms and of the log in ROS 2."""
 
 _TF, _LOG = "tf2_msgs/msg/TFMessage", "rcl_interfaces/msg/Log"
 _SCAN, _POSE = "sensor_msgs/msg/LaserScan", "geometry_msgs/msg/PoseStamped"
@@ -23,10 +23,10 @@ _MARKERS, _MARKER = "visualization_msgs/msg/MarkerArray", "visualization_msgs/ms
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"
 
 _NEAREST_M = 0.001
-"""A range that is shorter is none."""
+"""Least valid range."""
 
 _PIXEL_M = 0.01
-"""Width of a line that has it in pixels."""
+"""Width of a pixel, for lines whose width is in pixels."""
 
 _ADD, _DELETE_ALL = 0, 3
 _ARROW, _CUBE, _CYLINDER, _STRIP, _LIST, _TEXT, _TRIANGLES = 0, 1, 3, 4, 5, 9, 11
@@ -50,15 +50,15 @@ class RosViews:
                 (fg.LaserScan, self._scan), (fg.Log, self._log), (fg.SceneUpdate, self._scene))}
 
     def of(self, schema: str, channel: str, data: bytes) -> Shown:
-        """Yield what a view is in ROS 2; nothing if it is of another kind.
+        """Yield the messages for a view; none for an unknown schema.
 
         Args:
-            schema: name of its kind.
-            channel: it is on.
-            data: the view, JSON.
+            schema: name of its schema.
+            channel: name of its channel.
+            data: the view as JSON.
 
         Raises:
-            ValueError: it is no such view, or has a value that ROS 2 cannot say.
+            ValueError: it does not decode, or a value does not fit its field in ROS 2.
         """
         if schema in self._ways:
             kind, way = self._ways[schema]
@@ -74,7 +74,7 @@ class RosViews:
     def _pose(self, topic: str, view: fg.PoseInFrame) -> Shown:
         made = self._stamped(_POSE, view.timestamp, view.frame_id)
         self._place(made.pose, view.pose)
-        yield self._said(topic, _POSE, made)
+        yield self._encoded(topic, _POSE, made)
 
     def _scan(self, topic: str, view: fg.LaserScan) -> Shown:
         frame, at = topic.strip("/").replace("/", "_"), view.pose
@@ -86,14 +86,14 @@ class RosViews:
         made.range_min, made.range_max = _NEAREST_M, max(view.ranges, default=0.0)
         made.ranges = self._types.numbers(view.ranges)
         made.intensities = self._types.numbers(view.intensities)
-        yield self._said(topic, _SCAN, made)
+        yield self._encoded(topic, _SCAN, made)
 
     def _log(self, _topic: str, view: fg.Log) -> Shown:
         made = self._types.blank(_LOG)
         self._time(made.stamp, view.timestamp)
-        made.level = 10 * int(view.level)  # there they are counted in tens
+        made.level = 10 * int(view.level)  # ROS 2 counts levels in tens
         made.name, made.msg, made.file, made.line = view.name, view.message, view.file, view.line
-        yield self._said(ROSOUT, _LOG, made)
+        yield self._encoded(ROSOUT, _LOG, made)
 
     def _scene(self, topic: str, view: fg.SceneUpdate) -> Shown:
         made = self._types.blank(_MARKERS)
@@ -105,7 +105,7 @@ class RosViews:
             for number, marker in enumerate(self._markers(entity)):
                 marker.ns, marker.id, marker.action = entity.id, number, _ADD
                 made.markers.append(marker)
-        yield self._said(topic, _MARKERS, made)
+        yield self._encoded(topic, _MARKERS, made)
 
     def _markers(self, entity: fg.SceneEntity) -> Iterator[Any]:
         for arrow in entity.arrows:
@@ -155,7 +155,7 @@ class RosViews:
         return made
 
     def _tf(self, transforms: list[Any]) -> tuple[str, str, bytes]:
-        return self._said(TF, _TF, self._types.new(_TF, {"transforms": transforms}))
+        return self._encoded(TF, _TF, self._types.new(_TF, {"transforms": transforms}))
 
     def _place(self, pose: Any, view: fg.Pose) -> None:
         pose.position = self._types.like("geometry_msgs/msg/Point", view.position)
@@ -171,5 +171,5 @@ class RosViews:
     def _time(made: Any, at: fg.Time) -> None:
         made.sec, made.nanosec = at.sec, at.nsec
 
-    def _said(self, topic: str, kind: str, made: Any) -> tuple[str, str, bytes]:
+    def _encoded(self, topic: str, kind: str, made: Any) -> tuple[str, str, bytes]:
         return topic, kind, self._types.encode(kind, made)

@@ -16,7 +16,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import msgspec
 
@@ -161,8 +161,9 @@ class Gateway(Actor):
         """
         types = _types(parameters)
         for link in parameters.ros2:
-            asks, answers, beside = (topics[key].type if key else None
-                                     for key in (link.from_, link.to, link.beside))
+            asks, answers, beside = (  # the first two are there as the kind of the link needs them
+                cast("Any", topics[key].type if key else None)
+                for key in (link.from_, link.to, link.beside))
             with _named(link):
                 if link.way == "subscribe":
                     types.decoder(link.type)

@@ -30,7 +30,7 @@ from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.other_hosts import OtherHosts, others_of
-from rampart.actors.recording.process import stop_pipe, told
+from rampart.actors.recording.process import result_of, stop_pipe
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
@@ -136,7 +136,7 @@ def record(options: argparse.Namespace) -> int:
         path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
         check_target(path, overwrite=options.overwrite)
         recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants,
-                            others=_others(run), shown=lambda run: tools_credentials(run)[0])
+                            others=_others(run), credentials=lambda run: tools_credentials(run)[0])
         recorder.open()
     stop = stop_pipe()
     say(f"recording {run.title} in {path}; ctrl-C ends it")
@@ -144,7 +144,7 @@ def record(options: argparse.Namespace) -> int:
         why = recorder.run(stop, options.duration)
     except (BagError, ValueError, OSError) as error:
         raise NoEffectError(str(error)) from None
-    say(f"{told(recorder)}; it ends because {why}")
+    say(f"{result_of(recorder)}; it ends because {why}")
     if recorder.writer is None or not recorder.writer.messages:
         raise NoEffectError("no message arrived")
     return 0

@@ -132,23 +132,23 @@ def spans(silences: Silences) -> list[list[float | None]]:
 
 def test_a_partition_is_told_from_the_last_message_to_the_next():
     silences = Silences(OTHERS, 0.0)
-    silences.heard("supervisor_ground", 0.5)
+    silences.received("supervisor_ground", 0.5)
     silences.look(1.0)
     assert spans(silences) == []
     silences.look(1.2)
     assert spans(silences) == [[0.5, None]]
-    silences.heard("hmi", 3.0)  # it may run here by now: only guards are that host
+    silences.received("hmi", 3.0)  # it may run here by now: only guards are that host
     assert spans(silences) == [[0.5, None]]
-    silences.heard("router_a_ground", 4.0)
-    silences.heard("router_a_ground", 4.1)
+    silences.received("router_a_ground", 4.0)
+    silences.received("router_a_ground", 4.1)
     silences.look(4.2)
     assert spans(silences) == [[0.5, 4.0]]
 
 
 def test_one_that_nobody_looked_at_meanwhile_is_told_too():
     silences = Silences(OTHERS, 0.0)
-    silences.heard("supervisor_ground", 0.1)
-    silences.heard("supervisor_ground", 9.0)
+    silences.received("supervisor_ground", 0.1)
+    silences.received("supervisor_ground", 9.0)
     assert spans(silences) == [[0.1, 9.0]]
 
 
@@ -162,7 +162,7 @@ def test_a_link_that_flaps_all_the_time_does_not_fill_the_memory():
     silences = Silences(OTHERS, 0.0)
     for second in range(1, 1000):
         silences.look(second - 0.1)
-        silences.heard("supervisor_ground", float(second))
+        silences.received("supervisor_ground", float(second))
     told = spans(silences)
     assert len(told) == MOST_SILENCES
     assert told[-1][1] == 999.0  # it covers what follows

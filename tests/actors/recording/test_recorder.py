@@ -29,7 +29,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of
-from rampart.actors.recording.process import Order, RecorderProcess, told
+from rampart.actors.recording.process import Order, RecorderProcess, result_of
 from rampart.actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
 from rampart.cli.main import main
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port, wait_until
@@ -340,7 +340,7 @@ def test_a_recording_that_becomes_large_goes_on_in_another_file(
         assert (summary.reader.closed, summary.reader.damage) == (True, "")
         assert summary.end["lost"] == "{}"
     assert "run-2.mcap" in Summary(BagReader(files[0])).end["ended"]
-    assert f"recorded {robot.sent} messages" in told(recorder)
+    assert f"recorded {robot.sent} messages" in result_of(recorder)
 
 
 def test_a_disk_without_room_for_others_ends_the_recording(tmp_path, monkeypatch):

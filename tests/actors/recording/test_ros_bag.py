@@ -112,7 +112,7 @@ def test_poses_detections_and_views_are_read_by_others(tmp_path, capsys):
     assert next((said.level, said.name) for _, said in found["/rosout"][1]) == (30, "DM1")
     assert len(found["/view/map"][1][0][1].markers) > 10
     out = capsys.readouterr().out
-    assert "left out: no/such/topic: no actor that is known declares it (1 times)" in out
+    assert "left out: no/such/topic: no known actor declares it (1 times)" in out
     assert "left out: localization/pose: " in out, "garbage is no message"
 
 
