@@ -1,1 +1,1 @@
-"""The operator's page: its node, its server, what it shows and what may be asked."""
+"""The operator's page: its node, its server, its contents and its requests."""

@@ -1,12 +1,11 @@
-"""How much of what was heard pages are shown. Pure.
+"""Bounds of what a page shows. Pure.
 
-A node on the bus may say as much as a message holds; a page is for a person, and has to be
-drawn. Texts are clipped, lists end, and how many entries were left out is counted and shown. Each
-list has its own room, so that a long one takes nothing from what stands beside it: the recoveries
-that wait for a reset, for instance.
+Messages on the bus can be larger than what a person can read and a browser can draw. Texts and
+lists are cut, and the page shows the number of missing entries. Each list has its own bound, so a
+long one does not displace others, e.g. the recoveries that wait for a reset.
 
-A text is shown as one printable line: a line break could look like a line of the log, and a mark
-that turns the direction of writing like another name.
+A text becomes one printable line. A line break could forge a line of the log, and a mark that
+changes the direction of writing could forge a name.
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ import msgspec
 from rampart.files.plain_text import one_line
 
 MAX_NAME = 100
-"""Characters of a name."""
+"""Longest name."""
 
 _NUMBER_BYTES = 20
 
 
 class Bounds(msgspec.Struct, frozen=True):
-    """How much is shown of a value.
+    """Bounds of a value.
 
     Attributes:
         text: characters of a text.
         items: entries of a list or mapping.
-        room: bytes of a list, as JSON, about.
+        room: approximate bytes of a list as JSON.
     """
 
     text: int = 500
@@ -38,14 +37,14 @@ class Bounds(msgspec.Struct, frozen=True):
     room: int = 8_000
 
     def fit(self, value: Any) -> tuple[Any, int]:
-        """Return a value as it is shown, made of JSON's types, and how many entries are missing."""
+        """Return a value cut to the bounds, in types of JSON, and the number of missing entries."""
         fitting = _Fitting(self)
         return fitting.value(msgspec.to_builtins(value), None), fitting.left_out
 
 
 SHOWN = Bounds()
 LINE = Bounds(items=40, room=2_000)
-"""A line of a log."""
+"""Bounds of a line of a log."""
 
 
 class _Room(msgspec.Struct):
@@ -53,7 +52,7 @@ class _Room(msgspec.Struct):
 
 
 class _Fitting:
-    """One value on its way; `room` is that of the outermost list round what is looked at."""
+    """Cuts one value; `room` belongs to the outermost list around the part in hand."""
 
     def __init__(self, bounds: Bounds) -> None:
         self._bounds = bounds

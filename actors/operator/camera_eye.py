@@ -1,9 +1,8 @@
-"""Gets pictures from a renderer, a program of its own that is started when a page asks for one.
+"""Pictures from a renderer, a separate program that runs while a page requests pictures.
 
-The renderer, which the robot's page names, runs as long as pictures are asked for and `IDLE_S`
-longer. All pages share its pictures, `PERIOD_S` apart. It may fail, hang or be killed: then the
-page is told why, and the next try is made after `RETRY_S`. Nothing else waits for it, and it costs
-nothing while no page asks.
+The robot's page names the renderer. It ends `IDLE_S` after the last request. All pages share its
+pictures, `PERIOD_S` apart. If it fails, hangs or is killed, the page shows the reason, and the next
+try is `RETRY_S` later. Nothing else waits for it.
 """
 
 from __future__ import annotations
@@ -24,18 +23,18 @@ PERIOD_S = 0.2
 
 IDLE_S = 4.0
 START_S = 30.0
-"""Loading and the first picture, on a busy machine."""
+"""Real seconds to load and to render the first picture, on a busy machine."""
 
 PICTURE_S = 4.0
 RETRY_S = 10.0
 MAX_BYTES = 4_000_000
 
 _ENVIRONMENT = {"MUJOCO_GL": "egl", "LP_NUM_THREADS": "1"}
-"""Renders without a screen; and where Mesa renders in software, it leaves the other cores alone."""
+"""Renders without a screen, and with one thread if Mesa renders in software."""
 
 
 class CameraError(Exception):
-    """There is no picture; the text says why."""
+    """There is no picture; the text is the reason."""
 
 
 def renderer(module: str) -> tuple[str, ...]:
@@ -44,12 +43,12 @@ def renderer(module: str) -> tuple[str, ...]:
 
 
 class CameraEye:
-    """Pictures of what the controller believes.
+    """Pictures of the robot as the controller believes it to be.
 
     Args:
         command: the renderer's command line.
-        order: the line that it is given first.
-        view: returns the line for the next picture, or None while there is nothing to show.
+        order: first line of its input.
+        view: returns the line for the next picture, or None while the pose is not known.
     """
 
     def __init__(self, command: Sequence[str], order: Any, view: Callable[[], Any]) -> None:
@@ -60,7 +59,7 @@ class CameraEye:
         self._lock = asyncio.Lock()
         self._picture = b""
         self._failure = ""
-        self._until_s = 0.0  # so long holds the picture, or the failure
+        self._until_s = 0.0  # end of validity of the picture, or of the failure
         self._idle: asyncio.TimerHandle | None = None
         self._ending: set[asyncio.Task[int]] = set()
 
@@ -68,7 +67,7 @@ class CameraEye:
         """Return a JPEG that is younger than `PERIOD_S`.
 
         Raises:
-            CameraError: there is none.
+            CameraError: there is no picture.
         """
         if self._idle is not None:
             self._idle.cancel()
@@ -81,7 +80,7 @@ class CameraEye:
 
     async def _newest(self) -> bytes:
         loop = asyncio.get_running_loop()
-        async with self._lock:  # those who ask meanwhile get the same picture
+        async with self._lock:  # simultaneous requests get the same picture
             if loop.time() >= self._until_s:
                 await self._renew()
             if self._failure:
@@ -96,7 +95,7 @@ class CameraEye:
         try:
             self._picture = await self._take(view)
         except asyncio.CancelledError:
-            self.close()  # it may be in the middle of a picture
+            self.close()  # its output may end within a picture
             raise
         except (TimeoutError, OSError, CameraError) as error:
             self._failure, lasts_s = str(error) or "the renderer does not answer", RETRY_S
@@ -104,11 +103,11 @@ class CameraEye:
         self._until_s = asyncio.get_running_loop().time() + lasts_s
 
     def _rest(self) -> None:
-        if not self._lock.locked():  # else a page looks, and will set the timer again
+        if not self._lock.locked():  # otherwise a request is running, and sets the timer again
             self.close()
 
     def close(self) -> None:
-        """End the renderer, if there is one; the next picture starts another."""
+        """Kill the renderer, if there is one; the next picture starts another one."""
         process, self._process = self._process, None
         if process is not None and process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
@@ -118,7 +117,7 @@ class CameraEye:
             task.add_done_callback(self._ending.discard)
 
     async def ended(self) -> None:
-        """Wait until all renderers that were closed have ended."""
+        """Wait until all closed renderers have ended."""
         await asyncio.gather(*self._ending)
 
     async def _take(self, view: Any) -> bytes:
@@ -141,14 +140,14 @@ class CameraEye:
                     raise CameraError(f"the renderer sends a picture of {size} bytes")
                 return await answer.readexactly(size)
             except (asyncio.IncompleteReadError, ConnectionError):
-                raise CameraError(await _last_words(complaint)) from None
+                raise CameraError(await _last_line(complaint)) from None
 
 
-async def _last_words(complaint: asyncio.StreamReader) -> str:
-    """Return why a renderer that has ended could not go on: the last line that it said."""
-    words = b""
+async def _last_line(complaint: asyncio.StreamReader) -> str:
+    """Return why a renderer has ended: the last line of its stderr."""
+    text = b""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(1.0):
-            words = await complaint.read(65536)
-    lines = words.decode(errors="replace").strip().splitlines()
+            text = await complaint.read(65536)
+    lines = text.decode(errors="replace").strip().splitlines()
     return f"this machine cannot render: {lines[-1][:200]}" if lines else "the renderer died"

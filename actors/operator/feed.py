@@ -1,15 +1,15 @@
-"""Pushes the picture to the open pages: what changed, at most 25 times a second, encoded once.
+"""Pushes changes of the picture to the open pages, at most 25 times a second, encoded once.
 
-A change is on its way in the same turn of the event loop, unless the last frame is younger than
+A change is sent in the same turn of the event loop, unless the last frame is younger than
 `FRAME_GAP_S`. Pages at the same version share a frame.
 
-*No backlog.* The buffers between here and a browser hold minutes of frames, so that a page that
-cannot keep up would show the past. A page therefore reports which frame it has drawn, and has at
-most `IN_FLIGHT` frames that it has not; with its answer it gets the newest. A client that never
-answers (a script) is bounded by its socket alone. A page that takes nothing for `SEND_TIMEOUT_S` is
-disconnected; it may come back and is given everything.
+*No backlog.* The buffers up to a browser can hold minutes of frames, so a slow page would show the
+past. A page therefore reports each frame that it has drawn. It never has more than `IN_FLIGHT`
+frames that it has not drawn, and then gets the newest one. A client that never reports (a script)
+is bounded by its socket only. A page that takes nothing for `SEND_TIMEOUT_S` is disconnected; when
+it reconnects it gets everything.
 
-Nothing here costs anything while no page is open.
+While no page is open, nothing runs here.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ import msgspec
 from rampart.actors.operator.state import HmiState
 
 FRAME_GAP_S = 0.04
-"""Real seconds between two frames at least: 20 Hz, with room for jitter."""
+"""Least real seconds between two frames: 20 Hz with room for jitter."""
 
 LOOK_S = 1.0
-"""Between two looks at what no message carries: silent publishers, what the processes use."""
+"""Real seconds between two looks for silent publishers and at the usage of processes."""
 
 SEND_TIMEOUT_S = 5.0
 IN_FLIGHT = 2
@@ -37,10 +37,10 @@ _SEEN = re.compile(rb'\{"type":"seen","version":(\d{1,33})\}')
 
 
 class PageFeed:
-    """An open page: which versions it was sent, and which of them it has drawn.
+    """An open page: the versions that were sent to it, and those that it has drawn.
 
     Attributes:
-        version: the newest that it was sent.
+        version: the newest version that was sent.
     """
 
     def __init__(self) -> None:
@@ -52,15 +52,15 @@ class PageFeed:
         self.drawn.set()
 
     def sends(self, version: int) -> None:
-        """Take note of what it is being sent."""
+        """Note that a version is sent to it."""
         self.version = version
         self.news.clear()
-        self._on_the_way = [*self._on_the_way, version][-IN_FLIGHT:]  # it may never answer
+        self._on_the_way = [*self._on_the_way, version][-IN_FLIGHT:]  # it may never report
         if self._answers and len(self._on_the_way) == IN_FLIGHT:
             self.drawn.clear()
 
     def seen(self, version: int) -> None:
-        """Take note that it has drawn a frame, and with it all before."""
+        """Note that it has drawn a frame, and so all earlier ones."""
         self._answers = True
         self._on_the_way = [v for v in self._on_the_way if v > version]
         self.drawn.set()
@@ -70,9 +70,9 @@ class Feed:
     """Serves the picture to any number of pages.
 
     Args:
-        state: what is shown.
-        now: the present simulated time.
-        hello: what a page is told once.
+        state: contents of the page.
+        now: returns simulated seconds.
+        hello: returns the first message to a page.
         look: called once a second while a page is open, before staleness is checked.
     """
 
@@ -91,7 +91,7 @@ class Feed:
 
     @contextlib.contextmanager
     def page(self) -> Iterator[PageFeed]:
-        """Have a page among those that are sent news."""
+        """Add a page while the context is open."""
         page = PageFeed()
         self._pages.add(page)
         if self._looker is None:
@@ -106,10 +106,10 @@ class Feed:
                 self._timer = self._looker = None
 
     async def push(self, page: PageFeed, send: Callable[[str], Awaitable[None]]) -> None:
-        """Send a page what it should show, until cancelled.
+        """Send a page its contents until cancelled.
 
         Raises:
-            TimeoutError: it does not take it, or does not draw it.
+            TimeoutError: the page does not take or draw a frame.
         """
         async with asyncio.timeout(SEND_TIMEOUT_S):
             await send(_encode(self._hello()))
@@ -121,15 +121,15 @@ class Feed:
                 await send(text)
             await page.news.wait()
 
-    def heard(self, page: PageFeed, text: str | bytes | None) -> bool:
-        """Take note if a message reports a frame as drawn; return whether it does."""
+    def take(self, page: PageFeed, text: str | bytes | None) -> bool:
+        """Return whether a message of a page reports a drawn frame, and note the report."""
         raw = text.encode(errors="replace") if isinstance(text, str) else text or b""
         if found := _SEEN.fullmatch(raw):
             page.seen(int(found[1]))
         return found is not None
 
     def frame(self, since: int) -> str:
-        """Return what changed since a version; encoded once for all pages that are there."""
+        """Return the changes since a version, encoded once for all pages."""
         if since not in self._frames:
             picture = self._state.picture
             self._frames[since] = _encode({
@@ -141,9 +141,9 @@ class Feed:
         self._frames.clear()
         if self._pages and self._timer is None:
             loop = asyncio.get_running_loop()
-            self._timer = loop.call_at(max(self._last_s + FRAME_GAP_S, loop.time()), self._tell)
+            self._timer = loop.call_at(max(self._last_s + FRAME_GAP_S, loop.time()), self._wake)
 
-    def _tell(self) -> None:
+    def _wake(self) -> None:
         self._timer = None
         self._last_s = asyncio.get_running_loop().time()
         for page in self._pages:
@@ -152,8 +152,8 @@ class Feed:
     def _look_around(self) -> None:
         self._look()
         self._state.grow_old(self._now())
-        self._frames.clear()  # the time has gone on
-        self._tell()
+        self._frames.clear()  # they contain the time
+        self._wake()
         self._looker = asyncio.get_running_loop().call_later(LOOK_S, self._look_around)
 
 

@@ -1,8 +1,8 @@
-"""The operator's page as a node: shows what happens, and hands on what the operator asks for.
+"""The node of the operator's page: shows the run, and passes on the operator's requests.
 
-A non-control node (paper, section III): memoryless, may be killed and respawned at any time. What
-every system has is here: nodes, decisions, detections, faults, strategies, signals. A robot's page
-is derived from it. What is shown is collected in `state`, the page is served by `server`.
+A non-control node (paper, section III): it keeps no state and may be restarted at any time. It has
+what every system has: nodes, decisions, detections, faults, strategies, signals. A robot's page
+derives from it. `state` collects the contents, and `server` serves the page.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.specification import SystemSpec, check_document
 
 REPEAT_S = 0.5
-"""Simulated seconds between repetitions of what was not answered."""
+"""Simulated seconds between repetitions of unanswered messages."""
 
 TOKEN_HOLDER = "operator"  # noqa: S105 it is a name
-"""Who has the one token of a run that lists no visitors by name."""
+"""Name of the visitor on a page with one token."""
 
 _PANELS = Bounds(text=200, items=max(MAX_PANELS, 40), room=40_000)
 
@@ -72,20 +72,20 @@ class Hmi(Actor):
     """The operator's node.
 
     Class attributes:
-        requests: what its page may ask for.
-        shown: topics that are heard for the page alone.
-        drawn: those of them of which the page shows the newest alone: heard once one was opened.
-        panels: of the page, besides those that every page has and those of the specification.
-        files: folder of the JavaScript and CSS that `panels` need; None for none.
-        badge: what the page calls its connection.
-        refuses: why no page of it may ask for anything; "" if they may.
+        requests: types of the requests of its page.
+        shown: topics that it subscribes to for the page only.
+        drawn: those of them with only a newest value; it subscribes when the first page opens.
+        panels: of the page, besides common ones and those of the specification.
+        files: folder with the JavaScript and CSS of `panels`; None for none.
+        badge: name of the connection on the page.
+        refuses: why it refuses all requests; "" if it does not.
     """
 
     class Parameters(Actor.Parameters, frozen=True):
-        """What the loader puts together.
+        """Parameters that the loader fills in.
 
         Attributes:
-            panels: of its class and of the specification.
+            panels: panels of the class and of the specification.
             fault_orders: topics on which the page orders faults of the robot.
         """
 
@@ -111,12 +111,12 @@ class Hmi(Actor):
         super().__init_subclass__(**kwargs)
         for panel in cls.panels:
             if panel.script and not (cls.files and (cls.files / panel.script).is_file()):
-                raise ValueError(f"panel {panel.title!r}: script = {panel.script!r}: no such file "
-                                 f"in {cls.__name__}.files = {str(cls.files)!r}")
+                raise ValueError(f"panel {panel.title!r}: script = {panel.script!r}: expected a "
+                                 f"file in {cls.__name__}.files = {str(cls.files)!r}")
 
     @classmethod
     def given(cls, name: str, spec: SystemSpec, file: str) -> dict[str, Any]:
-        """Return the panels of class and specification; raises as that of its base."""
+        """Return the panels of class and specification; raises as the base class."""
         panels = (*cls.panels, *read_panels(spec, file))
         if problem := problem_of(panels):
             raise ValueError(f"{file}: {name}: {problem}")
@@ -125,17 +125,17 @@ class Hmi(Actor):
     @classmethod
     def completed(cls, parameters: Parameters, topics: Iterable[Topic[Any]],
                   ordered: Iterable[str]) -> Parameters:
-        """Return what it shows, plots if nothing is declared, and what it orders."""
+        """Return the parameters with panels, plots by default, and the topics of fault orders."""
         return msgspec.structs.replace(
             parameters, panels=parameters.panels or plots_of(topics), fault_orders=tuple(ordered))
 
     @classmethod
     def named(cls, parameters: Parameters) -> dict[str, list[Named]]:
-        """Return what its panels show and say, besides what its parameters name."""
+        """Return the topics of its panels and of its parameters."""
         found = super().named(parameters)
         for panel in parameters.panels:
             for shown in panel.fields():
-                found["published" if shown.is_said else "heard"].append(named(
+                found["published" if shown.is_published else "heard"].append(named(
                     shown.key, shown.field, kinds=shown.kinds, row=f"panel {panel.title!r}: "))
         return found
 
@@ -147,10 +147,10 @@ class Hmi(Actor):
 
     @classmethod
     def check_topics(cls, parameters: Parameters, topics: Mapping[str, Topic[Any]]) -> None:
-        """Refuse sticks of which no message can be made.
+        """Refuse sticks whose messages cannot be built.
 
         Raises:
-            ValueError: there is one.
+            ValueError: a field does not fit; the text names the panel.
         """
         for panel in parameters.panels:
             if panel.stick:
@@ -177,12 +177,12 @@ class Hmi(Actor):
         self._behind_until_s = 0.0
         self._version = -1
         self._is_seen = False
-        self._unheard: list[str] = []
+        self._refused_fields: list[str] = []
         if self._port:
-            self._hear_panels()
+            self._subscribe_panels()
         self._show_system(run.system, run.adapted.version if run.adapted else 0)
 
-    # -- what a robot's page may override --------------------------------------------------------
+    # -- for derived classes ---------------------------------------------------------------------
 
     def _make_state(self) -> HmiState:
         return HmiState()
@@ -194,7 +194,7 @@ class Hmi(Actor):
         return None
 
     def _hello(self) -> dict[str, Any]:
-        """Return what a page needs to know to begin; what it is not told of, it does not show."""
+        """Return the first message to a page; it offers only what this announces."""
         return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
                 "badge": self.badge,
                 "system": one_line(self.context.run.system.name),
@@ -203,7 +203,7 @@ class Hmi(Actor):
                 "panels": _PANELS.fit(self._panels)[0], "past": self._state.past()}
 
     def _expires(self) -> tuple[str, float] | None:
-        """Return which certificate of the run expires first, and when (Unix time)."""
+        """Return the certificate of the run that expires first, and the time (Unix time)."""
         plan, ends = self.context.run.plan, {}
         if self._tls is not None:
             ends["page"] = self._tls.says.until_s
@@ -217,10 +217,10 @@ class Hmi(Actor):
         return min(ends.items(), key=lambda end: end[1], default=None)
 
     def _fulfil(self, request: Request, page: int) -> str | dict[str, Any]:
-        """Act on a request of a page, known by its number, and return what to tell it.
+        """Act on a request of the page with a number, and return the answer.
 
         Raises:
-            RefusedError: it cannot be met; the text says why.
+            RefusedError: it cannot be fulfilled; the text is the reason.
         """
         if not isinstance(request, ResetRequest):
             return self._operating.fulfil(request, page)
@@ -229,25 +229,25 @@ class Hmi(Actor):
             raise RefusedError(f"{request.recovery[:40]!r} does not wait for a reset; "
                                f"waiting: {waiting}")
         self.publish(ftm_topics.RESET, fm.Reset(request.recovery, self.name))
-        return f"reset of {request.recovery} asked for"
+        return f"reset of {request.recovery} requested"
 
     @every(REPEAT_S)
     def _repeat(self) -> None:
-        """Send again what was not answered."""
+        """Repeat unanswered messages."""
         self._operating.repeat()
 
-    def _hear_panels(self) -> None:
-        """Hear what the panels show, each field once."""
+    def _subscribe_panels(self) -> None:
+        """Subscribe to the fields of the panels, once each."""
         kept_s: dict[str, float] = {}
         for panel in self._panels:
-            for shown in (field for field in panel.fields() if not field.is_said):
+            for shown in (field for field in panel.fields() if not field.is_published):
                 kept_s[shown.field] = max(panel.kept_s, kept_s.get(shown.field, 0.0))
         for field, past_s in kept_s.items():
             try:
                 rate_hz = self.chosen_topic(field.partition(":")[0]).rate_hz
                 self.hear_field(field, partial(self._field, field))
-            except ValueError as error:  # checked before the start; a replay may know less
-                self._unheard.append(str(error))
+            except ValueError as error:  # in a replay, where classes may be missing
+                self._refused_fields.append(str(error))
                 continue
             silent_s = max(STALE_S, 3 / rate_hz) if rate_hz > 0 else math.inf
             self._state.show_field(field, past_s, silent_s)
@@ -258,16 +258,16 @@ class Hmi(Actor):
     # -- the page -------------------------------------------------------------------------------
 
     def listens(self, topic: Topic[Any]) -> bool:
-        """Without a page, hear only what this node does without one."""
+        """Return whether to subscribe to a topic now; without a page only to those it needs."""
         return topic not in (self.drawn if self._port else self.shown)
 
     def on_start(self) -> None:
-        """Open the page's port; the robot drives without the page."""
+        """Open the page; if that fails, the node goes on without it."""
         self._repeat()
         if not self._port:
             return
         self._operating.start()
-        for why in self._unheard:
+        for why in self._refused_fields:
             self.report_diagnostic("panel", why, self.name)
         try:
             self._server = self._serve()
@@ -301,7 +301,7 @@ class Hmi(Actor):
                      self.refuses),
             lambda port: Gate(register, secret, port, owner=owner,
                               tls=tls is not None or page.behind.startswith("https:")), audit,
-            tls=tls, camera=self._camera, files=self.files, tell=complain)
+            tls=tls, camera=self._camera, files=self.files, complain=complain)
 
     def _complain(self, why: str) -> None:
         self.report_diagnostic("operator's page", one_line(why), f"port {self._port}")
@@ -330,7 +330,7 @@ class Hmi(Actor):
             self._state.narrator.titles = system.titles
             self._state.picture.put("system", draw_system(system))
 
-    # -- hearing --------------------------------------------------------------------------------
+    # -- messages -------------------------------------------------------------------------------
 
     @on(ftm_topics.ADAPTED_SYSTEM)
     def _adapted(self, message: fm.AdaptedSystem, _header: Header) -> None:
@@ -381,8 +381,8 @@ class Hmi(Actor):
 
 
 def _user() -> str:
-    """Return the name of the user whose page it is."""
+    """Return the name of this process's user."""
     try:
         return pwd.getpwuid(os.getuid()).pw_name
-    except KeyError:  # one that has no name
+    except KeyError:  # a user without a name
         return f"user {os.getuid()}"

@@ -1,8 +1,8 @@
-"""Faults that the operator injects from the page: ordered, watched, and reported.
+"""Faults that the operator injects from the page: orders, progress and results. Pure.
 
-Pure. A fault has a name of the catalogue that the launcher hands out, or is `MODE:TOPIC`. It acts
-where the topic is published; that node reports that it took hold, its first effect, and its end
-with the number of messages that it changed. None at all is *no effect*, and is said.
+A fault has a name in the launcher's catalogue, or is `MODE:TOPIC`. The node that publishes the
+topic injects it. It reports the begin, the first effect, and the end with the number of changed
+messages. A fault that changes no message is shown as *no effect*.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from rampart.actors.system.topics import declared_topics, find_topic
 from rampart.manager.spec.schema import SystemSpec
 
 TAKE_HOLD_S = 3.0
-"""Simulated seconds within which a publisher reports, even one that is being respawned."""
+"""Simulated seconds within which a publisher reports, even one that is being restarted."""
 
 LATE_END_S = 2.0
-"""Simulated seconds that the report of the end may be late before its publisher counts as gone."""
+"""Simulated seconds after the end of a fault within which its publisher reports the end."""
 
 DELAY_S = 1.5
 """Delay of `delay:TOPIC`: longer than any freshness timeout of the shipped system."""
 
 OWN_DURATION_S = 10.0
 STAMP_S = 0.5
-"""Error of `restamp:TOPIC`: ahead, and more than any reader accepts."""
+"""Error of `restamp:TOPIC`: further ahead than any reader accepts."""
 
 MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp")
-"""Modes that fit any topic; what to corrupt in a message is for the catalogue."""
+"""Modes that fit any topic; corruption of fields needs the catalogue."""
 
 MAX_WAITING = 16
 
@@ -49,7 +49,7 @@ _KEPT = 20
 
 @dataclass(slots=True, kw_only=True)
 class Ordered(FaultWatch):
-    """One fault as ordered, and what is known of it."""
+    """An ordered fault and its progress."""
 
     injection: str
     fault: str
@@ -62,13 +62,13 @@ class Ordered(FaultWatch):
     effective: bool | None = None
 
     def state(self, now_s: float) -> str:
-        """Return in a few words how far it is."""
+        """Return its progress in a few words."""
         if self.outcome:
             return self.outcome
         if now_s < self.begins_s:
             return f"begins at {self.begins_s:.0f} s"
         if not self.reports:
-            return "asked for"
+            return "requested"
         if self.affected:
             return f"in force, {self.affected} changed"
         return "in force, no effect so far"
@@ -78,11 +78,11 @@ class Injections:
     """The faults that were ordered from the page.
 
     Args:
-        prefix: of the ids; another one for each incarnation of the HMI.
-        catalogue: faults that have a name.
+        prefix: of the ids, unique to each incarnation of the node.
+        catalogue: faults with a name.
         places: keys of topics that can be disturbed.
-        robots: topics on which a fault of the catalogue may be ordered.
-        overhead_s: granted for what takes real time, in simulated seconds.
+        robots: topics for orders of faults of the catalogue.
+        overhead_s: added for delays in real time, in simulated seconds.
     """
 
     def __init__(self, prefix: str, catalogue: Iterable[NamedFault], places: Iterable[str],
@@ -96,13 +96,13 @@ class Injections:
         self._ordered: list[Ordered] = []
 
     def choice(self) -> dict[str, Any]:
-        """Return what can be injected, for the page."""
+        """Return the available faults, for the page."""
         return {"faults": [{"name": f.name, "title": f.title, "group": f.group,
                             "duration_s": f.duration_s} for f in self._catalogue.values()],
                 "modes": MODES, "topics": self._places, "duration_s": OWN_DURATION_S}
 
     def view(self, now_s: float) -> list[dict[str, Any]]:
-        """Return what was ordered, newest first, for the page."""
+        """Return the ordered faults, newest first, for the page."""
         return [{"injection": o.injection, "fault": o.fault, "state": o.state(now_s),
                  "ended": bool(o.outcome), "effective": o.effective}
                 for o in reversed(self._ordered)]
@@ -113,16 +113,16 @@ class Injections:
         """Take an order of the operator.
 
         Args:
-            fault: name of the catalogue, or `MODE:TOPIC`.
-            delay_s: until it begins.
-            duration_s: how long it lasts, infinity for permanent, None for the fault's own.
-            now_s: now, simulated seconds.
+            fault: name in the catalogue, or `MODE:TOPIC`.
+            delay_s: time until it begins.
+            duration_s: its duration, infinity for permanent, None for the fault's default.
+            now_s: simulated seconds.
 
         Raises:
-            RefusedError: there is none of this name, or too many wait.
+            RefusedError: there is no such fault, or there are too many.
         """
         if sum(not o.outcome for o in self._ordered) >= MAX_WAITING:
-            raise RefusedError(f"{MAX_WAITING} faults are under way; wait for one to end")
+            raise RefusedError(f"{MAX_WAITING} faults are active; wait for one to end")
         self._count += 1
         name = f"{self._prefix}.{self._count}"
         orders, own_s = self._find(fault, name)
@@ -136,10 +136,10 @@ class Injections:
         return ordered
 
     def end(self, injection: str, now_s: float) -> Sequence[Order]:
-        """End a fault now: return the orders that do it.
+        """End a fault now, and return the orders for that.
 
         Raises:
-            RefusedError: there is no such fault under way.
+            RefusedError: no such fault is active.
         """
         for ordered in self._ordered:
             if ordered.injection == injection and not ordered.outcome:
@@ -149,7 +149,7 @@ class Injections:
                 ordered.duration_s = max(now_s - ordered.begins_s, 0.0)
                 ordered.orders = [o.with_(duration_s=0.0) for o in ordered.orders]
                 return ordered.orders
-        raise RefusedError(f"no fault {injection[:60]!r} is under way")
+        raise RefusedError(f"no fault {injection[:60]!r} is active")
 
     def _find(self, fault: str, injection: str) -> tuple[list[Order], float]:
         if named := self._catalogue.get(fault):
@@ -158,11 +158,12 @@ class Injections:
                         math.inf if named.duration_s is None else named.duration_s)
         mode, colon, key = fault.partition(":")
         if not colon:
-            raise RefusedError(f"no fault {fault[:60]!r}; choose one of the list, or MODE:TOPIC")
+            raise RefusedError(f"no fault {fault[:60]!r}; expected a fault of the list, or "
+                               "MODE:TOPIC")
         if mode not in MODES:
-            raise RefusedError(f"mode {mode[:40]!r}: must be one of {', '.join(MODES)}")
+            raise RefusedError(f"mode {mode[:40]!r}: expected one of {', '.join(MODES)}")
         if key not in self._places:
-            raise RefusedError(f"topic {key[:60]!r}: this system has none of that key that can be "
+            raise RefusedError(f"topic {key[:60]!r}: this system has no such topic that can be "
                                "disturbed")
         order = bm.Injection(f"{injection}.1", key, mode, OWN_DURATION_S,
                              delay_s=DELAY_S if mode == "delay" else 0.0,
@@ -181,14 +182,14 @@ class Injections:
     # -- the run --------------------------------------------------------------------------------
 
     def due(self, now_s: float) -> list[Order]:
-        """Return the orders to send now, first or again: those without an answer."""
+        """Return the orders to send now: new ones and unanswered ones."""
         begun = [o for o in self._ordered if not o.outcome and now_s >= o.begins_s]
         for ordered in begun:
             ordered.sent = True
         return [order for o in begun for order in (o.unfinished if o.ending else o.unanswered)]
 
-    def hear(self, report: bm.InjectionReport) -> str:
-        """Take a report; return what to tell, "" if there is nothing to say yet."""
+    def take(self, report: bm.InjectionReport) -> str:
+        """Take a report; return a line for the operator, "" for none."""
         for o in self._ordered:
             if o.outcome or not o.hear(report):
                 continue
@@ -200,8 +201,8 @@ class Injections:
         return ""
 
     def expire(self, now_s: float) -> list[str]:
-        """Return what to tell of faults from which no more reports are to be expected."""
-        told = []
+        """Return lines about faults whose expected reports have not come."""
+        lines = []
         now_s -= self._overhead_s
         for o in self._ordered:
             if o.outcome:
@@ -209,15 +210,15 @@ class Injections:
             if o.unanswered and now_s > o.begins_s + TAKE_HOLD_S:
                 where = ", ".join(x.place for x in o.unanswered)
                 o.reason = f"no publisher of {where} answers"
-                told.append(self._conclude(o))
-            elif now_s > o.begins_s + o.duration_s + LATE_END_S:  # never of one that is permanent
-                o.reason = "its publisher did not report the end, it was restarted"
-                told.append(self._conclude(o))
+                lines.append(self._conclude(o))
+            elif now_s > o.begins_s + o.duration_s + LATE_END_S:  # never true of a permanent one
+                o.reason = "its publisher was restarted and did not report the end"
+                lines.append(self._conclude(o))
             elif (math.isinf(o.duration_s) and o.effective is None
                   and now_s > o.begins_s + FIRST_EFFECT_S):
                 o.effective = False
-                told.append(f"fault {o.fault} has had no effect for {FIRST_EFFECT_S:g} s; it stays")
-        return told
+                lines.append(f"fault {o.fault}: no effect for {FIRST_EFFECT_S:g} s; it goes on")
+        return lines
 
     def _conclude(self, o: Ordered) -> str:
         o.effective = o.affected > 0
@@ -227,19 +228,19 @@ class Injections:
             unit = "messages" if of_topics else "ticks"
             o.outcome = f"over, {o.affected} {unit} changed" + (f"; {reason}" if reason else "")
         else:
-            o.outcome = f"no effect: {reason or 'nothing was sent that it would have changed'}"
+            o.outcome = f"no effect: {reason or 'no message was sent'}"
         return f"fault {o.fault}: {o.outcome}"
 
 
 def places_of(system: SystemSpec) -> tuple[str, ...]:
-    """Return the keys of topics that can be disturbed: the common ones, then the robot's own.
+    """Return the keys of topics that can be disturbed: common ones, then the robot's.
 
-    Families are spelt out. Left out are the judge's (`world/`), those of the injections, and
-    greetings and error reports.
+    Each member of a family has its key. The judge's topics (`world/`), those of injections,
+    greetings and error reports are left out.
     """
     known = declared_topics(system)
     nodes, detections, recoveries = (
-        [one.name for one in part] for part in (system.nodes, system.detections, system.recoveries))
+        [row.name for row in rows] for rows in (system.nodes, system.detections, system.recoveries))
     members = {
         bus_topics.HEARTBEAT.key: [*nodes, *detections, *recoveries],
         topics.DETECTION.key: detections,

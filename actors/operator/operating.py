@@ -1,7 +1,7 @@
-"""What an operator does from every page: drives, chooses a strategy, sends signals, breaks things.
+"""Actions of an operator on every page: drive, choose a strategy, send signals, inject faults.
 
-Thin: `adaptation` and `injection` keep what waits for an answer, and `stick` who drives; here are
-the topics, and what pages are shown of it.
+`adaptation` and `injection` keep the requests that wait for an answer, and `stick` decides who
+drives. This module connects them to topics and to the page.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ if TYPE_CHECKING:
 from rampart.actors.runtime.actor import Actor
 
 OVERHEAD_S = 1.0
-"""Real seconds granted for what does not run in simulated time: sockets, scheduling, a respawn."""
+"""Real seconds added for sockets, scheduling and restarts, which take no simulated time."""
 
 OWN_DEATH_S = 0.2
-"""Real seconds between the answer to a page that has its own node killed, and that node's death."""
+"""Real seconds between the answer to a page that kills its own node, and the signal."""
 
 
 class Operating:
-    """The operator's hands; a robot that knows more of what they do derives its own from it.
+    """Actions of an operator; a robot's page may use a derived class.
 
     Args:
         actor: the page's node.
-        panels: of the page; among them are its sticks.
-        state: what its pages are shown; the section "operating" is this one's.
+        state: contents of the page; the section "operating" belongs to this class.
+        panels: of the page, with its sticks.
 
     Attributes:
-        drove: is told when a page has taken the stick of a panel, or let go of it, and why.
+        drove: called with page, panel, whether the page holds its stick now, and why not.
     """
 
     def __init__(self, actor: Actor, state: HmiState, panels: Sequence[Panel]) -> None:
@@ -79,27 +79,27 @@ class Operating:
         self.show()
 
     def start(self) -> None:
-        """Begin; the page is about to be served."""
+        """Start the sticks, before the page is served."""
         for stick in self._sticks.values():
             stick.start()
 
     def stop(self) -> None:
-        """End; the node stops."""
+        """Stop the sticks."""
         for stick in self._sticks.values():
             stick.stop()
 
     # -- requests -------------------------------------------------------------------------------
 
     def introduction(self, page: int) -> dict[str, Any]:
-        """Return what a page needs to know to offer all this."""
+        """Return the message that announces these actions to a page."""
         return {"type": "operating", "page": page, "strategies": self._choice.strategies,
                 "signals": [*SIGNALS] if self._has_processes else [], **self._injections.choice()}
 
     def fulfil(self, request: Request, page: int) -> str | dict[str, Any]:
-        """Act on a request of a page and return what to tell it.
+        """Act on a request of a page and return the answer.
 
         Raises:
-            RefusedError: it cannot be met; the text says why.
+            RefusedError: it cannot be fulfilled; the text is the reason.
         """
         try:
             match request:
@@ -108,29 +108,29 @@ class Operating:
                 case requests.StrategyRequest():
                     self._actor.publish(ftm_topics.ADAPT, self._choice.ask(
                         request.name, self._strategy, self._now()))
-                    told = f"strategy {request.name} asked for"
+                    answer = f"strategy {request.name} requested"
                 case requests.SignalRequest():
-                    told = self._send_signal(request, page)
+                    answer = self._send_signal(request, page)
                 case requests.InjectRequest():
-                    told = self._inject(request)
+                    answer = self._inject(request)
                 case requests.EndFaultRequest():
                     self._order(self._injections.end(request.injection, self._now()))
-                    told = "end of the fault asked for"
+                    answer = "end of the fault requested"
                 case _:
                     raise RefusedError("this page does not offer that")
         except SignalError as error:
             raise RefusedError(str(error)) from None
         self.show()
-        return told
+        return answer
 
     def left(self, page: int) -> None:
-        """Take note that a page was closed."""
+        """Release the sticks of a page that was closed."""
         for stick in self._sticks.values():
             stick.left(page)
 
     def _stick(self, panel: str) -> Stick:
         if panel not in self._sticks:
-            raise RefusedError(f"no stick {panel[:40]!r}; there are: "
+            raise RefusedError(f"no stick {panel[:40]!r}; known: "
                                f"{', '.join(self._sticks) or 'none'}")
         return self._sticks[panel]
 
@@ -142,26 +142,26 @@ class Operating:
 
     def _send_signal(self, request: requests.SignalRequest, page: int) -> str:
         if not self._has_processes:
-            raise SignalError("the nodes of this run have no processes that could be signalled")
+            raise SignalError("the nodes of this run have no processes")
         node, name, port = request.node, request.signal, self._actor.context.run.plan.base_port
         if name not in SIGNALS:
             raise SignalError(f"unknown signal {name[:20]!r}; known: {', '.join(SIGNALS)}")
-        if node == self._actor.name:  # the page that asked is to be told first
+        if node == self._actor.name:  # after the answer to the page
             asyncio.get_running_loop().call_later(
                 OWN_DEATH_S, lambda: signal_node(node, name, port))
-            told = f"{node}: {name}; the page will be back"
+            done = f"{node}: {name}; the page will reconnect"
         else:
             try:
                 victim = signal_node(node, name, port)
-                told = f"{node} (pid {victim.pid}): {name}"
+                done = f"{node} (pid {victim.pid}): {name}"
             except UnknownNodeError:
                 if node not in self._elsewhere:
                     raise
                 self._actor.publish(
                     ftm_topics.SIGNAL, fm.SignalOrder(next(self._orders), node, name))
-                told = f"{node}: {name}, by the supervisor of its host"
-        self._state.log(self._now(), "note", f"page {page} sent {told}")
-        return told
+                done = f"{node}: {name}, by the supervisor of its host"
+        self._state.log(self._now(), "note", f"page {page} sent {done}")
+        return done
 
     def _inject(self, request: requests.InjectRequest) -> str:
         lasts_s = math.inf if request.permanent else request.duration_s
@@ -170,57 +170,57 @@ class Operating:
         when = f" in {request.delay_s:g} s" if request.delay_s else ""
         lasts = ("until its process ends" if math.isinf(ordered.duration_s)
                  else f"for {ordered.duration_s:g} s")
-        return f"fault {request.fault} asked for{when}, {lasts}"
+        return f"fault {request.fault} requested{when}, {lasts}"
 
     def _order(self, orders: Sequence[Order]) -> None:
         for order in orders:
             self._actor.publish(order.topic, order.message)
 
-    # -- what it hears --------------------------------------------------------------------------
+    # -- messages -------------------------------------------------------------------------------
 
     def repeat(self) -> None:
-        """Send again what was not answered, and give up on what never will be."""
+        """Repeat unanswered messages, and withdraw those that are too old."""
         now = self._now()
         self._announce(self._choice.expire(now))
         if self._choice.pending is not None:
             self._actor.publish(ftm_topics.ADAPT, self._choice.pending)
-        for told in self._injections.expire(now):
-            self._announce(told)
+        for line in self._injections.expire(now):
+            self._announce(line)
         self._order(self._injections.due(now))
         self.show()
 
     def answered(self, message: fm.AdaptationAnswer) -> None:
-        """Hear whether a strategy was accepted."""
+        """Take the manager's answer to a strategy."""
         self._announce(self._choice.answer(message))
 
     def injected(self, message: bm.InjectionReport) -> None:
-        """Hear what came of a fault."""
-        self._announce(self._injections.hear(message))
+        """Take a report about a fault."""
+        self._announce(self._injections.take(message))
         self.show()
 
     def manager(self, message: fm.ManagerStatus) -> None:
-        """Hear the FTM Manager: its strategy."""
+        """Take the strategy in force."""
         if message.strategy != self._strategy:
             self._strategy = message.strategy
             self.show()
 
     def nodes(self, table: fm.NodeTable) -> None:
-        """Hear the supervisor: what runs on other hosts."""
+        """Take the nodes on other hosts."""
         own = self._actor.context.run.plan.host
         self._elsewhere = frozenset(row.name for row in table.nodes if row.host != own)
 
     def diagnostic(self, report: bm.Diagnostic) -> None:
-        """Hear a node complain."""
+        """Take an error report of a node."""
 
-    # -- what it shows --------------------------------------------------------------------------
+    # -- the page -------------------------------------------------------------------------------
 
-    def _announce(self, told: str) -> None:
-        if told:
-            self._state.announce(told, self._now())
+    def _announce(self, line: str) -> None:
+        if line:
+            self._state.announce(line, self._now())
             self.show()
 
     def effect(self, panel: str, now_s: float) -> tuple[bool, str]:  # noqa: ARG002
-        """Return whether a panel's stick has any effect now, and in words why not, or what."""
+        """Return whether a panel's stick has an effect now, and a text about that."""
         return True, ""
 
     def _view_stick(self, panel: str, stick: Stick, now_s: float) -> dict[str, Any]:
@@ -228,14 +228,14 @@ class Operating:
         return {"holder": stick.holder, "works": works, "text": text, "note": stick.note}
 
     def view(self, now_s: float) -> dict[str, Any]:
-        """Return the section: who drives, the strategy and the faults."""
+        """Return the section "operating": sticks, strategy and faults."""
         return {"sticks": {panel: self._view_stick(panel, stick, now_s)
                            for panel, stick in self._sticks.items()},
                 "strategy": self._strategy, "strategy_asked": self._choice.pending is not None,
                 "faults": self._injections.view(now_s)}
 
     def show(self) -> None:
-        """Show pages what is in force and under way."""
+        """Update the section "operating"."""
         self._state.picture.put("operating", self.view(self._now()))
 
     def _now(self) -> float:

@@ -1,7 +1,6 @@
-"""Panels of the operator's page, as a specification or the class of a page declares them. Pure.
+"""Panels of the operator's page: tables `[[panel]]` of a specification, or of a page's class. Pure.
 
-What is drawn of them is the browser's: `rampart/actors/operator/page/widgets.js`. The rows of a
-specification are the tables `[[panel]]`.
+The browser draws them: `rampart/actors/operator/page/widgets.js`.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from rampart.manager.spec.tables import SpecificationError, Table
 
 MAX_PANELS = 40
 MAX_PLOTS = 8
-"""Panels of a page that declares none."""
+"""Most generated plots of a page without panels."""
 LARGEST = 1e9
 """Greatest number of a stick."""
 MAX_KEPT = 32
-"""Fields of all plots and maps together: of each, some minutes are kept for a page that opens."""
+"""Most fields of all plots and maps: some minutes of each are kept for new pages."""
 
 FieldText = Annotated[str, msgspec.Meta(
     pattern=r"^[^:]+:[^:]+\Z", max_length=200,
@@ -44,20 +43,20 @@ _SHOWS: dict[str, tuple[tuple[str, ...], frozenset[str]]] = {
     "stick": ((NUMBER,), frozenset({"held", "scale"})),
     "script": ((), frozenset()),
 }
-"""What a panel may show: which kinds of fields that takes, and which options."""
+"""Kind of panel → kinds of fields that it takes, and its options."""
 _OPTIONS = sorted(frozenset().union(*(options for _, options in _SHOWS.values())))
 
 
 class Shown(NamedTuple):
-    """A field of a panel: the key that names it, the kinds it may have, and its publisher.
+    """A field of a panel: the key that names it, and the kinds it may have.
 
-    `is_said`: the page publishes it; it subscribes to the others.
+    `is_published`: the page publishes the field; it subscribes to others.
     """
 
     key: str
     field: str
     kinds: tuple[str, ...]
-    is_said: bool = False
+    is_published: bool = False
 
 
 class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
@@ -107,17 +106,17 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
     columns: Annotated[int, msgspec.Meta(ge=0, le=6)] = 0
 
     def __post_init__(self) -> None:
-        """Refuse a panel that shows nothing or several things, and options that mean nothing."""
+        """Refuse a panel that shows nothing or several things, and options that do not apply."""
         shown = [key for key in _SHOWS if getattr(self, key) is not None]
         if len(shown) != 1:
-            said = f"{self.title!r} gives {' and '.join(shown) or 'nothing to show'}"
-            raise ValueError(f"{said}; expected one of {', '.join(_SHOWS)}")
+            raise ValueError(f"{self.title!r} has {' and '.join(shown) or 'nothing to show'}; "
+                             f"expected one of {', '.join(_SHOWS)}")
         _, options = _SHOWS[self.kind]
         defaults = dict(zip(self.__struct_fields__[-len(self.__struct_defaults__):],
                             self.__struct_defaults__, strict=True))
         for name in _OPTIONS:
             if name not in options and getattr(self, name) != defaults[name]:
-                raise ValueError(f"{self.title!r}: {name} means nothing to a {self.kind}; "
+                raise ValueError(f"{self.title!r}: {name} does not apply to a {self.kind}; "
                                  f"it takes {', '.join(sorted(options)) or 'no options'}")
         low, high = self._ends()
         if low is not None and high is not None and not low < high:
@@ -134,7 +133,7 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
         keys = dict.fromkeys(field.partition(":")[0] for field in fields)
         if len(keys) > 1:
             raise ValueError(f"{self.title!r}: stick: fields of {' and '.join(keys)}; expected "
-                             "those of one topic")
+                             "fields of one topic")
         if len({*fields}) < len(fields):
             raise ValueError(f"{self.title!r}: stick: {', '.join(fields)}: expected each "
                              "field once")
@@ -147,17 +146,17 @@ class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
 
     @property
     def topic(self) -> str:
-        """Key of the topic that its stick publishes, "" if it is not a stick."""
+        """Key of the topic of its stick, "" if it is not a stick."""
         return self.stick[0].partition(":")[0] if self.stick else ""
 
     @property
     def kind(self) -> str:
-        """What it shows: the key that is given."""
+        """Kind of the panel."""
         return next(key for key in _SHOWS if getattr(self, key) is not None)
 
     @property
     def kept_s(self) -> float:
-        """How much of the past it shows, s; 0 for the present alone."""
+        """Seconds of the past that it shows; 0 for only the present."""
         return self.seconds if self.plot else 600.0 if self.map else 0.0
 
     def fields(self) -> Iterator[Shown]:
@@ -180,21 +179,21 @@ def read_panels(spec: SystemSpec, file: str) -> tuple[Panel, ...]:
     """Return the panels of a specification.
 
     Raises:
-        SpecificationError: one makes no sense, or they do not together.
+        SpecificationError: a panel is not valid, or panels contradict each other.
     """
     panels = read_rows(spec.panels, Panel, "panel", file)
     for place, panel in enumerate(panels):
         if panel.script is not None:
             raise SpecificationError(
                 file, f"$.panel[{place}].script", f"{panel.title!r}: only the class of a page has "
-                "scripts; expected a field of a topic, e.g. gauge", panel.script)
+                "scripts; expected a field of a topic, e.g. with gauge", panel.script)
     if problem := problem_of(panels):
         raise SpecificationError(file, "$.panel", problem)
     return panels
 
 
 def plots_of(topics: Iterable[Topic[Any]]) -> tuple[Panel, ...]:
-    """Return a plot of each topic with numbers that comes regularly, the first `MAX_PLOTS`."""
+    """Return a plot of each periodic topic with numbers, at most `MAX_PLOTS`."""
     engine = {topic.key for topic in (*ftm_topics.ALL, *BASE_OUTPUTS)}
     plots = (Panel(title=f"{topic.key} {unit}"[:60].strip(), plot=tuple(fields[:4]))
              for topic in topics
@@ -217,14 +216,14 @@ def _kind(topic: Topic[Any], path: str) -> str:
     try:
         return Field(topic.type, path).kind
     except ValueError:
-        return ""  # a list, or what has fields itself
+        return ""  # a list or struct
 
 
 def steered(panel: Panel, topic: Topic[Any]) -> StickMessages:
-    """Return what makes the messages of a panel's stick.
+    """Return the builder of messages of a panel's stick.
 
     Raises:
-        ValueError: none can be made.
+        ValueError: a field does not fit.
     """
     names = [shown.field.partition(":")[2] for shown in panel.fields()]
     count = len(panel.stick or ())
@@ -232,13 +231,13 @@ def steered(panel: Panel, topic: Topic[Any]) -> StickMessages:
 
 
 def problem_of(panels: Sequence[Panel]) -> str:
-    """Return what is wrong with the panels of a page together, "" if nothing."""
+    """Return why panels do not go together on a page, "" if they do."""
     titles = [panel.title for panel in panels]
     twice = next((title for title in titles if titles.count(title) > 1), None)
     if twice is not None:
-        return f"panel {twice!r}: there are two of this title; each panel needs its own"
-    told = [panel.topic for panel in panels if panel.stick]
-    rival = next((panel for panel in panels if told.count(panel.topic) > 1), None)
+        return f"panel {twice!r}: two panels have this title; expected different titles"
+    steered_topics = [panel.topic for panel in panels if panel.stick]
+    rival = next((panel for panel in panels if steered_topics.count(panel.topic) > 1), None)
     if rival is not None:
         return f"panel {rival.title!r}: another stick publishes {rival.topic} too; expected one"
     if len(panels) > MAX_PANELS:

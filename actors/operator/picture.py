@@ -1,12 +1,10 @@
-"""What pages are shown, in sections that remember when they last changed. Pure.
+"""The contents of pages, in parts that know when they last changed. Pure.
 
-Each change of anything gives the picture a new version. A page that has seen version *v* is sent
-the sections that changed since, and of a journal the lines that were added since; one that has
-seen nothing (version 0) is sent all. So what a page missed need not be remembered: a page that
-was suspended, or could not keep up, gets the newest of everything and no backlog.
+Each change gives the picture a new version. A page at version *v* receives the sections, rows and
+lines that changed since *v*; a new page (version 0) receives everything. So nothing has to be kept
+for a page that was suspended or too slow: it receives the newest contents and no backlog.
 
-A section is turned into JSON when it is sent for the first time, and that once for all pages; then
-it is also cut to its bounds (`bounds`). A table has rows of which those that changed are sent.
+A section is cut to its bounds (`bounds`) and encoded when it is first sent, once for all pages.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ _JSON = msgspec.json.Encoder()
 
 
 class Section:
-    """The latest value of something, and the version in which it became so."""
+    """A value, and the version of its last change."""
 
     __slots__ = ("_bounds", "_encoded", "_show", "_shown_version", "left_out", "value", "version")
 
@@ -40,7 +38,7 @@ class Section:
         self._shown_version = -1
 
     def since(self, _version: int) -> msgspec.Raw:
-        """Return the whole value as JSON; encoded anew only if it has changed."""
+        """Return the whole value as JSON, encoded only if it has changed."""
         if self._shown_version != self.version:
             shown, self.left_out = self._bounds.fit(self._show(self.value))
             self._encoded = msgspec.Raw(_JSON.encode(shown))
@@ -49,7 +47,7 @@ class Section:
 
 
 class Journal:
-    """The last lines of a log, each with the version in which it was added."""
+    """The last lines of a log, each with its version."""
 
     __slots__ = ("_bytes", "_lines", "version")
 
@@ -59,7 +57,7 @@ class Journal:
         self.version = 0
 
     def add(self, line: Any, version: int) -> None:
-        """Add a line, cut to its bounds; the oldest are dropped that there is no room for."""
+        """Add a line, cut to its bounds; old lines are dropped to make room."""
         encoded = _JSON.encode(LINE.fit(line)[0])
         self._lines.append((version, encoded))
         self._bytes += len(encoded)
@@ -68,15 +66,15 @@ class Journal:
         self.version = version
 
     def since(self, version: int) -> list[msgspec.Raw]:
-        """Return, as JSON, the lines that were added after a version, the oldest first."""
+        """Return the lines after a version as JSON, the oldest first."""
         return [msgspec.Raw(encoded) for added, encoded in self._lines if added > version]
 
 
 class Table:
-    """Rows by name, each with the version in which it last changed. One that is gone is None.
+    """Rows by name, each with the version of its last change. A deleted row is None.
 
     Args:
-        rows: at most so many are kept, and a row of another name is not.
+        rows: most rows; further names are ignored.
     """
 
     __slots__ = ("_most", "_rows", "version")
@@ -87,7 +85,7 @@ class Table:
         self.version = 0
 
     def set(self, name: str, row: Any, version: int) -> bool:
-        """Set a row, or remove it by None; False if that is no change, or there is no room."""
+        """Set a row, or delete it by None; return False without a change or without room."""
         before = self._rows.get(name)
         if (row is None if before is None else before[1] == row) or (
                 before is None and len(self._rows) >= self._most):
@@ -97,11 +95,11 @@ class Table:
         return True
 
     def rows(self) -> dict[str, Any]:
-        """Return all rows that there are."""
+        """Return all rows."""
         return {name: row for name, (_, row, _) in self._rows.items() if row is not None}
 
     def since(self, version: int) -> dict[str, msgspec.Raw]:
-        """Return, as JSON, the rows that changed after a version; since 0, those that there are."""
+        """Return the rows that changed after a version as JSON; since 0, all that exist."""
         return {name: encoded for name, (changed, row, encoded) in self._rows.items()
                 if changed > version and not (version == 0 and row is None)}
 
@@ -110,12 +108,12 @@ class Picture:
     """All sections, tables and journals by name, and the version of the whole.
 
     Attributes:
-        version: Grows with each change.
-        on_change: Called after each change.
+        version: grows with each change.
+        on_change: called after each change.
     """
 
     def __init__(self) -> None:
-        self.version = 1  # 0 is what a page has seen that has seen nothing
+        self.version = 1  # a new page is at 0
         self.on_change: Callable[[], None] = lambda: None
         self._sections: dict[str, Section] = {}
         self._tables: dict[str, Table] = {}
@@ -125,11 +123,11 @@ class Picture:
 
     def section(self, name: str, value: Any = None, show: Callable[[Any], Any] = lambda v: v,
                 bounds: Bounds = SHOWN) -> None:
-        """Declare a section, its first value, how to show a value and how much of it."""
+        """Declare a section with its first value, a conversion for pages, and bounds."""
         self._sections[name] = Section(value, show, bounds)
 
     def table(self, name: str, rows: int) -> None:
-        """Declare a table of so many rows at most."""
+        """Declare a table with a greatest number of rows."""
         self._tables[name] = Table(rows)
 
     def journal(self, name: str) -> None:
@@ -155,11 +153,11 @@ class Picture:
 
     @property
     def tables(self) -> tuple[str, ...]:
-        """Names of the tables, of which the rows are sent that changed."""
+        """Names of the tables, which are sent row by row."""
         return tuple(self._tables)
 
     def put_row(self, name: str, row: str, value: Any) -> None:
-        """Set a row of a table, None removes it; the same again is no change."""
+        """Set a row of a table, or delete it by None; the same value again is no change."""
         if self._tables[name].set(row, value, self.version + 1):
             self.version += 1
             self.on_change()
@@ -171,9 +169,9 @@ class Picture:
         self.on_change()
 
     def changes(self, since: int) -> dict[str, Any]:
-        """Return what changed after a version, each value as JSON already; since 0, everything.
+        """Return the parts that changed after a version as JSON; since 0, everything.
 
-        If that has changed as well, `left_out` says of which sections how many entries are missing.
+        `left_out` has the number of missing entries by section, if that has changed too.
         """
         parts: dict[str, Section | Table | Journal] = {
             **self._sections, **self._tables, **self._journals}

@@ -1,8 +1,8 @@
-"""What the processes of the run use, for the page: those of the nodes, and their guards.
+"""Usage of the processes of a run, for the page: nodes, and processes of the supervision.
 
-The nodes' pids come from the supervisor's table. Supervisor, spawners and launcher are in no
-table, for the supervisor would have to be well to say that it is not; they are found by their
-titles in /proc. Everything is looked at only while a page is open.
+The nodes' pids come from the supervisor's table. Supervisor, routers and launcher are found by
+their titles in /proc, so that the page shows them even if the supervisor fails. Everything is
+measured only while a page is open.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from rampart.actors.machine.process_usage import ProcessUsage, UsageMeter
 from rampart.actors.supervision.process_title import RunProcess, find_processes, process_state
 
 SEARCH_EVERY = 5
-"""Looks between two searches of /proc for the guards: a search reads a file of every process."""
+"""Looks between two searches of /proc, which read a file of every process."""
 
 MAX_NODES = 200
-"""So many rows of a table are looked up in /proc; the page shows no more."""
+"""Most rows of the table that are measured; the page shows no more."""
 
 GUARD_KIND = "supervision"
 LAUNCHER = "launch.py"
@@ -26,15 +26,15 @@ _STATES = {"T": "stopped", "t": "stopped", "Z": "crashed", "X": "crashed"}
 
 
 class ProcessObserver:
-    """Looks at the processes of one run.
+    """Measures the processes of one run.
 
     Args:
-        port: base port of the run; 0 if there is none, then only nodes are looked at.
+        port: base port of the run; 0 for nodes only.
         launcher: pid of its launcher.
-        host: name of this machine among those of the run.
-        meter: counts what they use.
-        find: finds the processes of a run by its port.
-        state: the kernel's state letter of a process, "X" if there is none.
+        host: name of this machine among the hosts of the run.
+        meter: measures usage.
+        find: returns the processes of a run by its port.
+        state: returns the kernel's state letter of a process, "X" if it does not exist.
     """
 
     def __init__(self, port: int, launcher: int, host: str = "", *,
@@ -51,12 +51,12 @@ class ProcessObserver:
         self._guards: dict[str, tuple[int, int]] = {}
 
     def look(self, table: NodeTable | None) -> dict[str, Any]:
-        """Return what each node and guard uses; to be called about once a second.
+        """Return the usage of each process; call it about once a second.
 
         Returns:
-            `nodes`: usage by node name, of those whose process exists. `guards`: a row for each
-            process that is in no table: name, kind, pid, state, incarnation, restarts, and
-            whether it can be sent signals by its name. The usage of a guard is among the nodes'.
+            `nodes`: usage by name, of nodes and guards whose process exists. `guards`: a row for
+            each process of the supervision: name, kind, pid, state, incarnation, restarts, and
+            whether it can be signalled by name.
         """
         nodes = [node for node in (table.nodes[:MAX_NODES] if table else ())
                  if node.host == self._host]
@@ -67,7 +67,7 @@ class ProcessObserver:
                 "+".join(p.names): (p.pid, p.incarnation) for p in found
                 if p.launcher == self._launcher and known.isdisjoint(p.names)}
             self._guards |= {LAUNCHER: (self._launcher, 1)} if self._launcher else {}
-        # Without a table it is not known which are guards: search again at the next look.
+        # Without a table guards cannot be told from nodes: search again at the next look.
         self._looks = self._looks + 1 if nodes else 0
         pids = {node.name: node.pid for node in nodes} | {
             name: pid for name, (pid, _) in self._guards.items()}
@@ -80,7 +80,7 @@ class ProcessObserver:
 
 
 def figures(pids: Mapping[str, int], usage: Mapping[int, ProcessUsage]) -> dict[str, Any]:
-    """Return per name: percent of a core, megabytes resident, age in real seconds."""
+    """Return by name: percent of a core, resident megabytes, age in real seconds."""
     return {
         name: {"cpu": round(100 * used.cpu_share, 1), "mb": round(used.memory_bytes / 1e6, 1),
                "age_s": round(used.age_s)}

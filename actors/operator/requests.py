@@ -1,7 +1,7 @@
-"""What a page may ask of its node: one struct each, decoded strictly. Pure.
+"""Requests of a page to its node, one struct each, decoded strictly. Pure.
 
-An unknown tag, an unknown field or a wrong type makes the whole message refused; so does a number
-that JSON cannot hold. Whether a request makes sense now is not decided here.
+A message with an unknown tag, an unknown field, a wrong type or a number beyond JSON is refused.
+Whether a request can be fulfilled is decided elsewhere.
 """
 
 from __future__ import annotations
@@ -21,40 +21,39 @@ R = TypeVar("R")
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a page asks for; the tag of a derived class is the `type` of its JSON.
+    """Base class of requests; the tag of a derived class is the `type` of its JSON.
 
     Class attributes:
-        role: who may; what declares none is for those who may do everything.
+        role: least role of the visitor; by default the highest.
     """
 
     role: ClassVar[Role] = Role.INJECT
 
 
 class ResetRequest(Request, frozen=True, tag="reset"):
-    """A latched recovery is to be released."""
+    """Release a latched recovery."""
 
     role = Role.DRIVE
     recovery: Name
 
 
 class StrategyRequest(Request, frozen=True, tag="strategy"):
-    """Another strategy is to be set: it changes what is done about faults, as injecting does."""
+    """Set another strategy; it changes the reaction to faults, so it needs the role `inject`."""
 
     name: Name
 
 
 class SignalRequest(Request, frozen=True, tag="signal"):
-    """A signal is to be sent to the process of a node."""
+    """Send a signal to the process of a node."""
 
     node: Name
     signal: Name
 
 
 class InjectRequest(Request, frozen=True, tag="inject"):
-    """A fault is to be injected.
+    """Inject a fault, after `delay_s` simulated seconds.
 
-    `duration_s` None takes the fault's own, `permanent` lets it last; both in simulated seconds,
-    as is `delay_s`, the time until it begins.
+    `duration_s` None is the fault's default duration; `permanent` overrides it.
     """
 
     fault: Name
@@ -64,16 +63,16 @@ class InjectRequest(Request, frozen=True, tag="inject"):
 
 
 class EndFaultRequest(Request, frozen=True, tag="end-fault"):
-    """An injected fault is to end now."""
+    """End an injected fault now."""
 
     injection: Name
 
 
 class StickRequest(Request, frozen=True, tag="stick"):
-    """Where the stick of a panel is, and whether the operator holds it.
+    """Position of a panel's stick, and whether the operator holds it.
 
-    `ticket` is the newest that the page was given (`stick`), `pressed_s` for how long the stick has
-    been held by the browser's clock.
+    `ticket` is the newest one that the page has received (`stick`), `pressed_s` the time for which
+    the stick has been held, by the browser's clock.
     """
 
     role = Role.DRIVE
@@ -87,22 +86,18 @@ class StickRequest(Request, frozen=True, tag="stick"):
 
 REQUESTS: tuple[type[Request], ...] = (
     ResetRequest, StrategyRequest, SignalRequest, InjectRequest, EndFaultRequest, StickRequest)
-"""What every page may ask for."""
+"""Requests of every page."""
 
 
 class RefusedError(ValueError):
-    """A request that cannot be met; the text is shown on the page."""
-
-
-class RequestError(ValueError):
-    """A message that is no request; the text says what is wrong with it."""
+    """A request cannot be fulfilled; the page shows the text."""
 
 
 class RequestReader:
-    """Reads the messages of a page.
+    """Decodes the messages of a page.
 
     Args:
-        kinds: of requests that there are.
+        kinds: types of requests.
     """
 
     def __init__(self, kinds: Sequence[type[Request]]) -> None:
@@ -110,28 +105,28 @@ class RequestReader:
             Union[tuple(kinds)])  # noqa: UP007 known at run time
 
     def read(self, text: str | bytes | None) -> Request:
-        """Decode a message of a page.
+        """Return the request in a message.
 
         Raises:
-            RequestError: it is none.
+            RefusedError: it is not a request.
         """
         try:
             return self._decoder.decode(text or b"")
         except UNREADABLE as error:
-            raise RequestError(f"message not understood: {error}") from None
+            raise RefusedError(f"message not understood: {error}") from None
 
 
 class Pending(Generic[R]):
-    """The one message of a kind that is sent again and again until it is answered.
+    """The message of a kind that is repeated until it is answered.
 
     Args:
-        prefix: of the messages' ids; another one for each incarnation of the node.
-        unanswered: what is said of one that was withdrawn.
-        patience_s: simulated seconds after which it is.
+        prefix: of the messages' ids, unique to each incarnation of the node.
+        unanswered: text about a message that was withdrawn.
+        patience_s: simulated seconds without an answer after which it is withdrawn.
 
     Attributes:
-        pending: the message to be sent now and again, or None.
-        name: what it asks for, for people.
+        pending: the message to repeat, or None.
+        name: name of the message for people.
     """
 
     def __init__(self, prefix: str, unanswered: str, patience_s: float) -> None:
@@ -147,7 +142,7 @@ class Pending(Generic[R]):
         """Return the id of the next message.
 
         Raises:
-            RefusedError: there is one that waits.
+            RefusedError: another message waits.
         """
         if self.pending is not None:
             raise RefusedError(f"{self.name} waits for its answer")
@@ -155,17 +150,17 @@ class Pending(Generic[R]):
         return f"{self._prefix}.{self._asked}"
 
     def put(self, name: str, message: R, now_s: float) -> R:
-        """Have a message wait from now on, simulated seconds; for ever without patience."""
+        """Make a message wait for its answer from now on, simulated seconds."""
         self.pending, self.name, self._give_up_s = message, name, now_s + self._patience_s
         return message
 
     def settle(self) -> str:
-        """Take an answer: nothing waits any more. Return what was asked for."""
+        """End the wait, and return the name of the message."""
         self.pending = None
         return self.name
 
     def expire(self, now_s: float) -> str:
-        """Withdraw a message that stays without an answer, and return what to tell; "" if none."""
+        """Withdraw a message that is too old, and return a line about it; "" if there is none."""
         if self.pending is None or now_s < self._give_up_s:
             return ""
         return f"{self.settle()} {self._unanswered}"

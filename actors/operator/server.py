@@ -1,11 +1,8 @@
-"""The web side of the page: static files and a WebSocket, on loopback unless asked otherwise.
+"""The web server of the page: static files and a WebSocket.
 
-It runs on the actor's own event loop and costs nothing while no page is open
-(`rampart.actors.web.server`).
-
-Who is let in is decided in `rampart.actors.web.door` and what is behind it, and what may be said in
-`requests`, which name the role that each needs: here it is held against that of whoever asks, and
-what came of it is written down.
+It runs on the actor's event loop (`rampart.actors.web.server`). `rampart.actors.web.door` finds the
+visitor of each connection. Each type in `requests` names the role that it needs; this module
+compares it with the visitor's role, and writes the result to the audit.
 """
 
 from __future__ import annotations
@@ -31,7 +28,6 @@ from rampart.actors.operator.feed import SEND_TIMEOUT_S, Feed, PageFeed
 from rampart.actors.operator.requests import (
     RefusedError,
     Request,
-    RequestError,
     RequestReader,
     StickRequest,
 )
@@ -43,27 +39,28 @@ from rampart.actors.web.server import WebServer
 from rampart.actors.web.tls import Tls
 from rampart.actors.web.visitors import Visitor
 from rampart.files.plain_text import one_line
-from rampart.files.streams import complain
+from rampart.files.streams import complain as to_stderr
 
 NOT_LOGGED_IN = 4401
-"""Close code of a WebSocket of nobody who is known, or not any more; its page asks for a token."""
+"""Close code of a WebSocket without a valid visitor; the page then asks for a token."""
 
 MAX_PAGES = 16
 MAX_MESSAGE_BYTES = 4096
 CLOSE_TIMEOUT_S = 1.0
-"""Real seconds for a goodbye to get into the socket."""
+"""Real seconds to send a close frame."""
 
 _PAGE = Path(__file__).with_name("page")
 _TYPES = {".css": "text/css", ".js": "text/javascript"}
 _INDEX = "/"
 ROBOT = "/robot/"
-"""Below it are the files of the robot's own panels."""
+"""Path of the files of the robot's panels."""
 _LINKS = "<!-- links -->\n"
 _CAMERA = "/camera.jpg"
-_REFUSAL = ("This page is for the user who runs the robot; you are another one of this machine. "
-            "With a token others get in too: launch.py --hmi-token-file FILE.")
+_REFUSAL = ("This page is for the user who runs the robot, and you are another user of this "
+            "machine. Other users need a token: launch.py --hmi-token-file FILE.")
+_REVOKED = "your token was revoked, or your role has changed"
 _LOOK_S = 1.0
-"""Real seconds after which a page that says nothing is closed when its token is withdrawn."""
+"""Real seconds between two checks whether a page's visitor is still valid."""
 _HEADERS = {
     "cache-control": "no-cache",
     "content-security-policy": (
@@ -78,14 +75,14 @@ class PortError(OSError):
 
 
 class Handlers(msgspec.Struct, frozen=True):
-    """What deals with the pages. A page is known by its number in this incarnation of the node.
+    """Callbacks for pages, which are numbered in each incarnation of the node.
 
     Attributes:
-        requests: what pages may ask for.
-        came: returns what a new page is told first.
-        fulfil: acts on a page's request and returns what to tell it; raises RefusedError.
-        left: hears of a page that was closed.
-        refuses: why no request of any page is met; "" if requests are.
+        requests: types of requests.
+        came: returns the first message to a new page.
+        fulfil: acts on a request of a page and returns the answer; raises RefusedError.
+        left: called when a page was closed.
+        refuses: why all requests are refused; "" if they are not.
     """
 
     requests: Sequence[type[Request]]
@@ -101,20 +98,20 @@ class _File(msgspec.Struct, frozen=True):
 
 
 def page_files(robot: Path | None) -> dict[str, _File]:
-    """Return the page's files by path, those of the robot's own panels among them."""
+    """Return the files of the page and of the robot's panels, by path."""
     found = {f"{head}{file.name}": _File(file.read_bytes(), _TYPES[file.suffix])
              for head, folder in (("/", _PAGE), (ROBOT, robot)) if folder is not None
              for file in sorted(folder.iterdir()) if file.suffix in _TYPES}
     links = "".join(
         f'<link rel="{"stylesheet" if file.kind.endswith("css") else "modulepreload"}" '
         f'href="{html.escape(path[1:])}">\n' for path, file in found.items()
-        if not path.endswith(".min.js"))  # of uPlot, a script and not a module
+        if not path.endswith(".min.js"))  # uPlot is a script and not a module
     index = (_PAGE / "index.html").read_text(encoding="utf-8").replace(_LINKS, links)
     return {_INDEX: _File(index.encode(), "text/html"), **found}
 
 
 class _Page(msgspec.Struct, frozen=True):
-    """An open page: its number, who looks at it, and where."""
+    """An open page."""
 
     number: int
     visitor: Visitor
@@ -122,18 +119,18 @@ class _Page(msgspec.Struct, frozen=True):
 
 
 class PageServer:
-    """Serves the operator's page, from when it is made, on the running loop.
+    """Serves the operator's page on the running loop until `stop`.
 
     Args:
-        access: where, and under which rules; port 0 lets the system choose one.
-        feed: what pages are shown.
-        handlers: what deals with the pages.
-        gate: returns who is let in to a page on a port.
-        audit: where it is written down who does what.
-        tls: what it is encrypted with, or None.
-        camera: where pictures come from, or None.
-        files: folder of the robot's own JavaScript and CSS, or None.
-        tell: called with one line for each error of a handler.
+        access: address and rules; port 0 lets the system choose one.
+        feed: contents of the page.
+        handlers: callbacks for pages.
+        gate: returns the gate of a page on a port.
+        audit: of the page.
+        tls: certificate, or None.
+        camera: source of pictures, or None.
+        files: folder with the robot's JavaScript and CSS, or None.
+        complain: called with one line for each error of a handler.
 
     Raises:
         PortError: the address cannot be bound.
@@ -142,9 +139,9 @@ class PageServer:
     def __init__(self, access: Access, feed: Feed, handlers: Handlers,
                  gate: Callable[[int], Gate], audit: AuditLog, *, tls: Tls | None = None,
                  camera: CameraEye | None = None, files: Path | None = None,
-                 tell: Callable[[str], None] = complain) -> None:
+                 complain: Callable[[str], None] = to_stderr) -> None:
         self._feed = feed
-        self._tell = tell
+        self._complain = complain
         self._camera = camera
         self._handlers = handlers
         self._audit = audit
@@ -168,21 +165,21 @@ class PageServer:
             Starlette(routes=routes, middleware=[Middleware(
                 Door, access=access, gate=self._gate, public=frozenset(public),
                 refusal="" if asks else _REFUSAL)]),
-            listening, tls=tls.serving() if tls else None, tell=tell,
+            listening, tls=tls.serving() if tls else None, complain=complain,
             proxy_headers=bool(access.behind), ws_max_size=MAX_MESSAGE_BYTES)
         self._server.start()
 
     @property
     def pages(self) -> int:
-        """How many are open."""
+        """Number of open pages."""
         return len(self._open)
 
     def stop(self) -> None:
-        """Stop listening and say goodbye to the pages."""
+        """Stop listening and close the pages."""
         self._server.stop()
 
     def drove(self, number: int, panel: str, held: bool, why: str) -> None:
-        """Write down that a page has taken the stick of a panel, or let go of it."""
+        """Write to the audit that a page has taken or released the stick of a panel."""
         self._note(self._open.get(number), "take the stick" if held else "let go",
                    asked={"panel": panel}, why=why)
 
@@ -193,7 +190,7 @@ class PageServer:
 
     async def _picture(self, request: HttpRequest) -> Response:
         if request.headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
-            return PlainTextResponse("only for this page", 403)
+            return PlainTextResponse("foreign origin", 403)
         try:
             if self._camera is None:
                 raise CameraError("this system has no camera")
@@ -222,22 +219,22 @@ class PageServer:
                 await _until_one_ends(self._talk(socket_, fed, page), self._push(socket_, fed),
                                       self._watch(socket_, page))
         except (WebSocketDisconnect, TimeoutError):
-            return  # the page has gone while it was being answered
+            return  # the page was closed
         except Exception as error:
             if WebSocketState.DISCONNECTED in {socket_.client_state, socket_.application_state}:
-                return  # the same
+                return
             await _close(socket_, 1011, self._failed("this page", error))
         finally:
             self._handlers.left(page.number)
             self._note(self._open.pop(page.number), "close")
 
     def _failed(self, what: str, error: Exception) -> str:
-        """Tell of an error in what deals with a page, and return what its visitor is told."""
-        self._tell(one_line(f"{what}: {type(error).__name__}: {error}"))
-        return f"{what} failed; the log of the run says why"
+        """Report an error of a handler, and return the text for the visitor."""
+        self._complain(one_line(f"{what}: {type(error).__name__}: {error}"))
+        return f"{what} failed; the log of the run has the reason"
 
     def _introduction(self, visitor: Visitor) -> dict[str, Any]:
-        """Return who the page's visitor is, and what that keeps it from."""
+        """Return the message that names the visitor, and the requests that are barred."""
         return {"type": "visitor", "name": visitor.name, "role": visitor.role,
                 "logs_out": self._gate.asks,
                 "barred": {str(kind.__struct_config__.tag): why
@@ -245,21 +242,21 @@ class PageServer:
                            if (why := self._bars(kind, visitor))}}
 
     def _bars(self, kind: type[Request], visitor: Visitor) -> str:
-        """Return why a visitor may not ask for something; "" if it may."""
+        """Return why a visitor may not make a request; "" if it may."""
         return self._handlers.refuses or ("" if visitor.role.may(kind.role) else (
-            f"Needs the role {kind.role}: you are {visitor.name}, with the role {visitor.role}"))
+            f"Needs the role {kind.role}; {visitor.name} has the role {visitor.role}"))
 
     async def _talk(self, socket_: WebSocket, fed: PageFeed, page: _Page) -> None:
         while (message := await socket_.receive())["type"] != "websocket.disconnect":
             text = message.get("text") or message.get("bytes")
-            if not self._feed.heard(fed, text):
+            if not self._feed.take(fed, text):
                 await _send(socket_, self._answer(text, page))
 
     async def _watch(self, socket_: WebSocket, page: _Page) -> None:
-        """Close the page of a visitor whose token is withdrawn, or whose role is another now."""
+        """Close the page when its visitor is not valid any more."""
         while self._gate.still(page.visitor):  # noqa: ASYNC110 it is a file that changes
             await asyncio.sleep(_LOOK_S)
-        await _close(socket_, NOT_LOGGED_IN, "your token is withdrawn, or your role was changed")
+        await _close(socket_, NOT_LOGGED_IN, _REVOKED)
 
     async def _push(self, socket_: WebSocket, page: PageFeed) -> None:
         with contextlib.suppress(WebSocketDisconnect):
@@ -273,29 +270,29 @@ class PageServer:
         try:
             request = self._reader.read(text)
             if not self._gate.still(page.visitor):
-                raise RefusedError("your token is withdrawn, or your role was changed")
+                raise RefusedError(_REVOKED)
             if why := self._bars(type(request), page.visitor):
                 raise RefusedError(why)
-            told = self._handlers.fulfil(request, page.number)
-        except (RequestError, RefusedError) as error:
-            self._heard(page, request, why=str(error), refused=True)
+            answer = self._handlers.fulfil(request, page.number)
+        except RefusedError as error:
+            self._note_request(page, request, why=str(error), refused=True)
             return {"type": "error", "text": str(error)}
-        except Exception as error:  # of a robot's own panel, say: the page goes on
+        except Exception as error:  # e.g. of a robot's panel: the page goes on
             kind = "a message" if request is None else str(request.__struct_config__.tag)
             why = self._failed(kind, error)
-            self._heard(page, request, why=why)
+            self._note_request(page, request, why=why)
             return {"type": "error", "text": why}
-        if not isinstance(request, StickRequest):  # it comes twenty times a second; see `drove`
-            self._heard(page, request, why=told if isinstance(told, str) else "")
-        return {"type": "done", "text": told} if isinstance(told, str) else told
+        if not isinstance(request, StickRequest):  # these come twenty times a second; see `drove`
+            self._note_request(page, request, why=answer if isinstance(answer, str) else "")
+        return {"type": "done", "text": answer} if isinstance(answer, str) else answer
 
-    def _heard(self, page: _Page, request: Request | None, **more: Any) -> None:
+    def _note_request(self, page: _Page, request: Request | None, **more: Any) -> None:
         asked = {} if request is None else msgspec.to_builtins(request)
         self._note(page, asked.pop("type", "message"), asked=asked, **more)
 
 
 async def _until_one_ends(*parts: Coroutine[Any, Any, None]) -> None:
-    """Run parts of a conversation side by side until one of them is over or raises."""
+    """Run coroutines concurrently until one ends or raises, and cancel the others."""
     tasks = [asyncio.ensure_future(part) for part in parts]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -308,7 +305,7 @@ async def _until_one_ends(*parts: Coroutine[Any, Any, None]) -> None:
 
 
 async def _close(socket_: WebSocket, code: int, reason: str) -> None:
-    """Say goodbye; a page that takes nothing does not hear it."""
+    """Close a WebSocket, even if the page takes nothing."""
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(socket_.close(code, reason), CLOSE_TIMEOUT_S)
 
@@ -324,7 +321,7 @@ def _listen(host: str, port: int) -> socket.socket:
         family, kind, number, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, number)
-        # A respawned HMI takes its predecessor's port although old connections linger.
+        # The next incarnation takes the port although old connections linger.
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
         listener.listen(16)
@@ -334,5 +331,5 @@ def _listen(host: str, port: int) -> socket.socket:
             listener.close()
         reason = getattr(error, "strerror", None) or str(error)
         raise PortError(f"cannot serve the page on {host}:{port}: {reason}; "
-                        "choose another hmi_port") from None
+                        "choose another port") from None
     return listener

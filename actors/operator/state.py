@@ -1,7 +1,7 @@
-"""What the operator's node has heard, as pages are to see it: fills the picture. Pure.
+"""Fills the picture with the contents of messages, as pages show them. Pure.
 
-Keeping is cheap, because it happens for every message: a state that says the same again changes
-nothing, and nothing is turned into JSON unless somebody looks (`picture`).
+It is cheap, because it runs for every message: a repeated state changes nothing, and nothing is
+encoded while no page is open (`picture`).
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from rampart.files.plain_text import one_line
 from rampart.manager.strategies.registry import decision_in_words
 
 STALE_S = 1.5
-"""A state that was not heard for so long is shown as stale (simulated seconds)."""
+"""Simulated seconds without a message after which a state is shown as stale."""
 
 _SYSTEM = Bounds(text=40_000, items=1000, room=100_000)
-"""Of what was laid out here, of up to 300 boxes (`system`)."""
+"""Bounds of the drawing of a system, with up to 300 boxes (`system`)."""
 
 TRACE_POINTS = 240
-"""Of the past of a number that a page is sent when it opens."""
+"""Points of a number's past that a new page receives."""
 
 LARGEST = 1e15
-"""Numbers beyond are not drawn."""
+"""Greatest number that is drawn."""
 
 
 class Heard(msgspec.Struct):
-    """A message, and whether the next one is overdue; pages see {"value", "stale"}."""
+    """The latest message, and whether the next one is overdue; pages see {"value", "stale"}."""
 
     value: Any
     stale: bool = False
     t: float = 0.0
-    """When the content was true; only where a page needs it."""
+    """Stamp of the message, if a page needs it."""
 
 
 def _timed(heard: Heard | None) -> dict[str, Any] | None:
@@ -50,15 +50,15 @@ def _timed(heard: Heard | None) -> dict[str, Any] | None:
 
 
 def as_heard(heard: Heard | None) -> dict[str, Any] | None:
-    """Return a section as pages see it."""
+    """Return a section in the form for pages."""
     return None if heard is None else {"value": heard.value, "stale": heard.stale}
 
 
 class Trace:
-    """What a number was, lately: one of its values in each interval.
+    """The recent past of a number: one value per interval.
 
     Args:
-        kept_s: how far back, simulated seconds.
+        kept_s: length of the past, simulated seconds.
     """
 
     def __init__(self, kept_s: float) -> None:
@@ -66,9 +66,9 @@ class Trace:
         self._step_s = kept_s / TRACE_POINTS
 
     def add(self, t_s: float, value: Any) -> None:
-        """Add a value, unless the last one is too young; what is no finite number is a gap."""
+        """Add a value, unless the last one is too young; a value that is not finite is a gap."""
         if self.points and t_s < self.points[-1][0]:
-            self.points.clear()  # the clock was put back: another run
+            self.points.clear()  # another run
         if not math.isfinite(t_s) or (
                 self.points and t_s - self.points[-1][0] < self._step_s):
             return
@@ -77,11 +77,11 @@ class Trace:
 
 
 class HmiState:
-    """The operator's picture of the system, as far as it has been heard of.
+    """The operator's view of the system.
 
     Attributes:
-        picture: what pages are shown.
-        narrator: words for what happens; it has the titles of modules, mechanisms and recoveries.
+        picture: contents of pages.
+        narrator: describes events, with the titles of modules, mechanisms and recoveries.
     """
 
     def __init__(self) -> None:
@@ -106,9 +106,9 @@ class HmiState:
         """Declare a field of a topic, "topic:field", that panels show.
 
         Args:
-            name: of the field, and of its section.
-            kept_s: how much of its past pages are shown, s; 0 for none.
-            silent_s: after which silence it is stale, s.
+            name: of the field and of its section.
+            kept_s: length of the past that pages show, s; 0 for none.
+            silent_s: seconds without a message after which it is stale.
         """
         if kept_s:
             self._traces[name] = Trace(kept_s)
@@ -116,44 +116,44 @@ class HmiState:
         self.aged(name, show=_timed if kept_s else as_heard)
 
     def field(self, name: str, value: Any, stamp_s: float, now_s: float) -> None:
-        """Keep the value of a declared field; its past too if a panel shows it."""
+        """Keep the value of a declared field, and its past if a panel shows it."""
         trace = self._traces.get(name)
         if trace is not None:
             trace.add(stamp_s, value)
         self.put(name, Heard(value, t=stamp_s if trace is not None else 0.0), now_s)
 
     def past(self) -> dict[str, list[tuple[float, Any]]]:
-        """Return of each field that is plotted what it was: simulated seconds, and its value."""
+        """Return the past of each plotted field: simulated seconds, and value."""
         return {name: list(trace.points) for name, trace in self._traces.items()}
 
     def aged(self, *names: str, show: Callable[[Heard | None], Any] = as_heard) -> None:
-        """Declare sections that are stale if nothing has been heard for a while."""
+        """Declare sections that become stale without messages."""
         for name in names:
             self._aged.append(name)
             self.picture.section(name, show=show)
 
-    # -- hearing --------------------------------------------------------------------------------
+    # -- messages -------------------------------------------------------------------------------
 
     def keep(self, what: str, message: Any, now_s: float) -> None:
-        """Keep the latest message of a kind."""
+        """Keep the latest message for a section that becomes stale."""
         self.put(what, Heard(message), now_s)
 
     def put(self, what: str, heard: Heard, now_s: float) -> None:
-        """Keep something for a section that grows old."""
+        """Set a section that becomes stale."""
         self._heard_s[what] = now_s
         self.picture.put(what, heard)
 
     def manager(self, status: fm.ManagerStatus, now_s: float) -> None:
-        """Keep the manager's view, and log which detections have come and gone."""
+        """Keep the manager's status, and log changes of detections."""
         self._detections = {view.name: view for view in status.detections[:SHOWN.items]}
         self._heard_s["manager"] = now_s
         self.picture.put("manager", Heard(status))
         self._show_detections(False)
         for name, view in self._detections.items():
-            self._tell(self.narrator.detection(name, view.active, view.reason), now_s)
+            self._log_lines(self.narrator.detection(name, view.active, view.reason), now_s)
 
     def decision(self, record: fm.DecisionRecord, now_s: float) -> None:
-        """Add a decision of the manager to the decision log."""
+        """Add a decision to the decision log."""
         r = record
         self.picture.add("decisions", {
             "t": round(now_s, 2), "number": r.decision, "active": r.active, "block": r.rule,
@@ -164,15 +164,15 @@ class HmiState:
             "rejected": [f"{name}: {why}" for name, why in r.rejected]})
 
     def event(self, message: fm.ProcessEvent | bm.Diagnostic, header: Header) -> None:
-        """Log what happened to a process, or an error report of a node."""
-        self._tell(self.narrator.describe(message, header), header.stamp)
+        """Log an event of a process, or an error report of a node."""
+        self._log_lines(self.narrator.describe(message, header), header.stamp)
 
-    def _tell(self, lines: Iterable[Line], now_s: float) -> None:
+    def _log_lines(self, lines: Iterable[Line], now_s: float) -> None:
         for line in lines:
             self.log(now_s, line.level, line.text)
 
     def announce(self, text: str, now_s: float, about: str = "") -> None:
-        """Log what became of something the operator asked for, and keep it to be shown."""
+        """Log the result of an operator's request, and show it."""
         self._outcomes += 1
         self.picture.put("order", {"number": self._outcomes, "text": text})
         self.log(now_s, "note", f"{about}{text}")
@@ -181,16 +181,16 @@ class HmiState:
         """Add a line to the event log; `kind` is fault, clear or note."""
         self.picture.add("events", {"t": round(now_s, 2), "kind": kind, "text": one_line(text)})
 
-    # -- showing --------------------------------------------------------------------------------
+    # -- contents -------------------------------------------------------------------------------
 
     @property
     def latched(self) -> tuple[str, ...]:
-        """Recoveries that wait for the operator's reset, as the manager last said."""
+        """Recoveries that wait for the operator's reset, by the manager's last status."""
         manager = self.picture.value("manager")
         return manager.value.latched if manager else ()
 
     def grow_old(self, now_s: float) -> None:
-        """Mark as stale what was not heard for a while; to be called before showing."""
+        """Mark sections without recent messages as stale."""
         for name in self._aged:
             heard = self.picture.value(name)
             if heard is None or heard.stale or now_s - self._heard_s[name] <= (

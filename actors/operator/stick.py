@@ -1,9 +1,9 @@
-"""The stick of a panel: which page drives, and the messages that the robot gets of it.
+"""The stick of a panel: the page that drives, and the messages to the robot.
 
-**A late message must not move the robot.** A network that stalls delivers its backlog in one burst,
-and the clock of a browser cannot be trusted. So each answer to a page carries a *ticket*: the time
-here when it was given. The page returns the newest ticket with its next position, which counts as
-measured at that time. `stick_arbitration` decides the rest.
+**A late message must not move the robot.** After a stall a network delivers its backlog in one
+burst, and the clock of a browser cannot be trusted. So each answer to a page contains a *ticket*:
+the time here. The page sends the newest ticket with its next position, which counts as measured at
+that time. `stick_arbitration` decides the rest.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from rampart.actors.operator.stick_arbitration import TIMEOUT_S, TOO_LATE, Rulin
 from rampart.actors.runtime.actor import Actor
 
 PATIENCE_S = 1.0
-"""A press that has not driven for so long drives no more: its connection is slow, or was stalled
-(real seconds)."""
+"""Real seconds after which a press that has not driven yet is refused: its connection stalls."""
 
 PERIOD_S = 0.1
 """Simulated seconds between messages of a held stick whose topic has no rate."""
@@ -29,20 +28,20 @@ _SHORTEST_S = 0.001
 
 
 class Stick:
-    """A panel's stick: publishes its position again and again while a page holds it.
+    """A panel's stick: publishes its position while a page holds it.
 
-    At a high rate a page is too slow for the robot; so the message is repeated as often as the rate
-    of its topic demands. A release, meant or not, is published once, as the message at rest.
+    Pages report less often than a fast robot needs, so the message is repeated at the rate of its
+    topic. Each release publishes the message at rest once.
 
     Args:
         actor: the page's node.
         panel: that declares it.
-        changed: called with a page when that holds it or lets go, whether it holds it, and the
-            reason of a release that no operator meant.
+        changed: called with a page that takes or releases the stick, whether it holds it, and the
+            reason of an involuntary release.
 
     Attributes:
         holder: the page that drives, or None.
-        note: what the pages are shown of it, "" for nothing.
+        note: text for the pages, "" for none.
 
     Raises:
         ValueError: the node knows no such topic.
@@ -64,11 +63,11 @@ class Stick:
         self._ticking: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
-        """Let go in case a former incarnation died while a page held it."""
+        """Release the stick, which a page may have held when the last incarnation died."""
         self._publish(None)
 
     def stop(self) -> None:
-        """Let go; the node ends."""
+        """Release the stick; the node ends."""
         if self._ticking is not None:
             self._ticking.cancel()
         if self.holder is not None:
@@ -88,12 +87,12 @@ class Stick:
             text = ruling.told
         self._obey(ruling)
         if is_stalled and request.held and self.holder is None:
-            text = "let go first, then press again: the connection is slow, or was stalled"
+            text = "release the stick and press again: the connection was stalled or is slow"
         return {"type": "stick", "panel": request.panel, "drives": ruling.follows, "text": text,
                 "ticket": now_s}
 
     def left(self, page: int) -> None:
-        """Take note that a page was closed; if it drove, the robot stops."""
+        """Release the stick if the page that was closed held it."""
         now_s = asyncio.get_running_loop().time()
         self._obey(self._arbiter.expire(now_s))
         if self._arbiter.offer(f"page {page}", False, now_s, now_s).released:
@@ -113,7 +112,7 @@ class Stick:
             self._tick()
 
     def _tick(self) -> None:
-        """Repeat the position of a held stick, and notice a silent holder."""
+        """Repeat the position of a held stick, and release it if the holder is silent."""
         loop = asyncio.get_running_loop()
         self._ticking = None
         self._obey(self._arbiter.expire(loop.time()))

@@ -1,8 +1,8 @@
-"""The fault tree with its barriers and the order of the recoveries, laid out for the page. Pure.
+"""Layout of the fault tree with its barriers, and of the order of recoveries, for the page. Pure.
 
-The fault tree grows from left to right: its rows are then as high as a line of text and not as
-wide as one, so that it can be read on a telephone. What is lit is not said here: that changes, and
-is in the manager's status; the drawing changes only when the system is adapted.
+The fault tree grows from left to right, because its boxes are wider than high, so it can be read on
+a telephone. The layout changes only when the system is adapted. The browser highlights it by the
+manager's status.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from rampart.manager.drawing.placing import place
 from rampart.manager.spec.schema import SystemSpec
 
 MAX_BOXES = 300
-"""A larger tree is not drawn: it could not be read, and the layout would keep the node busy."""
+"""Largest tree that is drawn; the layout of a larger one would keep the node busy."""
 
 LETTERS = 22
-"""In a line of a box."""
+"""Longest line of a box."""
 LINES = 3
 LINE = 14.0
 BOX_WIDTH = 156.0
 BARRIER = 78.0
-"""Length of the line before a box on which its barrier stands."""
+"""Length of the line with the barrier before a box."""
 SYMBOL = 34.0
-"""Length of the gate behind a box."""
+"""Length of the gate after a box."""
 STUB = 16.0
-"""Line before a box in a tree without barriers."""
+"""Length of the line before a box in a tree without barriers."""
 
 
 class Shape(msgspec.Struct, frozen=True):
-    """A box of a drawing; x and y are of its upper left corner, y grows downwards.
+    """A box of a drawing, with its upper left corner; y grows downwards.
 
-    For an event: `gate` is its qualifier ("&", "≥2", "≥1"; "" for a basic event), `mechanism` the
-    barrier on it with its gates over detection and recovery modules, and `way` the names of the
-    events above it, up to and including the first with a barrier.
+    For an event, `gate` is its qualifier ("&", "≥2", "≥1"; "" for a basic event), `mechanism` its
+    barrier, `detect` and `recover` the gates of that, and `way` the events above it, up to the
+    first one with a barrier.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Shape(msgspec.Struct, frozen=True):
 
 
 class Line(msgspec.Struct, frozen=True):
-    """A line from an upper box to a lower one, through some points."""
+    """A line from an upper box to a lower one, through points."""
 
     upper: str
     lower: str
@@ -65,7 +65,7 @@ class Line(msgspec.Struct, frozen=True):
 
 
 class Drawing(msgspec.Struct, frozen=True):
-    """Boxes and lines from (0, 0) to (width, height); `words` says the same to who cannot see."""
+    """Boxes and lines from (0, 0) to (width, height); `words` is the description of the drawing."""
 
     title: str
     width: float
@@ -78,12 +78,12 @@ class Drawing(msgspec.Struct, frozen=True):
 def draw_system(spec: SystemSpec) -> dict[str, Any]:
     """Return the drawings of a system's fault tree and of its order of recoveries.
 
-    Either is None where the system has none, or one that is too large (see `note`).
+    A drawing is None if the system has none, or if it is too large (see `note`).
     """
     order = spec.build_order()
     tree = draw(spec, "fault-tree", order, spec.criteria, Situation())
     ranks = draw(spec, "order", order, spec.criteria, Situation())
-    note = (f"The fault tree has {len(tree.boxes)} events; up to {MAX_BOXES} are drawn."
+    note = (f"The fault tree has {len(tree.boxes)} events, too many to draw (at most {MAX_BOXES})."
             if len(tree.boxes) > MAX_BOXES else "")
     return {"title": spec.title or spec.name, "titles": spec.titles,
             "strategy": spec.strategy, "criteria": spec.criteria, "note": note,
@@ -134,7 +134,7 @@ def _order(diagram: Diagram) -> Drawing:
 
 
 def _way(event: str, above: dict[str, list[str]], barriers: set[str]) -> tuple[str, ...]:
-    """Return the events that an event leads to until a barrier is met, that one included."""
+    """Return the events above an event, up to and including those with a barrier."""
     way: dict[str, None] = {}
     to_do = list(above[event])
     while to_do:
@@ -157,11 +157,11 @@ def _in_words(diagram: Diagram) -> str:
         below.setdefault(upper, []).append(names[lower])
     parts = []
     for box in diagram.boxes:
-        said = [names[box.name]]
+        words = [names[box.name]]
         if box.mechanism:
-            said.append(f"barrier {box.barrier_words}")
+            words.append(f"barrier {box.barrier_words}")
         if box.name in below:
             how = f"{box.gate_words} of" if box.gate else "above"
-            said.append(f"{how} {', '.join(below[box.name])}")
-        parts.append(f"{'; '.join(said)}.")
+            words.append(f"{how} {', '.join(below[box.name])}")
+        parts.append(f"{'; '.join(words)}.")
     return " ".join(parts)

@@ -82,7 +82,7 @@ def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO
         if probe and not existed:
             path.unlink()
     except FileNotFoundError:
-        raise BagError(f"{path}: cannot be written: no such directory") from None
+        raise BagError(f"{path}: cannot be written: there is no such directory") from None
     except OSError as error:
         raise BagError(f"{path}: cannot be written: {error.strerror or error}") from None
     return file

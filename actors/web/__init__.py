@@ -1,1 +1,1 @@
-"""HTTP and WebSocket serving that strangers cannot bring down: access, limits, tokens."""
+"""HTTP and WebSocket serving: access, TLS, limits, tokens, audit."""

@@ -1,17 +1,15 @@
-"""Which requests may reach a web page that a node serves, whoever makes them. Pure.
+"""Rules for the requests that may reach a page. Pure.
 
-A user who reaches the operator's page can drive the robot, kill its nodes and release its emergency
-stop. So:
+A user of the operator's page can drive the robot, kill its nodes and release its emergency stop.
+So:
 
-* On loopback the user may whose process serves it; other users of this machine need a token
-  (`server` asks the kernel whose connection it is). Other people's *web pages* must not, in the
-  user's own browser: the `Host` header must name this page (against DNS rebinding), and the
-  `Origin` of whatever changes something must be the page's own. Programs that are no browsers send
-  no Origin.
-* On any other address a token is needed as well, for everything but the files of the page, which
-  are the same for everybody. The page is encrypted, unless the operator declares that it need not
-  be. An address literal cannot be rebound, so it is a valid `Host`, as are the names in the page's
-  certificate.
+* On loopback only the user whose process serves the page may use it; other users of this machine
+  need a token (`door` asks the kernel for the user of a connection). Other web pages in the user's
+  browser must not use it: the `Host` header has to name this page (against DNS rebinding), and the
+  `Origin` of a request that changes something has to be this page. Other programs send no Origin.
+* On any other address everybody needs a token, except for the files of the page. The page is
+  encrypted, unless the operator declares otherwise. An address literal cannot be rebound, so it is
+  a valid `Host`, as are the names in the page's certificate.
 
 `gate` and `visitors` decide who a visitor is and what it may do.
 """
@@ -27,35 +25,35 @@ import msgspec
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 ANY = ("0.0.0.0", "::")  # noqa: S104 named, not bound
-"""Stand for all addresses of a machine."""
+"""All addresses of a machine."""
 
 SUBPROTOCOL = "rampart"
 _TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
 
 
 class AccessError(ValueError):
-    """An address at which the page must not be served like this; one line."""
+    """The page must not be served in this way at this address; one line."""
 
 
 def new_token() -> str:
-    """Return a token that cannot be guessed: 128 random bits, safe in a URL."""
+    """Return a token of 128 random bits that is safe in a URL."""
     return secrets.token_urlsafe(16)
 
 
 def check_token(token: str) -> str:
-    """Return a token.
+    """Return the token.
 
     Raises:
-        AccessError: it is short, or no word; the line does not say what it is.
+        AccessError: it is too short or has other characters; the text does not contain it.
     """
     if not _TOKEN.fullmatch(token):
-        raise AccessError(f"token of {len(token)} characters: must be 16 or more of "
+        raise AccessError(f"token of {len(token)} characters: expected 16 to 200 of "
                           "A to Z, a to z, 0 to 9, and - _ . ~")
     return token
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether only this machine can reach an address to bind to."""
+    """Return whether only this machine can reach a listening address."""
     address = _address(host)
     return host == "localhost" or (address is not None and address.is_loopback)
 
@@ -68,7 +66,7 @@ def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def page_url(host: str, port: int, *, tls: bool = False) -> str:
-    """Return where to open a page."""
+    """Return the URL of a page."""
     host = "127.0.0.1" if host in ANY else host
     host = f"[{host}]" if ":" in host else host
     return f"http{'s' if tls else ''}://{host}:{port}/"
@@ -80,16 +78,15 @@ class Access(msgspec.Struct, frozen=True):
     Args:
         host: address or name to bind to.
         port: TCP port.
-        asks: whether visitors have to show a token.
+        asks: whether visitors need a token.
         tls: whether the page is encrypted.
-        plain: whether it need not be, for other machines.
-        names: other names under which the page may be asked for: of this machine, and of the
-            page's certificate.
-        behind: origin under which a reverse proxy serves the page, as https://robot.example; ""
+        plain: whether other machines may reach it unencrypted.
+        names: other names of the page: of this machine, and of the page's certificate.
+        behind: origin under which a reverse proxy serves the page, e.g. https://robot.example; ""
             without one.
 
     Raises:
-        AccessError: it would be open to the network without a token, or unencrypted.
+        AccessError: the network could reach it without a token, or unencrypted.
     """
 
     host: str
@@ -105,27 +102,28 @@ class Access(msgspec.Struct, frozen=True):
             parts = urlsplit(self.behind)
             if parts.scheme not in {"http", "https"} or not parts.hostname or (
                     f"{parts.scheme}://{parts.netloc}" != self.behind):
-                raise AccessError(f"page behind {self.behind}: expected an origin, as "
+                raise AccessError(f"page behind {self.behind}: expected an origin, e.g. "
                                   "https://robot.example")
             if not self.asks:
-                raise AccessError(f"page behind {self.behind}: needs a token, since other machines "
-                                  "reach it")
+                raise AccessError(f"page behind {self.behind}: needs a token, because other "
+                                  "machines can reach it")
         if is_loopback(self.host):
             return
         if not self.asks:
-            raise AccessError(f"page on {self.host}: needs a token, since other machines reach it")
+            raise AccessError(f"page on {self.host}: needs a token, because other machines can "
+                              "reach it")
         if not (self.tls or self.plain):
-            raise AccessError(f"page on {self.host}: other machines reach it, so it is encrypted: "
-                              "--hmi-cert FILE --hmi-key FILE; or use --hmi-unencrypted on a "
-                              "network without strangers")
+            raise AccessError(f"page on {self.host}: has to be encrypted, because other machines "
+                              "can reach it: --hmi-cert FILE --hmi-key FILE; or "
+                              "--hmi-unencrypted on a trusted network")
 
     @property
     def url(self) -> str:
-        """Where to open the page."""
+        """URL of the page."""
         return f"{self.behind}/" if self.behind else page_url(self.host, self.port, tls=self.tls)
 
     def own_host(self, header: str | None) -> bool:
-        """Tell whether a `Host` header means this page."""
+        """Return whether a `Host` header names this page."""
         if self.behind and header == urlsplit(self.behind).netloc:
             return True
         try:
@@ -136,7 +134,7 @@ class Access(msgspec.Struct, frozen=True):
             return False
 
     def own_origin(self, origin: str | None) -> bool:
-        """Tell whether a page of this `Origin` is this page; programs send none."""
+        """Return whether an `Origin` is this page; programs send none."""
         if origin is None or (self.behind and origin == self.behind):
             return True
         scheme, port = ("https", 443) if self.tls else ("http", 80)

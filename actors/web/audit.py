@@ -1,11 +1,11 @@
-"""Who did what on a page: lines of JSON in a file, for the report of the run.
+"""The audit of a page: who did what, as lines of JSON in a file, for the report of the run.
 
-The process that serves a page may be killed at any moment: each line is written by one call, and is
-then the kernel's. (A machine that loses its power may lose the last ones.) Tokens are not in it.
+Each line is written by one call, so the kernel has it even if the process is killed; a power cut
+may lose the last lines. Tokens are not in the file.
 
-A line that cannot be written prevents no request: an emergency stop must be releasable on a full
-disk. The next line counts the missing ones. So it does for visitors without a token, of whom one
-line a second is kept. The last line of a full file says that it is full.
+A line that cannot be written prevents no request: an emergency stop has to be releasable on a full
+disk. The next line counts the missing ones. It also counts those of visitors without a token, who
+get one line per second. The last line of a full file reports that it is full.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from typing import Any, Literal
 import msgspec
 
 STRANGERS_S = 1.0
-"""Real seconds between two lines of visitors without a token."""
+"""Real seconds between two lines about visitors without a token."""
 
 MAX_BYTES = 4_000_000
-"""Of a file; some ten thousand lines."""
+"""Size of a full file: some ten thousand lines."""
 
 _LINE_BYTES = 4000
 _SELF = "page"
-_FULL = "full: what follows is not kept"
+_FULL = "full: later actions are not recorded"
 
 Outcome = Literal["accepted", "refused"]
 
 
 class AuditLine(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=True):
-    """Something that somebody did, or tried.
+    """An action of a visitor, or an attempt.
 
     Attributes:
-        utc: when, by the machine's wall clock, ISO 8601.
-        t_s: when, in simulated seconds.
-        who: the visitor's name; "" of one who is not known.
-        address: where from.
-        role: of the visitor, then.
-        page: number of the page, in one incarnation of its node; 0 for none.
+        utc: wall time, ISO 8601.
+        t_s: simulated seconds.
+        who: the visitor's name; "" if unknown.
+        address: of the visitor.
+        role: of the visitor at that time.
+        page: number of the page in one incarnation of its node; 0 for none.
         what: the kind of request; or log in, log out, open, close, take the stick, let go.
-        asked: what else the request said.
+        asked: the other fields of the request.
         outcome: accepted or refused.
-        why: it was refused, or what was answered.
-        left_out: how many lines between this one and the one before were not written.
+        why: reason of the refusal, or the answer.
+        left_out: number of lines before this one that were not written.
     """
 
     utc: str
@@ -64,13 +64,13 @@ class AuditLine(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=True):
 
 
 class AuditLog:
-    """Appends to the file of a run.
+    """Appends to the audit file of a run.
 
     Args:
-        file: where to; None keeps nothing. It may be there: of a former incarnation.
-        now: simulated seconds.
-        complain: is told why lines are lost, once for each reason in a row.
-        real_s: real seconds.
+        file: path, where an earlier incarnation may have written; None keeps nothing.
+        now: returns simulated seconds.
+        complain: called with the reason when lines are lost, once until the reason changes.
+        real_s: returns real seconds.
     """
 
     def __init__(self, file: Path | None, now: Callable[[], float],
@@ -100,7 +100,7 @@ class AuditLog:
         try:
             trouble = self._append(self._file, line)
         except OSError as error:
-            trouble = f"cannot be written ({error.strerror or error}): who does what is not kept"
+            trouble = f"cannot be written ({error.strerror or error}): actions are not recorded"
         if not trouble:
             self._left_out = 0
         elif trouble != self._trouble:
@@ -108,7 +108,7 @@ class AuditLog:
         self._trouble = trouble
 
     def _append(self, file: Path, line: AuditLine) -> str:
-        """Append a line by one call; return why it is not kept, "" if it is."""
+        """Append a line by one call; return why it is lost, "" if it is not."""
         encoded = msgspec.json.encode(line) + b"\n"
         if len(encoded) > _LINE_BYTES:
             encoded = msgspec.json.encode(msgspec.structs.replace(line, asked={})) + b"\n"
@@ -122,17 +122,17 @@ class AuditLog:
                 full = AuditLine(utc=line.utc, t_s=line.t_s, who=_SELF, what="audit",
                                  outcome="refused", why=_FULL)
                 encoded = msgspec.json.encode(full).ljust(MAX_BYTES - size) + b"\n"
-            if size and os.pread(handle, 1, size - 1) != b"\n":  # a full disk cut a line in two
+            if size and os.pread(handle, 1, size - 1) != b"\n":  # a full disk has cut a line
                 encoded = b"\n" + encoded
             if os.write(handle, encoded) < len(encoded):
-                return "the disk is full: who does what is not kept"
+                return "the disk is full: actions are not recorded"
             return _FULL if is_last else ""
         finally:
             os.close(handle)
 
 
 def read_audit(file: Path) -> tuple[AuditLine, ...]:
-    """Return the lines of a file, one that is broken as one that says so; none without a file."""
+    """Return the lines of a file, with a note in place of a damaged line; none without a file."""
     with contextlib.suppress(OSError), file.open("rb") as opened:
         return tuple(_read(line) for line in opened.read(MAX_BYTES + _LINE_BYTES).splitlines()
                      if line.strip())
@@ -144,4 +144,4 @@ def _read(line: bytes) -> AuditLine:
         return msgspec.json.decode(line, type=AuditLine)
     except (msgspec.DecodeError, ValueError):
         return AuditLine(utc="", t_s=0.0, who=_SELF, what="audit", outcome="refused",
-                         why="a line that cannot be read")
+                         why="damaged line")

@@ -1,8 +1,8 @@
-"""The door of a page: who makes a request, and may it come in at all.
+"""Middleware that finds the visitor of a request and refuses what must not reach the page.
 
-Other users of this machine, where no token is asked for, and foreign hosts and origins are turned
-away before all else. The page's files are for everybody, they
-are the same for all; so is the form where one logs in. Everything else is for visitors.
+Requests with a foreign host or origin are refused first, and, on a page without tokens, those of
+other users of this machine. Everybody may read the page's files and log in. Everything else needs a
+visitor.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ LOGOUT = "/logout"
 _MOST_BYTES = 1000
 _VISITOR = "visitor"
 _NO_STORE = {"cache-control": "no-store"}
-_LOG_IN = ("Log in first: POST {\"token\": \"...\"} to /login, or send the header "
+_UNKNOWN = "unknown token"
+_LOG_IN = ("Log in: POST {\"token\": \"...\"} to /login, or send the header "
            "Authorization: Bearer TOKEN")
 
 
@@ -36,26 +37,26 @@ class _Shown(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def visitor_of(scope: Scope) -> Visitor | None:
-    """Return who makes a request that has come through the door."""
+    """Return the visitor that `Door` has found for a request."""
     found: Visitor | None = scope["state"].get(_VISITOR)
     return found
 
 
 def address_of(scope: Scope) -> str:
-    """Return the address that a request comes from."""
+    """Return the address of a request's client."""
     client = scope.get("client")
     return str(client[0]) if client else ""
 
 
 class Door:
-    """Turns away foreign hosts and origins, and strangers from what is not for all.
+    """Refuses foreign hosts and origins, and requests for private paths without a visitor.
 
     Args:
-        app: behind it.
-        access: which hosts and origins are this page's.
-        gate: who is known.
-        public: paths that are for everybody.
-        refusal: answer to other users of this machine; "" lets them in.
+        app: application that it protects.
+        access: hosts and origins of this page.
+        gate: knows the visitors.
+        public: paths for everybody.
+        refusal: answer to other users of this machine; "" admits them.
     """
 
     def __init__(self, app: ASGIApp, access: Access, gate: Gate, public: frozenset[str],
@@ -67,7 +68,7 @@ class Door:
         self._public = public | {LOGIN}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request pass, or answer it."""
+        """Pass a request on, or refuse it."""
         connection = HTTPConnection(scope)
         hosts = connection.headers.getlist("host")
         is_here = len(hosts) == 1 and self._access.own_host(hosts[0])
@@ -78,7 +79,7 @@ class Door:
         is_user = not self._refusal or _is_this_user(scope)
         if scope["type"] == "websocket":
             if not (is_here and is_own and is_user):
-                await send({"type": "websocket.close", "code": 1008})  # before it was accepted: 403
+                await send({"type": "websocket.close", "code": 1008})  # not accepted: becomes 403
                 return
         elif not is_user:
             await PlainTextResponse(self._refusal + "\n", 403)(scope, receive, send)
@@ -87,7 +88,7 @@ class Door:
             await PlainTextResponse("Invalid host header", 400)(scope, receive, send)
             return
         elif scope["method"] not in ("GET", "HEAD") and not is_own:
-            await PlainTextResponse("Only for this page", 403)(scope, receive, send)
+            await PlainTextResponse("Foreign origin", 403)(scope, receive, send)
             return
         elif scope["path"] not in self._public and visitor is None:
             await PlainTextResponse(_LOG_IN, 401)(scope, receive, send)
@@ -96,41 +97,41 @@ class Door:
 
 
 def _is_this_user(scope: Scope) -> bool:
-    """Whether a request on loopback comes from a process of the user who serves the page."""
+    """Return whether a request comes over loopback from a process of the user of the page."""
     client, server = scope["client"], scope["server"]
     return bool(client and server) and plain_address(client[0]).is_loopback and (
         user_of_peer(server, client) == os.getuid())
 
 
 def login_routes(gate: Gate, audit: AuditLog) -> list[Route]:
-    """Return where one logs in and out; nowhere, where no token is asked for."""
+    """Return the routes to log in and out; none if the page needs no token."""
 
     async def log_in(request: Request) -> Response:
         address = address_of(request.scope)
         token = await _token(request)
         if token is None:
             return PlainTextResponse(_LOG_IN, 400, _NO_STORE)
-        visitor, told = gate.log_in(token)
+        visitor = gate.visitor(f"Bearer {token}", None)
         if visitor is None:
-            audit.write("log in", address=address, refused=True, why=told)
-            return PlainTextResponse(told, 403, _NO_STORE)
+            audit.write("log in", address=address, refused=True, why=_UNKNOWN)
+            return PlainTextResponse(_UNKNOWN, 403, _NO_STORE)
         audit.write("log in", who=visitor.name, role=visitor.role, address=address)
         return JSONResponse({"name": visitor.name, "role": visitor.role},
-                            headers={"set-cookie": told, **_NO_STORE})
+                            headers={"set-cookie": gate.cookie(visitor), **_NO_STORE})
 
     async def log_out(request: Request) -> Response:
         visitor = visitor_of(request.scope)
         if visitor is not None:
             audit.write("log out", who=visitor.name, role=visitor.role,
                         address=address_of(request.scope))
-        return Response(status_code=204, headers={"set-cookie": gate.log_out(), **_NO_STORE})
+        return Response(status_code=204, headers={"set-cookie": gate.no_cookie(), **_NO_STORE})
 
     return [Route(LOGIN, log_in, methods=["POST"]), Route(LOGOUT, log_out, methods=["POST"])
             ] if gate.asks else []
 
 
 async def _token(request: Request) -> str | None:
-    """Return the token in the body of a request, None if it is something else."""
+    """Return the token in the body of a request, None if there is none."""
     body = b""
     async for part in request.stream():
         body += part

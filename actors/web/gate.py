@@ -1,18 +1,15 @@
-"""Lets visitors in by their token, once, and then by a cookie. Pure but for the register.
+"""Identifies visitors by their token, and after that by a cookie. Pure, except for the register.
 
-A token in an address ends up in histories, logs and over shoulders, so it is in none: a person
-types it into a form, a script sends it as `Authorization: Bearer TOKEN`. Whoever logs in gets a
-cookie that the page's scripts cannot read, that no other site's page sends along, and that over
-TLS is sent over TLS alone.
+A token in a URL would end up in histories and logs. So a person types it into a form, and a script
+sends it as `Authorization: Bearer TOKEN`. The answer to the form sets a cookie that scripts of the
+page cannot read, that pages of other sites do not send, and that a TLS page receives over TLS only.
 
-The cookie is the visitor's name, signed with a time (itsdangerous) by a key that the run has made
-for itself, salted with the token's digest. So the node that serves the page keeps nothing: it may
-die, and its successor knows its visitors. With the token goes the cookie, and with the run all of
-them.
+The cookie is the visitor's name with a time, signed (itsdangerous) by a key of the run that is
+salted with the token's digest. So the page's node keeps no state, and its next incarnation knows
+the visitors. A cookie ends with its token, and all cookies end with the run.
 
-Cookies know no ports: a browser sends them to every server of the same host. The key makes those of
-another run worthless here, not the other way round; on plain loopback a page of another user of the
-machine, opened in the same browser, would be sent it.
+Browsers send cookies to every port of a host. The key makes cookies of other runs useless here. On
+plain loopback, another user's page that is opened in the same browser receives the cookie.
 """
 
 from __future__ import annotations
@@ -26,14 +23,14 @@ LASTS_S = 12 * 3600
 
 
 class Gate:
-    """Who is let in, and how they are known again.
+    """Identifies the visitor of a request.
 
     Args:
-        register: of those who may come.
-        secret: of the run: key of its cookies.
-        port: of the page: part of the cookie's name.
-        tls: whether the page is encrypted on its way to the browser.
-        owner: who everybody is where no token is asked for; None where one is.
+        register: the visitors.
+        secret: key of the run's cookies.
+        port: of the page, in the cookie's name.
+        tls: whether the browser reaches the page over TLS.
+        owner: the only visitor of a page without tokens; None if the page needs them.
     """
 
     def __init__(self, register: Register, secret: str, port: int, *, tls: bool,
@@ -46,11 +43,11 @@ class Gate:
 
     @property
     def asks(self) -> bool:
-        """Whether there is anything to show."""
+        """Whether the page needs tokens."""
         return self._owner is None
 
     def visitor(self, authorization: str | None, cookies: str | None) -> Visitor | None:
-        """Return who makes a request, by two of its headers; None if it shows nothing valid."""
+        """Return the visitor of a request by two of its headers; None if neither is valid."""
         if self._owner is not None:
             return self._owner
         scheme, _, token = (authorization or "").partition(" ")
@@ -63,19 +60,15 @@ class Gate:
         return None
 
     def still(self, visitor: Visitor) -> bool:
-        """Tell whether somebody who was let in may stay as who he was."""
+        """Return whether a visitor still has the same token and role."""
         return visitor == self._owner or self._register.still(visitor)
 
-    def log_in(self, token: str) -> tuple[Visitor | None, str]:
-        """Return who shows a token, and a `Set-Cookie` for them; or None, and why not."""
-        visitor = self._owner or self._register.by_token(token)
-        if visitor is None:
-            return None, "unknown token"
-        return visitor, self._set_cookie(
-            self._signer(visitor).sign(visitor.name).decode(), LASTS_S)
+    def cookie(self, visitor: Visitor) -> str:
+        """Return the `Set-Cookie` of a visitor."""
+        return self._set_cookie(self._signer(visitor).sign(visitor.name).decode(), LASTS_S)
 
-    def log_out(self) -> str:
-        """Return a `Set-Cookie` that takes the cookie away."""
+    def no_cookie(self) -> str:
+        """Return a `Set-Cookie` that deletes the cookie."""
         return self._set_cookie("", 0)
 
     def _set_cookie(self, value: str, lasts_s: int) -> str:

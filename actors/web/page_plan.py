@@ -1,4 +1,4 @@
-"""Where the operator's page of a run is, for whom, and encrypted how."""
+"""Address, visitors and encryption of the operator's page of a run."""
 
 from __future__ import annotations
 
@@ -8,21 +8,20 @@ from rampart.actors.web.access import page_url
 
 
 class PagePlan(msgspec.Struct, frozen=True):
-    """What is chosen for the operator's page of a run; secrets included.
+    """Settings of the operator's page of a run, secrets included.
 
     Attributes:
         port: TCP port; 0 for no page.
-        host: address at which it is served.
-        token: what everybody has to show there; "" for nothing, on loopback, or for tokens that a
-            file lists.
-        token_is_new: it was made for this run, so the operator has yet to be told.
-        token_file: path of the list of those who have tokens; "" for none.
-        cert: path of the certificate with which it is encrypted; "" for plain HTTP.
-        key: path of its key.
-        unencrypted: it need not be, though other machines reach it.
-        secret: key of its cookies; its node makes one for itself where there is none.
-        shown: address or name under which it is shown; "" for the one it is served at.
-        audit_log: file that keeps who did what there; "" for none.
+        host: address to bind to.
+        token: the one token of the page; "" if it needs none, or if a file lists tokens.
+        token_is_new: the token was made for this run, so the operator does not know it yet.
+        token_file: path of the list of visitors; "" for none.
+        cert: path of the certificate; "" for plain HTTP.
+        key: path of the certificate's key.
+        unencrypted: other machines may reach it unencrypted.
+        secret: key of its cookies; without one its node makes one.
+        shown: address or name in its URL; "" for `host`.
+        audit_log: path of its audit; "" for none.
         behind: origin under which a reverse proxy serves it; "" without one.
     """
 
@@ -41,7 +40,7 @@ class PagePlan(msgspec.Struct, frozen=True):
 
     @property
     def url(self) -> str:
-        """Where the page is, "" if there is none; the token is no part of it."""
+        """URL of the page without a token, "" if there is no page."""
         if self.behind:
             return f"{self.behind}/"
         return page_url(self.shown or self.host, self.port, tls=bool(self.cert)
@@ -49,7 +48,7 @@ class PagePlan(msgspec.Struct, frozen=True):
 
     @property
     def invitation(self) -> str:
-        """The same, once, for who has started the run: with the token, if it is new."""
+        """URL for the person who has started the run: with the token if it is new."""
         if self.token_is_new:
             return f"{self.url} asks for the token {self.token}"
         return f"{self.url} asks for your token" if self.token or self.token_file else self.url

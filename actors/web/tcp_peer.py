@@ -1,4 +1,4 @@
-"""Which user is at the other end of a TCP connection within this machine (proc_net_tcp(5))."""
+"""The user at the other end of a TCP connection within this machine (proc_net_tcp(5))."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 def plain_address(text: str) -> IpAddress:
-    """Return an address; one of IPv4 that is written as IPv6 is one of IPv4."""
+    """Return an address; an IPv4 address that is mapped to IPv6 as IPv4."""
     address = ipaddress.ip_address(text.partition("%")[0])
     return getattr(address, "ipv4_mapped", None) or address
 
@@ -19,11 +19,11 @@ def user_of_peer(local: tuple[str, int], peer: tuple[str, int]) -> int | None:
 
     Args:
         local: address and port of this end.
-        peer: those of the other end.
+        peer: address and port of the other end.
 
     Returns:
-        The user's number. None if there is no such connection, or its socket belongs to no process
-        any more: of those the kernel reports user 0.
+        User id. None if there is no such connection, or no process has its socket any more (the
+        kernel reports user 0 then).
     """
     ends = (plain_address(peer[0]), peer[1]), (plain_address(local[0]), local[1])
     for table in ("tcp", "tcp6"):
@@ -39,7 +39,7 @@ def user_of_peer(local: tuple[str, int], peer: tuple[str, int]) -> int | None:
 
 
 def _end(field: str) -> tuple[IpAddress, int]:
-    """Return address and port of a field as 0100007F:1F90: words of the machine's byte order."""
+    """Return address and port of e.g. 0100007F:1F90, in words of the machine's byte order."""
     address, _, port = field.partition(":")
     words = [bytes.fromhex(address[i:i + 8])[::-1] for i in range(0, len(address), 8)]
     return plain_address(str(ipaddress.ip_address(b"".join(words)))), int(port, 16)

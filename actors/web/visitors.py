@@ -1,13 +1,12 @@
-"""Who may use a page, and as what: named tokens, each with a role.
+"""The visitors of a page: named tokens, each with a role.
 
-A token is 128 random bits. Its file keeps no token but the SHA-256 of each, so that what is read
-in it, or in a copy of it, opens nothing; a slow hash is for secrets that can be guessed. One line
-per visitor:
+A token is 128 random bits. The file keeps the SHA-256 of each token, so a copy of the file gives no
+access. (Slow hashes are for secrets that can be guessed.) It has one line per visitor:
 
     anna drive 4c9184f37cff01bcdc32dc486ec36961ad8d...
 
-It is read anew when it has changed, so a token that is withdrawn is withdrawn at once, by an editor
-as well as by the verb. A file that is not there any more or cannot be read lets nobody in.
+The file is read again when it changes, so a token can be revoked at once, with the verb or with an
+editor. While the file is missing or wrong, it admits no visitors.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ from pathlib import Path
 import msgspec
 
 from rampart.actors.web.access import new_token
-from rampart.actors.web.token_file import SecretError, read_private
+from rampart.actors.web.token_file import SecretError, file_state, read_private
 
 MOST = 200
-"""Visitors in a file."""
+"""Most visitors in a file."""
 
 MAX_BYTES = 40_000
 
@@ -37,20 +36,20 @@ _HEAD = "# who may use the operator's page: name, role, SHA-256 of the token\n"
 
 
 class Role(StrEnum):
-    """What a visitor may do; each may do what those before it may."""
+    """Rights of a visitor; each role includes the previous ones."""
 
     LOOK = "look"
     DRIVE = "drive"
     INJECT = "inject"
 
     def may(self, needed: Role) -> bool:
-        """Tell whether it includes another."""
+        """Return whether it includes another role."""
         order = list(Role)
         return order.index(self) >= order.index(needed)
 
 
 class Visitor(msgspec.Struct, frozen=True):
-    """Somebody who may use a page; `digest` is of the token, "" where none is asked for."""
+    """A user of a page; `digest` is of the token, "" on a page without tokens."""
 
     name: str
     role: Role
@@ -58,19 +57,19 @@ class Visitor(msgspec.Struct, frozen=True):
 
 
 class VisitorError(ValueError):
-    """A name, role or line that cannot be; one line, without a token."""
+    """A name, role or line of the file is not valid; one line, without a token."""
 
 
 def digest(token: str) -> str:
-    """Return what is kept of a token."""
+    """Return the SHA-256 of a token."""
     return hashlib.sha256(token.encode(errors="replace")).hexdigest()
 
 
 def check_name(name: str) -> str:
-    """Return a visitor's name.
+    """Return the name of a visitor.
 
     Raises:
-        VisitorError: it can be none.
+        VisitorError: it is not a valid name.
     """
     if not _NAME.fullmatch(name):
         raise VisitorError(f"name {name[:40]!r}: expected up to 40 letters, digits, and _ . @ -, "
@@ -79,21 +78,21 @@ def check_name(name: str) -> str:
 
 
 def check_role(role: str) -> Role:
-    """Return a role by its name.
+    """Return the role with a name.
 
     Raises:
-        VisitorError: there is none of that name.
+        VisitorError: there is no such role.
     """
     if role not in set(Role):
-        raise VisitorError(f"role {role[:40]!r}: unknown; there are: {', '.join(Role)}")
+        raise VisitorError(f"role {role[:40]!r}: unknown; known: {', '.join(Role)}")
     return Role(role)
 
 
 def parse(lines: Iterable[str]) -> dict[str, Visitor]:
-    """Return the visitors that a file lists, by name; blank lines and # are comments.
+    """Return the visitors in lines of a file, by name; # begins a comment.
 
     Raises:
-        VisitorError: a line is none, or names somebody again.
+        VisitorError: a line is not valid, or repeats a name or token.
     """
     found: dict[str, Visitor] = {}
     for number, line in enumerate(lines, 1):
@@ -103,14 +102,14 @@ def parse(lines: Iterable[str]) -> dict[str, Visitor]:
         try:
             visitor = _visitor(words)
             if visitor.name in found:
-                raise VisitorError(f"name {visitor.name!r}: there already; each name once")
+                raise VisitorError(f"name {visitor.name!r}: there already; expected each name once")
             if any(hmac.compare_digest(visitor.digest, v.digest) for v in found.values()):
-                raise VisitorError(f"{visitor.name!r} has the token of another; each has its own")
+                raise VisitorError(f"{visitor.name!r}: another visitor has the same token")
         except VisitorError as error:
             raise VisitorError(f"line {number}: {error}") from None
         found[visitor.name] = visitor
     if len(found) > MOST:
-        raise VisitorError(f"{len(found)} names: {MOST} at most")
+        raise VisitorError(f"{len(found)} names; expected at most {MOST}")
     return found
 
 
@@ -125,21 +124,21 @@ def _visitor(words: list[str]) -> Visitor:
 
 
 def lists_visitors(file: Path) -> bool:
-    """Tell whether a file lists visitors; one of a single line that is none holds a bare token.
+    """Return whether a file lists visitors; otherwise its only line is a bare token.
 
     Raises:
-        SecretError, VisitorError: as of `read_visitors`.
+        SecretError, VisitorError: see `read_visitors`.
     """
     lines = "\n".join(_lines(file)).strip().splitlines()
     return len(lines) != 1 or len(lines[0].split()) == 3 or lines[0].startswith("#")
 
 
 def read_visitors(file: Path) -> dict[str, Visitor]:
-    """Return the visitors of a file that only this user can get at.
+    """Return the visitors of a private file.
 
     Raises:
-        SecretError: others can get at it, or it cannot be read.
-        VisitorError: it is no list of visitors.
+        SecretError: it cannot be read, or others can access it.
+        VisitorError: it is not a list of visitors.
     """
     return parse(_lines(file))
 
@@ -147,15 +146,15 @@ def read_visitors(file: Path) -> dict[str, Visitor]:
 def _lines(file: Path) -> list[str]:
     content = read_private(file, MAX_BYTES + 1)
     if len(content) > MAX_BYTES or not content.isascii():
-        raise VisitorError(f"must be of up to {MAX_BYTES} plain characters")
+        raise VisitorError(f"expected up to {MAX_BYTES} ASCII characters")
     return content.decode().splitlines()
 
 
 def issue(file: Path, name: str, role: Role) -> str:
-    """Add a visitor to a file, which is made if need be, and return the token, kept nowhere.
+    """Add a visitor to a file, which may be new, and return the token, which is stored nowhere.
 
     Raises:
-        SecretError, VisitorError: as of `read_visitors`; or there is one of that name.
+        SecretError, VisitorError: see `read_visitors`; or the name is there already.
         OSError: the file cannot be written.
     """
     visitors = read_visitors(file) if file.exists() else {}
@@ -167,22 +166,22 @@ def issue(file: Path, name: str, role: Role) -> str:
 
 
 def revoke(file: Path, name: str) -> None:
-    """Take a visitor out of a file: the token opens nothing any more, from now on.
+    """Remove a visitor from a file; the token is invalid at once.
 
     Raises:
-        SecretError, VisitorError: as of `read_visitors`; or there is none of that name.
+        SecretError, VisitorError: see `read_visitors`; or there is no such name.
         OSError: the file cannot be written.
     """
     visitors = read_visitors(file)
     if name not in visitors:
-        raise VisitorError(f"no {name[:40]!r}; there are: {', '.join(visitors) or 'none'}")
+        raise VisitorError(f"no visitor {name[:40]!r}; known: {', '.join(visitors) or 'none'}")
     _write(file, {k: v for k, v in visitors.items() if k != name})
 
 
 def _write(file: Path, visitors: dict[str, Visitor]) -> None:
     """Replace the file as a whole; comments in it are lost."""
     if len(visitors) > MOST:
-        raise VisitorError(f"{len(visitors)} names: {MOST} at most")
+        raise VisitorError(f"{len(visitors)} names; expected at most {MOST}")
     lines = "".join(f"{v.name} {v.role} {v.digest}\n" for v in visitors.values())
     target = file.resolve()
     handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")  # mode 0600
@@ -198,12 +197,12 @@ def _write(file: Path, visitors: dict[str, Visitor]) -> None:
 
 
 class Register:
-    """The visitors that there are now: fixed, or those of a file.
+    """The current visitors: given ones, and those of a file.
 
     Args:
-        fixed: of whom the page was told.
-        file: where more of them are, or None.
-        complain: is told why the file is not taken, once for each content of it.
+        fixed: visitors that are always there.
+        file: list of further visitors, or None.
+        complain: called with the reason when the file cannot be used, once per change.
     """
 
     def __init__(self, fixed: Iterable[Visitor] = (), file: Path | None = None,
@@ -215,18 +214,18 @@ class Register:
         self._listed: dict[str, Visitor] = {}
 
     def visitors(self) -> dict[str, Visitor]:
-        """Return who may come now, by name."""
-        if self._file is not None and (state := _state(self._file)) != self._seen:
+        """Return the current visitors by name."""
+        if self._file is not None and (state := file_state(self._file)) != self._seen:
             self._seen = state
             try:
                 self._listed = read_visitors(self._file)
             except (SecretError, VisitorError) as error:
                 self._listed = {}
-                self._complain(f"{self._file}: {error}; it lets nobody in")
+                self._complain(f"{self._file}: {error}; it admits no visitors")
         return {**self._listed, **self._fixed}
 
     def by_token(self, token: str) -> Visitor | None:
-        """Return whose token it is."""
+        """Return the visitor with a token."""
         shown = digest(token)
         found = None
         for visitor in self.visitors().values():
@@ -235,14 +234,5 @@ class Register:
         return found
 
     def still(self, visitor: Visitor) -> bool:
-        """Tell whether somebody may come as before: with this token, and in this role."""
+        """Return whether a visitor still has the same token and role."""
         return self.visitors().get(visitor.name) == visitor
-
-
-def _state(file: Path) -> tuple[int, ...]:
-    """Return what changes when a file does."""
-    try:
-        found = file.stat()
-    except (OSError, ValueError):
-        return ()
-    return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_ctime_ns, found.st_size

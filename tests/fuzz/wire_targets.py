@@ -9,7 +9,7 @@ import msgspec
 from rampart.actors.bus.envelope import UNREADABLE, ArrivalGuard, Header, encode
 from rampart.actors.bus.recorder_connection import frame, parse_frame
 from rampart.actors.bus.run_info import RunInfo, read_info
-from rampart.actors.operator.requests import RequestError, RequestReader
+from rampart.actors.operator.requests import RefusedError, RequestReader
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
@@ -105,7 +105,7 @@ _FORMS = Forms(topics.ALL)
 _READER = RequestReader(OSMOSIS_REQUESTS)
 
 
-@target("page-request", refuses=(RequestError,), kind="json", samples=lambda: [
+@target("page-request", refuses=(RefusedError,), kind="json", samples=lambda: [
         b'{"type":"reset","recovery":"RM1"}', b'{"type":"order","action":"pause","reason":"x"}',
         b'{"type":"stick","panel":"Drive","held":true,"ticket":3,"forward":0.5,"left":-1}',
         b'{"type":"inject","fault":"gps-bias","duration_s":5,"permanent":false}',
@@ -132,7 +132,7 @@ def page_headers(data: bytes) -> None:
         access.own_origin(text)
     _GATE.visitor(text, None)
     _GATE.visitor(None, text)
-    _GATE.log_in(text)
+    _GATE.visitor(f"Bearer {text}", None)
 
 
 @target("page-tokens", refuses=(VisitorError,), kind="text", words=("look", "drive", "#", "\n"),

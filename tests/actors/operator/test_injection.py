@@ -55,11 +55,11 @@ def test_a_fault_is_sent_until_its_publisher_reports_and_its_effect_is_told_once
     assert (order.message.topic, order.message.mode, order.message.duration_s) == (
         "localization/pose", "freeze", 10.0)
     assert faults.due(5.5) == [order]
-    assert faults.hear(report(order)) == ""
+    assert faults.take(report(order)) == ""
     assert faults.due(6.0) == []
-    assert faults.hear(report(order, 1)) == "fault localization-not-updated takes effect"
-    assert faults.hear(report(order, 1)) == ""
-    told = faults.hear(report(order, 200, finished=True))
+    assert faults.take(report(order, 1)) == "fault localization-not-updated takes effect"
+    assert faults.take(report(order, 1)) == ""
+    told = faults.take(report(order, 200, finished=True))
     assert told == "fault localization-not-updated: over, 200 messages changed"
     assert (ordered.effective, faults.view(16.0)[0]["ended"]) == (True, True)
 
@@ -68,8 +68,8 @@ def test_a_fault_that_changes_nothing_is_called_without_effect():
     faults = injections()
     faults.order("freeze:plan/route", 0.0, 2.0, 0.0)
     (order,) = faults.due(0.0)
-    faults.hear(report(order))
-    assert faults.hear(report(order, 0, finished=True)) == (
+    faults.take(report(order))
+    assert faults.take(report(order, 0, finished=True)) == (
         "fault freeze:plan/route: no effect: nothing was sent that it would have changed")
 
 
@@ -86,7 +86,7 @@ def test_a_fault_whose_publisher_is_restarted_ends_all_the_same():
     faults = injections()
     faults.order("gps-bias", 0.0, 3.0, 0.0)
     (order,) = faults.due(0.0)
-    faults.hear(report(order, 7))
+    faults.take(report(order, 7))
     assert faults.expire(3.0 + LATE_END_S - 0.1) == []
     (told,) = faults.expire(3.0 + LATE_END_S + 0.1)
     assert "over, 7 messages changed; its publisher did not report the end" in told
@@ -111,13 +111,13 @@ def test_a_permanent_fault_is_ended_on_request_and_the_order_repeated_until_that
     ordered = faults.order("drop:localization/pose", 0.0, math.inf, 0.0)
     (order,) = faults.due(0.0)
     assert math.isinf(order.message.duration_s)
-    faults.hear(report(order, 9))
+    faults.take(report(order, 9))
     faults.expire(1e6)
     assert not faults.view(1e6)[0]["ended"]
     faults.end(ordered.injection, 50.0)
     (again,) = faults.due(50.5)
     assert (again.injection, again.message.duration_s) == (order.injection, 0.0)
-    assert "over, 12 messages" in faults.hear(report(again, 12, finished=True))
+    assert "over, 12 messages" in faults.take(report(again, 12, finished=True))
 
 
 @pytest.mark.parametrize(("fault", "why"), [
@@ -210,7 +210,7 @@ def test_each_fault_is_concluded_once_whatever_is_reported(events):
             names.append(faults.order("gps-bias", 0.0, 3.0, now_s).injection)
         elif kind == "report" and names:
             name = names[number % len(names)]
-            told.append(faults.hear(bm.InjectionReport(
+            told.append(faults.take(bm.InjectionReport(
                 f"{name}.1", "simulator", number, number > 3, "")))
         elif kind == "end" and names:
             try:

@@ -151,7 +151,7 @@ async def test_a_withdrawn_token_closes_its_pages_and_a_changed_role_has_them_co
             file.unlink()
             await turned_away(other)
         await eventually(lambda: bool(world.others.diagnostics))
-        assert "it lets nobody in" in world.others.diagnostics[0].reason
+        assert "it admits no visitors" in world.others.diagnostics[0].reason
 
 
 @pytest.mark.usefixtures("patient")
@@ -216,7 +216,7 @@ async def test_an_action_that_is_accepted_is_written_down_before_its_page_is_tol
 
 
 @pytest.mark.parametrize(("fields", "why"), [
-    ({}, "needs a token"), ({"hmi_token": TOKEN}, "other machines reach it, so it is encrypted"),
+    ({}, "needs a token"), ({"hmi_token": TOKEN}, "has to be encrypted"),
     ({"hmi_token": TOKEN, "hmi_cert": "/no/cert", "hmi_key": "/no/key"}, "key /no/key: cannot be")])
 async def test_a_page_that_must_not_be_served_is_not_and_the_reason_reported(world, fields, why):
     async with world.hmi(hmi_port=free_port(), hmi_host="0.0.0.0", **fields) as hmi:

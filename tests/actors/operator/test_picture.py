@@ -175,14 +175,14 @@ async def test_a_page_is_greeted_then_gets_everything_then_changes():
 async def test_a_page_that_answers_has_few_frames_on_the_way_and_then_the_newest():
     async with Pushing() as p:
         await p.line.until(lambda frames: len(frames) >= 2)
-        assert p.feed.heard(p.page, b'{"type":"seen","version":0}')
+        assert p.feed.take(p.page, b'{"type":"seen","version":0}')
         for i in range(30):
             p.state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, str(i), 0), 1.0)
             await asyncio.sleep(hmi_feed.FRAME_GAP_S / 4)
         on_the_way = len(p.line.frames) - 1
         assert on_the_way <= hmi_feed.IN_FLIGHT + 1
         version = p.line.frames[-1]["version"]
-        p.feed.heard(p.page, f'{{"type":"seen","version":{version}}}')
+        p.feed.take(p.page, f'{{"type":"seen","version":{version}}}')
         await p.line.until(lambda frames: frames[-1].get("pilot", {}).get(
             "value", {}).get("reason") == "29")
         assert len(p.line.frames) - 1 == on_the_way + 1
@@ -202,7 +202,7 @@ async def test_a_page_that_draws_nothing_is_given_up(monkeypatch):
     monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.3)
     async with Pushing() as p:
         await p.line.until(lambda frames: len(frames) >= 2)
-        p.feed.heard(p.page, b'{"type":"seen","version":0}')
+        p.feed.take(p.page, b'{"type":"seen","version":0}')
         for i in range(hmi_feed.IN_FLIGHT + 1):
             p.state.log(1.0, "note", str(i))
             await asyncio.sleep(2 * hmi_feed.FRAME_GAP_S)
@@ -229,4 +229,4 @@ async def test_a_flood_of_changes_becomes_few_frames():
 ])
 def test_what_is_no_answer_is_left_to_others(text):
     feed = Feed(OsmosisState(), lambda: 0.0, dict)
-    assert feed.heard(hmi_feed.PageFeed(), text) is False
+    assert feed.take(hmi_feed.PageFeed(), text) is False

@@ -109,14 +109,14 @@ ELSEWHERE = ["--hmi-host", "0.0.0.0"]
      "--hmi-host 192.0.2.1: expected an address of this machine"),
     (["--hmi-host", "no such host", "--hmi-unencrypted"],
      "--hmi-host no such host: expected an address of this machine"),
-    (ELSEWHERE, "--hmi-host 0.0.0.0: page on 0.0.0.0: other machines reach it, so it is encrypted: "
-                "--hmi-cert FILE --hmi-key FILE; or use --hmi-unencrypted"),
+    (ELSEWHERE, "--hmi-host 0.0.0.0: page on 0.0.0.0: has to be encrypted, because other machines "
+                "can reach it: --hmi-cert FILE --hmi-key FILE; or --hmi-unencrypted"),
     ([*ELSEWHERE, "--hmi-cert", "robot.crt"],
      "--hmi-cert robot.crt: contains no key; expected --hmi-key FILE, too"),
     ([*ELSEWHERE, "--hmi-cert", "nothing"], "--hmi-cert, --hmi-key: key nothing: cannot be read"),
     ([*ELSEWHERE, "--hmi-key", "robot.key"], "--hmi-key robot.key: expected --hmi-cert FILE, too"),
     ([*ELSEWHERE, "--hmi-cert", "robot.crt", "--hmi-key", "other.key"],
-     "--hmi-cert, --hmi-key: key other.key: is not that of certificate robot.crt"),
+     "--hmi-cert, --hmi-key: key other.key: does not fit certificate robot.crt"),
     ([*ELSEWHERE, "--hmi-cert", "old.crt", "--hmi-key", "old.key"],
      "--hmi-cert, --hmi-key: certificate old.crt: certificate has expired"),
     ([*ELSEWHERE, "--hmi-cert", "no", "--hmi-key", "other.key"],
@@ -125,7 +125,7 @@ ELSEWHERE = ["--hmi-host", "0.0.0.0"]
      "--hmi-unencrypted: contradicts --hmi-cert robot.crt"),
     (["--hmi-token-file", "twice"], "--hmi-token-file twice: line 2: name 'anna': there already"),
     (["--hmi-token-file", "captain"], "--hmi-token-file captain: line 1: role 'captain': unknown; "
-                                      "there are: look, drive, inject"),
+                                      "known: look, drive, inject"),
     (["--hmi-token-file", "nobody"], "--hmi-token-file nobody: is empty; rampart tokens issue"),
 ])
 def test_a_page_that_cannot_be_served_like_this_is_one_clear_line(tmp_path, arguments, words):

@@ -225,14 +225,14 @@ def test_the_recorder_writes_what_comes_by_the_bus_and_tells_when_nothing_does(t
                 send("pilot", "supervisor_ground")
                 time.sleep(0.02)
                 writer = recorder.writer
-                return writer is not None and writer.unheard == {"ground": "[]"}
+                return writer is not None and writer.silences == {"ground": "[]"}
 
             wait_until(heard, 10, "the other host is not heard")
             for _ in range(50):
                 send("pilot", "hmi", "supervisor_ground")
-            wait_until(lambda: "null" in recorder.writer.unheard["ground"], 10, "no silence")
+            wait_until(lambda: "null" in recorder.writer.silences["ground"], 10, "no silence")
             send("supervisor_ground")
-            wait_until(lambda: "null" not in recorder.writer.unheard["ground"], 10, "no end of it")
+            wait_until(lambda: "null" not in recorder.writer.silences["ground"], 10, "no end of it")
             os.write(write_end, bytes([RUN_ENDED]))
             thread.join(20)
             here.close()

@@ -133,7 +133,7 @@ def test_a_sweep_is_in_the_frame_of_its_laser(tmp_path):
 @pytest.mark.parametrize("topic", all_topics(), ids=lambda topic: topic.key)
 def test_each_type_of_the_system_is_read_from_its_definition(topic):
     types = Types("jazzy")
-    name, make = StructTypes(types).writer(topic)
+    name, make = StructTypes(types).encoder(topic)
     body = some(topic.type)
     data = make(Header("a", 2, 3, 0.5), body, 1_500_000_000)
     text, _ = types.definition(name)
@@ -237,7 +237,7 @@ def test_bad_words_are_refused_and_nothing_is_left_behind(tmp_path, capsys):
     for words, told in (
             ([path, tmp_path / "there"], "exists already; choose another name"),
             ([path, tmp_path / "new", "--distribution", "foxy"],
-             "--distribution = 'foxy': known: humble, iron, jazzy, kilted, lyrical, rolling"),
+             "--distribution = 'foxy': unknown; known: humble, iron, jazzy, kilted"),
             ([tmp_path / "none.mcap", tmp_path / "new"], "not an MCAP file"),
             ([path, "/proc/nowhere/bag"], "/proc/nowhere/bag: No such file or directory"),
             ([path, tmp_path / "new", "--system", "nosuch"], "nosuch")):

@@ -78,7 +78,7 @@ def test_a_line_that_was_cut_in_two_spoils_no_other(tmp_path, made):
         torn.write(b'{"utc":"2026-01-01T00:00:00","t_s":1,"wh')
     made.log(file).write("close", who="anna")
     assert [(line.what, line.why) for line in read_audit(file)] == [
-        ("open", ""), ("audit", "a line that cannot be read"), ("close", "")]
+        ("open", ""), ("audit", "damaged line"), ("close", "")]
 
 
 def test_of_visitors_without_a_token_one_line_a_second_is_kept_and_the_others_counted(
@@ -103,8 +103,8 @@ def test_a_full_file_says_so_in_its_last_line_and_grows_no_more(tmp_path, made, 
     size = file.stat().st_size
     assert 4000 < size < 5400
     last = read_audit(file)[-1]
-    assert (last.who, last.why) == ("page", "full: what follows is not kept")
-    assert made.told == [f"{file}: full: what follows is not kept"]
+    assert (last.who, last.why) == ("page", "full: later actions are not recorded")
+    assert made.told == [f"{file}: full: later actions are not recorded"]
 
 
 def test_a_file_that_cannot_be_written_keeps_nobody_from_acting_and_is_told_once(tmp_path, made):
@@ -113,7 +113,7 @@ def test_a_file_that_cannot_be_written_keeps_nobody_from_acting_and_is_told_once
     for _ in range(3):
         log.write("reset", who="anna")
     assert made.told == [
-        f"{file}: cannot be written (No such file or directory): who does what is not kept"]
+        f"{file}: cannot be written (No such file or directory): actions are not recorded"]
     file.parent.mkdir()
     log.write("reset", who="anna")
     assert [(line.who, line.left_out) for line in read_audit(file)] == [("anna", 3)]

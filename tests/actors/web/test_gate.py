@@ -31,22 +31,22 @@ def made(*, register: Register | None = None, secret: str = SECRET, tls: bool = 
 
 
 def cookie(gate: Gate, token: str = TOKEN) -> str:
-    visitor, told = gate.log_in(token)
+    visitor = gate.visitor(f"Bearer {token}", None)
     assert visitor is not None
-    return told.partition(";")[0]
+    return gate.cookie(visitor).partition(";")[0]
 
 
 def test_a_cookie_is_hidden_from_scripts_and_other_sites_and_over_tls_sent_over_tls_alone(clock):
-    _, over_tls = made().log_in(TOKEN)
+    over_tls = made().cookie(ANNA)
     name, *attributes = over_tls.split("; ")
     assert name.startswith("__Host-rampart-8080=anna.")
     assert attributes == ["Path=/", f"Max-Age={LASTS_S}", "HttpOnly", "SameSite=Strict", "Secure"]
-    _, plain = made(tls=False).log_in(TOKEN)
+    plain = made(tls=False).cookie(ANNA)
     assert plain.startswith("rampart-8080=")
     assert plain.split("; ")[1:] == attributes[:-1]
     assert TOKEN not in over_tls + plain
     assert digest(TOKEN) not in over_tls + plain
-    assert "Max-Age=0;" in made().log_out()
+    assert "Max-Age=0;" in made().no_cookie()
 
 
 def test_a_cookie_ends_after_hours_and_is_none_from_the_future(clock):

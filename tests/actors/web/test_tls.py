@@ -43,7 +43,7 @@ def test_one_file_may_hold_both(tmp_path):
 
 
 @pytest.mark.parametrize(("certificate", "key", "why"), [
-    ("robot.crt", "other.key", "key {key}: is not that of certificate {certificate}"),
+    ("robot.crt", "other.key", "key {key}: does not fit certificate {certificate}"),
     ("old.crt", "old.key", "certificate {certificate}: certificate has expired"),
     ("client.crt", "client.key", "certificate {certificate}: unsuitable certificate purpose"),
     ("robot.crt", "locked.key", "key {key}: needs a passphrase; expected a key without, in a file "
@@ -67,7 +67,7 @@ def test_files_that_are_not_there_torn_or_open_to_others_are_refused(tmp_path):
             load(*files)
         assert why in str(error.value)
     key.chmod(0o640)
-    with pytest.raises(TlsError, match="mode 0640: others may get at it; chmod 600 it"):
+    with pytest.raises(TlsError, match="mode 0640: others can access it"):
         load(certificate, key)
     key.chmod(0o600)
     certificate.write_text(PEMS["robot.crt"][:300])
@@ -89,7 +89,7 @@ def test_a_renewed_certificate_is_taken_and_one_that_does_not_fit_is_not(tmp_pat
 
     certificate.write_text(PEMS["other.crt"])  # its key is not there yet
     assert tls.context() is before
-    assert told == [f"key {key}: is not that of certificate {certificate}; the one before stays in "
+    assert told == [f"key {key}: does not fit certificate {certificate}; the previous one stays in "
                     "force"]
     tls.context()
     assert len(told) == 1

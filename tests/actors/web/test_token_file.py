@@ -41,13 +41,13 @@ def test_a_file_that_only_its_owner_can_read_is_taken(file, tmp_path):
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o620, 0o602, 0o610, 0o601, 0o777])
 def test_a_file_that_others_can_get_at_is_refused(file, mode):
     file.chmod(mode)
-    assert refused(file) == f"mode {mode:04o}: others may get at it; chmod 600 it"
+    assert refused(file) == f"mode {mode:04o}: others can access it; chmod 600"
 
 
 @needs_root
 def test_a_file_of_somebody_else_is_refused(file):
     os.chown(file, NOBODY, NOBODY)
-    assert refused(file) == f"belongs to user {NOBODY}; it must be yours"
+    assert refused(file) == f"belongs to user {NOBODY}; expected your file"
 
 
 @pytest.mark.parametrize("content", [
@@ -55,13 +55,13 @@ def test_a_file_of_somebody_else_is_refused(file):
     "ключ-от-ангара-семь".encode()])
 def test_what_is_not_one_plain_line_is_refused(file, content):
     file.write_bytes(content)
-    assert refused(file).startswith("must hold one line")
+    assert refused(file).startswith("expected one line")
 
 
 def test_what_is_no_file_is_refused_and_a_fifo_waits_for_nobody(tmp_path):
-    assert refused(tmp_path) == "must be an ordinary file"
+    assert refused(tmp_path) == "expected an ordinary file"
     os.mkfifo(tmp_path / "fifo", 0o600)
-    assert refused(tmp_path / "fifo") == "must be an ordinary file"
+    assert refused(tmp_path / "fifo") == "expected an ordinary file"
     assert refused(tmp_path / "nothing") == "cannot be read (No such file or directory)"
     assert refused(Path("a\0b")).startswith("cannot be read")
 
@@ -99,4 +99,4 @@ def test_a_bad_token_names_where_it_came_from_and_not_what_it_is(tmp_path, file)
     file.chmod(0o644)
     done = launched("--hmi-token-file", str(file), cwd=tmp_path)
     assert (done.returncode, done.stderr.splitlines()) == (2, [
-        f"launch.py: --hmi-token-file {file}: mode 0644: others may get at it; chmod 600 it"])
+        f"launch.py: --hmi-token-file {file}: mode 0644: others can access it; chmod 600"])

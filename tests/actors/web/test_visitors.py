@@ -34,7 +34,7 @@ def test_a_file_is_read_with_comments_and_blank_lines():
 
 @pytest.mark.parametrize(("lines", "why"), [
     (["anna drive"], "line 1: expected NAME ROLE SHA256"),
-    (["", "anna captain " + "a" * 64], "line 2: role 'captain': unknown; there are: look, drive, "
+    (["", "anna captain " + "a" * 64], "line 2: role 'captain': unknown; known: look, drive, "
                                        "inject"),
     ([ANNA, f"anna look {'b' * 64}"], "line 2: name 'anna': there already; each name once"),
     ([ANNA, f"bob look {'a' * 64}"], "line 2: 'bob' has the token of another; each has its own"),
@@ -71,7 +71,7 @@ def test_a_token_is_issued_once_kept_as_a_digest_and_revoked(tmp_path):
         issue(file, "anna", Role.LOOK)
     revoke(file, "anna")
     assert list(read_visitors(file)) == ["bob"]
-    with pytest.raises(VisitorError, match="no 'anna'; there are: bob"):
+    with pytest.raises(VisitorError, match="no visitor 'anna'; known: bob"):
         revoke(file, "anna")
 
 
@@ -103,15 +103,16 @@ def test_a_file_that_changes_is_read_anew_and_one_that_breaks_lets_nobody_in(tmp
     assert register.by_token(anna) is None
     assert register.visitors() == {}
     assert told == [f"{file}: line 1: expected NAME ROLE SHA256, as `rampart tokens issue` writes "
-                    "it; it lets nobody in"]
+                    "it; it admits no visitors"]
     file.unlink()
     assert register.visitors() == {}
     bob = issue(file, "bob", Role.INJECT)
     assert register.by_token(bob).name == "bob"
     file.chmod(0o644)
     assert register.by_token(bob) is None
-    assert told[1:] == [f"{file}: cannot be read (No such file or directory); it lets nobody in",
-                        f"{file}: mode 0644: others may get at it; chmod 600 it; it lets nobody in"]
+    assert told[1:] == [
+        f"{file}: cannot be read (No such file or directory); it admits no visitors",
+        f"{file}: mode 0644: others can access it; chmod 600; it admits no visitors"]
 
 
 # ---- the verbs ----------------------------------------------------------------------------------
@@ -132,7 +133,7 @@ def test_the_verbs_issue_show_and_revoke(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["issue", "bob", "--role", "captain"], "--role: role 'captain': unknown; there are: look, "
+    (["issue", "bob", "--role", "captain"], "--role: role 'captain': unknown; known: look, "
                                             "drive, inject"),
     (["issue", "b b", "--role", "look"], "page.tokens: name 'b b': expected up to 40"),
     (["issue", "anna", "--role", "look"], "page.tokens: anna has a token already; revoke it first"),
