@@ -87,7 +87,7 @@ class Stick:
             text = ruling.told
         self._obey(ruling)
         if is_stalled and request.held and self.holder is None:
-            text = "release the stick and press again: the connection was stalled or is slow"
+            text = "let go first, then press again: the connection is slow, or was stalled"
         return {"type": "stick", "panel": request.panel, "drives": ruling.follows, "text": text,
                 "ticket": now_s}
 

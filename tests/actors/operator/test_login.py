@@ -140,7 +140,7 @@ async def test_a_withdrawn_token_closes_its_pages_and_a_changed_role_has_them_co
                 open_page(at, additional_headers={"Authorization": f"Bearer {bob}"}) as other:
             assert (await hear(page, "visitor"))["name"] == "anna"
             file.write_text(file.read_text().replace("anna drive", "anna inject"))
-            assert await turned_away(page) == "your token is withdrawn, or your role was changed"
+            assert await turned_away(page) == "your token was revoked, or your role has changed"
             async with open_page(at, additional_headers=of_anna) as again:
                 assert (await hear(again, "visitor"))["role"] == "inject"
                 revoke(file, "anna")
@@ -193,7 +193,7 @@ async def test_what_is_done_on_pages_is_written_down(world, tmp_path):
     assert found[2].asked == {"recovery": "RM1"}
     assert found[2].why == "'RM1' does not wait for a reset; waiting: none"
     assert found[3].asked == {"action": "pause", "reason": "look"}
-    assert found[4].why == "Needs the role inject: you are anna, with the role drive"
+    assert found[4].why == "Needs the role inject; anna has the role drive"
     assert found[9].why == "the page that drove was closed"
     assert {line.address for line in found} == {"127.0.0.1"}
     assert [line.t_s for line in found] == sorted(line.t_s for line in found)
@@ -209,7 +209,7 @@ async def test_an_action_that_is_accepted_is_written_down_before_its_page_is_tol
             line = read_audit(log)[-1]
     assert (line.what, line.asked, line.outcome) == (
         "strategy", {"name": "mission-first"}, "accepted")
-    assert line.why == "strategy mission-first asked for"
+    assert line.why == "strategy mission-first requested"
 
 
 # ---- off loopback -------------------------------------------------------------------------------

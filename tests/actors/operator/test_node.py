@@ -190,7 +190,7 @@ async def test_without_a_free_port_the_hmi_works_without_a_page_and_says_why(wor
     report = world.others.diagnostics[0]
     assert report.offender == f"port {port}"
     assert "Address already in use" in report.reason
-    assert "choose another hmi_port" in report.reason
+    assert "choose another port" in report.reason
 
 
 async def test_a_successor_takes_the_page_over_at_once(world):

@@ -121,7 +121,7 @@ async def test_what_a_role_lacks_is_out_of_use_and_says_why(tmp_path, role):
         if drives:
             await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
         else:
-            why = f"Needs the role drive: you are anna, with the role {role}"
+            why = f"Needs the role drive; anna has the role {role}"
             await tab.until(f"document.getElementById('toast').textContent === '{why}'")
             assert world.others.resets == []
         await tab.value("document.querySelector('.stick').focus()")

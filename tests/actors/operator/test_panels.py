@@ -159,7 +159,7 @@ def caught(panels: str) -> ValueError:
      "tank.toml: page: panel 'Pump': states: topic tank/level: height_m is a number; expected a "
      "text or a truth"),
     (panel("Level", 'gauge = "tank/level:height_m"') * 2,
-     "tank.toml: $.panel: panel 'Level': there are two of this title; each panel needs its own"),
+     "tank.toml: $.panel: panel 'Level': two panels have this title; expected different titles"),
     (panel("Map", 'script = "map.js"'),
      "tank.toml: $.panel[0].script = 'map.js': 'Map': only the class of a page has scripts; "
      "expected a field of a topic, e.g. gauge"),
@@ -175,10 +175,10 @@ def test_a_panel_that_names_something_wrong_is_refused_in_one_line(panels, line)
 
 
 @pytest.mark.parametrize(("rest", "words"), [
-    ("", "'Level' gives nothing to show; expected one of gauge, plot, table, states, text, map, "
+    ("", "'Level' has nothing to show; expected one of gauge, plot, table, states, text, map, "
      "stick, script"),
-    ('gauge = "a:b"\ntext = "a:b"', "'Level' gives gauge and text; expected one of "),
-    ('gauge = "a:b"\nseconds = 3', "'Level': seconds means nothing to a gauge; it takes max, min, "
+    ('gauge = "a:b"\ntext = "a:b"', "'Level' has gauge and text; expected one of "),
+    ('gauge = "a:b"\nseconds = 3', "'Level': seconds does not apply to a gauge; it takes max, min, "
      "unit"),
     ('gauge = "a:b"\nmin = 2', "'Level': min = 2 is not below max = 1"),
     ('map = ["a:x", "a:y"]\nextent_m = [0, 0, 0, 1]', "'Level': extent_m: expected x0, y0"),
@@ -203,7 +203,7 @@ def test_more_panels_than_a_page_has_room_for_are_refused():
 
 
 def test_a_script_that_is_not_there_is_noticed_when_the_class_is_made():
-    with pytest.raises(ValueError, match=r"panel 'Map': script = 'nothing.js': no such file in "
+    with pytest.raises(ValueError, match=r"panel 'Map': script = 'nothing.js': expected a file in "
                                          r"Wrong.files = '.*files'"):
         type("Wrong", (Hmi,), {"files": OsmosisHmi.files,
                                "panels": (Panel(title="Map", script="nothing.js"),)})

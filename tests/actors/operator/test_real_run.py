@@ -211,7 +211,7 @@ def test_what_visitors_do_over_tls_is_in_the_report_though_the_node_of_the_page_
     assert kept.count(("anna", "log in", "accepted")) == 2
     assert all(line["utc"] and line["address"] == "127.0.0.1" for line in record["audit"])
     assert "On the operator&#39;s page" in page or "On the operator's page" in page
-    assert "Needs the role inject: you are bob, with the role look" in page
+    assert "Needs the role inject; bob has the role look" in page
     (log,) = Path(result["report"]).parent.glob("audit-*.jsonl")
     assert len(log.read_text().splitlines()) == len(record["audit"])
     for file in tmp_path.rglob("*"):

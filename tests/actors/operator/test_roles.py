@@ -59,7 +59,7 @@ async def test_what_a_role_lacks_the_server_refuses_and_nothing_happens(
                 assert [tag(type(request)) for request in asked] == [kind]
                 assert kind not in told["barred"]
             else:
-                why = f"Needs the role {NEEDS[kind]}: you are anna, with the role {role}"
+                why = f"Needs the role {NEEDS[kind]}; anna has the role {role}"
                 assert (answer, asked) == ({"type": "error", "text": why}, [])
                 assert told["barred"][kind] == why
     if not role.may(NEEDS[kind]):

@@ -155,18 +155,18 @@ def test_a_member_of_a_family_has_a_stick_and_the_others_are_somebody_else_s():
     ('stick = ["tank/hand:forward"]\nheld = "tank/hand:left"',
      "tank.toml: page: panel 'Drive': held: topic tank/hand: left is a number; expected a truth"),
     ('stick = ["tank/hand:forward", "tank/level:height_m"]',
-     "'Drive': stick: fields of tank/hand and tank/level; expected those of one topic"),
+     "'Drive': stick: fields of tank/hand and tank/level; expected fields of one topic"),
     (f'{FIELDS}\nheld = "tank/pump:running"',
-     "'Drive': stick: fields of tank/hand and tank/pump; expected those of one topic"),
+     "'Drive': stick: fields of tank/hand and tank/pump; expected fields of one topic"),
     (f"{FIELDS}\nscale = [1.0]",
      "'Drive': scale = [1.0]: expected one number for each of tank/hand:forward, tank/hand:left"),
     (f"{FIELDS}\nscale = [1.0, 0.0]",
      "'Drive': scale = [1.0, 0.0]: expected numbers other than 0, at most 1e+09"),
     (f"{FIELDS}\nscale = [0.1, nan]", "scale"),
     (f"{FIELDS}\nscale = [0.1, inf]", "scale"),
-    (f"{FIELDS}\nseconds = 3", "'Drive': seconds means nothing to a stick; it takes held, scale"),
+    (f"{FIELDS}\nseconds = 3", "'Drive': seconds does not apply to a stick; it takes held, scale"),
     ('text = "tank/hand:left"\nheld = "tank/hand:held"',
-     "'Drive': held means nothing to a text; it takes unit"),
+     "'Drive': held does not apply to a text; it takes unit"),
     ("stick = []", "tank.toml: $.panel[0].stick = []: "),
     ('stick = ["tank/hand"]', "tank.toml: $.panel[0].stick[0] = 'tank/hand': expected "
      "'topic:field'"),
@@ -284,7 +284,7 @@ async def test_what_is_no_message_of_this_stick_moves_nothing(world):
     async with driven(world) as (robot, _, at):
         async with open_page(at) as page:
             told = await ask(page, type="stick", panel="Drvie", held=True)
-            assert told == {"type": "error", "text": "no stick 'Drvie'; there are: Drive"}
+            assert told == {"type": "error", "text": "no stick 'Drvie'; known: Drive"}
             for wrong in ('"forward":NaN', '"forward":1e999', '"left":"x"', '"forward":[1]',
                           '"forward":-1e308'):
                 await page.send(f'{{"type":"stick","panel":"Drive","held":true,{wrong}}}')

@@ -84,7 +84,7 @@ async def test_on_loopback_another_user_is_refused_in_one_clear_line(world):
     async with world.hmi(hmi_port=free_port()) as hmi:
         told = await output(as_nobody(await served(hmi), code))
         assert told.startswith("HTTP/1.1 403 Forbidden\n")
-        assert told.rstrip().endswith("With a token others get in too: "
+        assert told.rstrip().endswith("Other users need a token: "
                                       "launch.py --hmi-token-file FILE.")
         assert "<html" not in told
 

@@ -68,7 +68,8 @@ def test_a_tree_that_nobody_could_read_is_not_drawn_and_the_page_says_so():
     assert drawn["tree"] is None
     assert drawn["order"] is not None
     assert drawn["note"] == (
-        f"The fault tree has {len(events) + MAX_BOXES} events; up to {MAX_BOXES} are drawn.")
+        f"The fault tree has {len(events) + MAX_BOXES} events, too many to draw "
+        f"(at most {MAX_BOXES}).")
 
 
 # ---- processes -----------------------------------------------------------------------------------

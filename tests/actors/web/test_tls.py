@@ -48,8 +48,8 @@ def test_one_file_may_hold_both(tmp_path):
     ("client.crt", "client.key", "certificate {certificate}: unsuitable certificate purpose"),
     ("robot.crt", "locked.key", "key {key}: needs a passphrase; expected a key without, in a file "
                                 "of mode 0600"),
-    ("robot.key", "robot.key", "certificate {certificate}: no certificate in PEM"),
-    ("robot.crt", "other.crt", "key {key}: no private key in PEM")])
+    ("robot.key", "robot.key", "certificate {certificate}: expected a certificate in PEM"),
+    ("robot.crt", "other.crt", "key {key}: expected a private key in PEM")])
 def test_what_cannot_encrypt_a_page_is_one_line_that_names_the_file(tmp_path, certificate, key,
                                                                     why):
     files = pem(tmp_path, certificate), pem(tmp_path, key)
@@ -73,7 +73,7 @@ def test_files_that_are_not_there_torn_or_open_to_others_are_refused(tmp_path):
     certificate.write_text(PEMS["robot.crt"][:300])
     with pytest.raises(TlsError) as torn:
         load(certificate, key)
-    assert str(torn.value).startswith(f"certificate {certificate}, key {key}: not taken (")
+    assert str(torn.value).startswith(f"certificate {certificate}, key {key}: cannot be loaded (")
     assert len(str(torn.value).splitlines()) == 1
     key.write_text(PEMS["robot.key"][:100])
     with pytest.raises(TlsError):

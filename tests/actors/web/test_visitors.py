@@ -36,11 +36,12 @@ def test_a_file_is_read_with_comments_and_blank_lines():
     (["anna drive"], "line 1: expected NAME ROLE SHA256"),
     (["", "anna captain " + "a" * 64], "line 2: role 'captain': unknown; known: look, drive, "
                                        "inject"),
-    ([ANNA, f"anna look {'b' * 64}"], "line 2: name 'anna': there already; each name once"),
-    ([ANNA, f"bob look {'a' * 64}"], "line 2: 'bob' has the token of another; each has its own"),
+    ([ANNA, f"anna look {'b' * 64}"],
+     "line 2: name 'anna': there already; expected each name once"),
+    ([ANNA, f"bob look {'a' * 64}"], "line 2: 'bob': another visitor has the same token"),
     (["an|na drive " + "a" * 64], "line 1: name 'an|na': expected up to 40"),
     (["anna drive " + "A" * 64], "line 1: anna: expected the SHA-256 of a token"),
-    ([f"v{i} look {i:064x}" for i in range(MOST + 1)], f"{MOST + 1} names: {MOST} at most")])
+    ([f"v{i} look {i:064x}" for i in range(MOST + 1)], f"{MOST + 1} names; expected at most {MOST}")])
 def test_what_is_no_list_of_visitors_is_one_line(lines, why):
     with pytest.raises(VisitorError) as error:
         parse(lines)
@@ -137,10 +138,10 @@ def test_the_verbs_issue_show_and_revoke(tmp_path, capsys):
                                             "drive, inject"),
     (["issue", "b b", "--role", "look"], "page.tokens: name 'b b': expected up to 40"),
     (["issue", "anna", "--role", "look"], "page.tokens: anna has a token already; revoke it first"),
-    (["revoke", "bob"], "page.tokens: no 'bob'; there are: anna"),
+    (["revoke", "bob"], "page.tokens: no visitor 'bob'; known: anna"),
     (["show", "--file", "nowhere"], "nowhere: cannot be read (No such file or directory)"),
     (["issue", "bob", "--role", "look", "--file", "no/where"], "no/where: cannot be written"),
-    (["show", "--file", "open"], "open: mode 0644: others may get at it; chmod 600 it")])
+    (["show", "--file", "open"], "open: mode 0644: others can access it; chmod 600")])
 def test_what_a_verb_cannot_do_is_one_line_and_code_2(tmp_path, monkeypatch, capsys, arguments,
                                                       words):
     monkeypatch.chdir(tmp_path)
