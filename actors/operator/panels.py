@@ -186,7 +186,7 @@ def read_panels(spec: SystemSpec, file: str) -> tuple[Panel, ...]:
         if panel.script is not None:
             raise SpecificationError(
                 file, f"$.panel[{place}].script", f"{panel.title!r}: only the class of a page has "
-                "scripts; expected a field of a topic, e.g. with gauge", panel.script)
+                "scripts; expected a field of a topic, e.g. gauge", panel.script)
     if problem := problem_of(panels):
         raise SpecificationError(file, "$.panel", problem)
     return panels

@@ -233,5 +233,5 @@ def test_a_strategy_that_nobody_sets_is_withdrawn():
     choice = StrategyChoice("p", "operator", NAMES)
     choice.ask("mission-first", "", 0.0)
     assert choice.expire(GIVE_UP_S - 0.1) == ""
-    assert "the FTM Manager does not answer" in choice.expire(GIVE_UP_S)
+    assert "no answer from the FTM Manager" in choice.expire(GIVE_UP_S)
     assert choice.pending is None
