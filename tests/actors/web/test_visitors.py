@@ -41,7 +41,8 @@ def test_a_file_is_read_with_comments_and_blank_lines():
     ([ANNA, f"bob look {'a' * 64}"], "line 2: 'bob': another visitor has the same token"),
     (["an|na drive " + "a" * 64], "line 1: name 'an|na': expected up to 40"),
     (["anna drive " + "A" * 64], "line 1: anna: expected the SHA-256 of a token"),
-    ([f"v{i} look {i:064x}" for i in range(MOST + 1)], f"{MOST + 1} names; expected at most {MOST}")])
+    ([f"v{i} look {i:064x}" for i in range(MOST + 1)],
+     f"{MOST + 1} names; expected at most {MOST}")])
 def test_what_is_no_list_of_visitors_is_one_line(lines, why):
     with pytest.raises(VisitorError) as error:
         parse(lines)
