@@ -1,18 +1,18 @@
-// Who looks at the page: logging in and out, and what the visitor's role lacks.
+// The visitor of the page: log in and out, and requests that the visitor's role does not permit.
 //
-// The token is typed once and kept nowhere here: the HMI answers with a cookie that no script can read.
+// The page does not keep the token: the HMI answers with a cookie that scripts cannot read.
 
 import { $, element, say } from "./dom.js";
 
 export const NOT_LOGGED_IN = 4401;
 const tabs = new BroadcastChannel("rampart-login");  // the other tabs of this browser
 
-let why = {};               // kind of request: why the visitor may not make it
+let why = {};               // type of request → why the visitor may not make it
 const notes = new WeakMap();
 
 export const barred = (kind) => why[kind] || "";
 
-/** Take a part of the page out of use if the visitor's role lacks what it is for, and say so. */
+/** Disable a part of the page, and show why, if the visitor may not make its requests. */
 export function bar(part, kind) {
   const text = barred(kind);
   part.inert = Boolean(text);
@@ -37,12 +37,12 @@ export class Visitor {
       event.preventDefault();
       this.enter($("login-token").value.trim());
     });
-    $("login").addEventListener("cancel", (event) => event.preventDefault());  // nothing is behind it
+    $("login").addEventListener("cancel", (event) => event.preventDefault());  // the page needs a login
     $("logout").addEventListener("click", () => this.leave());
     tabs.addEventListener("message", (event) => (event.data === "in" ? this.close() : this.left()));
   }
 
-  /** Ask for a token, and say what was wrong with what there was. */
+  /** Show the form for a token, with the reason. */
   ask(text) {
     say($("login-text"), text);
     if (!$("login").open) $("login").showModal();
@@ -64,7 +64,7 @@ export class Visitor {
         return;
       }
     } catch {
-      this.ask("The HMI does not answer; try again.");
+      this.ask("No answer from the HMI; try again.");
       return;
     }
     this.close();
@@ -80,7 +80,7 @@ export class Visitor {
     }
   }
 
-  /** Take a message of the HMI; return whether it names the visitor. */
+  /** Take a message from the HMI; return whether it names the visitor. */
   receive(message) {
     if (message.type !== "visitor") return false;
     why = message.barred;

@@ -1,4 +1,4 @@
-// The operator's page: shows the picture that the HMI pushes, asks for what the operator wants.
+// The operator's page: draws the picture that the HMI pushes, and sends the operator's requests.
 
 import { $, Memory, clock, element, pill, say } from "./dom.js";
 import { NOT_LOGGED_IN, Visitor, bar, barred } from "./access.js";
@@ -16,34 +16,34 @@ const tree = new FaultTree($("tree"));
 const order = new Order($("order"));
 const processes = new ProcessTable($("nodes"));
 const logs = {
-  decisions: new DecisionLog($("decisions"), "Nothing to decide so far."),
-  events: new EventLog($("events"), "Nothing happened so far."),
+  decisions: new DecisionLog($("decisions"), "No decisions yet."),
+  events: new EventLog($("events"), "No events yet."),
 };
 const operating = new Operating((wish) => send(wish));
 const camera = new Camera();
 const memory = new Memory();
 const visitor = new Visitor(connect, () => { if (socket) lost("logged out"); });
-let picture = {};            // all that was received, by section
-let fresh = { decisions: [], events: [] };  // lines of the logs that are not shown yet
-const changed = new Set();   // sections that are not shown yet
+let picture = {};            // latest value of each section
+let fresh = { decisions: [], events: [] };  // lines of the logs that are not drawn yet
+const changed = new Set();   // sections that are not drawn yet
 let frame = 0;
-let tables = [];             // sections of which the rows arrive that changed, null for one that is gone
-let ready = false;           // whether the panels of this connection are there
-let tooMuch = {};            // what the HMI had no room for when it began, and how many
-let introduction = null;     // what the HMI offers this page: it comes before the panels are there
+let tables = [];             // sections that arrive row by row, with null for a deleted row
+let ready = false;           // whether the panels of this connection exist
+let tooMuch = {};            // number of missing entries at the start of the connection
+let introduction = null;     // the HMI's offer to this page: it comes before the panels exist
 let socket = null;           // null between two attempts
 let retryMs = 500;
 let retry = 0;
 let lastHeard = 0;
 let toastTimer = 0;
-let expires = null;          // the certificate of the run that expires first, and when
-let badge = "";              // what the HMI calls this connection: live, or replay
+let expires = null;          // the certificate of the run that expires first, and the time
+let badge = "";              // kind of the connection: live, or replay
 
-const OLD_MS = 1700;         // the HMI sends a frame once a second at least
+const OLD_MS = 1700;         // the HMI sends at least one frame per second
 const SILENT_MS = 4000;
 const OPENING_MS = 10000;
 
-// ---- connection: reconnects by itself, and notices a server that only hangs -------------------
+// ---- connection: reconnects by itself, also when the server hangs ------------------------------
 
 function connect() {
   lastHeard = Date.now();
@@ -55,14 +55,14 @@ function connect() {
   };
 }
 
-/** Wait for a token: what was shown last, if anything, opens nothing any more. */
+/** Wait for a token: the last one, if any, is not valid any more. */
 function turnedAway(reason) {
   lost("not logged in");
   clearTimeout(retry);
   visitor.ask(`${reason[0].toUpperCase()}${reason.slice(1)}.`);
 }
 
-/** Take the connection for lost now: a browser waits a minute for a server that does not say goodbye. */
+/** Treat the connection as lost: a browser waits a minute for a server that does not close it. */
 function lost(why) {
   socket.onclose = socket.onmessage = null;
   socket.close();
@@ -87,7 +87,7 @@ function link(kind, text) {
   pill("link", kind, text);
   document.body.classList.toggle("offline", kind === "bad");
   $("cut").hidden = kind !== "bad" || picture.time_s === undefined;
-  say($("cut"), `Not connected. Every value below is old: it is of ${clock(picture.time_s)}.`);
+  say($("cut"), `Not connected. All values below are from ${clock(picture.time_s)}.`);
 }
 
 function send(wish) {
@@ -104,7 +104,7 @@ function receive(message) {
   else if (message.text) toast(message.text);
 }
 
-// ---- the picture: sections arrive when they changed, and are drawn with the next frame ----------
+// ---- the picture: changed sections arrive, and are drawn with the next frame --------------------
 
 function take(message) {
   link(badge === "live" ? "good" : "warn", badge);
@@ -118,7 +118,7 @@ function take(message) {
   soon();
 }
 
-/** Draw with the next frame; a page that is hidden has seen it, one that has no panels yet has not. */
+/** Draw with the next frame; a hidden page reports at once that it has drawn. */
 function soon() {
   if (!ready) return;
   if (document.hidden) seen();
@@ -137,7 +137,7 @@ function draw() {
   seen();
 }
 
-/** Tell the HMI what was drawn: it sends the newest then, and never a backlog. */
+/** Report the drawn version to the HMI, which then sends the newest one, and never a backlog. */
 function seen() {
   if (!connected() || picture.version === undefined) return;
   socket.send(`{"type":"seen","version":${picture.version}}`);
@@ -152,9 +152,9 @@ function toast(text) {
   toastTimer = setTimeout(() => { $("toast").hidden = true; }, 5000);
 }
 
-// ---- showing ----------------------------------------------------------------------------------
+// ---- drawing ----------------------------------------------------------------------------------
 
-/** Begin a connection; what the HMI does not announce is not offered. */
+/** Begin a connection; the page offers only what the HMI announces. */
 async function hello(message) {
   const from = socket;
   retryMs = 500;
@@ -173,14 +173,14 @@ async function hello(message) {
   expires = message.expires;
   $("rate").textContent = message.rate === 1 ? "" : `× ${message.rate}`;
   await panels.begin(message);
-  if (socket !== from) return;  // lost meanwhile
+  if (socket !== from) return;  // lost in the meantime
   panels.receive(introduction);
   panels.take(picture);
   ready = true;
   soon();
 }
 
-/** Parts of the page, each with the sections that it is made of. */
+/** Parts of the page, each with its sections. */
 const PARTS = [
   [["operating"], (s) => { if (s.operating) operating.show(s.operating); }],
   [["manager", "detections"], safety],
@@ -199,7 +199,7 @@ const PARTS = [
   }],
 ];
 
-/** Show what changed. A part that fails on unexpected values does not affect the others. */
+/** Draw the changes. A part that fails on unexpected values does not affect the others. */
 function show(s) {
   say($("clock"), clock(s.time_s));
   panels.show(s, changed);
@@ -217,14 +217,14 @@ function guarded(part) {
   }
 }
 
-/** Say what is not shown, because there is more of it than a page can hold. */
+/** Show the number of entries that do not fit on the page. */
 function leftOut(counts) {
   const missing = [...Object.entries(tooMuch), ...Object.entries(counts)];
   $("left-out").hidden = !missing.length;
   say($("left-out"), `Too much to show: ${missing.map(([what, n]) => `${n} of the ${what}`).join(", ")} left out.`);
 }
 
-/** Say for how many days the credentials of the run are still valid. */
+/** Show the days of validity of the run's credentials. */
 function credentials() {
   $("credentials").hidden = !expires;
   if (!expires) return;
@@ -245,7 +245,7 @@ function system(drawn) {
   order.begin(drawn && drawn.order);
   if (!drawn) return;
   say($("tree-title"), `Fault tree: ${drawn.title}`);
-  say($("order-words"), `By ${drawn.criteria.join(", then ")}: what is above is preferred in doubt. ${drawn.note}`);
+  say($("order-words"), `Ordered by ${drawn.criteria.join(", then ")}: upper recoveries are preferred. ${drawn.note}`);
 }
 
 function safety(s) {
@@ -254,7 +254,7 @@ function safety(s) {
     const silent = d.stale || s.manager?.value.silent.includes(d.name);
     const chip = element("li", d.active ? "active" : silent ? "stale" : "", `${d.active ? "▲ " : silent ? "? " : ""}${d.name}`);
     const nodes = d.nodes.length ? ` (${d.nodes.join(", ")})` : "";
-    const state = d.active ? `${d.reason}${nodes}` : silent ? "not heard" : "idle";
+    const state = d.active ? `${d.reason}${nodes}` : silent ? "silent" : "idle";
     chip.title = `${named(d.name)}: ${state}`;
     chip.append(element("span", "unseen", `: ${state}`));
     return chip;
@@ -268,7 +268,7 @@ function named(name) {
 
 function manager(heard) {
   const m = heard && heard.value;
-  const facts = [["Manager", !m ? "not heard" : heard.stale ? "silent" : "alive"]];
+  const facts = [["Manager", !m ? "no message yet" : heard.stale ? "silent" : "alive"]];
   if (m) {
     facts.push(["Strategy", m.strategy], ["Active", m.active.map(named).join(", ") || "none"],
       ["Activated", m.activated.map(named).join(", ") || "none"]);
@@ -280,7 +280,7 @@ function manager(heard) {
   $("alarm").hidden = !latched.length && !acting;
   $("alarm").classList.toggle("mild", !latched.length);
   say($("alarm-title"), latched.length
-    ? `${latched.map(named).join(", ")}: latched, waits for your reset.` : acting
+    ? `${latched.map(named).join(", ")}: latched until you reset it.` : acting
       ? m.activated.length ? m.activated.map(named).join(", ") : "A fault is detected." : "");
   say($("alarm-text"), m && m.active.length ? `${m.active.map(named).join(", ")}.` : "");
   document.title = `${latched.length ? "⚠ stopped · " : acting ? "▲ recovery · " : ""}Rampart`;

@@ -1,6 +1,6 @@
-// Where the panels are: CSS lays them out in a dense grid, which needs to know how many of its small
-// rows each one covers. The order of the elements is the operator's, and that in which the keyboard
-// goes through them. The browser remembers order and folded panels for each system.
+// Layout of the panels: a dense CSS grid, where each panel has to span a number of small rows. The
+// operator orders the elements, and the keyboard visits them in this order. The browser remembers
+// order and folded panels for each system.
 
 import { $, element } from "./dom.js";
 
@@ -29,7 +29,7 @@ export class Arrangement {
 
   get panels() { return [...this.main.children]; }
 
-  /** Give a panel the handle by which it is moved. */
+  /** Add the handle that moves a panel. */
   adopt(panel) {
     const { name } = panel.dataset;
     const handle = Object.assign(element("button", "tool", "⠿"), { type: "button", title: `Move ${name}: drag, or use the arrow keys` });
@@ -53,7 +53,7 @@ export class Arrangement {
   step(event, panel, handle) {
     if (!(event.key in ARROWS)) return;
     event.preventDefault();
-    const shown = this.panels.filter((one) => !one.hidden);
+    const shown = this.panels.filter((each) => !each.hidden);
     const other = shown[shown.indexOf(panel) + ARROWS[event.key]];
     if (!other) return;
     this.move(panel, other);
@@ -61,7 +61,7 @@ export class Arrangement {
     $("arrange-said").textContent = `${panel.dataset.name}: place ${shown.indexOf(other) + 1} of ${shown.length}`;
   }
 
-  /** Put a panel where another one is. */
+  /** Move a panel to the place of another one. */
   move(panel, other) {
     const { panels } = this;
     if (panels.indexOf(panel) < panels.indexOf(other)) other.after(panel);
@@ -69,14 +69,14 @@ export class Arrangement {
     this.keep();
   }
 
-  /** Begin with the panels of a system, in the order that was kept for it. */
+  /** Begin with the panels of a system, in the remembered order. */
   begin(system) {
     this.key = KEPT + system;
     this.delivered = this.panels;
     let kept = null;
     try {
       kept = JSON.parse(localStorage.getItem(this.key));
-    } catch { /* as delivered */ }
+    } catch { /* default order */ }
     this.arrange(strings(kept?.order), strings(kept?.folded));
   }
 
@@ -95,10 +95,10 @@ export class Arrangement {
     const names = (list) => list.map((panel) => panel.dataset.name);
     try {
       localStorage.setItem(this.key, JSON.stringify({ order: names(panels), folded: names(folded) }));
-    } catch { /* then it holds until the page is closed */ }
+    } catch { /* kept only until the page is closed */ }
   }
 
-  /** Tell the grid how high each panel is; nothing moves under a pointer that is pressed. */
+  /** Set the rows of each panel from its height; nothing moves while a pointer is pressed. */
   layOut() {
     if (this.main.matches(":active")) return;
     const { paddingLeft, paddingRight } = getComputedStyle(this.main);

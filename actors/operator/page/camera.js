@@ -1,5 +1,5 @@
-// A picture of the robot, rendered while a page shows it. The next one is asked for when the last
-// one is shown, so a slow page or renderer gets fewer pictures and no backlog.
+// A picture of the robot, rendered while a page shows it. The page requests the next picture when it
+// has drawn the last one, so a slow page or renderer gets fewer pictures and no backlog.
 
 import { $, say } from "./dom.js";
 

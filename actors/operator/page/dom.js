@@ -38,14 +38,14 @@ export function clock(seconds) {
   return `${minutes}:${((tenths - 600 * minutes) / 10).toFixed(1).padStart(4, "0")}`;
 }
 
-/** A value of a message in words: a number with four digits, a text as it is. */
+/** A value of a message as text: a number with four digits, a text unchanged. */
 export function figure(value) {
   if (value === null || value === undefined) return "no value";
   if (typeof value !== "number") return String(value);
   return Number.isInteger(value) && Math.abs(value) < 1e6 ? String(value) : String(Number(value.toPrecision(4)));
 }
 
-/** Remembers what was shown, so that a part is rebuilt only if its data changed. */
+/** Remembers what is shown, so that a part is rebuilt only if its data has changed. */
 export class Memory {
   constructor() { this.shown = {}; }
 

@@ -1,5 +1,5 @@
-// The decision log, each certificate readable, and the event log. The newest line is on top; only
-// new lines are added, so that an open certificate stays open.
+// The decision log with the certificates of decisions, and the event log. The newest line is on top.
+// Only new lines are added, so an open certificate stays open.
 
 import { clock, element } from "./dom.js";
 
@@ -50,7 +50,7 @@ export class DecisionLog extends Log {
     const fact = (name, ...values) => facts.append(element("dt", "", name),
       ...values.map((value) => element("dd", "", value)));
     fact("Rule", d.rule);
-    fact("Path", ...(d.path.length ? d.path : ["no dominance was needed"]));
+    fact("Path", ...(d.path.length ? d.path : ["no comparison needed"]));
     fact("Rejected", ...(d.rejected.length ? d.rejected : ["no alternative"]));
     details.append(element("summary", "", `Certificate of decision ${d.number}`), facts);
     line.append(details);

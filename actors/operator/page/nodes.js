@@ -1,5 +1,5 @@
-// Every process: state, age, restarts, processor and memory. Rows stay where they are and only
-// their texts change, so that a focused button in one keeps the focus.
+// The table of processes: state, age, restarts, processor and memory. Rows stay in place and only
+// their texts change, so a focused button keeps the focus.
 
 import { $, element, say } from "./dom.js";
 import { signalButton } from "./operate.js";
@@ -33,7 +33,7 @@ export class ProcessTable {
     sorted.forEach(([node], i) => {
       const row = this.rows.get(node.name) || this.add(node);
       const there = this.body.children[i];
-      if (there !== row.line) {  // move the one that is out of place: a moved row loses the focus
+      if (there !== row.line) {  // move only the row that is out of place: it loses the focus
         if (this.body.children[i + 1] === row.line) this.body.append(there);
         else this.body.insertBefore(row.line, there || null);
       }
@@ -53,7 +53,7 @@ export class ProcessTable {
 
   count(heard, all) {
     const up = all.filter((n) => n.state === "running").length;
-    say($("nodes-count"), heard ? `${up} of ${all.length} running${heard.stale ? " · supervisor silent" : ""}` : "supervisor not heard");
+    say($("nodes-count"), heard ? `${up} of ${all.length} running${heard.stale ? " · supervisor silent" : ""}` : "no message from the supervisor yet");
   }
 
   add(node) {

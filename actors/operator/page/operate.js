@@ -1,13 +1,13 @@
-// What the operator does on every page: chooses the strategy, signals processes, injects faults.
+// Actions on every page: choose the strategy, signal processes, inject faults.
 
 import { $, element, say } from "./dom.js";
 
 const SIGNALS = {
-  KILL: "the process is gone at once",
+  KILL: "the process ends at once",
   STOP: "the process is suspended until CONT",
   CONT: "a suspended process continues",
-  TERM: "the process exits cleanly; its supervisor counts that as a crash",
-  SEGV: "as after an invalid memory access",
+  TERM: "the process exits cleanly; its supervisor treats that as a crash",
+  SEGV: "the process ends as after an invalid memory access",
   WEDGE: "the process runs, but its event loop is blocked",
 };
 const GROUPS = { paper: "The paper's", sensor: "Sensors", actuator: "Actuators" };
@@ -17,7 +17,7 @@ const WAYS = {
   duplicate: "every message arrives twice", restamp: "every stamp is half a second ahead",
 };
 
-/** A button in a node's row; a click on it opens the dialog of its signals. */
+/** A button in a node's row that opens the dialog of its signals. */
 export function signalButton(node) {
   const button = element("button", "small signal", "⋯");
   button.type = "button";
@@ -57,7 +57,7 @@ export class Operating {
     });
   }
 
-  /** Take a message of the HMI; return whether it was for this part of the page. */
+  /** Take a message from the HMI; return whether it was for this part of the page. */
   receive(message) {
     if (message.type !== "operating") return false;
     $("strategy-name").replaceChildren(...message.strategies.map((name) => new Option(name, name)));
@@ -122,7 +122,7 @@ export class Operating {
     $("signal-dialog").showModal();
   }
 
-  /** A signal cannot be taken back, so it is chosen first and sent by a second button. */
+  /** A signal cannot be undone, so it is chosen first, and a second button sends it. */
   choose(name) {
     this.signal = name;
     for (const button of $("signals").children) {
@@ -134,10 +134,10 @@ export class Operating {
     if (name) $("signal-confirm").focus();
   }
 
-  /** Lines stay and only their texts change, so that a button keeps its focus and its click. */
+  /** Lines stay and only their texts change, so a button keeps its focus and its click. */
   show(operating) {
     const { strategy } = operating;
-    say($("strategy-now"), strategy ? `in force: ${strategy}` : "FTM Manager not heard");
+    say($("strategy-now"), strategy ? `in force: ${strategy}` : "no message from the FTM Manager yet");
     $("strategy-set").disabled = operating.strategy_asked || !strategy;
     if (strategy && strategy !== this.current) this.current = $("strategy-name").value = strategy;
     const there = new Set(operating.faults.map((fault) => fault.injection));

@@ -1,12 +1,12 @@
-// The panels that robot and specification contribute: drawn by widgets, or by scripts of the robot.
+// Panels of the robot and of the specification, drawn by widgets or by scripts of the robot.
 //
 // A script's default export is a class `(room, page)`. `room` has the panel's `section`, `title` and
-// `body`; `page` has `send(wish)`, `toast(text)`, the declaration, `declared`, `barred(kind)`, why the
-// visitor may not make requests of that type ("" if it may), and `bar(part, kind)`, which takes a part
-// of the panel out of use then and says why; call it from `begin`. It may have
-// `begin(hello)` for each connection, `take(state)` for each message of the picture, also while the
-// page is hidden, `show(picture, changed)` for each frame, `receive(message)` for other messages of
-// the HMI (true if it was its own), and `offline()`.
+// `body`. `page` has `send(wish)`, `toast(text)`, the declaration `declared`, `barred(kind)`, which
+// returns why the visitor may not make requests of a type ("" if permitted), and `bar(part, kind)`,
+// which disables a part of the panel in that case and shows why; call it from `begin`. The class may
+// have `begin(hello)` for each connection, `take(state)` for each message of the picture, also while
+// the page is hidden, `show(picture, changed)` for each frame, `receive(message)` for other messages
+// of the HMI (true if it was for this panel), and `offline()`.
 
 import { element } from "./dom.js";
 import { WIDGETS } from "./widgets.js";
@@ -20,7 +20,7 @@ export class Panels {
     this.sections = [];
   }
 
-  /** Begin a connection. The same panels as before stay as they are: a stick that is held, too. */
+  /** Begin a connection. Panels that are the same as before stay, even a stick that is held. */
   async begin(hello) {
     const declared = JSON.stringify([hello.system, hello.panels]);
     if (declared !== this.declared) {
@@ -60,7 +60,7 @@ export class Panels {
     }
   }
 
-  /** Call what a widget may have; one that fails does not take the others along. */
+  /** Call a method of all widgets that have it; an error in one does not affect the others. */
   each(method, ...values) {
     return this.widgets.map((widget) => {
       try {

@@ -1,14 +1,14 @@
-// A stick: arrow keys or WASD, a pad to drag, a gamepad. Each is its own dead man.
+// A stick: arrow keys or WASD, a pad to drag, a gamepad. Each has its own dead-man function.
 //
-// While something is held, the position is sent 20 times a second with the newest ticket of the
-// HMI, which alone decides who drives; silence is letting go. Whatever ends the hold (key up,
-// pointer up, focus lost, tab hidden, page closed) is sent at once.
+// While the stick is held, its position is sent 20 times a second with the newest ticket of the HMI,
+// which decides who drives; silence counts as release. The end of the hold (key up, pointer up,
+// focus lost, tab hidden, page closed) is sent at once.
 
 import { element, pill, say } from "./dom.js";
 
 const PERIOD_MS = 50;
 const DEAD_ZONE = .12;
-const SHOULDERS = [4, 5];  // of a standard gamepad: either is the dead man
+const SHOULDERS = [4, 5];  // buttons of a standard gamepad: either is the dead man
 const KEYS = {
   ArrowUp: [1, 0], KeyW: [1, 0], ArrowDown: [-1, 0], KeyS: [-1, 0],
   ArrowLeft: [0, 1], KeyA: [0, 1], ArrowRight: [0, -1], KeyD: [0, -1],
@@ -24,7 +24,7 @@ export class Stick {
     this.panel = page.declared.title;
     this.axes = page.declared.stick.length;  // forward alone, or left as well
     this.gamepads = false;  // a gamepad is for the first stick of a page
-    this.armed = false;     // whether the gamepad was seen at rest, in this window
+    this.armed = false;     // whether the gamepad has been at rest in this window
     this.keys = new Set();
     this.dragged = null;
     this.timer = 0;         // of a hold
@@ -32,7 +32,7 @@ export class Stick {
     this.drives = false;
     this.text = "";
     this.ticket = 0;
-    this.page = null;       // its number; null while not connected
+    this.page = null;       // number of this page; null while not connected
     this.status = null;
     this.build(room);
     this.listen();
@@ -90,12 +90,12 @@ export class Stick {
 
   key(event, down) {
     if (event.ctrlKey || event.altKey || event.metaKey) {
-      this.letGo();  // a browser need not report which keys are released under one of these
+      this.letGo();  // with one of these a browser need not report the release of other keys
       return;
     }
     if (!KEYS[event.code]?.slice(0, this.axes).some(Boolean)) return;
     event.preventDefault();  // do not scroll
-    if (down && event.repeat && !this.keys.has(event.code)) return;  // held since before: press again
+    if (down && event.repeat && !this.keys.has(event.code)) return;  // held since before the focus: press again
     if (down) this.keys.add(event.code); else this.keys.delete(event.code);
     this.update();
   }
@@ -110,17 +110,17 @@ export class Stick {
     this.update();
   }
 
-  /** Where the gamepad is whose shoulder button is held; a press in another window does not count. */
+  /** Position of the gamepad with a held shoulder button; a press in another window is ignored. */
   gamepad() {
     const pads = this.gamepads && navigator.getGamepads ? [...navigator.getGamepads()] : [];
-    const pad = pads.find((one) => one?.connected && SHOULDERS.some((i) => one.buttons[i]?.pressed));
+    const pad = pads.find((each) => each?.connected && SHOULDERS.some((i) => each.buttons[i]?.pressed));
     if (!pad || !document.hasFocus()) this.armed = !pad;
     if (!pad || !this.armed) return null;
     const axis = (i) => (Math.abs(pad.axes[i] || 0) < DEAD_ZONE ? 0 : -pad.axes[i]);
     return [axis(1), this.axes > 1 ? axis(0) : 0];
   }
 
-  /** Where the stick is: [forward, left] in [-1, 1], or null if it is not held. */
+  /** Position of the stick: [forward, left] in [-1, 1], or null if it is not held. */
   position() {
     const pad = this.gamepad();
     if (this.visitor.barred("stick")) return null;
@@ -130,7 +130,7 @@ export class Stick {
     return at && at.map((value) => clip(value) * share);
   }
 
-  /** Something was pressed or let go. */
+  /** Start or stop reporting after a press or release. */
   update() {
     const at = this.position();
     if (at && !this.timer) {
@@ -147,7 +147,7 @@ export class Stick {
     this.draw();
   }
 
-  /** Forget what is held: a page without focus may never receive its end. */
+  /** Release everything: a page without focus may not receive the release. */
   letGo() {
     this.keys.clear();
     this.dragged = null;
@@ -175,7 +175,7 @@ export class Stick {
       this.page = message.page;
       this.ticket = 0;
       this.visitor.bar(this.row, "stick");
-      if (!this.visitor.barred("stick")) this.report();  // the HMI follows who was seen at rest
+      if (!this.visitor.barred("stick")) this.report();  // the HMI follows only a stick that has been at rest
     } else if (message.type === "stick" && message.panel === this.panel) {
       ({ ticket: this.ticket, drives: this.drives } = message);
       if (message.text || message.drives) this.text = message.text;
@@ -206,7 +206,7 @@ export class Stick {
     const { status } = this;
     const other = status && status.holder !== null && status.holder !== this.page;
     const [kind, text] = this.page === null || !status ? ["warn", "not connected"]
-      : this.visitor.barred("stick") ? ["", "not for you"]
+      : this.visitor.barred("stick") ? ["", "not permitted"]
         : other ? ["warn", `page ${status.holder} drives`]
           : !status.works ? ["warn", "no effect now"]
             : !driving ? ["", "free"]

@@ -1,19 +1,19 @@
-// What part of a map is seen: wheel, two fingers, buttons and keys zoom, dragging and arrow keys move.
+// Zoom and pan of a map: wheel, two fingers, buttons and keys zoom, dragging and arrow keys pan.
 
 import { element } from "./dom.js";
 
-const MIN_M = 4;  // width of the closest look
-const STEP = 1.5;  // of a button or key
+const MIN_M = 4;  // least width
+const STEP = 1.5;  // zoom factor of a button or key
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
 export class View {
-  /** `looked` is called with the width that is shown, m, whenever that may have changed. */
+  /** `looked` is called with the visible width, m, whenever it may have changed. */
   constructor(svg, looked) {
     this.svg = svg;
     this.looked = looked;
-    this.bounds = null;  // x0, y0, x1, y1 of the whole, m, y upwards
-    this.seen = null;    // centre and width of what is shown; null for the whole
-    this.at = null;      // the robot's place
+    this.bounds = null;  // x0, y0, x1, y1 of the whole map, m, y upwards
+    this.seen = null;    // centre and width of the visible part; null for the whole map
+    this.at = null;      // position of the robot
     this.following = false;
     this.pointers = new Map();
     svg.tabIndex = 0;
@@ -32,7 +32,7 @@ export class View {
     new ResizeObserver(() => this.look()).observe(svg);
   }
 
-  /** Return buttons that do the same. */
+  /** Return buttons to zoom. */
   buttons() {
     return [["−", "Zoom out", () => this.zoom(STEP)], ["+", "Zoom in", () => this.zoom(1 / STEP)],
       ["Fit", "Show the whole map", () => this.fit()]].map(([text, title, act]) => {
@@ -54,7 +54,7 @@ export class View {
     event.preventDefault();
   }
 
-  /** Return the place on the map of an event, m. */
+  /** Return the position of an event on the map, m. */
   place(event) {
     const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
     return [at.x, -at.y];
@@ -76,14 +76,14 @@ export class View {
     this.pointers.set(event.pointerId, this.place(event));
   }
 
-  /** Return centre and width of what is shown, m. */
+  /** Return centre and width of the visible part, m. */
   shown() {
     const [x0, y0, x1, y1] = this.bounds;
     const seen = this.seen || { x: (x0 + x1) / 2, y: (y0 + y1) / 2, width: x1 - x0 };
     return this.following && this.at ? { ...seen, x: this.at[0], y: this.at[1] } : seen;
   }
 
-  /** Show more (above 1) or less, and leave a place where it is on the screen. */
+  /** Zoom out (factor above 1) or in, around a fixed position. */
   zoom(factor, [x, y] = [this.shown().x, this.shown().y]) {
     const seen = this.shown();
     const whole = this.bounds[2] - this.bounds[0];

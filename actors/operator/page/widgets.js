@@ -1,5 +1,5 @@
-// What panels can show of fields of topics. A field's section of the picture is named as the field,
-// "topic:field", and has its value, whether that is stale, and where the past is shown its time.
+// Widgets that show fields of topics. The section of a field has its name, "topic:field", with its
+// value, whether that is stale, and its time if a widget shows the past.
 
 import { clock, element, figure, say, svg } from "./dom.js";
 import { Stick } from "./stick.js";
@@ -7,10 +7,10 @@ import { View } from "./view.js";
 
 const label = (field) => field.slice(field.indexOf(":") + 1);
 
-/** The present value of a field in words, or that it was not heard. */
+/** The present value of a field as text. */
 function now(picture, field, unit = "") {
   const heard = picture[field];
-  if (!heard) return "not heard";
+  if (!heard) return "no data";
   const text = figure(heard.value) + (unit && heard.value !== null ? ` ${unit}` : "");
   return heard.stale ? `${text} (stale)` : text;
 }
@@ -115,7 +115,7 @@ class States extends Widget {
     this.list = element("ol", "states");
     this.list.setAttribute("aria-label", this.declared.title);
     this.items = (this.declared.of || []).map((state) => element("li", "", state));
-    this.other = element("li", "other");  // what is not listed
+    this.other = element("li", "other");  // a state that is not listed
     this.list.append(...this.items, this.other);
     this.words = element("p", "quiet");
     this.body.append(this.list, this.words);
@@ -134,14 +134,14 @@ class States extends Widget {
     say(this.other, listed ? "" : state);
     this.other.hidden = !heard || Boolean(listed);
     this.list.classList.toggle("stale", !heard || heard.stale);
-    say(this.words, !heard ? "not heard" : heard.stale ? "stale" : "");
+    say(this.words, !heard ? "no data" : heard.stale ? "stale" : "");
     this.words.hidden = !this.words.textContent;
   }
 }
 
 const POINTS = 600;
 
-/** What a number was: [seconds, value or null], the oldest first, at most so far back. */
+/** The past of a number: [seconds, value or null], the oldest first, over a number of seconds. */
 class Past {
   constructor(seconds) {
     this.seconds = seconds;
@@ -175,7 +175,7 @@ class Remembering extends Widget {
   }
 }
 
-const REDRAW_MS = 500;  // also without a new value: time goes on
+const REDRAW_MS = 500;  // without a new value, because time goes on
 const HEIGHT = 180;
 const DASHES = [[], [7, 3], [2, 3], [9, 3, 2, 3], [14, 2], [4, 4], [12, 4], [1, 4]];
 
@@ -274,10 +274,10 @@ class Place extends Remembering {
       : "The position is not known.");
   }
 
-  /** Draw the grid, and the robot in the same size, for what is shown of the map. */
+  /** Draw the grid for the visible part of the map, and the robot at a constant size. */
   scale(width) {
     const { x, y } = this.view.shown();
-    const step = STEPS_M.find((one) => width / one <= 16) || Math.ceil(width / 16);
+    const step = STEPS_M.find((each) => width / each <= 16) || Math.ceil(width / 16);
     const lines = [...Array(2 * Math.ceil(width / step) + 1).keys()].map((i) => i * step - width);
     const [left, top] = [Math.floor(x / step) * step, Math.floor(y / step) * step];
     this.step = step;
@@ -286,7 +286,7 @@ class Place extends Remembering {
   }
 }
 
-/** Return what holds a way: at most twice as wide as high, and never higher than wide. */
+/** Return the extent around a track: at most twice as wide as high, and not higher than wide. */
 function extent(way) {
   if (!way.length) return [-5, -5, 5, 5];
   const [xs, ys] = [0, 1].map((axis) => way.map((point) => point[axis]));

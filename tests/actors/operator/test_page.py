@@ -116,7 +116,7 @@ async def test_values_of_a_connection_that_is_cut_are_marked_as_old_within_two_s
             assert await tab.value(old) is False
             hmi._server._feed._pages.clear()  # as a cable that is pulled: nothing arrives
             await tab.until(old, 2.5)  # with half a second for this test itself
-            assert "every value" in (await tab.value(
+            assert "all values" in (await tab.value(
                 "document.getElementById('cut').textContent")).lower()
 
 
@@ -125,9 +125,9 @@ async def test_a_module_that_is_not_heard_is_shown_apart_from_one_that_is_idle(w
     status = m.ManagerStatus((), ("DM3",), (), (), "guarded-repair", 1, tuple(
         m.DetectionView(name, False, "", ()) for name in ("DM2", "DM3")))
     async with page(world) as tab:
-        assert "not heard" in await tab.value("document.getElementById('manager').textContent")
+        assert "no message yet" in await tab.value("document.getElementById('manager').textContent")
         async with repeated(lambda: world.others.publish(topics.MANAGER_STATUS, status)):
-            await tab.until(f"{chips}.join() === 'DM2: idle,? DM3: not heard'")
+            await tab.until(f"{chips}.join() === 'DM2: idle,? DM3: silent'")
 
 
 async def test_a_machine_that_does_not_keep_up_with_the_rate_is_a_banner(world):

@@ -132,7 +132,7 @@ async def test_what_a_role_lacks_is_out_of_use_and_says_why(tmp_path, role):
         if not drives:
             assert not any(s.dead_man for s in world.others.stick)
             assert await tab.value("document.querySelector('.stick-state').textContent") == (
-                "not for you")
+                "not permitted")
         assert tab.errors == []
 
 
@@ -158,7 +158,7 @@ async def test_a_withdrawn_token_brings_the_form_back_and_a_new_one_opens_again(
         await enter(tab, token)
         await tab.until(f"{LIVE} && document.getElementById('inject').inert")
         revoke(file, "anna")
-        await tab.until(f"{ASKED} && {TEXT}.startsWith('Your token is withdrawn')")
+        await tab.until(f"{ASKED} && {TEXT}.startsWith('Your token was revoked')")
         await enter(tab, issue(file, "anna", Role.INJECT))
         await tab.until(f"{LIVE} && !document.getElementById('inject').inert")
         assert await tab.value(notes()) == 0

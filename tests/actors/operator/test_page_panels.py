@@ -76,7 +76,7 @@ def text(name: str) -> str:
 
 async def test_each_kind_of_panel_shows_its_fields_and_whether_they_are_heard(world):
     async with tank(world) as (tab, said):
-        assert "not heard" in await tab.value(text("Level"))
+        assert "no data" in await tab.value(text("Level"))
         height = 0.25
 
         def say() -> None:
