@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -13,13 +13,11 @@ from rampart.actors.bus.bounds import Count, Text, clip
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.ros2.links import Gateway
 from rampart.actors.ros2.translation.mapping import Inward, Outward
 from rampart.actors.ros2.translation.mirror import message_of
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
-
-if TYPE_CHECKING:
-    from rampart.actors.ros2.gateway import Gateway
 
 _REQUEST, _RESPONSE = "_Request", "_Response"
 _GOAL, _SEND, _GET = "_Goal", "_SendGoal", "_GetResult"

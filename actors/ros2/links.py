@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
+
+import msgspec
 
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.topic import Qos as BusQos
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ros2.graph import RosGraph
+from rampart.actors.ros2.node import RosNode
+from rampart.actors.ros2.ros_clock import RosClock
 from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.wire import Attachment, Qos
-
-if TYPE_CHECKING:
-    from rampart.actors.ros2.gateway import Gateway
+from rampart.actors.runtime.clock import Clock
 
 SILENT_S = 1.0
 """A publisher that is silent for so many simulated seconds may be replaced by another one."""
@@ -23,6 +27,30 @@ _ROUNDING = 0.999
 
 _ZEROS = 20
 """Messages of zeros that are published after the system has fallen silent."""
+
+
+class Gateway(Protocol):
+    """The gateway as its links use it; `gateway.Gateway` describes the members."""
+
+    node: RosNode
+    graph: RosGraph
+    time: RosClock
+    clock: Clock
+
+    def newest(self, key: str) -> tuple[msgspec.Struct, float] | None:
+        """Return the newest message on a topic of `beside`, and its stamp."""
+
+    def emit(self, topic: Topic[Any], body: msgspec.Struct, stamp_s: float | None) -> None:
+        """Publish a message to the system."""
+
+    def refuse(self, where: str, why: str) -> None:
+        """Report and count a message that is not passed on."""
+
+    def enqueue(self, slot: str | None, call: Callable[[], None]) -> None:
+        """Put a call into the mailbox."""
+
+    def call_later(self, delay_s: float, call: Callable[[], None]) -> object:
+        """Call a function after simulated seconds."""
 
 
 class Subscription:
