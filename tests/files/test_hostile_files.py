@@ -62,7 +62,8 @@ AIRPORTS = {
                                    "nodes.T[0]: 1000000000"),
     "a coordinate beyond the earth": (edited("T = [30.0", "T = [3e7"), "nodes.T[0]: 30000000.0"),
     "a thousand million lights": (edited("count = 3", "count = 1000000000"), "row[0].count"),
-    "a million lights": (edited("count = 3", "count = 1000000"), "1000000 lights: at most 100000"),
+    "a million lights": (edited("count = 3", "count = 1000000"),
+                         "1000000 lights: expected at most 100000"),
     "a name that steers the terminal": (edited(
         'name = "R"', 'name = "\\u001b[2J\\nlaunch.py: all is well"'
         ).split("[world")[0].replace("10.0, 0.0", "10.0, 9.0"), "off the pavement"),
@@ -303,10 +304,6 @@ def test_a_damaged_store_of_results_is_refused_in_one_line(tmp_path, capsys, dam
         except sqlite3.IntegrityError:  # of a column that must not be null
             database.execute("update runs set result = ''")
     database.close()
-    if damage == "drop table runs":
-        assert "no run" in refusal(capsys, rampart, "campaign", "--replay", "abc", "--out",
-                                    str(tmp_path))
-        return
     refusal(capsys, rampart, "campaign", "--replay", "abc", "--out", str(tmp_path))
 
 
