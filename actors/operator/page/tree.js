@@ -1,6 +1,6 @@
 // The fault tree with its mechanisms as barriers, and the order of recoveries. The HMI computes the
-// layout; this module draws it once, and highlights detections. No state is shown by colour only: a
-// highlighted box also has a frame and a word.
+// layout; this module draws it once, and marks detections. No state is shown by colour only: a
+// marked box also has a frame and a word.
 
 import { svg, say } from "./dom.js";
 
@@ -85,7 +85,7 @@ export class FaultTree {
     svg("text", { class: "qualifier", x: left + 13, y: y + 3.5 }, group, qualifier);
   }
 
-  /** Highlight detected events, the events above them, and the next barriers. */
+  /** Mark detected events, the events above them, and the next barriers. */
   show(manager, detections) {
     const status = manager ? manager.value : { active: [], activated: [], latched: [], silent: [] };
     const stale = !manager || manager.stale;
@@ -118,7 +118,7 @@ export class FaultTree {
       line.drawn.classList.toggle("lit", on);
     }
     this.canvas.classList.toggle("stale", stale);
-    return stale ? "No message from the manager: highlights may be out of date."
+    return stale ? "No message from the manager: the marks may be out of date."
       : words.length ? `Detected: ${words.join(". ")}.` : "Nothing is detected.";
   }
 }
