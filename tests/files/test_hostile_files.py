@@ -225,7 +225,7 @@ def test_a_chunk_that_is_too_large_unpacked_is_refused(tmp_path, capsys, kind):
     assert path.stat().st_size < 500_000
     for verb in (("bag", "info", str(path)), ("bag", "repair", str(path), str(tmp_path / "out")),
                  ("replay", str(path))):
-        assert "bytes, unpacked; at most 67108864" in refusal(capsys, rampart, *verb)
+        assert "bytes uncompressed; at most 67108864" in refusal(capsys, rampart, *verb)
     assert not (tmp_path / "out").exists()
 
 

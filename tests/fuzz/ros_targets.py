@@ -72,7 +72,7 @@ def ros_token(data: bytes) -> None:
     """A liveliness token: it comes, it is told, and it goes."""
     token, graph = data.decode(errors="replace"), RosGraph()
     found = graph.changed(token, alive=True)
-    if found is None or graph.who(found.gid) is not found:
+    if found is None or graph.endpoint(found.gid) is not found:
         raise AssertionError("came, and is not there")
     list(misfits(graph.of(*EndpointKind), graph.of(*EndpointKind)))
     if graph.changed(token, alive=False) is not found or graph.nodes():

@@ -102,7 +102,7 @@ def test_what_only_the_stand_in_declares_is_a_topic_and_what_nobody_does_is_one_
 
 @pytest.mark.parametrize(("old", "new", "line"), [
     ("./wheels", "./none", "command = .*: no such file"),
-    ("./wheels", "./cart.py", "command = .*cart.py is not executable; chmod"),
+    ("./wheels", "./cart.py", "command = .*cart.py is not executable; use chmod"),
     ("./wheels", "no-such-program", "command = .*: no program 'no-such-program' in PATH"),
     (COMMAND, f'{COMMAND}\nfolder = "none"', "folder = 'none': no such folder")])
 def test_a_program_that_cannot_be_run_is_one_line(tug, old, new, line):
