@@ -171,7 +171,7 @@ def test_the_joystick_drives_and_the_keyboard_is_told_who_has_the_stick(run):
 
 def test_the_keyboard_needs_a_terminal_and_a_speed(run):
     told = run.tool("joystick")
-    assert (told.returncode, "no terminal" in told.stderr) == (2, True)
+    assert (told.returncode, "expected a terminal" in told.stderr) == (2, True)
     told = run.tool("joystick", "--speed", "7")
     assert (told.returncode, "--speed 7: must be between" in told.stderr) == (2, True)
     told = run.tool("joystick", "--device", "/nonexistent/js0")

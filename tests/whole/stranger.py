@@ -10,6 +10,7 @@ import json
 import os
 import socket
 import sys
+import threading  # noqa: F401 zenoh imports it, and the other user cannot read the library
 import time
 from pathlib import Path
 from typing import Any

@@ -97,7 +97,7 @@ def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
         for words in (("status",), ("node", "list"), ("top", "--once")):
             refused = rampart(run, *words, key=stolen)
             assert (refused.returncode, refused.stdout) == (1, ""), words
-            assert "ada hear nothing: its certificate is revoked" in refused.stderr
+            assert "send ada no messages: its certificate is revoked" in refused.stderr
             assert refused.stderr.count("\n") == 1
         looking = rampart(run, "status", key=keys / "bob.pem")
         assert looking.returncode == 0
@@ -107,7 +107,7 @@ def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
         key_folder.issue(keys, ("eve",), "viewer")  # the routers do not know her yet
         early = rampart(run, "status", key=keys / "eve.pem")
         assert early.returncode == 1
-        assert "eve hear nothing: it was issued after the routers started" in early.stderr
+        assert "send eve no messages: it was issued after the routers started" in early.stderr
         assert run.process.poll() is None
 
 
