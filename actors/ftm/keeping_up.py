@@ -62,9 +62,9 @@ class KeptUp(msgspec.Struct, frozen=True):
         found = f"{self.with_rate:.2g}"
         what = (f"rate {self.rate:g} most of the time" if float(found) >= self.rate
                 else f"rate {found}, not {self.rate:g}")
-        return (f"this machine keeps up with {what}: loops "
-                f"are up to {1e3 * self.late_s:.0f} ms late ({self.node}){world}; simulated time, "
-                f"{1e3 * self.allowed_s:.0f} ms are in order")
+        return (f"this machine keeps up with {what}: event loops are up to "
+                f"{1e3 * self.late_s:.0f} ms late ({self.node}){world}; allowed are "
+                f"{1e3 * self.allowed_s:.0f} ms of simulated time")
 
 
 class KeepingUp:

@@ -176,7 +176,7 @@ class Launcher:
                     self.on_interrupt(message.signal)
                 case _:
                     self._answers.put_nowait(message)
-        self.failed("the root of the run has ended")
+        self.failed("the root of the run has ended; --resume continues a mission")
         self._answers.put_nowait(None)
 
     def _send(self, request: requests.FromRun) -> None:

@@ -109,9 +109,10 @@ def kernel() -> Iterator[Finding]:
 
 def processors() -> Iterator[Finding]:
     """Check processors and memory."""
-    count = len(os.sched_getaffinity(0))
-    yield _finding("processors", f"{count}, load {os.getloadavg()[0]:.1f}", there=count >= 2,
-                   cost="rate 1 may be too much: use --rate 0.5, or --virtual")
+    count, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
+    yield _finding("processors", f"{count}, load {load:.1f}", there=count >= 2 and load < count,
+                   cost="other programs and too few processors make messages late, and the robot "
+                        "stops: end them, or use --rate 0.5 or --virtual")
     meminfo = Path("/proc/meminfo").read_text(encoding="ascii")
     free = int(re.findall(r"MemAvailable:\s+(\d+) kB", meminfo)[0]) / 1e3
     yield _finding("memory", f"{free:,.0f} MB available", there=free >= NEEDED_MB,

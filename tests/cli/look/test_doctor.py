@@ -23,6 +23,15 @@ def test_this_machine_can_run_and_each_thing_that_is_missing_has_its_cost(capsys
     assert len(capsys.readouterr().out.splitlines()) == 1 + len(found)
 
 
+@pytest.mark.parametrize(("load", "state"), [(0.3, "ok"), (11.7, "without")])
+def test_a_machine_that_is_busy_is_named_with_what_it_costs(capsys, monkeypatch, load, state):
+    monkeypatch.setattr(doctor_verb.os, "sched_getaffinity", lambda _pid: {0, 1})
+    monkeypatch.setattr(doctor_verb.os, "getloadavg", lambda: (load, 0.0, 0.0))
+    assert main(["doctor", "--json"]) == 0
+    [found] = [one for one in json.loads(capsys.readouterr().out) if one["what"] == "processors"]
+    assert found["state"] == state
+
+
 def test_every_extra_of_the_package_is_looked_for(capsys):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     main(["doctor", "--json"])

@@ -49,8 +49,8 @@ def test_the_rate_it_keeps_up_with_is_that_at_which_the_same_real_lateness_is_in
 def test_it_is_said_while_it_runs_with_node_and_world_and_not_too_often():
     _, lines = run([0.6] * 100, 4.0, world_s=0.36)
     assert lines[0] == (
-        "this machine keeps up with rate 1, not 4: loops are up to 600 ms late (a), the world "
-        "360 ms behind; simulated time, 150 ms are in order")
+        "this machine keeps up with rate 1, not 4: event loops are up to 600 ms late (a), the "
+        "world 360 ms behind; allowed are 150 ms of simulated time")
     assert len(lines) == pytest.approx(50 / LINE_S, abs=3)
 
 
