@@ -18,6 +18,8 @@ from tests.actors.operator.browser import CHROMIUM
 # What waits for a processor at the lowest priority is not slow. `make test-nightly` tries more.
 hypothesis.settings.register_profile("patient", deadline=None, max_examples=30)
 hypothesis.settings.register_profile("thorough", deadline=None, max_examples=300)
+hypothesis.settings.register_profile(
+    "fuzz", deadline=None, max_examples=int(os.environ.get("FUZZ_RUNS", "10000")))
 hypothesis.settings.load_profile("patient")
 
 HOW_TO_GET_CHROMIUM = "no Chromium: `apt-get install chromium` brings it"

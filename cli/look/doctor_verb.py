@@ -36,8 +36,7 @@ EXTRAS = {
     "video": ("imageio_ffmpeg", "no `rampart replay --video`"),
     "search": ("optuna", "no `rampart campaign --search`"),
     "dask": ("distributed", "no `rampart campaign --backend dask`"),
-    "ray": ("ray", "no `rampart campaign --backend ray`"),
-    "fuzz": ("atheris", "`make fuzz` is not guided by coverage")}
+    "ray": ("ray", "no `rampart campaign --backend ray`")}
 """Extra → its module, and the consequence if it is not installed."""
 
 State = Literal["ok", "without", "missing"]

@@ -25,8 +25,7 @@ from rampart.files.streams import complain
 from rampart.sim.osmosis.trial.mission_trial import MissionConsole
 from rampart.sim.runs.console import LINES_PER_S, REPORTS_PER_S
 from tests.fuzz.handler_fuzz import system
-from tests.fuzz.message_extremes import TEXTS, all_topics
-from tests.fuzz.test_bounded_state import told
+from tests.fuzz.message_extremes import TEXTS, all_topics, filled
 
 HOSTILE = ("\x1b[2J\x1b]0;owned\x07", "a\nb", "a\r\x1b[1A[   0.00 s] UNSAFE: forged", "\x9b31m",
            "\u202edrawkcab", "\u2028", "\x00", "\x7f", "\U000e0041", "\u2066")
@@ -81,7 +80,7 @@ def test_a_console_shows_control_characters_without_obeying_them(topic):
     console = MissionConsole(stream)
     picture = RunPicture(OsmosisLines())
     for number, text in enumerate((*HOSTILE, *TEXTS)):
-        body = convert(hostile(inspect.type_info(topic.type), number, text), topic.type,
+        body = convert(filled(inspect.type_info(topic.type), text, number), topic.type,
                        builtin_types=(bytes,))
         header = Header(text[:200], 1, number, float(number))
         console.take(topic, body, header)
@@ -93,19 +92,6 @@ def test_a_console_shows_control_characters_without_obeying_them(topic):
     for line in top_view.lines(top_view.Frame("x", 7450, 1.0, 0.0, picture), 100, 40):
         screen.print(line)
     assert harmless(screen.file.getvalue())
-
-
-def hostile(kind, number, text):
-    """Return a message of a type in which every text is a hostile one."""
-    if isinstance(kind, inspect.StrType):
-        return text[:kind.max_length]
-    if isinstance(kind, inspect.StructType):
-        return {field.encode_name: hostile(field.type, number, text) for field in kind.fields}
-    if isinstance(kind, inspect.VarTupleType):
-        return [hostile(kind.item_type, number, text)]
-    if isinstance(kind, inspect.TupleType):
-        return [hostile(part, number, text) for part in kind.item_types]
-    return told(kind, number)
 
 
 def report(number):

@@ -1,5 +1,4 @@
-"""Fuzzing: every decoder of bytes that somebody else wrote, under limits of time and memory.
+"""Fuzzing with Hypothesis: inputs to every decoder of data from outside, messages to every actor.
 
-`targets` has one function per decoder, `mutate` makes inputs, `worker` runs them in a process of
-its own, `run` is the command: `make fuzz`, docs/contributing/tests.md.
+`make fuzz`, docs/contributing/tests.md.
 """

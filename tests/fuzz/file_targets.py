@@ -40,7 +40,7 @@ from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests import CELL, ROOT
 from tests.actors.osmosis.airport.test_formats import GRAPH, TOML
 from tests.actors.recording.samples import documents, pose
-from tests.fuzz.samples import sample
+from tests.fuzz.message_extremes import sample
 from tests.fuzz.target import target
 
 SYSTEMS = ROOT / "systems"
@@ -116,7 +116,7 @@ def written(name: str, data: bytes) -> Path:
 # -- airports and missions -------------------------------------------------------------------------
 
 
-@target("airport-toml", refuses=(AirportError,), kind="toml", says_one_line=True, suite_runs=100,
+@target("airport-toml", refuses=(AirportError,), form="toml", one_line=True,
         samples=lambda: [TOML.encode(), (
             "fillet_radius_m = 1.0\n" + TOML + '[[prohibited]]\nname = "P"\n'
             'polygon = [[20, -1], [22, -1], [22, -3]]\n[[building]]\nname = "B"\nx_m = 5.0\n'
@@ -125,13 +125,13 @@ def airport_toml(data: bytes) -> None:
     load_airport(written("airport/field.toml", data))
 
 
-@target("mission-toml", refuses=(AirportError,), kind="toml", says_one_line=True,
+@target("mission-toml", refuses=(AirportError,), form="toml", one_line=True,
         samples=lambda: [b'name = "M"\ngoals = [{ x_m = 4, y_m = 0, mode = "taxi" }]\n'])
 def mission_toml(data: bytes) -> None:
     load_mission(written("mission.toml", data), _field())
 
 
-@target("mission-miss", refuses=(AirportError,), kind="text", says_one_line=True,
+@target("mission-miss", refuses=(AirportError,), form="text", one_line=True,
         words=("x=", "y=", "taxi=", ","),
         samples=lambda: [b"x=9.5,y=0,taxi=1\n\nx=3,y=0.25,taxi=0\n"])
 def mission_miss(data: bytes) -> None:
@@ -143,7 +143,7 @@ def _field() -> Any:
     return load_airport(written("airport/field.toml", TOML.encode()))
 
 
-@target("graph", refuses=(AirportError,), kind="json", says_one_line=True, suite_runs=100,
+@target("graph", refuses=(AirportError,), form="json", one_line=True,
         samples=lambda: [json.dumps(GRAPH).encode(), json.dumps({
             "nodes": [*GRAPH["nodes"], {"id": "N3", "x": 5, "y": 4}],
             "edges": [["N1", "N2"], ["N2", "N3"]]}).encode()])
@@ -153,7 +153,7 @@ def graph(data: bytes) -> None:
     load_airport(written("foreign/field.graph", data))
 
 
-@target("mask", refuses=(AirportError,), kind="png", says_one_line=True, suite_runs=100,
+@target("mask", refuses=(AirportError,), form="png", one_line=True,
         samples=lambda: [_image("PNG"), _image("PNG", "P"), _image("PNG", "RGBA"),
                          _image("JPEG")])
 def mask(data: bytes) -> None:
@@ -176,14 +176,14 @@ _WORDS = ("[[node]]\n", "[[event]]\n", "enabled = false\n", "parameters = {}\n",
           "[orders.b]\n", "timeout_s = 1e-9\n", "at_least", "nan", "[robot]\n", "latched = true\n")
 
 
-@target("toml", refuses=(FileError,), kind="toml", says_one_line=True,
+@target("toml", refuses=(FileError,), form="toml", one_line=True,
         samples=lambda: [b'a.b = [1, {c = "x"}, 1979-05-27]\n[t]\ns = \'\'\'x\'\'\'\n"q" = """y"""',
                          TOML.encode()])
 def toml_document(data: bytes) -> None:
     toml.parse(data.decode(errors="replace"))
 
 
-@target("system", refuses=(SpecificationError,), kind="toml", says_one_line=True, suite_runs=60,
+@target("system", refuses=(SpecificationError,), form="toml", one_line=True,
         words=_WORDS, samples=lambda: [_SMALL.encode()] * 9 + [_CELL.encode()])
 def system(data: bytes) -> None:
     spec = parse_specification(data.decode(errors="replace"), "system.toml")
@@ -197,7 +197,7 @@ def _document() -> dict[str, Any]:
 
 
 @target("adaptation", refuses=(ChangeError, SpecificationError, ValueError, RecursionError),
-        kind="json", suite_runs=60, samples=lambda: [json.dumps(change).encode() for change in (
+        form="json", samples=lambda: [json.dumps(change).encode() for change in (
             {"action": "disable", "name": "FTM7"},
             {"action": "retune", "name": "RM3", "values": {"deadline_s": 2.5}},
             {"action": "retune", "name": "DM1", "values": {"margin_m": 0.7}},
@@ -210,21 +210,21 @@ def adaptation(data: bytes) -> None:
     adapt(_document(), msgspec.json.decode(data, type=Change), "paper.toml")
 
 
-@target("system-json", refuses=(SpecificationError, ValueError, RecursionError), kind="json",
-        suite_runs=60, samples=lambda: [msgspec.json.encode(read_document(text, "small.toml"))
+@target("system-json", refuses=(SpecificationError, ValueError, RecursionError), form="json",
+        samples=lambda: [msgspec.json.encode(read_document(text, "small.toml"))
                                         for text in [_SMALL] * 9 + [_CELL]])
 def system_json(data: bytes) -> None:
     """A changed system, as `manager/system` carries it."""
     check_document(msgspec.json.decode(data, type=dict[str, Any]), "cell.toml")
 
 
-@target("value", refuses=(ChangeError,), kind="text", says_one_line=True,
+@target("value", refuses=(ChangeError,), form="text", one_line=True,
         samples=lambda: [b"0.5", b"true", b"'text'", b"[1, {a = 2}]", b"guarded-repair"])
 def value(data: bytes) -> None:
     parse_value(data.decode(errors="replace"))
 
 
-@target("gate", refuses=(GateError,), kind="text", says_one_line=True,
+@target("gate", refuses=(GateError,), form="text", one_line=True,
         words=(" and ", " or ", "not ", "2 of (", "(", ")", ",", "DM1", "DM2"),
         samples=lambda: [b"DM1 or (DM2 and not DM3)", b"2 of (DM1, DM2, DM3)", b"RM4 or RM3",
                          b"(A or B) and (C or D) and (E or F)"])
@@ -244,7 +244,7 @@ def gate(data: bytes) -> None:
         raise refused
 
 
-@target("open-psa", refuses=(OpenPsaError,), kind="text", says_one_line=True,
+@target("open-psa", refuses=(OpenPsaError,), form="text", one_line=True,
         words=("<and>", "</and>", "<not>", '<event name="a"/>', "<!DOCTYPE x>", "<![CDATA[",
                '<define-gate name="g">', "&lt;", "<house-event name='h'/>",
                "<constant value='true'/>",
@@ -261,7 +261,7 @@ def open_psa(data: bytes) -> None:
     read_open_psa(data, "tree.xml")
 
 
-@target("fault", refuses=(ScenarioError, UnknownFaultError), kind="text",
+@target("fault", refuses=(ScenarioError, UnknownFaultError), form="text",
         words=("@", "+", "goal", "inf", ":", "kill", "corrupt:", "localization/pose"),
         samples=lambda: [b"kill:osmosis_control@30", b"gps-bias@goal2+5",
                          b"weak-wheel:front-left:0.2", b"corrupt:localization/pose@goal1:3+inf",
@@ -305,7 +305,7 @@ def _foreign(compression: CompressionType) -> bytes:
     return out.getvalue()
 
 
-@target("mcap-info", refuses=(BagError,), kind="mcap", says_one_line=True, samples=recordings)
+@target("mcap-info", refuses=(BagError,), form="mcap", one_line=True, samples=recordings)
 def mcap_info(data: bytes) -> None:
     summary = Summary(BagReader(written("bag.mcap", data)))
     msgspec.json.encode(described(summary))
@@ -313,8 +313,7 @@ def mcap_info(data: bytes) -> None:
     restore([file for file in summary.files if len(file[2]) < 1 << 16], folder())
 
 
-@target("mcap-repair", refuses=(BagError,), kind="mcap", says_one_line=True, samples=recordings,
-        suite_runs=100)
+@target("mcap-repair", refuses=(BagError,), form="mcap", one_line=True, samples=recordings)
 def mcap_repair(data: bytes) -> None:
     reader = BagReader(written("torn.mcap", data))
     whole = folder() / "whole.mcap"
@@ -326,7 +325,7 @@ def mcap_repair(data: bytes) -> None:
 _KEYS = ("rampart/localization/pose", "rampart/detection/DM1", "rampart/world/strange")
 
 
-@target("recorded-json", refuses=(ValueError, RecursionError), kind="json", samples=lambda: [
+@target("recorded-json", refuses=(ValueError, RecursionError), form="json", samples=lambda: [
         b'{"source":"l","incarnation":1,"sequence":1,"stamp":1.0,"body":{"x_m":0.0,"y_m":0.0,'
         b'"yaw_rad":null}}', b'{"source":"","incarnation":0,"sequence":0,"stamp":null,'
         b'"raw":"wQ==","error":"x"}'])
@@ -345,7 +344,7 @@ def recorded_json(data: bytes) -> None:
         raise refused
 
 
-@target("stored-run", refuses=_NO_RUN, kind="msgpack", samples=lambda: [
+@target("stored-run", refuses=_NO_RUN, form="msgpack", samples=lambda: [
         msgspec.msgpack.encode([msgspec.to_builtins(sample(kind)) for kind in (Job, RunResult)])])
 def stored_run(data: bytes) -> None:
     """A row of a campaign's store: a job and its result."""

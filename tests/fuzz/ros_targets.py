@@ -48,7 +48,7 @@ def messages() -> Sequence[bytes]:
             for number, kind in enumerate(_TYPES)]
 
 
-@target("ros-message", refuses=(ValueError, NotMeantError), samples=messages, suite_runs=600)
+@target("ros-message", refuses=(ValueError, NotMeantError), samples=messages)
 def ros_message(data: bytes) -> None:
     """Bytes on a topic of ROS 2: refused in a line, or a message that all readers take."""
     topic, kind, made = link(data[0] if data else 0)
@@ -65,7 +65,7 @@ _TOKEN = Endpoint(0, "ab", "0", "3", EndpointKind.PUBLISHER, "talker", "/robot",
                   "std_msgs::msg::dds_::String_", "RIHS01_0", Qos(depth=10)).token
 
 
-@target("ros-token", refuses=(ValueError,), kind="text", says_one_line=True,
+@target("ros-token", refuses=(ValueError,), form="text", one_line=True,
         words=("@ros2_lv", "/", "%", "MP", "NN", "SS", ":", ","),
         samples=lambda: [_TOKEN.encode(), b"@ros2_lv/0/ab/0/0/NN/%/%/talker"])
 def ros_token(data: bytes) -> None:
@@ -79,7 +79,7 @@ def ros_token(data: bytes) -> None:
         raise AssertionError("went, and is there")
 
 
-@target("ros-attachment", refuses=(ValueError,), says_one_line=True,
+@target("ros-attachment", refuses=(ValueError,), one_line=True,
         samples=lambda: [Attachment(7, 1_700_000_000_000_000_000, bytes(16)).pack(), b""])
 def ros_attachment(data: bytes) -> None:
     """What goes with a message."""
@@ -87,8 +87,7 @@ def ros_attachment(data: bytes) -> None:
         raise AssertionError("another one comes back")
 
 
-@target("ros-bag", refuses=(BagError,), kind="mcap", says_one_line=True, samples=recordings,
-        suite_runs=60)
+@target("ros-bag", refuses=(BagError,), form="mcap", one_line=True, samples=recordings)
 def ros_bag(data: bytes) -> None:
     """Whatever recording on its way into a bag of ROS 2."""
     there = folder() / "ros-bag"

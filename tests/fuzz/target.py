@@ -1,36 +1,84 @@
-"""What is fuzzed: a decoder, what it may raise, and inputs that it reads.
+"""Targets of fuzzing: a decoder, its documented errors, and samples of its input.
 
-A new target is a function of bytes with a decorator, in a module that `fuzz.targets` imports:
+A target is a function of bytes with a decorator, in a module that `test_decoders` imports:
 
     @target("greeting", refuses=(ValueError,), samples=lambda: [b"hello"])
     def greeting(data: bytes) -> None:
         decode_greeting(data)
 
-It must raise nothing but `refuses`, for any input, within `LIMIT_S` of processor time and
-`LIMIT_BYTES` of memory on top of what the process had.
+For any input it raises nothing but `refuses`, within `LIMIT_S` and `LIMIT_BYTES`.
 """
 
 from __future__ import annotations
 
-import re
-import traceback
-from collections.abc import Callable, Sequence
+import contextlib
+import resource
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tests import ROOT
 
 CORPUS = Path(__file__).with_name("corpus")
+LAST = ROOT / ".hypothesis" / "inputs"
+"""The last input of each target. After a failure, it is the smallest that fails."""
 
 LIMIT_S = 2.0
-LIMIT_BYTES = 500 << 20
-MAX_INPUT = 1 << 16
-"""Bytes of an input."""
+"""Processor time of one input, or of one message to an actor."""
 
+LIMIT_BYTES = 500 << 20
 MAX_LINE = 2000
-_VALUES = re.compile(r"\d+|'[^']*'|`[^`]*`|\"[^\"]*\"|/\S+")
 
 Run = Callable[[bytes], object]
+
+
+class SlowError(Exception):
+    """An input takes more than `LIMIT_S`."""
+
+
+class UnsoundError(Exception):
+    """The text of a documented error is not one printable line."""
+
+
+def restart_limit() -> None:
+    """Start `LIMIT_S` again."""
+    signal.setitimer(signal.ITIMER_VIRTUAL, LIMIT_S)
+    signal.setitimer(signal.ITIMER_PROF, 5 * LIMIT_S)
+
+
+@contextlib.contextmanager
+def limits() -> Iterator[None]:
+    """Limit the processor time and the memory of what runs inside.
+
+    SIGPROF ends the process if a library does not return to Python.
+
+    Raises:
+        SlowError: after `LIMIT_S`.
+        MemoryError: beyond `LIMIT_BYTES` more than before.
+    """
+    late: list[SlowError] = []
+
+    def stop(*_: Any) -> None:
+        late.append(SlowError(f"more than {LIMIT_S:g} s of processor time"))
+        raise late[0]
+
+    pages = int(Path("/proc/self/statm").read_text("ascii").split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    handler = signal.signal(signal.SIGVTALRM, stop)
+    restart_limit()
+    resource.setrlimit(resource.RLIMIT_AS,
+                       (pages * resource.getpagesize() + LIMIT_BYTES, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGVTALRM, handler)
+        if late:  # the decoder may have caught it
+            raise late[0]
 
 
 @dataclass(frozen=True)
@@ -39,77 +87,55 @@ class Target:
 
     Attributes:
         name: of the target, and of the folder of its corpus.
-        run: hands it an input.
-        refuses: what it is documented to raise.
-        samples: returns inputs that it reads, from which others are made.
-        kind: of its format, for `mutate`: text, binary, json, msgpack, toml, png or mcap.
+        run: decodes an input.
+        refuses: its documented errors.
+        samples: returns inputs that it accepts, from which others are made.
+        form: of its input, for `inputs`: text, binary, json, msgpack, toml, png or mcap.
         words: of its language.
-        says_one_line: the text of what it raises is one printable line.
-        suite_runs: inputs that the ordinary suite makes anew.
+        one_line: whether the text of its errors is one printable line.
     """
 
     name: str
     run: Run
     refuses: tuple[type[Exception], ...]
     samples: Callable[[], Sequence[bytes]]
-    kind: str
+    form: str
     words: tuple[str, ...]
-    says_one_line: bool
-    suite_runs: int
+    one_line: bool
 
-    @property
-    def folder(self) -> Path:
-        """Where inputs are kept that have found something once."""
-        return CORPUS / self.name
+    def corpus(self) -> list[Path]:
+        """Return the inputs that once were findings."""
+        return sorted((CORPUS / self.name).glob("*"))
 
-    def corpus(self) -> list[bytes]:
-        """Return what was found once."""
-        return [path.read_bytes() for path in sorted(self.folder.glob("*"))]
-
-    def outcome(self, data: bytes) -> str:
-        """Run one input and return in short what came of it.
+    def try_input(self, data: bytes) -> bool:
+        """Run one input within the limits; return whether it is accepted.
 
         Raises:
-            Exception: whatever it raises that it must not.
+            Exception: a finding.
         """
+        LAST.mkdir(parents=True, exist_ok=True)
+        (LAST / self.name).write_bytes(data)
         try:
-            self.run(data)
+            with limits():
+                self.run(data)
         except self.refuses as error:
             text = str(error)
-            if self.says_one_line and not (text.isprintable() and len(text) <= MAX_LINE):
-                raise UnsoundError(f"no printable line: {text[:200]!r}") from error
-            return f"{type(error).__name__}: {_VALUES.sub('#', text)[:120]}"
-        return "read"
-
-
-class UnsoundError(Exception):
-    """A decoder refused as it may, and what it said is not what it promises."""
+            if self.one_line and not (text.isprintable() and len(text) <= MAX_LINE):
+                raise UnsoundError(f"not a printable line: {text[:200]!r}") from error
+            return False
+        return True
 
 
 ALL: dict[str, Target] = {}
 
 
 def target(name: str, *, refuses: tuple[type[Exception], ...],
-           samples: Callable[[], Sequence[bytes]], kind: str = "binary",
-           words: Sequence[str] = (), says_one_line: bool = False,
-           suite_runs: int = 300) -> Callable[[Run], Run]:
+           samples: Callable[[], Sequence[bytes]], form: str = "binary",
+           words: Sequence[str] = (), one_line: bool = False) -> Callable[[Run], Run]:
     """Register a function of bytes as a target; see `Target` for the arguments."""
 
     def register(run: Run) -> Run:
-        if name in ALL:
-            raise ValueError(f"two targets of the name {name}")
-        ALL[name] = Target(name, run, refuses, samples, kind, tuple(words), says_one_line,
-                           suite_runs)
+        ALL[name] = Target(name, run, refuses, samples, form, tuple(words), one_line)
         return run
 
     return register
-
-
-def place_of(error: BaseException) -> str:
-    """Return what was raised and where, the last places in this project: the same for one cause."""
-    cause = error.__cause__ if isinstance(error, UnsoundError) else error
-    frames = [frame for frame in traceback.extract_tb(cause.__traceback__ if cause else None)
-              if frame.filename.startswith(str(ROOT)) and "/.venv/" not in frame.filename
-              and "/tests/fuzz/" not in frame.filename]
-    places = [f"{Path(frame.filename).relative_to(ROOT)}:{frame.lineno}" for frame in frames[-2:]]
-    return f"{type(error).__name__} at {' < '.join(reversed(places))}"

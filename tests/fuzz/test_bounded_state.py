@@ -35,7 +35,7 @@ from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock
 from rampart.testing import VirtualSystem, run
 from tests.fuzz.handler_fuzz import Machine, cases, system
-from tests.fuzz.message_extremes import all_topics
+from tests.fuzz.message_extremes import all_topics, filled
 
 FLOOD = 700
 """Messages of each topic, each about other names and half of them from another source."""
@@ -48,24 +48,6 @@ _FOREIGN = (Context, VirtualBus, Hub, VirtualClock, type, types.ModuleType, type
 
 
 # -- every actor --------------------------------------------------------------------------------
-
-
-def told(kind, number):
-    """Return a message of a type in which every name is another one for each number."""
-    return _TOLD.get(type(kind), lambda *_: b"")(kind, number)
-
-
-_TOLD = {
-    inspect.StrType: lambda _kind, number: f"n{number}",
-    inspect.IntType: lambda kind, number: min(number, number if kind.le is None else kind.le),
-    inspect.FloatType: lambda _kind, number: float(number % 40),
-    inspect.BoolType: lambda _kind, _number: True,
-    inspect.EnumType: lambda kind, number: list(kind.cls)[number % len(kind.cls)].value,
-    inspect.VarTupleType: lambda kind, number: [told(kind.item_type, number)],
-    inspect.TupleType: lambda kind, number: [told(part, number) for part in kind.item_types],
-    inspect.DictType: lambda _kind, number: {f"n{number}": 1.0},
-    inspect.StructType: lambda kind, number: {
-        field.encode_name: told(field.type, number) for field in kind.fields}}
 
 
 def holdings(root):
@@ -108,7 +90,7 @@ def flooded(of, name):
                     living.bus.publish(
                         topic, topic.at(member_of) if topic.is_family else topic.at(),
                         msgspec.msgpack.encode(
-                            (source, 1, next(sequence), 0.9, told(kind, number))))
+                            (source, 1, next(sequence), 0.9, filled(kind, f"n{number}", number))))
                     if number % 100 == 0:
                         await asyncio.sleep(0.02)
             await asyncio.sleep(0.1)
@@ -148,7 +130,8 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
         kind = inspect.type_info(topic.type)
         for number in range(5000):
             header = Header(f"s{number}", 1, 1, 0.0)
-            body = msgspec.convert(told(kind, number), topic.type, builtin_types=(bytes,))
+            body = msgspec.convert(filled(kind, f"n{number}", number), topic.type,
+                                   builtin_types=(bytes,))
             for sink in run.sinks(clock) if number < FLOOD else ():
                 sink(topic, body, header)
             if topic in (*DECODED, *OsmosisLines.read):

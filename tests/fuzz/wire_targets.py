@@ -28,7 +28,7 @@ from rampart.actors.web.access import Access
 from rampart.actors.web.gate import Gate
 from rampart.actors.web.visitors import Register, Role, Visitor, VisitorError, digest, parse
 from rampart.manager.actor import MANAGER_STATE
-from tests.fuzz.samples import sample
+from tests.fuzz.message_extremes import sample
 from tests.fuzz.target import target
 
 # -- the bus ---------------------------------------------------------------------------------------
@@ -41,7 +41,7 @@ def payloads() -> list[bytes]:
     return [encode(Header("a", 1, 1, 0.5), sample(topic.type)) for topic in topics.ALL]
 
 
-@target("envelope", refuses=(), kind="msgpack", samples=payloads, suite_runs=200)
+@target("envelope", refuses=(), form="msgpack", samples=payloads)
 def envelope(data: bytes) -> None:
     """A payload, on every key: refused with a reason or handed over, twice for what is kept."""
     guard = ArrivalGuard(lambda: 1.0)
@@ -55,7 +55,7 @@ def envelope(data: bytes) -> None:
         raise AssertionError("neither handed over nor refused")
 
 
-@target("recorded", refuses=(), kind="msgpack", samples=payloads, suite_runs=100)
+@target("recorded", refuses=(), form="msgpack", samples=payloads)
 def recorded(data: bytes) -> None:
     """A payload on its way into a recording, and back."""
     for key in (*TOPICS, "rampart/world/strange"):
@@ -74,13 +74,13 @@ def tap_frame(data: bytes) -> None:
 # -- processes -------------------------------------------------------------------------------------
 
 
-@target("process-title", refuses=(), kind="text", words=("rampart[", "/", "] ", " #", "+"),
+@target("process-title", refuses=(), form="text", words=("rampart[", "/", "] ", " #", "+"),
         samples=lambda: [b"rampart[7400/123] osmosis_control #1", b"rampart[7400/1] a+b #42 x"])
 def process_title(data: bytes) -> None:
     parse_title(1, data.rstrip(b"\0").decode(errors="replace"))
 
 
-@target("run-info", refuses=UNREADABLE, kind="json",
+@target("run-info", refuses=UNREADABLE, form="json",
         samples=lambda: [msgspec.json.encode(sample(RunInfo))])
 def run_info(data: bytes) -> None:
     _ = read_info(data).endpoints
@@ -105,7 +105,7 @@ _FORMS = Forms(topics.ALL)
 _READER = RequestReader(OSMOSIS_REQUESTS)
 
 
-@target("page-request", refuses=(RefusedError,), kind="json", samples=lambda: [
+@target("page-request", refuses=(RefusedError,), form="json", samples=lambda: [
         b'{"type":"reset","recovery":"RM1"}', b'{"type":"order","action":"pause","reason":"x"}',
         b'{"type":"stick","panel":"Drive","held":true,"ticket":3,"forward":0.5,"left":-1}',
         b'{"type":"inject","fault":"gps-bias","duration_s":5,"permanent":false}',
@@ -120,7 +120,7 @@ _ACCESS = (Access("127.0.0.1", 8080),
 _GATE = Gate(Register([Visitor("anna", Role.DRIVE, digest("t" * 20))]), "", 8080, tls=False)
 
 
-@target("page-headers", refuses=(), kind="text",
+@target("page-headers", refuses=(), form="text",
         words=("@", "[::1]", ":", "http://", "rampart-8080=", "Bearer ", "localhost", "127.0.0.1"),
         samples=lambda: [b"127.0.0.1:8080", b"http://localhost:8080", b"[::1]:8080",
                          b"Bearer tttttttttttttttttttt", b"rampart-8080=anna|1|ab; a=b"])
@@ -135,7 +135,7 @@ def page_headers(data: bytes) -> None:
     _GATE.visitor(f"Bearer {text}", None)
 
 
-@target("page-tokens", refuses=(VisitorError,), kind="text", words=("look", "drive", "#", "\n"),
+@target("page-tokens", refuses=(VisitorError,), form="text", words=("look", "drive", "#", "\n"),
         samples=lambda: [b"anna drive " + b"a" * 64 + b"\n# all\n"])
 def page_tokens(data: bytes) -> None:
     """The file of those who have tokens."""
@@ -147,7 +147,7 @@ def page_tokens(data: bytes) -> None:
 _STATES = (CONTROL_STATE, MISSION_STATE, ROUTE_STATE, MANAGER_STATE)
 
 
-@target("checkpoint", refuses=(StateError,), kind="msgpack",
+@target("checkpoint", refuses=(StateError,), form="msgpack",
         samples=lambda: [msgspec.msgpack.encode(sample(form.kind)) for form in _STATES])
 def checkpoint(data: bytes) -> None:
     """Bytes of a state with a sound checksum, of this version, an older and a newer one."""

@@ -30,7 +30,7 @@ from rampart.cli.main import main
 from tests import ROOT
 from tests.actors.recording.samples import documents, pose, sample, write
 from tests.fuzz.message_extremes import all_topics
-from tests.fuzz.samples import sample as some
+from tests.fuzz.message_extremes import sample as some
 
 JAZZY = Types("jazzy")
 TWIST = "geometry_msgs/msg/Twist"
