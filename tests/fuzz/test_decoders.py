@@ -29,8 +29,7 @@ def pool(decoder):
 
 
 @pytest.mark.parametrize("decoder", ALL.values(), ids=ALL)
-@settings(max_examples=max(100, settings.default.max_examples),
-          suppress_health_check=list(HealthCheck), phases=set(Phase) - {Phase.explain})
+@settings(suppress_health_check=list(HealthCheck), phases=set(Phase) - {Phase.explain})
 @given(st.data())
 def test_changed_samples_are_accepted_or_refused(decoder, data):
     drawn = data.draw(inputs(pool(decoder), decoder.form, decoder.words))
