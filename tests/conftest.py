@@ -16,7 +16,8 @@ from tests import ROOT
 from tests.actors.operator.browser import CHROMIUM
 
 # What waits for a processor at the lowest priority is not slow. `make test-nightly` tries more.
-hypothesis.settings.register_profile("patient", deadline=None, max_examples=30)
+hypothesis.settings.register_profile("patient", deadline=None, max_examples=30,
+                                       derandomize=True)
 hypothesis.settings.register_profile("thorough", deadline=None, max_examples=300)
 hypothesis.settings.register_profile(
     "fuzz", deadline=None, max_examples=int(os.environ.get("FUZZ_RUNS", "10000")))
