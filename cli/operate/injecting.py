@@ -92,9 +92,9 @@ async def run_fault(name: str, orders: Sequence[Order], options: argparse.Namesp
                 if watch.is_settled:
                     say(f"{name}: affects {where}, continues" if watch.unfinished else
                         f"{name}: over, {watch.affected} {what}")
-                else:  # a fault ends with the process that carries it out
-                    say(f"{name}: {watch.affected} {what}, until {', '.join(watch.nodes)} was "
-                        "restarted")
+                else:  # a fault ends with the process that carries it out, and so does its count
+                    say(f"{name}: at least {watch.affected} {what}, until "
+                        f"{', '.join(watch.nodes)} was restarted")
     return 0
 
 
