@@ -186,18 +186,20 @@ def _consequences(spec: SystemSpec) -> Iterator[Consequence]:
                 recovery, sakes or decision.mechanisms, mechanisms.contracts, arrangement)[1:])
         needs = {m.name: m.detect for m in spec.mechanisms
                  if m.name in listening and m.name not in active}
-        yield Consequence(name, detection.title, detection.latency_s, listening, active, needs,
-                          decision.recoveries, str(decision.rule), escalation)
+        yield Consequence(name, detection.title, spec.latency_s(detection), listening, active,
+                          needs, decision.recoveries, str(decision.rule), escalation)
 
 
 def _show(found: Explanation) -> None:
-    count = sum(len(process.nodes) for process in found.processes)
+    filled = [process for process in found.processes if process.nodes]
+    count = sum(len(process.nodes) for process in filled)
     say(f"{found.title} ({found.system}), strategy {found.strategy}")
     say()
-    say(f"{len(found.processes)} processes, {count} nodes")
+    say(f"{len(filled)} processes, {count} nodes and modules; and "
+        f"{len(found.processes) - len(filled)} processes of supervision")
     print_table(("process", "kind", "restarted by", "nodes"), [
         (p.name, p.kind, p.brought_back_by or "-", ", ".join(
-            f"{name} ({actor.partition(':')[2]})" for name, actor in p.nodes.items()))
+            f"{name} ({actor.partition(':')[2] or 'command'})" for name, actor in p.nodes.items()))
         for p in found.processes])
     say()
     say(f"{len(found.talks)} topics")

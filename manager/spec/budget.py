@@ -101,7 +101,7 @@ def _of_mechanisms(spec: SystemSpec) -> Iterator[Budget]:
             left_s = min(detections[name].soonest_s for name in parent.detections)
             hazard = f"{parent.detect} of {parent.name} detects the consequence"
         # Any input may be the one that opens the gate: count the slowest.
-        detection_s = max(detection.latency_s for detection in listens_to) + (
+        detection_s = max(map(spec.latency_s, listens_to)) + (
             spec.link_s(manager, mechanism.detections))
         arbitration_s = timing.arbitration_s + spec.link_s(manager, mechanism.recoveries)
         yield Budget(mechanism.name, hazard, left_s, detection_s, arbitration_s, timing.actuation_s,

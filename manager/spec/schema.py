@@ -262,11 +262,16 @@ class SystemSpec(Table, frozen=True):
 
     @property
     def titles(self) -> dict[str, str]:
-        """Titles of modules and mechanisms by name; a mechanism has those of its detections."""
+        """Titles of modules and mechanisms by name.
+
+        A mechanism has the title of its detection module, or its gate with titles in quotes.
+        """
         titles = {d.name: d.title for d in self.detections}
+        quoted = {name: f"'{title}'" for name, title in titles.items() if title}
+        gates = {m.name: detection_gate(m.detect) for m in self.mechanisms}
         titles |= {r.name: r.title for r in self.recoveries}
-        return titles | {m.name: " / ".join(titles[name] for name in m.detections)
-                         for m in self.mechanisms}
+        return titles | {name: titles[gate.name] if gate.name else str(gate.renamed(quoted))
+                         for name, gate in gates.items()}
 
     def without_disabled(self) -> SystemSpec:
         """Return the spec without disabled mechanisms; itself if none is disabled.
@@ -305,6 +310,16 @@ class SystemSpec(Table, frozen=True):
         """The name of the host of each node, detection and recovery module."""
         first = self.hosts[0].name if self.hosts else ""
         return {row.name: row.host if first and row.host else first for _, row in self.placed()}
+
+    def latency_s(self, detection: DetectionSpec) -> float:
+        """Return the longest time from an error to the report of a detection module.
+
+        A watched command that hangs sends the node's heartbeats until the timeout of its own.
+        """
+        watched = detection.watch if "timeout_s" in detection.parameters else ()
+        return max([detection.latency_s, *(
+            node.heartbeat.timeout_s for node in self.nodes
+            if node.heartbeat and node.name in watched)])
 
     def link_s(self, node: str, others: Iterable[str]) -> float:
         """Return the link's delay if any of the others is on another host, else 0."""

@@ -82,3 +82,43 @@ def test_what_a_system_is_for_scripts(capsys):
     crash = next(each for each in found["consequences"] if each["detection"] == "DM4")
     assert (crash["mechanisms"], crash["active"], crash["decided"], crash["escalation"]) == (
         ["FTM4"], ["FTM4"], ["RM3"], {"RM3": ["RM2", "RM1"]})
+
+
+def test_explain_counts_the_processes_of_the_system_as_check_does(capsys):
+    checked = json.loads(said(capsys, "check", str(CELL), "--json")[0])
+    out, _ = said(capsys, "explain", str(CELL))
+    modules = checked["detection_modules"] + checked["recovery_modules"]
+    assert (f"{checked['processes']} processes, {checked['nodes'] + modules} nodes and modules"
+            in out)
+
+
+def with_command(name: str, timeout_s: float) -> str:
+    """The cell with a command in place of a node, with a timeout of its own heartbeat."""
+    actor = f'name = "{name}"\nactor = "rampart.actors.runtime.stub_node:StubNode"'
+    assert TEXT.count(actor) == 1
+    return TEXT.replace(actor, f'name = "{name}"\ncommand = ["sleep", "1000"]\n'
+                               f'heartbeat = {{ key = "alive", timeout_s = {timeout_s} }}')
+
+
+def test_a_hang_of_a_command_is_detected_after_the_timeout_of_its_own_heartbeat(capsys, tmp_path):
+    file = tmp_path / "cell.toml"
+    file.write_text(with_command("camera", 0.42))
+    found = json.loads(said(capsys, "explain", str(file), "--json")[0])
+    within_s = {each["detection"]: each["within_s"] for each in found["consequences"]}
+    assert (within_s["D_VISION_CRASH"], within_s["D_MOTION_CRASH"]) == (0.42, 0.3)
+    assert "camera (command)" in said(capsys, "explain", str(file))[0]
+
+
+def test_a_command_with_too_long_a_timeout_of_its_heartbeat_is_refused(capsys, tmp_path):
+    file = tmp_path / "cell.toml"
+    file.write_text(with_command("motion_planner", 1.0))
+    _, err = said(capsys, "check", str(file), code=2)
+    assert "the time budget does not fit: M_MOTION" in err
+
+
+@pytest.mark.parametrize(("mechanism", "detected"), [
+    ("M_MISSED_PART", "'Part not where it should be' and not 'Force at the wrist too high'"),
+    ("M_CURTAIN", "Light curtain broken")])
+def test_a_decision_states_the_gate_of_its_detections(capsys, mechanism, detected):
+    out, _ = said(capsys, "decide", mechanism, "--system", str(CELL))
+    assert f" {detected} ({mechanism})" in out
