@@ -8,8 +8,9 @@ While it runs, use `kill-node`, `rampart inject` and `rampart status` in another
 
 exit code: 0 success and safe; 1 mission failed but safe, or a node was given up or
 kept failing; 2 bad usage or unsound system; 3 unsafe; 4 safety not known. Causes of 4
-are a missing ground truth, unstable physics, and a killed process `run`. A report that
-cannot be written does not change the code; "report_error" of --json has the reason.
+are a missing ground truth, a world that has died, unstable physics, and a killed
+process `run`. A report that cannot be written does not change the code; "report_error"
+of --json has the reason.
 """
 
 from __future__ import annotations

@@ -135,8 +135,9 @@ def action_of(planned: PlannedFault, injection: str, nodes: Collection[str],
         if kind in ("slow", "stop") and node == ALL:
             node = ""
         elif node not in nodes:
-            raise ScenarioError(f"fault {planned.fault!r}: no node {node!r}; there are: "
-                                f"{', '.join(nodes)}")
+            raise ScenarioError(f"fault {planned.fault!r}: no node {node!r} that a fault can hit; "
+                                f"there are: {', '.join(nodes)} (not the world: it stands for the "
+                                "real one, and nothing could restart it)")
         pace_s = number(planned.fault, details[1:], _SLOW_S, most=60.0) if kind == "slow" else 0.0
         return OnProcess(kind, node, pace_s, _LASTS_S[kind] if lasts_s is None else lasts_s)
     own = faults.own(planned.fault, injection, lasts_s)

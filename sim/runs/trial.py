@@ -8,6 +8,7 @@ names.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -20,12 +21,12 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.keeping_up import KeepingUp
-from rampart.actors.ftm.messages import NodeTable, ProcessEvent
+from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable, ProcessEvent
 from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.run_context import RunContext
-from rampart.actors.runtime.run_plan import OBSERVER
+from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR
 from rampart.actors.system.members import (
     application_class,
     import_class,
@@ -47,6 +48,10 @@ from rampart.sim.runs.report import Written, margin_text, render, try_report
 
 LAUNCHER = "launch.py"
 RECORDER = "recorder"
+
+_DEAD_S = 0.4
+"""Least time between two node tables with a dead world that end a judged run; simulated seconds. A
+new supervisor may publish a table before it has adopted all living processes."""
 
 _SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
 
@@ -109,6 +114,11 @@ class Trial:
         self._brought_back = 0
         self._curves = CurveRecorder(system_topics(run.system) if self.draws else ())
         self._worlds = frozenset(n.name for n in run.system.nodes if n.kind is Kind.WORLD)
+        # The process of a world is restarted only if a recovery module owns it.
+        self._mortal = frozenset(
+            nodes[0].name for nodes in run.system.processes().values()
+            if self.judges and nodes[0].kind is Kind.WORLD and nodes[0].respawn == SUPERVISOR)
+        self._dead_from_s: dict[str, float] = {}
         self._unjudged = ""
         self._keeping_up = None if run.plan.virtual else KeepingUp(
             run.system.timing, sorted(self._worlds), run.plan.rate, run.plan.begins_s)
@@ -123,6 +133,19 @@ class Trial:
         if topic is bus_topics.DIAGNOSTIC and message.context == UNSTABLE \
                 and header.source in self._worlds and not self._unjudged:
             self._unjudged = f"{UNSTABLE}: {message.reason}"
+        elif topic is topics.NODES and self._mortal and not self._unjudged:
+            for row in message.nodes:
+                if row.name in self._mortal:
+                    self._look_at_row(row, header.stamp)
+
+    def _look_at_row(self, row: NodeInfo, now_s: float) -> None:
+        if row.state is not NodeState.CRASHED:
+            self._dead_from_s[row.name] = math.inf
+        elif row.name in self._dead_from_s:  # else its first process is not forked yet
+            from_s = self._dead_from_s[row.name] = min(self._dead_from_s[row.name], now_s)
+            if now_s - from_s >= _DEAD_S:
+                self._unjudged = (f"the world has died: nothing restarts {row.name}, and without "
+                                  "it there is no ground truth")
 
     def outside(self, context: Callable[[str], Context], heard: Callable[[NodeTable], None],
                 scenario: Sequence[PlannedFault], control: ProcessControl, nodes: Sequence[str],
@@ -195,11 +218,11 @@ class Trial:
         """Do not count simulated seconds in which the launcher was stopped."""
 
     def ended(self, now_s: float) -> str | None:
-        """Return why the run is over, also if its physics are unstable, or None."""
+        """Return why the run is over, also if its world is unstable or dead, or None."""
         return self._unjudged or self.over(now_s)
 
     def settled(self, verdict: Verdict) -> Verdict:
-        """Return a verdict that takes unstable physics into account.
+        """Return a verdict that takes an unstable or dead world into account.
 
         After that, an unsafe run stays unsafe, and any other cannot be judged.
         """
@@ -233,12 +256,13 @@ class Trial:
 
     def concluded(self, verdict: Verdict, now_s: float, why: str) -> RunRecord:
         """Return the record of a judged run that ended for a reason."""
-        verdict = self.settled(verdict)
+        verdict, now_s = self.settled(verdict), max(0.0, now_s)
+        ended = () if why == self._unjudged else (f"ended: {why}",)
         return self.recorder.record(
             now_s, **self._seen_to(now_s),
             mission="success" if verdict.success else "fail",
             safety=_SAFETY[verdict.safe],
-            reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
+            reasons=() if verdict.success and verdict.safe else (*verdict.reasons, *ended))
 
     def summary(self, record: RunRecord) -> dict[str, Any]:
         """Return the data of the last line of stdout with --json."""

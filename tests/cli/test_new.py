@@ -15,6 +15,7 @@ import pytest
 
 from rampart.cli import new
 from rampart.cli.main import main
+from rampart.testing import RealRun, virtual_run
 from tests import ROOT
 
 
@@ -70,6 +71,41 @@ def test_what_it_makes_runs_on_processes(tmp_path, monkeypatch):
                           capture_output=True, check=False,
                           env={**os.environ, "PYTHONPATH": str(ROOT)})
     assert json.loads(done.stdout.splitlines()[-1])["safety"] == "safe", done.stderr
+
+
+DIES = {
+    "after five seconds": ("    def step(self) -> None:\n", "        if self.clock.now() > 5:\n"
+                           "            raise RuntimeError('died')\n"),
+    "at its start": ("    parameters: Parameters\n", "    def __init__(self, context):\n"
+                     "        raise ValueError('a broken model')\n")}
+
+
+@pytest.mark.parametrize(("when", "name", "by_s"), [
+    ("after five seconds", "mortal", 6.5), ("at its start", "stillborn", 1.5)])
+def test_a_world_that_dies_ends_its_run_and_safety_is_not_known(tmp_path, monkeypatch, when, name,
+                                                                by_s):
+    robot = made(tmp_path, monkeypatch, name)
+    world = robot / name / "world.py"
+    before, more = DIES[when]
+    text = world.read_text()
+    assert text.count(before) == 1
+    world.write_text(text.replace(before, before + more))
+    done = virtual_run(robot / f"{name}.toml")
+    assert (done.record.mission, done.record.safety) == ("fail", "not known")
+    assert (done.judgement.success, done.judgement.safe) == (False, None)
+    assert done.record.duration_s < by_s
+    assert "the world has died" in done.record.reasons[0]
+
+
+@pytest.mark.processes
+def test_a_world_that_is_killed_ends_its_run_with_exit_code_4(tmp_path, monkeypatch):
+    robot = made(tmp_path, monkeypatch)
+    with RealRun(tmp_path, robot / "courier.toml", "--duration", "40") as real:
+        real.sleep_until(3)
+        real.kill("world")
+        code, result = real.result()
+    assert (code, result["mission"], result["safety"]) == (4, "fail", "not known")
+    assert result["duration_s"] < 20
 
 
 @pytest.mark.parametrize("name", ["Courier", "9lives", "a-b", "a b", "", "../x", "/tmp/x", "class",

@@ -94,7 +94,7 @@ REFUSED = [
     (["--host", "ground"], "--host ground: osmosis has no [[host]]; it runs on one machine"),
     (["--no-keys"], "--no-keys: osmosis runs on one machine"),
     ([*OF_TANK, "--virtual"], "--virtual: expected --duration S"),
-    ([*OF_TANK, "--fault", "kill:nobody"], "no node 'nobody'; there are: supervisor, pump_contr"),
+    ([*OF_TANK, "--fault", "kill:nobody"], "no node 'nobody' that a fault can hit; there are:"),
     ([*OF_TANK, "--patience", "7"], "--patience 7: tank has no mission"),
     ([*OF_TANK, "--obstacles", "1"], f"--obstacles: {NO_OPTION}"),
     ([*OF_TANK, "--joystick"], f"--joystick: {NO_OPTION}"),

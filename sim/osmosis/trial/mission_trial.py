@@ -15,7 +15,7 @@ from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
-from rampart.manager.spec.schema import Kind, SystemSpec
+from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
 from rampart.sim.osmosis.trial.report import headline, render
@@ -119,9 +119,7 @@ class MissionTrial(Trial):
         self.title = f"{self.name} on {known.airport.name}"
         self.about = f"mission {self.name} ({self.goals} goals) on {known.airport.name}"
         self._end = RunEnd(
-            _PATIENCE_S if limit_s is None else limit_s, run.plan.waits,
-            [node.name for node in run.system.nodes if node.kind is Kind.WORLD],
-            run.plan.begins_s)
+            _PATIENCE_S if limit_s is None else limit_s, run.plan.waits, run.plan.begins_s)
         self.recorder = MissionRecorder(run.plan, self.strategy, known.airport, known.mission,
                                         run.system.titles)
 

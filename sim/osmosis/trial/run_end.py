@@ -2,18 +2,16 @@
 
 A run ends when the mission has ended, when the Mission Manager has lost it, or without progress for
 `patience_s`, and then when the robot stands. A robot that keeps driving is observed for a minute,
-since it may leave the pavement. A run whose world has ended ends at once; one whose world is silent
-ends after half a minute.
+since it may leave the pavement. A run whose world is silent ends after half a minute.
+`rampart.sim.runs.trial` ends a run whose world has died.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from rampart.actors.ftm.messages import ProcessEvent
 from rampart.actors.osmosis import messages as m
 
 _ENDED = (m.MissionPhase.SUCCEEDED, m.MissionPhase.FAILED, m.MissionPhase.CANCELLED)
@@ -29,7 +27,6 @@ STANDING_MPS, STANDING_RADPS = 0.05, 0.1
 
 LOST_AFTER_S = 3.0
 ACCEPT_WITHIN_S = 30.0
-WORLD_SILENT_S = 3.0
 WORLD_LATE_S = 30.0
 """On an overloaded machine the ground truth of a running world may be missing for ten seconds."""
 _STEP_TOWARDS_GOAL_M = 0.5
@@ -45,13 +42,11 @@ class RunEnd:
         patience_s: longest time without progress: a step, a measured light, half a metre towards
             the goal, or a detour.
         waits: whether the operator starts the mission at any time.
-        worlds: names of the nodes that simulate the world.
         begins_s: start of this part of the run.
     """
 
     patience_s: float
     waits: bool = False
-    worlds: Collection[str] = ()
     begins_s: float = 0.0
     _mission_id: str = ""
     _progress: tuple[int, int] = (-1, -1)
@@ -63,7 +58,6 @@ class RunEnd:
     _lost_at_s: float = math.inf
     _truth_at_s: float = math.inf
     _moves: bool = False
-    _is_gone: bool = False
 
     def __post_init__(self) -> None:
         """Start the patience."""
@@ -77,8 +71,6 @@ class RunEnd:
             self.control(message, now_s)
         elif isinstance(message, m.GroundTruth):
             self.truth(message.twist, now_s)
-        elif isinstance(message, ProcessEvent) and message.node in self.worlds:
-            self._is_gone = message.event not in {"running", "resumed", "adopted"}
 
     def mission(self, status: m.MissionStatus, now_s: float) -> None:
         """Take the mission's state."""
@@ -121,9 +113,8 @@ class RunEnd:
 
     def world_gone(self, now_s: float) -> str:
         """Return that ground truth is missing, or ""."""
-        late_s = WORLD_SILENT_S if self._is_gone else WORLD_LATE_S
         return ("the world is gone: no ground truth from the simulator"
-                if now_s - self._truth_at_s > late_s else "")
+                if now_s - self._truth_at_s > WORLD_LATE_S else "")
 
     def ended(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""

@@ -98,8 +98,8 @@ def test_all_processes_are_slow_at_once_and_none_is_killed_by_a_name_that_means_
 
 
 @pytest.mark.parametrize(("fault", "words"), [
-    ("kill:nobody", "no node 'nobody'; there are: supervisor, "),
-    ("kill", "no node ''"), ("kill:simulator", "no node 'simulator'"),
+    ("kill:nobody", "no node 'nobody' that a fault can hit; there are: supervisor, "),
+    ("kill", "no node ''"), ("kill:simulator", "not the world"),
     ("slow:DM1:x", "must be one number between 0 and 60"),
     ("stuck-wheel:fifth", "unknown wheel 'fifth'; known: front-left"),
     ("weak-wheel:rear-left:2", "must be one number between 0 and 1"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from rampart.actors.ftm.messages import ProcessEvent
 from rampart.actors.osmosis.messages import (
     ControlPhase,
     ControlStatus,
@@ -18,7 +17,6 @@ from rampart.sim.osmosis.trial.run_end import (
     SETTLE_S,
     WATCH_S,
     WORLD_LATE_S,
-    WORLD_SILENT_S,
     RunEnd,
 )
 
@@ -138,17 +136,6 @@ def test_who_has_no_route_yet_or_has_arrived_does_not_say_how_near_it_came():
     end.control(going(20.0), 35.0)
     assert end.ended(60.0) is None
     assert end.ended(76.0) == "no progress for 40 s"
-
-
-def test_a_world_whose_process_has_ended_is_not_waited_for():
-    end = RunEnd(100.0, waits=True, worlds=["simulator"])
-    end.truth(STANDS, 2.0)
-    for node, event in (("simulator", "running"), ("localization", "crashed")):
-        end.take(ProcessEvent(node, event, 1, 1, "supervisor", ""), 2.0)
-    assert end.world_gone(2.1 + WORLD_SILENT_S) == ""
-    end.take(ProcessEvent("simulator", "crashed", 1, 1, "supervisor", ""), 2.0)
-    assert end.world_gone(2.0 + WORLD_SILENT_S) == ""
-    assert "the world is gone" in end.world_gone(2.1 + WORLD_SILENT_S)
 
 
 def test_a_part_that_begins_late_has_the_patience_of_one_that_begins_at_zero():
