@@ -208,8 +208,11 @@ class Gateway(Actor):
             self._note(name, note)
 
     def on_stop(self) -> None:
-        """Leave the graph."""
+        """Stop what the gateway commands, and leave the graph."""
         if self._side is not None:
+            for link in self._links.values():
+                if isinstance(link, Publication):
+                    link.end()
             self._side.close()
             self._recorder.close()
 

@@ -175,10 +175,19 @@ class Publication:
         self._passed_s, self._zeros = now_s, 0
         self._publish(payload)
 
+    def end(self) -> None:
+        """Publish a last message of zeros, if zeros are configured and have not come already."""
+        if self._link.stop_after_s is not None and self._zeros < _ZEROS:
+            self._publish_zeros()
+
+    def _publish_zeros(self) -> None:
+        gateway = self._gateway
+        self._publish(self._translate.zero(gateway.time.stamp_ns(gateway.clock.now())))
+
     def _stop_if_silent(self) -> None:
         silence_s = self._link.stop_after_s or math.inf
         now_s = self._gateway.clock.now()
         if self._zeros < _ZEROS and now_s - self._passed_s >= silence_s:
             self._zeros += 1
-            self._publish(self._translate.zero(self._gateway.time.stamp_ns(now_s)))
+            self._publish_zeros()
         self._gateway.call_later(silence_s / 2, self._stop_if_silent)

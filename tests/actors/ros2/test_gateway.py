@@ -148,6 +148,40 @@ async def test_when_the_system_falls_silent_ros_2_is_told_zeros(system):
 
 
 @beside()
+async def test_at_an_orderly_end_ros_2_gets_one_last_zero(system):
+    base = system.start_node("base")
+    system.start_node("gateway")
+    system.start_node("driver")
+    await asyncio.sleep(1.0)
+    assert base.heard[-1] == 0.5
+    await system.stop("gateway")
+    await asyncio.sleep(0.5)
+    assert base.heard.count(0.0) == 1
+    assert base.heard[-1] == 0.0
+
+
+@beside()
+async def test_a_gateway_that_has_commanded_nothing_ends_without_a_zero(system):
+    base = system.start_node("base")
+    system.start_node("gateway")
+    await asyncio.sleep(1.0)
+    await system.stop("gateway")
+    await asyncio.sleep(0.5)
+    assert base.heard == []
+
+
+@beside(base=SYSTEM.replace("stop_after_s = 0.2\n", ""))
+async def test_without_stop_after_s_no_zero_ends_a_topic(system):
+    base = system.start_node("base")
+    system.start_node("gateway")
+    system.start_node("driver")
+    await asyncio.sleep(1.0)
+    await system.stop("gateway")
+    await asyncio.sleep(0.5)
+    assert base.heard[-1] == 0.5
+
+
+@beside()
 async def test_the_graph_says_who_is_there_and_when_a_process_dies_it_is_gone(system):
     system.start_node("gateway")
     graph = system.hear(GRAPH, "gateway")
