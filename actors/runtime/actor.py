@@ -12,6 +12,7 @@ mailbox, so a handler that never returns silences it.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -311,7 +312,16 @@ class Actor(Declared):
         finally:
             await self._tear_down()
 
+    def _check_names(self) -> None:
+        """Raise TypeError if an attribute of a subclass hides a method."""
+        for base in type(self).__mro__:
+            for name, member in vars(base).items():
+                if inspect.isfunction(member) and not callable(getattr(self, name)):
+                    raise TypeError(f"{type(self).__name__}.{name}: {base.__name__} has a method "
+                                    "of this name; expected another name for the attribute")
+
     def _set_up(self) -> None:
+        self._check_names()
         declared: dict[str, tuple[Topic[Any], list[Callable[[Any, Header], None]]]] = {}
         for topic, method in self._handlers:
             if self.listens(topic):

@@ -376,6 +376,26 @@ def test_a_handler_with_a_name_that_the_base_class_has_is_refused(base, name):
         type("Own", (base,), {name: every(1.0)(lambda self: None)})
 
 
+async def test_an_attribute_that_hides_a_method_is_refused_before_the_node_works():
+    class Own(Actor):
+        def __init__(self, context: Context) -> None:
+            super().__init__(context)
+            self.stop = False
+
+    node = Own(Context("own", 1, Clock(0.0), VirtualBus(Hub(), "own")))
+    with pytest.raises(TypeError, match=r"Own\.stop: Actor has a method of this name"):
+        await node.run()
+
+
+async def test_a_value_of_the_class_that_hides_a_method_is_refused():
+    class Own(DetectionModule):
+        activate = 3
+
+    node = Own(Context("own", 1, Clock(0.0), VirtualBus(Hub(), "own")))
+    with pytest.raises(TypeError, match=r"Own\.activate: DetectionModule has a method"):
+        await node.run()
+
+
 def test_a_handler_may_be_replaced_by_one_of_a_derived_class():
     class First(Actor):
         @every(1.0)
