@@ -25,6 +25,7 @@ from rampart.actors.runtime.checkpoint import StateFormat as StateFormat
 from rampart.actors.runtime.fault_watch import Order as Order
 from rampart.actors.runtime.parameters import FieldName as FieldName
 from rampart.actors.runtime.parameters import Suspects as Suspects
+from rampart.actors.runtime.parameters import TopicHeard as TopicHeard
 from rampart.actors.runtime.run_context import RunContext as RunContext
 from rampart.actors.runtime.timer import Timer as Timer
 from rampart.manager.analysis.verification import verify as verify

@@ -6,6 +6,7 @@ of its own, where the page has the usual one.
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import shlex
@@ -15,7 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from rampart.testing import RealRun, free_port
+from rampart.actors.bus.topics import DIAGNOSTIC
+from rampart.testing import RealRun, VirtualSystem, free_port, run
 from tests import ROOT
 from tests.documents.test_authors import follow
 
@@ -49,9 +51,33 @@ def test_the_guarded_robot_is_sound_and_its_navigation_restarted_in_virtual_time
     write(tmp_path / "guarded")
     make, enter, *rest = COMMANDS[:COMMANDS.index(RUN)]
     assert (make, enter) == ("mkdir guarded", "cd guarded")
-    check, run = rest
+    check, begin = rest
     assert "sound" in execute(check, tmp_path / "guarded")
-    assert "navigation respawned by R_RESTART" in execute(run, tmp_path / "guarded")
+    assert "navigation respawned by R_RESTART" in execute(begin, tmp_path / "guarded")
+
+
+@pytest.mark.parametrize("field", ["linear_mps", "angular_radps"])
+def test_a_velocity_beyond_the_limits_is_refused_between_guard_and_gateway(
+        tmp_path, monkeypatch, field):
+    write(tmp_path / "guarded")
+    monkeypatch.syspath_prepend(tmp_path / "guarded")
+    for module in ("guard", "robot"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+
+    async def scenario() -> None:
+        async with VirtualSystem.load(tmp_path / "guarded/guarded.toml") as system:
+            for name in ("gateway", "guard", "navigation", "base"):
+                system.start_node(name)
+            reports = system.hear(DIAGNOSTIC, "gateway")
+            await asyncio.sleep(1.0)
+            assert not reports
+            checked = system.layout.topics["guard/velocity"]
+            system.say(checked, checked.type(**{
+                "linear_mps": 0.0, "angular_radps": 0.0, field: 1e6}), "guard", incarnation=2)
+            await asyncio.sleep(0.5)
+            assert {report.message.context for report in reports} == {"payload rejected"}
+
+    run(scenario)
 
 
 @pytest.mark.processes

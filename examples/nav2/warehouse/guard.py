@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rampart import Actor, Context, Header, every, on
-from rampart.actors.runtime.parameters import TopicHeard
+from rampart import Actor, Context, Header, TopicHeard, every, on
 from rampart.manager.spec.tables import Positive
 from warehouse import topics
 from warehouse.topics import GuardState, Order, Velocity
