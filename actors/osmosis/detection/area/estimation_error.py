@@ -35,7 +35,7 @@ class EstimationMonitor(Finding):
 
     def __init__(self, known_after_s: float) -> None:
         super().__init__(known_after_s)
-        self.vote = PositionVote(_POSE)
+        self.vote = PositionVote(_POSE, aligned=known_after_s == -math.inf)
         self._yaw_rad = 0.0
         self._turned = 0
 

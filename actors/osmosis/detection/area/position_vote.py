@@ -72,9 +72,12 @@ class Track:
         stamp_s: time of the newest odometry.
         speed_mps: speed of the newest odometry.
         parity: whether odometry, encoders and gyro agree.
+        aligned: whether its heading is that in `map`. The gyro starts aligned, and drifts; a module
+            that joins a running system has to wait for a course.
     """
 
-    def __init__(self, fresh_s: float) -> None:
+    def __init__(self, fresh_s: float, *, aligned: bool = True) -> None:
+        self.aligned = aligned
         self.place: Place = (0.0, 0.0)
         self.stamp_s = -math.inf
         self.speed_mps = 0.0
@@ -136,7 +139,10 @@ class Track:
     def align(self, course_rad: float) -> None:
         """Align with the course over ground while the robot drives straight ahead."""
         off = math.remainder(course_rad - self.heading_rad, math.tau)
-        if abs(off) < _WILD_COURSE_RAD:
+        if not self.aligned:
+            self._turn(off)
+            self.aligned = True
+        elif abs(off) < _WILD_COURSE_RAD:
             self._turn(_ALIGN_GAIN * off)
 
     def align_slowly(self, yaw_rad: float) -> None:
@@ -166,6 +172,8 @@ _ALIGN_GAIN, _WILD_COURSE_RAD, _FALLBACK_S = 0.02, 0.3, 2.0
 _SLOW_GAIN, _SLOW_RAD = 0.005, 0.01
 """20 times a second 1 mrad/s at most: four times the drift of the simulated gyro."""
 _COURSE_FROM_MPS, _STRAIGHT_RADPS = 0.4, 0.1
+_ALONE_S = 1.0
+"""Without GPS for so long, a module that joins takes the heading of the other position."""
 
 
 class Witness:
@@ -225,6 +233,7 @@ class PositionVote:
 
     Args:
         name: name of the position that is not GPS.
+        aligned: whether the gyro's heading is that in `map`, as at the start of a system.
 
     Attributes:
         outlier: name of the outvoted position, or "".
@@ -233,8 +242,9 @@ class PositionVote:
             positions. Two against two: no position is trusted.
     """
 
-    def __init__(self, name: str) -> None:
-        self.track = Track(WHEELS_FRESH_S)
+    def __init__(self, name: str, *, aligned: bool = True) -> None:
+        self.track = Track(WHEELS_FRESH_S, aligned=aligned)
+        self._alone_since_s = math.inf
         self.position = Witness(name, POSITION_FRESH_S)
         self.gps = Witness(GPS, GPS_FRESH_S)
         self.outlier = ""
@@ -258,7 +268,11 @@ class PositionVote:
             return False
         without_gps = self.outlier == GPS or not (self.outlier or self.gps.fresh(now_s))
         if yaw_rad is not None and without_gps:
-            self.track.align_slowly(yaw_rad)
+            self._alone_since_s = min(self._alone_since_s, stamp_s)
+            if self.track.aligned:
+                self.track.align_slowly(yaw_rad)
+            elif stamp_s - self._alone_since_s > _ALONE_S:
+                self._align(yaw_rad)
         self.position.see(stamp_s, place, self.track, self._forget_s(self.position))
         return True
 
@@ -273,12 +287,19 @@ class PositionVote:
         track = self.track
         self.gps.see(stamp_s, (fix.x_m, fix.y_m), track, self._forget_s(self.gps))
         if track.straight and self.outlier != GPS and not self.contradicted:
-            track.align(math.atan2(fix.velocity_y_mps, fix.velocity_x_mps))
+            self._align(math.atan2(fix.velocity_y_mps, fix.velocity_x_mps))
         if self.position.fresh(now_s):
             self._compare(now_s)
         else:
             self._differing = self._agreeing = 0
         return True
+
+    def _align(self, course_rad: float) -> None:
+        was_aligned = self.track.aligned
+        self.track.align(course_rad)
+        if not was_aligned:  # so far the track led elsewhere
+            self.position.restart()
+            self.gps.restart()
 
     def _usable(self, witness: Witness, stamp_s: float, place: Place, now_s: float) -> bool:
         return (stamp_s > witness.stamp_s and is_sane(*place)
@@ -324,7 +345,7 @@ class PositionVote:
         """Compare two agreeing positions with confirmed dead reckoning."""
         parity, pair = self.track.parity, (self.position, self.gps)
         stray = all(witness.strays for witness in pair)
-        if self.track.by_gyro and parity.confirmed(now_s):
+        if self.track.aligned and self.track.by_gyro and parity.confirmed(now_s):
             self.contradicted = stray
         elif not self.contradicted and not self.outlier and (
                 stray or not (parity.whole(now_s) and parity.sure(now_s))):
@@ -332,8 +353,9 @@ class PositionVote:
                 witness.restart()
 
     def wheels_agree(self, now_s: float) -> bool:
-        """Whether odometry is received and nothing contradicts it."""
-        return self.wheels_fresh(now_s) and self.track.parity.sure(now_s)
+        """Whether dead reckoning is possible and nothing contradicts it."""
+        return (self.track.aligned and self.wheels_fresh(now_s)
+                and self.track.parity.sure(now_s))
 
     def wheels_fresh(self, now_s: float) -> bool:
         """Whether odometry is received."""

@@ -32,10 +32,12 @@ class VotedPosition:
         accuracy_m: error bound of a voted position, m.
         blind_s: longest time on dead reckoning, s.
         blind_m: longest distance on dead reckoning, m.
+        aligned: as for `PositionVote`.
     """
 
-    def __init__(self, accuracy_m: float, blind_s: float, blind_m: float) -> None:
-        self.vote = PositionVote(_ABSOLUTE)
+    def __init__(self, accuracy_m: float, blind_s: float, blind_m: float, *,
+                 aligned: bool = True) -> None:
+        self.vote = PositionVote(_ABSOLUTE, aligned=aligned)
         self._accuracy_m = accuracy_m
         self._blind_s, self._blind_m = blind_s, blind_m
         self._anchor: tuple[float, float] | None = None
@@ -99,7 +101,8 @@ class VotedArea(DetectionModule):
         parameters = self.parameters
         self._looked_s = -math.inf
         self._where = VotedPosition(
-            context.run.system.robot.gps_accuracy_m, parameters.blind_s, parameters.blind_m)
+            context.run.system.robot.gps_accuracy_m, parameters.blind_s, parameters.blind_m,
+            aligned=self.first_life)
         self.monitor = self.judged_by(fence_of(
             self, parameters.margin_m, "position that two sources agree on", parameters.unknown_s))
 

@@ -155,15 +155,17 @@ def test_how_long_and_how_far_it_goes_on_blind_is_bounded():
     assert never < 0.3
 
 
-def vote(a, gps, wheels_mps, seconds=3.0, start=0.0, *, encoders_mps=None):
+def vote(a, gps, wheels_mps, seconds=3.0, start=0.0, *, encoders_mps=None, drifted_rad=0.0,
+         aligned=True):
     """A robot that drives along x with 1 m/s; a, gps: functions of time to an error along y.
 
-    `encoders_mps` is what the base's status says of its wheels; None for no status.
+    `encoders_mps` is what the base's status says of its wheels; None for no status. The gyro's
+    heading is wrong by `drifted_rad`.
     """
-    it = PositionVote("a")
+    it = PositionVote("a", aligned=aligned)
     for i in range(round(seconds * 50)):
         t = start + 0.02 * i
-        it.track.imu(m.Imu(0.0, 0.0, 0.001 * i, 0.0), t, t)
+        it.track.imu(m.Imu(drifted_rad, 0.0, 0.001 * i, 0.0), t, t)
         it.track.odometry(
             m.Odometry(m.Pose(wheels_mps * t, 0.0, 0.0), m.Twist(wheels_mps, 0.0)), t, t)
         if i % 5 == 0 and encoders_mps is not None:
@@ -174,6 +176,17 @@ def vote(a, gps, wheels_mps, seconds=3.0, start=0.0, *, encoders_mps=None):
         if i % 5 == 0 and gps is not None:
             it.see_gps(m.GpsFix(t, gps(t), 1.0, 0.0, 0.02), t, t)
     return it, start + 0.02 * (round(seconds * 50) - 1)
+
+
+@pytest.mark.parametrize("drifted_rad", [0.0, 0.5, 3.0])
+def test_a_module_that_joins_long_after_the_start_takes_its_heading_from_the_course(drifted_rad):
+    it, now_s = vote(none, none, 1.0, 20.0, encoders_mps=1.0, drifted_rad=drifted_rad,
+                     aligned=False)
+    assert (it.contradicted, it.outlier, it.agreeing(now_s)) == (False, "", ("a", "GPS"))
+    assert it.track.heading_rad == pytest.approx(0.0, abs=0.01)
+    blind, now_s = vote(none, None, 1.0, 20.0, encoders_mps=1.0, drifted_rad=drifted_rad,
+                        aligned=False)
+    assert not blind.wheels_agree(now_s)  # no course, and no heading from the position
 
 
 def none(_t):
