@@ -50,6 +50,7 @@ class CommandNode(Actor):
         heartbeat: ChildHeartbeat | None = None
         publishes: TopicsPublished = ()
         hears: TopicsHeard = ()
+        may_end: bool = False
 
     parameters: Parameters
     outputs = (PROGRAM_END,)
@@ -65,6 +66,7 @@ class CommandNode(Actor):
         self._notify: NotifySocket | None = None
         self._pulse = self._new_pulse()
         self._failure = ""  # of this incarnation
+        self._is_done = False
         if self._heartbeat.topic:  # from its own client; for its socket see `_take`
             self.hear_topic(self._heartbeat.topic, self._own_topic)
         for key in self.parameters.hears:
@@ -86,6 +88,8 @@ class CommandNode(Actor):
 
     def is_well(self) -> bool:
         """Whether the program lives and shows that it works; kills a program that hangs."""
+        if self._is_done:
+            return True
         if self._failure or self._program is None:
             self._report_failure()
             return False
@@ -177,7 +181,12 @@ class CommandNode(Actor):
 
     def _ended(self, how: str) -> None:
         self._log.note(f"{self.name} #{self._incarnation} {how}")
-        self._failed(self._failure or how)
+        program = self._program
+        if self.parameters.may_end and program and program.exit_code == 0 and not self._failure:
+            self._is_done, self._program = True, None
+            self._close()
+        else:
+            self._failed(self._failure or how)
 
     def _failed(self, why: str) -> None:
         """Note why this incarnation has failed, and report that until the next one starts."""

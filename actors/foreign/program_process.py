@@ -69,6 +69,7 @@ class ProgramProcess:
                  inherited: Sequence[int], ended: Callable[[str], None]) -> None:
         self._log = log
         self._ended = ended
+        self.exit_code: int | None = None
         self._loop = asyncio.get_running_loop()
         self._loop.add_signal_handler(signal.SIGCHLD, _reap)
         for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
@@ -122,6 +123,7 @@ class ProgramProcess:
 
     def _end_seen(self, status: int) -> None:
         self._leave_nothing()
+        self.exit_code = os.waitstatus_to_exitcode(status)
         self._ended(f"ended: {in_words(status)}")
 
     def _leave_nothing(self) -> None:

@@ -95,6 +95,7 @@ class NodeSpec(Table, frozen=True):
         heartbeat: How the command shows that it runs; None if only its end counts.
         publishes: Keys of topics that it publishes on its socket.
         hears: Keys of topics that it receives there.
+        may_end: Whether the command has done its work when it ends with 0, and stays ended.
         stand_in: Class of the actor that replaces it in virtual time.
     """
 
@@ -113,6 +114,7 @@ class NodeSpec(Table, frozen=True):
     heartbeat: ChildHeartbeat | None = None
     publishes: tuple[str, ...] = ()
     hears: tuple[str, ...] = ()
+    may_end: bool = False
     stand_in: OptionalClassPath = ""
 
     @property
@@ -128,7 +130,7 @@ class NodeSpec(Table, frozen=True):
 
 
 COMMAND_FIELDS = ("command", "env", "folder", "limits", "heartbeat", "publishes", "hears",
-                  "stand_in")
+                  "may_end", "stand_in")
 """Fields that only a node with a command may have."""
 
 _NO_COMMAND = {field: getattr(NodeSpec("none", Kind.WORLD), field) for field in COMMAND_FIELDS}

@@ -325,3 +325,30 @@ def test_ctrl_c_in_the_start_leaves_no_traceback_and_no_program(tmp_path, after_
         tug.process.wait(20)
     assert "Traceback" not in tug.story
     assert [pid for pid in os.listdir("/proc") if folder_of(pid) == str(tmp_path)] == []  # noqa: PTH208
+
+
+def test_a_program_that_may_end_with_0_stays_ended_and_one_that_fails_is_restarted(tmp_path):
+    system_of(tmp_path, """
+[[node]]
+name = "calibration"
+command = ["sh", "-c", "echo $RAMPART_INCARNATION >> calibrated"]
+may_end = true
+kind = "non-control"
+
+[[node]]
+name = "failing"
+command = ["sh", "-c", "[ $RAMPART_INCARNATION -gt 2 ]"]
+may_end = true
+kind = "non-control"
+""")
+    with RealRun(tmp_path, "tug.toml", "--duration", "30") as tug:
+        tug.sleep_until(1)
+        tug.wait_until(lambda: state(tug, "failing") == ("running", 3), 20, "it was not restarted")
+        tug.sleep_until(8)
+        assert state(tug, "calibration") == ("running", 1)
+        assert state(tug, "failing") == ("running", 3)
+        assert below(tug, "calibration") == below(tug, "failing") == {}
+        old = tug.kill("calibration")
+        tug.wait_until(lambda: tug.pid("calibration") not in {None, old}, 10, "not replaced")
+        tug.wait_until(lambda: (tmp_path / "calibrated").read_text().split() == ["1", "2"], 10,
+                       "it did not run again")
