@@ -8,9 +8,9 @@ afterwards nothing could find what the program has forked.
 
 The program never waits for a reader of its output, which is read at once.
 
-It starts by `setpriv` (util-linux), which sets its PR_SET_PDEATHSIG, and gets its limits by
-prlimit(2). Python's `preexec_fn` could do both. But it needs a fork of this process with all its
-memory, 4 to 9 ms, and is not safe beside the threads of Zenoh.
+It starts by `setpriv` and, if it has limits, by `prlimit` (both util-linux): so PR_SET_PDEATHSIG
+and limits hold from its first instruction on. Python's `preexec_fn` could do both. But it needs a
+fork of this process with all its memory, 4 to 9 ms, and is not safe beside the threads of Zenoh.
 """
 
 from __future__ import annotations
@@ -76,11 +76,13 @@ class ProgramProcess:
             signal.signal(number, lambda *_: None)  # a program would inherit SIG_IGN
         _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
-        most = _limits(limits)
+        begin = [_util("setpriv"), "--pdeathsig", "KILL"]
+        if most := _limits(limits):
+            begin += [_util("prlimit"), *most]
         output, printed = os.pipe()
         try:
             process = subprocess.Popen(  # noqa: S603 the specification names the program
-                [_setpriv(), "--pdeathsig", "KILL", program, *arguments], cwd=folder,
+                [*begin, program, *arguments], cwd=folder,
                 env=environment, stdin=subprocess.DEVNULL, stdout=printed, stderr=printed,
                 pass_fds=inherited, start_new_session=True)
         except BaseException:
@@ -91,9 +93,6 @@ class ProgramProcess:
         self.pid = process.pid
         process.returncode = 0  # `_reap` waits for it
         _programs[self.pid] = self._end_seen
-        with contextlib.suppress(ProcessLookupError):  # it has ended already
-            for kind, value in most.items():
-                resource.prlimit(self.pid, kind, (value, value))
         os.set_blocking(output, False)
         self._output = output
         self._loop.add_reader(output, self._read, 1)
@@ -165,26 +164,27 @@ def _kill_descendants() -> None:
     kill_all(left)
 
 
-def _limits(limits: ChildLimits) -> dict[int, int]:
-    wanted = ((resource.RLIMIT_AS, limits.memory_mb, _MEGABYTE, "memory_mb"),
-              (resource.RLIMIT_CPU, limits.processor_s, 1, "processor_s"),
-              (resource.RLIMIT_NOFILE, limits.open_files, 1, "open_files"),
-              (resource.RLIMIT_FSIZE, limits.file_mb, _MEGABYTE, "file_mb"))
-    most = {}
-    for kind, value, unit, field in wanted:
+def _limits(limits: ChildLimits) -> list[str]:
+    """Return the options of prlimit(1)."""
+    wanted = (("as", resource.RLIMIT_AS, limits.memory_mb, _MEGABYTE, "memory_mb"),
+              ("cpu", resource.RLIMIT_CPU, limits.processor_s, 1, "processor_s"),
+              ("nofile", resource.RLIMIT_NOFILE, limits.open_files, 1, "open_files"),
+              ("fsize", resource.RLIMIT_FSIZE, limits.file_mb, _MEGABYTE, "file_mb"))
+    options = []
+    for option, kind, value, unit, field in wanted:
         if value is None:
             continue
-        most[kind] = math.ceil(value * unit)
-        hard = resource.getrlimit(kind)[1]
-        if hard != resource.RLIM_INFINITY and most[kind] > hard:
+        most, hard = math.ceil(value * unit), resource.getrlimit(kind)[1]
+        if hard != resource.RLIM_INFINITY and most > hard:
             raise ValueError(f"limits.{field} = {value:g} is above the hard limit")
-    return most
+        options.append(f"--{option}={most}:{most}")
+    return options
 
 
-def _setpriv() -> str:
-    found = shutil.which("setpriv")
+def _util(program: str) -> str:
+    found = shutil.which(program)
     if found is None:
-        raise FileNotFoundError(errno.ENOENT, "no program setpriv (util-linux) in PATH")
+        raise FileNotFoundError(errno.ENOENT, f"no program {program} (util-linux) in PATH")
     return found
 
 
