@@ -2,13 +2,16 @@
 
 A stored result is valid only for the same content. So the digest is part of the job, and of the key
 of the result. It covers the specification, the application's files, files that specification and
-options name, the code of the packages of the system's own classes, and the engine.
+options name, the packages of the system's own classes, and the engine. It also covers models
+and data beside the specification. Other files there, such as logs and recordings, change during a
+campaign and would prevent its continuation.
 """
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from importlib.metadata import version
@@ -21,10 +24,19 @@ import rampart
 from rampart.actors.system.members import application_class, judge_class
 from rampart.manager.spec.specification import check_document
 from rampart.sim.campaign.job import Job, application_of_job, read_document_of
+from rampart.sim.campaign.store import FILE_NAME
 from rampart.sim.runs.trial import trial_class
 
 _ENGINE_ROOMS = ("files", "manager", "actors", "sim")
 _ENGINE_FILES = {".py", ".xml"}
+_DATA_FILES = {".xml", ".mjcf", ".mjb", ".urdf", ".stl", ".obj", ".msh", ".skn", ".dae", ".png",
+               ".bin", ".csv", ".npy", ".npz", ".yaml", ".yml"}
+_FOREIGN_FOLDERS = {"reports", "__pycache__", "node_modules"}
+_FOREIGN_MARKS = {"pyvenv.cfg", FILE_NAME}
+"""A folder below the robot's that contains one of these is an environment or a campaign."""
+_LEVELS = 3
+_LARGEST_BYTES = 64 << 20
+"""A larger file counts by its size and time of change."""
 _LONGEST_NAME = 400
 _DIGITS = 16
 
@@ -59,9 +71,11 @@ def content_of(job: Job) -> str:
     digest.update(_engine().encode())
     paths = [path for _, path in application.documents()]
     paths += _named((document, job.options), Path(file).parent)
+    paths += [path for path in _files_below(Path(file).parent)
+              if path.suffix.lower() in _DATA_FILES]
     for path in sorted({path.resolve() for path in paths} | set(_sources(names))):
         try:
-            data = path.read_bytes()
+            data = _bytes_of(path)
         except OSError as error:
             raise ValueError(f"{path}: {error.strerror}; it belongs to {file}") from None
         digest.update(f"{path.name} {len(data)}\n".encode() + data)
@@ -90,16 +104,37 @@ def _named(value: Any, beside: Path) -> Iterator[Path]:
         yield from (path for member in value for path in _named(member, beside))
 
 
+def _files_below(folder: Path) -> Iterator[Path]:
+    """Yield the robot's files in a folder and at most `_LEVELS` folders below it."""
+    for name, folders, files in os.walk(folder):
+        here = Path(name)
+        if here != folder and not _FOREIGN_MARKS.isdisjoint(files):
+            folders.clear()
+            continue
+        deep = len(here.relative_to(folder).parts) >= _LEVELS
+        folders[:] = [] if deep else [below for below in folders if not below.startswith(".")
+                                      and below not in _FOREIGN_FOLDERS]
+        yield from (here / file for file in files
+                    if not file.startswith(".") and (here / file).is_file())
+
+
+def _bytes_of(path: Path) -> bytes:
+    """Return the content of a file, or of a large one its size and time of change."""
+    status = path.stat()
+    if status.st_size > _LARGEST_BYTES:
+        return f"{status.st_size} {status.st_mtime_ns}".encode()
+    return path.read_bytes()
+
+
 def _sources(modules: Iterable[str]) -> set[Path]:
-    """Return the code of the user's modules: their packages, or the files beside them."""
+    """Return the files of the user's packages, or the code beside a module without a package."""
     found: set[Path] = set()
     for top in {name.partition(".")[0] for name in modules} - {"rampart"}:
         spec = importlib.util.find_spec(top)
-        if spec is not None and spec.origin:
-            file = Path(spec.origin)
-            found |= set(file.parent.rglob("*.py") if spec.submodule_search_locations else
-                         file.parent.glob("*.py"))
-        elif spec is not None:
-            found |= {path for folder in spec.submodule_search_locations or ()
-                      for path in Path(folder).rglob("*.py")}
+        if spec is None:
+            continue
+        for folder in map(Path, spec.submodule_search_locations or ()):
+            found |= {*folder.rglob("*.py"), *_files_below(folder)}
+        if spec.origin and not spec.submodule_search_locations:
+            found |= set(Path(spec.origin).parent.glob("*.py"))
     return {path.resolve() for path in found}

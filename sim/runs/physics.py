@@ -46,7 +46,8 @@ class RobotModel:
     An application names a derived class as `model`. Its argument is the application of the run.
 
     Args:
-        model: The robot and its surroundings; its first joint is free.
+        model: The robot and its surroundings. `stand` needs a free first joint; a fixed arm sets
+            `data.qpos` in `take` instead.
         data: State; None for a new one.
 
     Attributes:
@@ -76,7 +77,7 @@ class RobotModel:
         """
 
     def stand(self, position_m: Sequence[float], attitude: Sequence[float]) -> None:
-        """Set the pose of the robot; a pose that is not finite is ignored.
+        """Set the pose of a robot whose first joint is free; ignore one that is not finite.
 
         Args:
             position_m: x, y, z of the first body.

@@ -53,13 +53,16 @@ class Pump(Actor):
 """
 FILES = {"tank.toml": SPEC, "curve.csv": "1,2\n", "tank_parts/pump.py": PUMP,
          "tank_parts/limits.py": "import json\nMOST_M = 2.0\n", "tank_parts/__init__.py": "",
-         "notes.txt": "nothing", "tank_parts/unused.py": "X = 1\n"}
+         "notes.txt": "nothing", "tank_parts/unused.py": "X = 1\n",
+         "scene.xml": "<mujoco/>", "meshes/tank.stl": "solid", "tank_parts/tank.xml": "<mujoco/>",
+         "tank_parts/tables/flow.bin": "1", "tank_parts/.cache/old.bin": "1",
+         "reports/run/old.xml": "1", "mine/runs.sqlite": "", "mine/shrunk.xml": "1"}
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     for name, text in FILES.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -78,7 +81,10 @@ def digest(folder: Path) -> str:
 @pytest.mark.parametrize(("name", "counts"), [
     ("tank.toml", True), ("curve.csv", True), ("tank_parts/pump.py", True),
     ("tank_parts/limits.py", True), ("tank_parts/__init__.py", True), ("notes.txt", False),
-    ("tank_parts/unused.py", True)])
+    ("tank_parts/unused.py", True), ("scene.xml", True), ("meshes/tank.stl", True),
+    ("tank_parts/tank.xml", True), ("tank_parts/tables/flow.bin", True),
+    ("tank_parts/.cache/old.bin", False), ("reports/run/old.xml", False),
+    ("mine/shrunk.xml", False)])
 def test_what_goes_into_a_run_is_part_of_its_key(folder, name, counts):
     before = digest(folder)
     assert digest(folder) == before
@@ -92,6 +98,31 @@ def test_a_comment_in_the_specification_changes_nothing(folder):
     before = digest(folder)
     (folder / "tank.toml").write_text("# a comment\n" + SPEC)
     assert digest(folder) == before
+
+
+def test_a_restored_file_restores_the_key(folder):
+    before = digest(folder)
+    (folder / "scene.xml").write_text("<mujoco model='other'/>")
+    assert digest(folder) != before
+    (folder / "scene.xml").write_text(FILES["scene.xml"])
+    assert digest(folder) == before
+
+
+def test_two_files_that_swap_their_names_change_the_key(folder):
+    (folder / "meshes/other.stl").write_text("liquid")
+    before = digest(folder)
+    (folder / "meshes/other.stl").write_text(FILES["meshes/tank.stl"])
+    (folder / "meshes/tank.stl").write_text("liquid")
+    assert digest(folder) != before
+
+
+def test_a_file_too_large_to_read_counts_by_its_size(folder):
+    digests = {digest(folder)}
+    for size in (1 << 40, 1 << 41):
+        with (folder / "tank_parts/world.mjb").open("ab") as file:
+            file.truncate(size)
+        digests.add(digest(folder))
+    assert len(digests) == 3
 
 
 def test_the_engine_is_part_of_it(folder, monkeypatch):
@@ -122,6 +153,8 @@ def test_an_edited_specification_makes_its_runs_anew(folder):
 
     assert made() == "1 runs, 1 of them made now"
     assert made() == "1 runs, 0 of them made now"
+    (folder / "scene.xml").write_text("<mujoco model='other'/>")
+    assert made() == "1 runs, 1 of them made now"
     (folder / "tank.toml").write_text(SPEC.replace("after_s = 3.0", "after_s = 2.0"))
     assert made() == "1 runs, 1 of them made now"
     (folder / "tank_parts/limits.py").write_text("MOST_M = 3.0\n")
