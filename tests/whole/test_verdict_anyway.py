@@ -204,7 +204,7 @@ def test_a_recording_that_is_taken_away_is_not_said_to_be_there(tmp_path):
     recording = VirtualRecording(path, {}, "title", nodes=(), lead_s=1.0, overwrite=False)
     recording.take(*pose(1, 0.5))
     path.unlink()
-    assert recording.close() == f"{path}: was taken away while it was written: nothing is recorded"
+    assert recording.close() == f"{path}: was removed while it was written: nothing is recorded"
 
 
 # -- real processes ------------------------------------------------------------------------------
