@@ -288,7 +288,7 @@ class Gateway(Actor):
         nodes = self.graph.nodes()
         bypassed = self._bypassed()
         problems = [f"{topic}: {who} publishes besides {self.node.full_name}"
-                    for topic, who in bypassed] + self._misfits()
+                    for topic, who in bypassed] + self._strangers() + self._misfits()
         self.publish(GRAPH, RosGraphReport(
             is_linked, tuple(clip(one, NAME_CHARS) for one in list(nodes)[:MANY]),
             tuple(clip(name, NAME_CHARS) for name, count in nodes.items() if count > 1)[:MANY],
@@ -299,6 +299,13 @@ class Gateway(Actor):
         mine = {link.publish for link in self.parameters.ros2 if link.publish}
         return [(one.topic, one.full_name) for one in self.graph.of(EndpointKind.PUBLISHER)
                 if one.topic in mine and not self._is_mine(one.session)]
+
+    def _strangers(self) -> list[str]:
+        expected = {link.subscribe: link.publisher for link in self.parameters.ros2
+                    if link.publisher}
+        return [f"{one.topic}: {one.full_name} publishes; only messages of {expected[one.topic]} "
+                "are passed on" for one in self.graph.of(EndpointKind.PUBLISHER)
+                if expected.get(one.topic, one.full_name) != one.full_name]
 
     def _misfits(self) -> list[str]:
         endpoints = self.graph.of(*EndpointKind)

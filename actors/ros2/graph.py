@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from rampart.actors.ros2.wire import Endpoint, EndpointKind, ros_name
+from rampart.actors.ros2.wire import Endpoint, EndpointKind, gid_of, ros_name
 
 MOST = 20_000
 """Most tokens that are kept; a robot has some hundred."""
@@ -29,7 +29,7 @@ class RosGraph:
         if not alive:
             gone = self._endpoints.pop(token, None)
             if gone is not None:
-                self._by_gid.pop(gone.gid, None)
+                self._by_gid.pop(gid_of(token), None)
             return gone
         if token in self._endpoints:
             return None
@@ -37,7 +37,7 @@ class RosGraph:
             raise ValueError(f"more than {MOST} tokens; the others are ignored")
         found = Endpoint.parse(token)
         self._endpoints[token] = found
-        self._by_gid[found.gid] = found
+        self._by_gid[gid_of(token)] = found  # of all of it: `Endpoint` leaves some parts out
         return found
 
     def of(self, *kinds: EndpointKind) -> list[Endpoint]:

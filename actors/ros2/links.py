@@ -113,14 +113,17 @@ class Subscription:
         return newest[0]
 
     def _is_new(self, attachment: Attachment, now_s: float) -> bool:
-        """Return whether a message is no copy; raises ValueError if a second node publishes."""
+        """Return whether a message is new; raises ValueError if its publisher is refused."""
         gid, graph = attachment.gid, self._gateway.graph
         if gid != self._publisher:
+            expected, name = self._link.publisher, self._name_of(gid)
+            if expected and name != expected:
+                raise ValueError(f"published by {name}; expected {expected}")
             has_left = self._is_in_graph and graph.endpoint(self._publisher) is None
             if (self._link.publishers == "one" and now_s - self._published_s < SILENT_S
                     and not has_left):
                 raise ValueError(f"two publishers, {self._name_of(self._publisher)} and "
-                                 f"{self._name_of(gid)}; only the first one is passed on")
+                                 f"{name}; only the first one is passed on")
             self._publisher, self._sequence, self._is_in_graph = gid, 0, False
         elif 0 < attachment.sequence <= self._sequence:
             return False

@@ -123,7 +123,7 @@ class Endpoint(msgspec.Struct, frozen=True):
     @property
     def gid(self) -> bytes:
         """Id of the endpoint in its messages, 16 bytes."""
-        return xxhash.xxh3_128_intdigest(self.token.encode()).to_bytes(_GID_BYTES, "little")
+        return gid_of(self.token)
 
     @classmethod
     def parse(cls, token: str) -> Endpoint:
@@ -185,6 +185,11 @@ class Attachment(msgspec.Struct, frozen=True):
                              f"with a gid of {_GID_BYTES}")
         sequence, stamp_ns, _, gid = _ATTACHMENT.unpack(data)
         return cls(sequence, stamp_ns, gid)
+
+
+def gid_of(token: str) -> bytes:
+    """Return the id of the endpoint that has declared a token."""
+    return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(_GID_BYTES, "little")
 
 
 def data_key(domain: int, topic: str, dds_type: str, digest: str) -> str:

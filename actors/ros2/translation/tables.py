@@ -71,6 +71,8 @@ class Ros2Link(Table, frozen=True, kw_only=True):
         within_s: How long the answer of a call may take, real seconds.
         stamp: Time of messages from ROS 2: of their header, or of their arrival.
         publishers: Whether a second publisher is refused.
+        publisher: Full name of the node whose messages are taken; "" for any node. It guards
+            against misconfiguration: a client that forges the node's id passes.
         reliable: Whether messages are requested, or offered, reliably.
         transient_local: Whether a late subscriber receives earlier messages.
         depth: Length of the queue.
@@ -97,6 +99,7 @@ class Ros2Link(Table, frozen=True, kw_only=True):
     within_s: Positive = 1.0
     stamp: Literal["header", "arrival"] = "header"
     publishers: Literal["one", "any"] = "one"
+    publisher: OptionalRosName = ""
     reliable: bool = True
     transient_local: bool = False
     depth: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 10
@@ -147,6 +150,8 @@ def _find_wrong(number: int, links: Sequence[Ros2Link],
         yield Finding(".type", f"with {way}, expected package/{kind}/Name", (link.type,))
     if link.stop_after_s and way != "publish":
         yield Finding(".stop_after_s", "is for publish", (link.stop_after_s,))
+    if link.publisher and way != "subscribe":
+        yield Finding(".publisher", "is for subscribe", (link.publisher,))
     if link.answer and way not in {"call", "serve", "goal"}:
         yield Finding(".answer", "is for call, serve or goal", (link.answer,))
     subscribed = {one.to for one in links if one.subscribe}

@@ -213,6 +213,45 @@ async def test_a_second_publisher_is_refused_and_told(system):
     assert "two publishers, /robot/base and /robot/base" in told[0].message.reason
 
 
+NAMED = SYSTEM.replace('''frame = "odom"
+''', '''frame = "odom"
+publisher = "/robot/base"
+''') + """
+[[node]]
+name = "stranger"
+actor = "tests.actors.ros2.robot:Stranger"
+kind = "world"
+"""
+
+
+@beside(base=NAMED)
+async def test_messages_of_another_node_than_the_named_one_never_pass(system):
+    stranger = system.start_node("stranger")
+    gateway = system.start_node("gateway")
+    graph = system.hear(GRAPH, "gateway")
+    odometry = system.hear(gateway.chosen_topic("base/odometry"))
+    told = system.hear(DIAGNOSTIC, "gateway")
+    await asyncio.sleep(3.0)  # it is the only publisher
+    assert stranger.count > 50
+    assert not odometry
+    assert graph[-1].message.refused > 30
+    assert "/odom: /stranger publishes; only messages of /robot/base are passed on" in (
+        graph[-1].message.problems)
+    assert "published by /stranger; expected /robot/base" in told[-1].message.reason
+    base = system.start_node("base")
+    base.speed_mps = 0.5
+    await asyncio.sleep(1.0)
+    assert len(odometry) > 15
+    await system.kill("base")
+    count = len(odometry)
+    await asyncio.sleep(3.0)  # longer than the silence after which another one may take over
+    assert len(odometry) == count
+    system.start_node("base")  # another id, the same name
+    await asyncio.sleep(1.0)
+    assert len(odometry) > count + 15
+    assert 99.0 not in {heard.message.x_m for heard in odometry}
+
+
 def asked(system, gateway, key, **fields):
     topic = gateway.chosen_topic(key)
     system.say(topic, msgspec.convert(fields, topic.type), source="driver")
@@ -518,6 +557,10 @@ async def test_a_node_of_ros_2_whose_token_goes_is_detected_and_named(system):
     ('subscribe = "/odom"\ntype = "std_msgs/msg/Bool"\nto = "a"', "is in ros2[0] already"),
     ('subscribe = "/a"\ntype = "std_msgs/msg/Bool"\nto = "a"\ngateway = "x"',
      "unknown gateway; known: gateway"),
+    ('publish = "/a"\ntype = "std_msgs/msg/Bool"\nfrom = "base/wanted"\npublisher = "/b"',
+     "ros2[2].publisher"),
+    ('subscribe = "/a"\ntype = "std_msgs/msg/Bool"\nto = "a"\npublisher = "b"',
+     "ros2[2].publisher"),
     ('subscribe = "/a"\ntype = "std_msgs/msg/Boole"\nto = "a"',
      "gateway: ros2 /a: type 'std_msgs/msg/Boole' is not known to jazzy"),
     ('publish = "/a"\ntype = "std_msgs/msg/Bool"\nfrom = "a"', "no actor has a topic 'a'"),

@@ -13,6 +13,7 @@ from rampart.actors.ros2.wire import (
     Qos,
     data_key,
     dds_name,
+    gid_of,
     ros_name,
 )
 
@@ -65,6 +66,16 @@ def test_nodes_in_namespaces_and_keys():
 
 def test_what_newer_versions_add_to_a_token_is_left_out():
     assert Endpoint.parse(f"{CAPTURED}/more/and/more") == Endpoint.parse(CAPTURED)
+
+
+@pytest.mark.parametrize("token", [
+    CAPTURED, f"{CAPTURED}/more", CAPTURED.replace(":1:,1:,:,:,,", ":1:,1:2,0:,:,,")])
+def test_the_graph_knows_an_endpoint_by_the_id_of_its_whole_token(token):
+    graph, gid = RosGraph(), gid_of(token)
+    graph.changed(token, True)
+    assert graph.endpoint(gid).node == "_ros2cli_712"
+    graph.changed(token, False)
+    assert graph.endpoint(gid) is None
 
 
 @pytest.mark.parametrize("token", [
