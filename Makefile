@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements docs diagrams release licences pictures
+.PHONY: run test test-slow test-nightly lint campaign bench bench-peers ros-wheels chaos chaos-pairs overload fuzz soak setup clean requirements docs diagrams stop release licences pictures
 
 run: setup
 	$(BIN)/python launch.py
@@ -99,6 +99,11 @@ docs: .venv-docs/installed
 	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	@touch $@
 
+# Compiles rampart-stop, statically; with Debian's musl-tools it needs no other file on the robot.
+stop: stop/rampart-stop
+stop/rampart-stop: stop/rampart-stop.c
+	$$(command -v musl-gcc || echo cc) -static -O2 -Wall -Wextra -Werror -o $@ $<
+
 # Draws docs/images/*.mmd as SVG, with Node's mermaid-cli and Chromium.
 diagrams:
 	for file in docs/images/*.mmd; do \
@@ -142,4 +147,4 @@ licences: setup
 		--packages $$(sed 's/==.*//' requirements.txt); } > docs/contributing/licences.md
 
 clean:
-	rm -rf .venv .venv-docs .venv-peers .venv-ros build site dist reports *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-docs .venv-peers .venv-ros build site dist reports *.egg-info stop/rampart-stop .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -10,7 +10,7 @@ from typing import Any
 
 import argcomplete
 
-from rampart.cli import new
+from rampart.cli import new, service_verb
 from rampart.cli.analyse import (
     check_verbs,
     cut_set_verbs,
@@ -36,7 +36,7 @@ from rampart.files import interrupts, streams, working_folder
 _MODULES = (
     node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
     record_verbs, keys_verb, token_verbs, bench_verb, check_verbs, cut_set_verbs, decide_verbs,
-    tree_verbs, verify_verb, doctor_verb)
+    tree_verbs, verify_verb, doctor_verb, service_verb)
 """Each adds its verbs."""
 
 _GROUPS = {
@@ -44,7 +44,7 @@ _GROUPS = {
     "look": ("status", "top", "node", "topic", "bag", "live", "ros2"),
     "operate": ("reset", "inject", "adapt", "bench"),
     "analyse": ("check", "explain", "decide", "tree", "verify", "cut-sets", "campaign"),
-    "administer": ("keys", "tokens")}
+    "administer": ("keys", "tokens", "service")}
 """Groups of the help. Verbs of other packages come last, under `robots`."""
 
 _HELP = """usage: rampart VERB ...

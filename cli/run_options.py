@@ -106,6 +106,8 @@ _OPTIONS = (
          "full control"),
     word("--host", "NAME", "the [[host]] that this machine is; the run starts when all hosts "
          "are connected (default: the first)"),
+    word("--watchdog", "DEVICE", "watchdog device, such as /dev/watchdog: it resets the machine if "
+         "the root, the supervisor or the FTM Manager stays away (default: none)", ""),
     word("--report", "DIR", f"directory of the report, of checkpoints, and of {ERROR_LOG} with "
          "tracebacks (default: reports/TIME-MISSION, without a mission "
          "reports/TIME-SYSTEM)"),
@@ -219,7 +221,8 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
         rate=options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
-        shadow=options.shadow, waits=options.wait, virtual=options.virtual, host=host)
+        shadow=options.shadow, waits=options.wait, virtual=options.virtual, host=host,
+        watchdog=options.watchdog)
     spec = load_system(plan)
     for node in spec.nodes:
         if node.spare not in {"", "none", "pool"}:
@@ -313,6 +316,9 @@ def _check(options: argparse.Namespace) -> None:
                          "messages of real processes")
     if options.virtual and options.network not in NETWORKS:
         raise UsageError(f"--network {options.network}: unknown; known: {', '.join(NETWORKS)}")
+    if options.watchdog and options.virtual:
+        raise UsageError(f"--watchdog {options.watchdog}: not with --virtual, which runs ahead of "
+                         "real time")
     for role, name in (("--strategy", options.strategy), ("--shadow", options.shadow)):
         if name and name not in STRATEGIES:
             raise UsageError(f"{role} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")

@@ -56,6 +56,7 @@ class RunPlan(msgspec.Struct, frozen=True):
         options: options of the application, in place of the specification's.
         host: name of this plan's host; "" on the first one.
         incarnations: incarnations of this host's supervisor and routers are above this number.
+        watchdog: device that the root feeds while supervisor and manager work, or "".
         part: number of times the run was resumed.
         begins_s: simulated time at which this part of the run begins, after start-up.
     """
@@ -82,6 +83,7 @@ class RunPlan(msgspec.Struct, frozen=True):
     options: dict[str, Any] = {}
     host: str = ""
     incarnations: int = 0
+    watchdog: str = ""
     part: int = 0
     begins_s: float = 0.0
 

@@ -22,7 +22,7 @@ from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.machine.patience import AT_LEISURE, Usage, usage
 from rampart.actors.machine.unix_peer import process_state
 from rampart.actors.supervision.process_title import RunProcess, find_processes, kill
-from rampart.actors.supervision.requests import ALIVE, REQUEST_BYTES, ForkRequest, Reply
+from rampart.actors.supervision.requests import ALIVE, REQUEST_BYTES, WELL, ForkRequest, Reply
 
 __all__ = ["OsProcesses", "ProcessHandle", "Processes", "RunProcess"]
 
@@ -148,27 +148,30 @@ class OsProcesses:
         launcher: Pid of the root.
         root: Descriptor of the connection to the root.
         call_soon: Puts a call into the supervisor's mailbox, under a name.
+        manager_works: Whether the FTM Manager works, as far as the supervisor knows.
     """
 
     has_routers = True
 
     def __init__(self, folder: str, port: int, launcher: int, root: int,
-                 call_soon: Callable[[str, Callable[[], None]], None]) -> None:
+                 call_soon: Callable[[str, Callable[[], None]], None],
+                 *, manager_works: Callable[[], bool]) -> None:
         self.folder = folder
         self._port = port
         self._launcher = launcher
         self._root = socket.socket(fileno=root)
         self._root.setblocking(False)
         self._call_soon = call_soon
+        self._manager_works = manager_works
         self._asked: dict[ForkRequest, Answer] = {}
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._root, self._answered)
-        self._show_alive()
+        self._loop.call_soon(self._show_alive)
 
     def _show_alive(self) -> None:
         """Show the root that this event loop works, and continue the root if it is stopped."""
         with contextlib.suppress(OSError):
-            self._root.send(ALIVE)
+            self._root.send(WELL if self._manager_works() else ALIVE)
         if process_state(self._launcher) == "T":
             kill(self._launcher, signal.SIGCONT)
         self._loop.call_later(ALIVE_S, self._show_alive)

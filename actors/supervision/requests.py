@@ -14,8 +14,8 @@ from rampart.actors.runtime.run_plan import RunPlan
 REQUEST_BYTES = 4096
 """Longest `ForkRequest` or `Reply`: the name of a process, a number, a line."""
 
-ALIVE = b" "
-"""A datagram by which the supervisor shows only that it works."""
+ALIVE, WELL = b" ", b"+"
+"""Datagrams by which the supervisor shows that it works, and that the FTM Manager works as well."""
 
 
 class LaunchError(Exception):

@@ -61,6 +61,7 @@ from rampart.actors.supervision.pool import Pool, wait
 from rampart.actors.supervision.process_title import POOL, kill, set_title
 from rampart.actors.supervision.requests import ForkRequest, LaunchError, Reply
 from rampart.actors.supervision.supervised_process import RestartPolicy
+from rampart.actors.supervision.watchdog import Watchdogs
 from rampart.actors.system.layout import Layout, adapted_system, load_run, published_keys
 from rampart.files import streams, working_folder
 from rampart.files.plain_text import one_line
@@ -146,6 +147,7 @@ class Root:
         self._supervisor_link: socket.socket | None = None
         self._pool: Pool | None = None
         self._held: list[socket.socket] = []
+        self._watchdogs: Watchdogs | None = None
         self._supervisor = SupervisorState()
 
     # -- the whole ------------------------------------------------------------------------------
@@ -352,6 +354,10 @@ class Root:
             run_folder.issue(folder, (OBSERVER,), 1)
         except OSError as error:
             raise LaunchError(f"no folder for the run's sockets: {error}") from None
+        try:
+            self._watchdogs = Watchdogs(plan.watchdog)
+        except OSError as error:
+            raise LaunchError(f"--watchdog {plan.watchdog}: {error.strerror}") from None
         ports = reserve_ports(port) if plan.keys else []
         self._held += ports
         self._take_plan(ports=tuple(reserved.getsockname()[1] for reserved in ports))
@@ -412,6 +418,8 @@ class Root:
         self._await_end(lambda: not self._children, _KILLED_S)
         kill_orphans(self._pid)
         run_folder.remove(self.plan.folder)
+        if self._watchdogs is not None:
+            self._watchdogs.end()
         for kept in self._held:
             if kept in self._selector.get_map():
                 self._selector.unregister(kept)
@@ -514,7 +522,9 @@ class Root:
             return
         self._supervisor.works = True
         self._supervisor.patience.answered()
-        if data == requests.ALIVE:
+        if data == requests.WELL and self._watchdogs is not None:
+            self._watchdogs.feed()
+        if data in (requests.ALIVE, requests.WELL):
             return
         request = msgspec.json.decode(data, type=ForkRequest)
         try:
@@ -655,6 +665,8 @@ class Root:
             os.close(opened) if isinstance(opened, int) else opened.close()
         os.close(wakes)
         self._selector.close()
+        if self._watchdogs is not None:
+            self._watchdogs.release()
 
 
 def _raise_limits(processes: int) -> None:

@@ -91,7 +91,7 @@ class Supervisor(Actor):
         self._layout = Layout(self._plan, self._spec)
         self._machine: Processes = processes or OsProcesses(
             self._plan.folder, self._plan.base_port, self._plan.launcher_pid, run.root,
-            self.call_soon)
+            self.call_soon, manager_works=self._manager_works)
         self._routers = self._layout.routers if self._machine.has_routers else {}
         self._processes = {
             name: self._held(unit) for name, unit in {**self._routers, **self._layout.here}.items()}
@@ -189,6 +189,13 @@ class Supervisor(Actor):
         """Release all processes: the next supervisor adopts them, or the root ends them."""
         for process in self._processes.values():
             process.release()
+
+    def _manager_works(self) -> bool:
+        """Whether the status of the manager is fresh; always on a host without a manager."""
+        limit_s = self._spec.timing.manager_timeout_s / self._plan.rate
+        return all(self._loop.time() - process.heard_s.get(STATUS, -math.inf) <= limit_s
+                   for process in self._processes.values()
+                   if process.unit.kind == Kind.MANAGER.value)
 
     # -- messages -------------------------------------------------------------------------------
 

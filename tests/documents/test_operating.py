@@ -20,12 +20,13 @@ from tests import ROOT, system_file, two_hosts
 
 HOW_TO = {name: (ROOT / f"docs/how-to/{name}.md").read_text(encoding="utf-8") for name in (
     "operator-page", "terminal", "recordings", "several-machines", "credentials",
-    "troubleshooting")}
+    "troubleshooting", "zero-velocity")}
 COMMANDS = [(page, line.partition("  #")[0].strip()) for page, text in HOW_TO.items()
             for block in re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
             for line in block.splitlines()]
-ELSEWHERE = {"pip": "needs an index", "scp": "needs another machine"}
-ALONE = re.compile(r"rampart (keys|tokens|bag|doctor)\b")
+ELSEWHERE = {"pip": "needs an index", "scp": "needs another machine",
+             "make": "compiles what tests/stop compiles"}
+ALONE = re.compile(r"rampart (keys|tokens|bag|doctor|service)\b")
 """Commands that need no run."""
 
 
