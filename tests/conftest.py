@@ -40,7 +40,7 @@ VIRTUAL = ("tests/whole/test_virtual_run.py", "tests/whole/test_guards_alone.py"
            "tests/whole/test_verdict_anyway.py", "tests/whole/test_ros2_mission.py",
            "tests/sim/campaign", "tests/manager/analysis", "tests/cli/analyse",
            "tests/actors/osmosis", "tests/actors/ros2/test_against_ros.py",
-           "examples/quadrotor/tests/test_flights.py", "examples/nav2")
+           "examples/nav2")
 """Tests that only compute, long and in virtual time: they run beside those on real processes."""
 
 TIMED = "tests/actors/osmosis/control/teleoperation"
