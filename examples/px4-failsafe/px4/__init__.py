@@ -1,0 +1,1 @@
+"""The replay of PX4's failsafe tests."""
