@@ -10,12 +10,10 @@ incarnation. When this actor ends in any way, the program ends with everything t
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
 import os
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -25,7 +23,7 @@ from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.foreign.channel import Channel
 from rampart.actors.foreign.output_log import OutputLog
-from rampart.actors.foreign.program import LOGS, find_program, folder_of, log_folder
+from rampart.actors.foreign.program import find_program, folder_of, log_folder, make_log_folder
 from rampart.actors.foreign.program_process import ProgramProcess
 from rampart.actors.foreign.pulse import NotifySocket, Pulse, extension_s
 from rampart.actors.ftm.messages import ProcessEvent, ProgramEnd
@@ -83,7 +81,8 @@ class CommandNode(Actor):
         if self._heartbeat.key:
             self._bus.subscribe(
                 f"{ROOT}/{self._heartbeat.key}", lambda _key, _load: self._alive())
-        self._make_log_folder()
+        if why := make_log_folder(self.context.run.plan):
+            self.report_diagnostic("command", why, self.name)
         self._start()
 
     def is_well(self) -> bool:
@@ -207,18 +206,6 @@ class CommandNode(Actor):
             asyncio.get_running_loop().remove_reader(self._notify.socket)
             self._notify.close()
         self._channel = self._notify = None
-
-    def _make_log_folder(self) -> None:
-        """Make the folder for output, and a link to it in the folder of the run, for tools."""
-        plan = self.context.run.plan
-        folder, here = log_folder(plan), Path(plan.folder, LOGS)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            self.report_diagnostic("command", f"its output is not stored: {error}", self.name)
-        if plan.folder and here != folder:
-            with contextlib.suppress(FileExistsError):
-                here.symlink_to(folder)
 
     # -- its heartbeat --------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 from pathlib import Path
@@ -49,6 +50,23 @@ def find_program(name: str, folder: Path, path: str | None = None) -> str | None
 def log_folder(plan: RunPlan) -> Path:
     """Return the folder for the output of commands: beside the report, if there is one."""
     return (Path(plan.error_log).parent if plan.error_log else Path(plan.folder)) / LOGS
+
+
+def make_log_folder(plan: RunPlan) -> str:
+    """Make the folder for output, and a link to it in the folder of the run, for tools.
+
+    Returns:
+        Why output is not stored; "" if it is.
+    """
+    folder, here = log_folder(plan), Path(plan.folder, LOGS)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        return f"its output is not stored: {error}"
+    if plan.folder and here != folder:
+        with contextlib.suppress(FileExistsError):
+            here.symlink_to(folder)
+    return ""
 
 
 def _flaw(plan: RunPlan, node: NodeSpec) -> tuple[str, object, str] | None:

@@ -1,5 +1,6 @@
-"""The gateway to ROS 2: an actor with a second Zenoh session, among those of `rmw_zenoh`.
+"""The gateway to ROS 2: an actor that is also a node of ROS 2.
 
+There it has a second Zenoh session, among those of `rmw_zenoh`, or a relay, over any middleware.
 It passes on what the tables `[[ros2]]` of the system list, and nothing else. Each row is an
 endpoint of a node in the graph of ROS 2, where `ros2 node info` shows it. The gateway watches the
 graph and reports its nodes to the system. It reports detections to ROS 2 on `/diagnostics`, and
@@ -23,6 +24,8 @@ import msgspec
 from rampart.actors.bus.bounds import MANY, NAME_CHARS, clip
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import Topic
+from rampart.actors.foreign.output_log import OutputLog
+from rampart.actors.foreign.program import log_folder, make_log_folder
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DecisionRecord, DetectionReport, RecoveryReport
 from rampart.actors.ros2.calls import (
@@ -38,6 +41,7 @@ from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.links import Publication, Subscription
 from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.ros2.node import RosNode
+from rampart.actors.ros2.relay_side import RelayError, RelaySide
 from rampart.actors.ros2.ros_clock import NS, RosClock
 from rampart.actors.ros2.side import Mode, Side
 from rampart.actors.ros2.stand_in import side_of, wall_ns
@@ -68,6 +72,10 @@ class Gateway(Actor):
         """Address of ROS 2, and the gateway's name there.
 
         Attributes:
+            middleware: "zenoh" for `rmw_zenoh`, without an installation of ROS 2, or "rclpy" for
+                the middleware of an installation, such as DDS.
+            setup: with "rclpy", the file that bash sources first, relative to the system's file;
+                "" for the environment or, if that has no ROS 2, /opt/ros/DISTRIBUTION/setup.bash.
             connect: endpoints of the routers of ROS 2.
             mode: "client", which works from any machine, or "peer", which works on the machine of
                 ROS 2 only and survives its router.
@@ -81,6 +89,8 @@ class Gateway(Actor):
             ros2: rows `[[ros2]]` of the system, filled in by `given`.
         """
 
+        middleware: Literal["zenoh", "rclpy"] = "zenoh"
+        setup: str = ""
         connect: tuple[str, ...] = (ROUTER,)
         mode: Mode = "client"
         domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
@@ -93,6 +103,11 @@ class Gateway(Actor):
         diagnostics: bool = True
         ros2: tuple[Ros2Link, ...] = ()
 
+        def __post_init__(self) -> None:
+            """Refuse a setup that nothing would source."""
+            if self.setup and self.middleware != "rclpy":
+                raise ValueError('setup: is for middleware = "rclpy"')
+
     parameters: Parameters
     tables = ("ros2",)
     outputs = (GRAPH,)
@@ -104,6 +119,7 @@ class Gateway(Actor):
         self.time = RosClock(given.clock, self.clock.now, self.clock.rate, partial(wall_ns, self))
         self._types = _types(given)
         self._side: Side | None = None
+        self._relay: RelaySide | None = None  # the same, if it is one
         self._links: dict[tuple[str, str], Publication | ServiceCall | ActionCall] = {}
         self._graph_due = False
         self._was_linked = False
@@ -179,7 +195,10 @@ class Gateway(Actor):
         """Join the graph of ROS 2, and declare all endpoints."""
         given, run = self.parameters, self.context.run
         self._recorder = RecorderConnection(run.plan.base_port)
-        self._side = side_of(self, self._bus, given.connect, given.mode, self._recorder.take)
+        if given.middleware == "rclpy" and not run.plan.virtual:
+            self._side = self._relay = self._start_relay()
+        else:
+            self._side = side_of(self, self._bus, given.connect, given.mode, self._recorder.take)
         self.node = RosNode(self._side, self._types, given.node, wall_ns=partial(wall_ns, self),
                             refuse=self.refuse, namespace=given.namespace, domain=given.domain)
         if given.clock == "ros":
@@ -206,6 +225,26 @@ class Gateway(Actor):
         self._side.tokens(f"{ADMIN}/{given.domain}/**", self._token)
         for name, note in self._types.notes.items():
             self._note(name, note)
+
+    def _start_relay(self) -> RelaySide:
+        given, run = self.parameters, self.context.run
+        if why := make_log_folder(run.plan):
+            self._note("relay", why)
+        log = OutputLog(log_folder(run.plan) / f"{self.name}.log")
+        log.note(f"{self.name} #{self.context.incarnation} starts its relay")
+        return RelaySide(given.node, given.namespace, given.domain, given.distribution,
+                         given.setup, lost=self._relay_lost, record=self._recorder.take,
+                         output=log.write, first_s=run.system.timing.startup_grace_s)
+
+    def _relay_lost(self, error: RelayError) -> None:
+        def fail() -> None:
+            raise error
+
+        self.enqueue(None, fail)
+
+    def is_well(self) -> bool:
+        """Whether the relay answers, if there is one."""
+        return self._relay is None or self._relay.is_well(self.clock.now())
 
     def on_stop(self) -> None:
         """Stop what the gateway commands, and leave the graph."""
@@ -282,13 +321,14 @@ class Gateway(Actor):
         if self._side is None:
             return
         is_linked = self._side.is_linked()
-        if self._was_linked and not is_linked:
+        if self._was_linked and not is_linked:  # a relay that is lost ends this process
             self._note("graph", f"no router at {', '.join(self.parameters.connect)} any more")
         self._was_linked = is_linked
         nodes = self.graph.nodes()
         bypassed = self._bypassed()
         problems = [f"{topic}: {who} publishes besides {self.node.full_name}"
-                    for topic, who in bypassed] + self._strangers() + self._misfits()
+                    for topic, who in bypassed] + self._strangers() + self._misfits() + (
+                        self._relay.problems if self._relay else [])
         self.publish(GRAPH, RosGraphReport(
             is_linked, tuple(clip(one, NAME_CHARS) for one in list(nodes)[:MANY]),
             tuple(clip(name, NAME_CHARS) for name, count in nodes.items() if count > 1)[:MANY],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from rampart.actors.ros2.wire import Endpoint, EndpointKind, gid_of, ros_name
+from rampart.actors.ros2.wire import UNKNOWN_HASH, Endpoint, EndpointKind, gid_of, ros_name
 
 MOST = 20_000
 """Most tokens that are kept; a robot has some hundred."""
@@ -81,7 +81,7 @@ def misfits(here: Iterable[Endpoint], there: Iterable[Endpoint]) -> Iterator[str
             who = f"{mine.topic}: {other.full_name}"
             if mine.type != other.type:
                 yield f"{who} has the type {ros_name(other.type)}; expected {ros_name(mine.type)}"
-            elif mine.hash != other.hash:
+            elif other.hash not in {mine.hash, UNKNOWN_HASH}:
                 yield (f"{who} has another definition of {ros_name(mine.type)} ({other.hash}, here "
                        f"{mine.hash}): they exchange nothing; another distribution?")
             elif mine.kind in _OF_TOPICS:

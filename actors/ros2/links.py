@@ -17,7 +17,7 @@ from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import RosClock
 from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward
 from rampart.actors.ros2.translation.tables import Ros2Link
-from rampart.actors.ros2.wire import Attachment, Qos
+from rampart.actors.ros2.wire import UNKNOWN_GID, Attachment, Qos
 from rampart.actors.runtime.clock import Clock
 
 SILENT_S = 1.0
@@ -115,6 +115,9 @@ class Subscription:
     def _is_new(self, attachment: Attachment, now_s: float) -> bool:
         """Return whether a message is new; raises ValueError if its publisher is refused."""
         gid, graph = attachment.gid, self._gateway.graph
+        if gid == UNKNOWN_GID and self._link.publishers == "one":
+            raise ValueError("several publishers, which this ROS 2 does not tell apart; none is "
+                             "passed on")
         if gid != self._publisher:
             expected, name = self._link.publisher, self._name_of(gid)
             if expected and name != expected:

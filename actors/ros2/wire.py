@@ -6,6 +6,7 @@ github.com/ros2/rmw_zenoh.
 
 from __future__ import annotations
 
+import re
 import struct
 from enum import StrEnum
 
@@ -18,8 +19,15 @@ ADMIN = "@ros2_lv"
 DEFAULT_DEPTH = 42
 """Depth of a queue, unless a token has another one."""
 
+UNKNOWN_GID = bytes(16)
+"""In place of a gid: one of several publishers, which a relay could not tell apart."""
+
+UNKNOWN_HASH = "unknown"
+"""In place of a type's hash, in the graph of a relay."""
+
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
+_RELAYED = re.compile(r"[0-9a-f]{32}")
 
 
 class EndpointKind(StrEnum):
@@ -188,7 +196,13 @@ class Attachment(msgspec.Struct, frozen=True):
 
 
 def gid_of(token: str) -> bytes:
-    """Return the id of the endpoint that has declared a token."""
+    """Return the id in messages of the endpoint that has declared a token.
+
+    That of an endpoint in the graph of a relay is its id in the token.
+    """
+    own_id = token.split("/")[4]
+    if _RELAYED.fullmatch(own_id):
+        return bytes.fromhex(own_id)
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(_GID_BYTES, "little")
 
 

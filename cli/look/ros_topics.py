@@ -1,6 +1,7 @@
-"""`rampart topic … --ros` and `rampart ros2 check`: the graph of ROS 2, without ROS.
+"""`rampart topic … --ros` and `rampart ros2 check`: the graph of ROS 2.
 
-They join the graph as a session without a node, which is invisible there, and publish nothing.
+Over Zenoh they join the graph as a session without a node, which is invisible there; by a relay, as
+a hidden node. They publish nothing.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import msgspec
 
 from rampart.actors.ros2.gateway import Gateway, types_of
 from rampart.actors.ros2.graph import RosGraph, misfits
+from rampart.actors.ros2.relay_side import RelayError, RelaySide
 from rampart.actors.ros2.ros_nodes import RosNodes
 from rampart.actors.ros2.side import ZenohSide
 from rampart.actors.ros2.translation.fields import plain
@@ -24,6 +26,7 @@ from rampart.actors.ros2.translation.tables import GATEWAY, Ros2Link
 from rampart.actors.ros2.translation.types import DISTRIBUTIONS, Types
 from rampart.actors.ros2.wire import (
     ADMIN,
+    UNKNOWN_HASH,
     Attachment,
     Endpoint,
     EndpointKind,
@@ -40,8 +43,18 @@ from rampart.manager.spec.schema import SystemSpec
 DOMAIN, DISTRIBUTION = "ROS_DOMAIN_ID", "ROS_DISTRO"
 """Variables of ROS 2."""
 
+RELAY = "rclpy"
+"""In place of a router's endpoint: the middleware of the environment."""
+
 _LINK_S = 3.0
+_RELAY_S = 20.0
 _GRAPH_S = 1.0
+_DISCOVERY_S = 3.0
+"""Fast DDS was seen to take 2.4 s to find a node of the same machine."""
+
+_NODE = "_rampart"
+"""Node of a relay that looks on; `ros2 node list` leaves out names with `_` before them."""
+
 _TOPICS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
 
 
@@ -58,7 +71,7 @@ class Onlooker:
         odd: problems with tokens that cannot be read.
     """
 
-    def __init__(self, side: ZenohSide, domain: int) -> None:
+    def __init__(self, side: ZenohSide | RelaySide, domain: int) -> None:
         self.side, self.graph, self.odd = side, RosGraph(), set[str]()
         side.tokens(f"{ADMIN}/{domain}/**", self._changed)
 
@@ -70,26 +83,40 @@ class Onlooker:
 
 
 @asynccontextmanager
-async def onlooker(connect: tuple[str, ...], domain: int) -> AsyncIterator[Onlooker]:
+async def onlooker(connect: tuple[str, ...], domain: int, distribution: str = "", setup: str = ""
+                   ) -> AsyncIterator[Onlooker]:
     """Yield a session that has received the graph.
 
+    Args:
+        connect: endpoints of routers; `(RELAY,)` for a relay.
+        domain: domain of ROS.
+        distribution: of the relay.
+        setup: of the relay, see `RelaySide`.
+
     Raises:
-        UsageError: an endpoint is invalid.
+        UsageError: an endpoint is invalid, or there is no relay.
         NoEffectError: no router answers.
     """
+    is_relayed, lost = connect == (RELAY,), list[RelayError]()
     try:
-        side = ZenohSide(connect, asyncio.get_running_loop())
-    except ValueError as error:
+        side = (RelaySide(_NODE, "/", domain, distribution, setup, lost=lost.append, whole=True,
+                          first_s=_RELAY_S) if is_relayed
+                else ZenohSide(connect, asyncio.get_running_loop()))
+    except (ValueError, RelayError) as error:
         raise UsageError(str(error)) from None
     try:
         found = Onlooker(side, domain)
-        until_s = time.monotonic() + _LINK_S
+        until_s = time.monotonic() + (_RELAY_S if is_relayed else _LINK_S)
         while not side.is_linked():
+            if lost:
+                raise UsageError(str(lost[0]))
             if time.monotonic() > until_s:
-                raise NoEffectError(f"no router of ROS 2 at {', '.join(connect)}; "
-                                    "`ros2 run rmw_zenoh_cpp rmw_zenohd` starts one")
+                raise NoEffectError(
+                    f"the relay to ROS 2 has not started in {_RELAY_S:g} s" if is_relayed else
+                    f"no router of ROS 2 at {', '.join(connect)}; "
+                    "`ros2 run rmw_zenoh_cpp rmw_zenohd` starts one")
             await asyncio.sleep(0.02)
-        await asyncio.sleep(_GRAPH_S)
+        await asyncio.sleep(_DISCOVERY_S if is_relayed else _GRAPH_S)
         yield found
     finally:
         side.close()
@@ -107,8 +134,8 @@ def domain_of_environment() -> int:
     return int(domain)
 
 
-def types_of_environment() -> Types:
-    """Return the types of the distribution of the environment, by default those of Jazzy.
+def distribution() -> str:
+    """Return the distribution of the environment, by default Jazzy.
 
     Raises:
         UsageError: the distribution is unknown.
@@ -116,12 +143,12 @@ def types_of_environment() -> Types:
     name = os.environ.get(DISTRIBUTION, "jazzy")
     if name not in DISTRIBUTIONS:
         raise UsageError(f"{DISTRIBUTION}={name}: unknown; known: {', '.join(DISTRIBUTIONS)}")
-    return Types(name)
+    return name
 
 
 async def list_topics(options: argparse.Namespace) -> int:
     """Print the topics of ROS 2, as `rampart topic list` does."""
-    async with onlooker((options.ros,), domain_of_environment()) as there:
+    async with onlooker((options.ros,), domain_of_environment(), distribution()) as there:
         found = [_described(topic, ends) for topic, ends in there.graph.topics().items()]
     if options.json:
         print_json(found)
@@ -177,9 +204,9 @@ async def measure(options: argparse.Namespace) -> int:
 async def _receive(options: argparse.Namespace, heard: Any, done: asyncio.Event, *,
                    times: list[float] | None = None, duration_s: float | None = None) -> None:
     """Receive a topic until `done`, the end of the duration, or an interruption."""
-    domain, types = domain_of_environment(), types_of_environment()
+    domain, types = domain_of_environment(), Types(distribution())
     duration_s = duration_s or options.duration
-    async with onlooker((options.ros,), domain) as there:
+    async with onlooker((options.ros,), domain, types.distribution) as there:
         ends = there.graph.on(options.key, EndpointKind.PUBLISHER)
         if not ends:
             known = ", ".join(there.graph.topics()) or "none"
@@ -187,7 +214,7 @@ async def _receive(options: argparse.Namespace, heard: Any, done: asyncio.Event,
         name = ros_name(ends[0].type)
         try:
             decode = types.decoder(name)
-            if types.hash(name) != ends[0].hash:
+            if ends[0].hash not in {types.hash(name), UNKNOWN_HASH}:
                 warn(f"{ends[0].full_name} has another definition of {name} than "
                      f"{types.distribution}; set {DISTRIBUTION} to its distribution")
         except ValueError as error:
@@ -199,8 +226,9 @@ async def _receive(options: argparse.Namespace, heard: Any, done: asyncio.Event,
             except ValueError as error:
                 warn(f"{options.key}: {error}")
 
-        there.side.subscribe(ends[0].key, Qos(transient_local=ends[0].qos.transient_local,
-                                              depth=1), arrived)
+        offered = ends[0].qos
+        there.side.subscribe(
+            ends[0].key, Qos(offered.reliable, offered.transient_local, depth=1), arrived)
         until_s = time.monotonic() + (duration_s or float("inf"))
         while not done.is_set() and time.monotonic() < until_s:
             await asyncio.sleep(1.0 if times is not None else 0.02)
@@ -239,20 +267,27 @@ async def check(options: argparse.Namespace) -> int:
 
 
 async def _checked(name: str, gateway: Gateway.Parameters, spec: SystemSpec) -> list[Finding]:
+    relay = gateway.middleware == RELAY
+    connect = (RELAY,) if relay else gateway.connect
     try:
-        async with onlooker(gateway.connect, gateway.domain) as there:
-            found = [Finding(f"router of {name}", True, ", ".join(gateway.connect))]
+        async with onlooker(connect, gateway.domain, gateway.distribution, gateway.setup) as there:
+            found = [Finding(f"{'relay' if relay else 'router'} of {name}", True,
+                             ", ".join(connect))]
+            if isinstance(there.side, RelaySide):
+                found += [Finding("types", False, why)
+                          for why in await there.side.known(one.type for one in gateway.ros2)]
             found += [Finding("graph", False, odd) for odd in sorted(there.odd)]
             types = types_of(gateway.distribution, gateway.interfaces)
             found += [Finding(kind, True, note) for kind, note in types.notes.items()]
             node = Endpoint(gateway.domain, "0", "0", "0", EndpointKind.NODE, gateway.node,
                             gateway.namespace)
-            unlinked = await _unlinked(there, gateway.connect) if gateway.mode == "peer" else set()
+            unlinked = (await _unlinked(there, connect)
+                        if gateway.mode == "peer" and not relay else set())
             found += [_of_link(link, there.graph, node, types, unlinked)
                       for link in gateway.ros2]
             known = there.graph.nodes()
     except NoEffectError as error:
-        return [Finding(f"router of {name}", False, str(error))]
+        return [Finding(f"{'relay' if relay else 'router'} of {name}", False, str(error))]
     watched = [one for row in spec.detections
                if row.actor == f"{RosNodes.__module__}:{RosNodes.__name__}"
                for one in row.parameters.get("nodes", ()) if row.parameters["gateway"] == name]

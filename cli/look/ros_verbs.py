@@ -1,13 +1,15 @@
 """`rampart ros2`: compare a system with a graph of ROS 2.
 
 Check a system against ROS 2. `rampart topic list`, `echo` and `hz` show topics of
-ROS 2 with --ros. These verbs need no installation of ROS, but the extra:
-pip install 'rampart-robot[ros2]'. The variables ROS_DOMAIN_ID and ROS_DISTRO
-select domain and distribution, as in ROS 2.
+ROS 2 with --ros. Over rmw_zenoh these verbs need no installation of ROS, over
+DDS they do. They need the extra: pip install 'rampart-robot[ros2]'.
+The variables ROS_DOMAIN_ID and ROS_DISTRO select domain and distribution, as in
+ROS 2.
 
 Examples:
   rampart ros2 check --system warehouse.toml
   rampart topic list --ros
+  rampart topic list --ros rclpy
   rampart topic echo /odom --ros tcp/192.168.0.12:7447 -n 1
 """
 
@@ -31,7 +33,7 @@ def check(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     """Check a system against the present graph of ROS 2.
 
     List for each [[ros2]] of a system the nodes on the other side, or the problem.
-    Problems are: no router, no node, another type, another definition of the type,
+    Problems are: no router, no relay, no node, another type, another definition of the type,
     an incompatible quality of service, and a publisher that bypasses the gateway.
     Nothing is published, and the system need not run.
 

@@ -51,7 +51,8 @@ def add(verbs: Any) -> None:
     topic = add_family(verbs, "topic", "list, print and measure topics", __doc__)
     key = option("key", metavar="KEY", completer=completion.topics, help="key of a topic")
     ros = option("--ros", nargs="?", const=ROUTER, metavar="ENDPOINT",
-                 help=f"use topics of ROS 2, by the router at ENDPOINT (default: {ROUTER})")
+                 help=f"use topics of ROS 2, by the router at ENDPOINT (default: {ROUTER}), or, "
+                      "with rclpy in its place, by the sourced ROS 2")
     add_verb(topic, "list", "list all topics; needs no run", topic_list,
              systems.choice(default="that of the run, else osmosis"),
              either(JSON, flag("--markdown", "print the reference page of topics")), ros)

@@ -36,8 +36,8 @@ LARGEST, SMALLEST = 1e9, 1e-9
 LARGEST_INTEGER = 2 ** 63 - 1
 """Of MessagePack, by which parameters reach an actor."""
 
-INTERFACES = "interfaces"
-"""Parameter of a node in a system with `[[ros2]]`: folders, relative to the system's file."""
+INTERFACES, SETUP = "interfaces", "setup"
+"""Parameters of a node in a system with `[[ros2]]`: folders, and a file, relative to its file."""
 
 
 def parse_specification(text: str, file: str) -> SystemSpec:
@@ -191,11 +191,12 @@ def _resolve_folders(spec: SystemSpec, file: str) -> SystemSpec:
     """Make the folders of a ROS 2 gateway relative to the folder of the system's file."""
 
     def resolved(node: NodeSpec) -> NodeSpec:
-        folders = node.parameters.get(INTERFACES)
-        if not isinstance(folders, list):
-            return node
-        parent = PurePath(file).parent
-        return replace(node, parameters={**node.parameters, INTERFACES: [
-            str(parent / folder) if isinstance(folder, str) else folder for folder in folders]})
+        parent, given = PurePath(file).parent, node.parameters
+        found = {name: str(parent / given[name]) for name in (SETUP,)
+                 if isinstance(given.get(name), str) and given[name]}
+        folders = given.get(INTERFACES)
+        more = {INTERFACES: [str(parent / folder) if isinstance(folder, str) else folder
+                             for folder in folders]} if isinstance(folders, list) else {}
+        return replace(node, parameters={**given, **found, **more}) if found or more else node
 
     return replace(spec, nodes=tuple(map(resolved, spec.nodes))) if spec.ros2 else spec

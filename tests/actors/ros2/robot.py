@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import msgspec
 
@@ -112,12 +113,13 @@ class Stranger(StandIn):
 
 
 class Asker(Actor):
-    """Asks the base to shut once a second, by the gateway's own topic."""
+    """Asks the base to shut, or something else, once a second, by the gateway's own topic."""
 
     class Parameters(Actor.Parameters, frozen=True, kw_only=True):
-        """Which topic."""
+        """Which topic, and what."""
 
         topic: TopicPublished = "base/shut"
+        body: dict[str, Any] = msgspec.field(default_factory=lambda: {"data": True})
 
     parameters: Parameters
 
@@ -125,7 +127,7 @@ class Asker(Actor):
     def ask(self) -> None:
         """Ask."""
         topic = self.chosen_topic(self.parameters.topic)
-        self.publish(topic, msgspec.convert({"data": True}, topic.type))
+        self.publish(topic, msgspec.convert(self.parameters.body, topic.type))
 
 
 class Screen(Actor):

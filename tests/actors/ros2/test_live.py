@@ -21,10 +21,10 @@ PEER = ROOT / "tests/actors/ros2/sdk_peer.py"
 class Peer:
     """The other implementation, and what it says."""
 
-    def __init__(self, port):
+    def __init__(self, *command):
         self.lines = []
         self.process = subprocess.Popen(
-            [PYTHON, PEER, str(port), ROS / "share"], stdin=subprocess.PIPE, text=True,
+            [PYTHON, *command], stdin=subprocess.PIPE, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         self.reader = threading.Thread(target=self._read, daemon=True)
         self.reader.start()
@@ -35,6 +35,9 @@ class Peer:
 
     def said(self, key):
         return [line[key] for line in self.lines if key in line]
+
+    def wait_for(self, key):
+        wait_until(lambda: self.said(key), 30)
 
     def ask(self, line):
         self.process.stdin.write(f"{line}\n")
@@ -89,7 +92,7 @@ parameters = {{ connect = ["tcp/127.0.0.1:{port}"], distribution = "kilted" }}
     path = tmp_path / "guarded.toml"
     path.write_text(text + MORE.format(port=port))
     with RealRun(tmp_path, path) as run:
-        with Peer(port) as peer:
+        with Peer(PEER, str(port), ROS / "share") as peer:
             wait_until(lambda: len(peer.said("heard")) > 10, 20)
             assert set(peer.said("heard")) <= {0.5}
             wait_until(lambda: True in peer.said("shut"), 10)

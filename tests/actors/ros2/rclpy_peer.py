@@ -1,0 +1,123 @@
+"""Run by the Python that has the wheels of ROS 2: nodes of a robot in rclpy, over DDS.
+
+    python rclpy_peer.py base|rival|wrong
+
+`base` publishes /odom 20 times a second (best effort) and its name once (transient local), offers
+/base/shut, the action /count and the lifecycle node /camera, and calls /rampart/stop for a line on
+standard input. `rival` publishes /odom and /cmd_vel too; `wrong` publishes texts on /odom. Each
+writes a line of JSON for each message, request and transition.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+
+import rclpy
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from rclpy.action import ActionServer
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+from test_msgs.action import Fibonacci
+
+
+def say(**what):
+    os.write(1, f"{json.dumps(what)}\n".encode())
+
+
+class Camera(LifecycleNode):
+    """A node with states and a parameter."""
+
+    def __init__(self):
+        super().__init__("camera")
+        self.declare_parameter("rate_hz", 12.5)
+
+    def on_configure(self, state):
+        say(state="inactive")
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state):
+        say(state="active")
+        return super().on_activate(state)
+
+
+def publish_odometry(node, speed_mps):
+    publisher = node.create_publisher(
+        Odometry, "/odom", QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+    began = time.monotonic()
+
+    def step():
+        message = Odometry()
+        message.header.stamp = node.get_clock().now().to_msg()
+        message.header.frame_id, message.child_frame_id = "odom", "base_link"
+        message.pose.pose.position.x = time.monotonic() - began
+        message.twist.twist.linear.x = speed_mps
+        publisher.publish(message)
+
+    node.create_timer(0.05, step)
+
+
+def base():
+    node = rclpy.create_node("base")
+    node.create_subscription(Twist, "/cmd_vel", lambda message: say(heard=message.linear.x), 10)
+    publish_odometry(node, 0.5)
+    name = node.create_publisher(String, "/base/name", QoSProfile(
+        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    name.publish(String(data="osmosis"))
+
+    def shut(request, response):
+        say(shut=request.data)
+        response.success, response.message = request.data, "by the other implementation"
+        return response
+
+    node.create_service(SetBool, "/base/shut", shut)
+
+    def count(goal):
+        say(goal=goal.request.order)
+        goal.succeed()
+        return Fibonacci.Result(sequence=[0, 1])
+
+    node.held = name, ActionServer(node, Fibonacci, "/count", count)
+    client = node.create_client(SetBool, "/rampart/stop")
+
+    def listen():
+        for line in sys.stdin:
+            client.call_async(SetBool.Request(data=line.strip() == "stop")).add_done_callback(
+                lambda future: say(answer=future.result().message))
+
+    threading.Thread(target=listen, daemon=True).start()
+    return [node, Camera()]
+
+
+def rival():
+    node = rclpy.create_node("rival")
+    publish_odometry(node, 9.0)
+    command = node.create_publisher(Twist, "/cmd_vel", 10)
+    node.create_timer(0.05, lambda: command.publish(Twist()))
+    return [node]
+
+
+def wrong():
+    node = rclpy.create_node("wrong")
+    node.held = node.create_publisher(String, "/odom", 10)
+    return [node]
+
+
+def main():
+    rclpy.init()
+    executor = MultiThreadedExecutor(2)
+    for node in {"base": base, "rival": rival, "wrong": wrong}[sys.argv[1]]():
+        executor.add_node(node)
+    say(up=sys.argv[1])
+    executor.spin()
+
+
+if __name__ == "__main__":
+    main()

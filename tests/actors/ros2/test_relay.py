@@ -1,0 +1,364 @@
+"""The gateway beside nodes in rclpy, over DDS."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import os
+import shutil
+import signal
+import time
+
+import psutil
+import pytest
+
+from rampart.actors.ros2.node import RosNode
+from rampart.actors.ros2.relay_side import RelayError, RelaySide
+from rampart.actors.ros2.translation.types import Types
+from rampart.actors.ros2.wire import UNKNOWN_GID, Qos
+from rampart.cli.main import main
+from rampart.testing import RealRun, wait_until
+from tests import ROOT
+from tests.actors.ros2.test_against_ros import ROS
+from tests.actors.ros2.test_gateway import SYSTEM
+from tests.actors.ros2.test_live import MORE, Peer
+
+pytestmark = [pytest.mark.ros, pytest.mark.processes]
+
+PEER = ROOT / "tests/actors/ros2/rclpy_peer.py"
+TWIST = "geometry_msgs/msg/Twist"
+NUMBERS = itertools.count(0, 7)
+SETUP = ROS.resolve() / "bin/activate"
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch):
+    """A domain of this test, on this machine only: killed nodes stay in a graph for 20 s."""
+    number = (os.getpid() + next(NUMBERS)) % 100 + 1
+    for name, value in {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+                        "PYTHONPATH": str(ROOT)}.items():
+        monkeypatch.setenv(name, value)
+    return number
+
+
+@pytest.fixture
+def system(tmp_path, domain):
+    def write(more="", setup=SETUP):
+        text = SYSTEM.replace('''actor = "tests.actors.ros2.robot:Base"
+kind = "world"
+''', '''actor = "tests.actors.ros2.robot:Asker"
+kind = "control"
+''').replace('''actor = "rampart.actors.ros2.gateway:Gateway"
+''', f'''actor = "rampart.actors.ros2.gateway:Gateway"
+parameters = {{ middleware = "rclpy", setup = "{setup}", domain = {domain}, \
+distribution = "kilted", interfaces = ["interfaces"] }}
+''').replace('frame = "odom"\n', 'frame = "odom"\nreliable = false\n')
+        text += MORE[MORE.index("[[node]]\nname = \"screen\""):].replace("{{", "{").replace(
+            "}}", "}")
+        path = tmp_path / "guarded.toml"
+        path.write_text(text + more)
+        for name in ("test_msgs/action/Fibonacci.action", "rcl_interfaces/srv/GetParameters.srv"):
+            where = tmp_path / "interfaces" / name
+            where.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROS / "share" / name, where)
+        return path
+
+    return write
+
+
+def relay_of(run):
+    relay, = psutil.Process(run.pid("gateway")).children()
+    return relay
+
+
+def echoed(run, key, count=1):
+    done = run.tool("topic", "echo", key, "-n", str(count), "--json", "--duration", "15")
+    return [json.loads(line)["message"] for line in done.stdout.splitlines()]
+
+
+MANY = """
+[[node]]
+name = "counter"
+actor = "tests.actors.ros2.robot:Asker"
+kind = "non-control"
+parameters = { topic = "count/goal", body = { order = 3 } }
+
+[[ros2]]
+goal = "/count"
+type = "test_msgs/action/Fibonacci"
+from = "count/goal"
+to = "count/state"
+
+[[node]]
+name = "activator"
+actor = "tests.actors.ros2.robot:Asker"
+kind = "non-control"
+parameters = { topic = "camera/change", body = { transition = { id = 1, label = "" } } }
+
+[[ros2]]
+call = "/camera/change_state"
+type = "lifecycle_msgs/srv/ChangeState"
+from = "camera/change"
+to = "camera/changed"
+
+[[node]]
+name = "reader"
+actor = "tests.actors.ros2.robot:Asker"
+kind = "non-control"
+parameters = { topic = "camera/rate_wanted", body = { names = ["rate_hz"] } }
+
+[[ros2]]
+call = "/camera/get_parameters"
+type = "rcl_interfaces/srv/GetParameters"
+from = "camera/rate_wanted"
+to = "camera/rate"
+answer = { rate_hz = "values[0].double_value" }
+"""
+
+
+def test_topics_services_actions_states_and_parameters_over_dds(tmp_path, system):
+    path = system(MANY)
+    with Peer(PEER, "base") as peer:
+        peer.wait_for("up")
+        with RealRun(tmp_path, path) as run:
+            run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
+            assert set(peer.said("heard")) <= {0.5}
+            run.wait_until(lambda: True in peer.said("shut"), 10, "no request")
+            peer.ask("stop")
+            run.wait_until(lambda: "told" in peer.said("answer"), 10, "no answer")
+            run.wait_for("passed on: 20", 10)
+            run.wait_until(lambda: 3 in peer.said("goal"), 10, "no goal")
+            assert "succeeded" in {one["phase"] for one in echoed(run, "count/state", 6)}
+            run.wait_until(lambda: "inactive" in peer.said("state"), 10, "no transition")
+            assert echoed(run, "camera/rate")[0]["rate_hz"] == 12.5
+            told = json.loads(run.tool("status", "--json").stdout)["ros2"]
+            assert set(told["nodes"]) == {"/rampart", "/base", "/camera"}
+            assert run.tool("node", "log", "gateway").returncode == 0
+        wait_until(lambda: peer.said("heard")[-1] == 0.0, 5, "the last command is not zero")
+        assert peer.said("heard").count(0.0) == 1
+
+
+@pytest.mark.parametrize(("number", "line"), [
+    (signal.SIGKILL, "the relay to ROS 2 ended: signal 9"),
+    (signal.SIGSTOP, "the relay to ROS 2 hung: no answer for 1 s")])
+def test_a_relay_that_is_killed_or_stopped_comes_back_with_its_gateway(
+        tmp_path, system, number, line):
+    with Peer(PEER, "base") as peer, RealRun(tmp_path, system()) as run:
+        run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
+        before, relay = run.pid("gateway"), relay_of(run)
+        relay.send_signal(number)
+        run.wait_for(line, 10)
+        run.wait_until(lambda: not relay.is_running(), 5, "the relay is left")
+        heard = len(peer.said("heard"))
+        run.wait_until(lambda: run.pid("gateway") not in {None, before}, 10, "no new gateway")
+        run.wait_until(lambda: len(peer.said("heard")) > heard + 20, 20, "no command any more")
+        assert set(peer.said("heard")) <= {0.5}
+
+
+def test_a_killed_gateway_leaves_no_relay(tmp_path, system):
+    with Peer(PEER, "base") as peer, RealRun(tmp_path, system()) as run:
+        run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
+        relay = relay_of(run)
+        run.kill("gateway")
+        run.wait_until(lambda: not relay.is_running(), 5, "the relay is left")
+        heard = len(peer.said("heard"))
+        run.wait_until(lambda: len(peer.said("heard")) > heard + 20, 20, "no command any more")
+
+
+def test_a_second_publisher_is_refused_and_a_bypass_reported(tmp_path, system):
+    with Peer(PEER, "base") as peer, RealRun(tmp_path, system("""
+[[detection]]
+name = "D_ALONE"
+title = "The gateway is bypassed"
+actor = "rampart.actors.ros2.ros_nodes:RosNodes"
+parameters = { gateway = "gateway", nodes = ["/base"], alone = true }
+within_s = 2.0
+
+[[mechanism]]
+name = "M_ALONE"
+detect = "D_ALONE"
+recover = "R_RESTART"
+event = "missing"
+against = { within_s = 5.0, hazard = "the robot stands" }
+""")) as run:
+        run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
+        with Peer(PEER, "rival"):
+            run.wait_until(lambda: "two publishers, /base and /rival" in run.tool(
+                "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3").stdout, 10,
+                "not refused")
+            assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
+            run.wait_for("(D_ALONE): /cmd_vel: /rival publishes besides /rampart", 10)
+
+
+# -- without a run ---------------------------------------------------------------------------------
+
+
+class Side:
+    """A relay of the test itself, and what comes from it."""
+
+    def __init__(self, domain, setup=SETUP, distribution="kilted", node="rampart", **more):
+        self.lost, self.refused, self.types = [], [], Types(distribution)
+        self.side = RelaySide(node, "/", domain, distribution, str(setup),
+                              lost=self.lost.append, **more)
+        self.node = RosNode(self.side, self.types, node, wall_ns=time.time_ns,
+                            refuse=lambda *what: self.refused.append(what), domain=domain)
+
+    def twist(self, speed_mps):
+        message = self.types.blank(TWIST)
+        message.linear.x = speed_mps
+        return self.types.encode(TWIST, message)
+
+    async def until(self, condition, timeout_s=20):
+        until_s = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < until_s, (self.lost, self.side.problems)
+            await asyncio.sleep(0.02)
+
+
+async def test_a_command_that_waits_for_a_stopped_relay_is_not_repeated(domain):
+    with Peer(PEER, "base") as peer:
+        side = Side(domain)
+        publish = side.node.publisher("/cmd_vel", TWIST, Qos(depth=10))
+
+        def heard():
+            publish(side.twist(1.0))
+            return peer.said("heard")
+
+        await side.until(heard)
+        os.kill(side.side._process.pid, signal.SIGSTOP)
+        publish(side.twist(2.0))
+        await asyncio.sleep(0.6)
+        publish(side.twist(3.0))
+        os.kill(side.side._process.pid, signal.SIGCONT)
+        await side.until(lambda: 3.0 in peer.said("heard"))
+        assert 2.0 not in peer.said("heard")
+        side.side.close()
+
+
+async def test_publishers_that_an_older_rclpy_does_not_tell_apart_have_no_gid(domain, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text("""
+from rclpy.subscription import Subscription
+
+init = Subscription.__init__
+
+def older(self, impl, msg_type, topic, callback, *rest, **more):
+    init(self, impl, msg_type, topic, lambda message, info: callback(message, {
+        key: value for key, value in info.items() if key != "publisher_gid"}), *rest, **more)
+
+Subscription.__init__ = older
+""")
+    setup = tmp_path / "setup.bash"
+    setup.write_text(f". {SETUP}\nexport PYTHONPATH={tmp_path}\n")
+    side, gids = Side(domain, setup), []
+    side.node.subscribe("/odom", "nav_msgs/msg/Odometry", Qos(reliable=False, depth=10),
+                        lambda _, attachment: gids.append(attachment.gid))
+    with Peer(PEER, "base"):
+        await side.until(lambda: len(gids) > 5)
+        base, = set(gids)
+        assert base != UNKNOWN_GID
+    with Peer(PEER, "base"):  # a killed node stays in the graph for 20 s; it is the same node
+        await side.until(lambda: UNKNOWN_GID in gids)
+        await side.until(lambda: gids[-10:] == [base] * 10)
+        with Peer(PEER, "rival"):
+            await side.until(lambda: gids[-40:] == [UNKNOWN_GID] * 40)
+    side.side.close()
+
+
+async def test_an_environment_of_another_distribution_passes_nothing(domain):
+    side = Side(domain, distribution="jazzy")
+    side.node._endpoint = lambda *what: type(side.node)._endpoint(side.node, *what)
+    side.types._hashes[TWIST] = "RIHS01_" + 64 * "0"
+    got = []
+    side.node.subscribe("/cmd_vel", TWIST, Qos(depth=10), lambda *_: got.append(1))
+    await side.until(lambda: side.side.problems)
+    assert "another definition of geometry_msgs/msg/Twist" in side.side.problems[0]
+    assert "nothing passes" in side.side.problems[0]
+    side.side.close()
+
+
+async def test_without_rclpy_the_reason_is_one_line(domain, tmp_path):
+    empty = tmp_path / "setup.bash"
+    empty.write_text("")
+    side = Side(domain, empty)
+    await side.until(lambda: side.lost)
+    assert str(side.lost[0]) == ("the relay to ROS 2 ended: exit code 1; ModuleNotFoundError: No "
+                                 "module named 'rclpy'")
+    side.side.close()
+
+
+async def test_a_setup_that_is_not_there_is_refused(domain, monkeypatch):
+    with pytest.raises(RelayError, match=r"setup = '/nowhere/setup\.bash': no such file"):
+        Side(domain, "/nowhere/setup.bash")
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    with pytest.raises(RelayError, match=r"no ROS 2: .* /opt/ros/kilted/setup.bash"):
+        Side(domain, "")
+
+
+# -- verbs -----------------------------------------------------------------------------------------
+
+
+def checked(capsys, path):
+    code = main(["ros2", "check", "--system", str(path), "--json"])
+    printed = capsys.readouterr()
+    return code, printed.err, {one["what"]: (one["well"], one["why"]) for one in json.loads(
+        printed.out or '{"findings": []}')["findings"]}
+
+
+def test_the_check_finds_the_nodes_on_dds(capsys, system):
+    with Peer(PEER, "base") as peer:
+        peer.wait_for("up")
+        code, _, found = checked(capsys, system(MANY))
+    assert found["relay of gateway"] == (True, "rclpy")
+    assert found["subscribe /odom"] == (True, "/base, nav_msgs/msg/Odometry")
+    assert found["publish /cmd_vel"] == (True, "/base, geometry_msgs/msg/Twist")
+    assert found["call /base/shut"] == (True, "/base, std_srvs/srv/SetBool")
+    assert found["goal /count"] == (True, "/base, test_msgs/action/Fibonacci")
+    assert code == 0
+
+
+def test_the_check_finds_a_wrong_type_and_a_rival(capsys, system):
+    with Peer(PEER, "wrong") as wrong, Peer(PEER, "rival") as rival, Peer(PEER, "base") as base:
+        for peer in (wrong, rival, base):
+            peer.wait_for("up")
+        code, _, found = checked(capsys, system())
+    assert code == 1
+    assert "/wrong has the type std_msgs/msg/String" in found["subscribe /odom"][1]
+    assert "/rival publishes it too" in found["publish /cmd_vel"][1]
+
+
+def test_the_check_without_rclpy_is_one_line_and_exit_code_2(capsys, system, tmp_path):
+    (tmp_path / "empty.bash").write_text("")
+    code, err, _ = checked(capsys, system(setup="empty.bash"))
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "No module named 'rclpy'" in err
+
+
+def test_a_type_that_the_environment_lacks_is_found(capsys, system):
+    code, _, found = checked(capsys, system("""
+[[ros2]]
+publish = "/rampart/pose"
+type = "bond/msg/Status"
+from = "base/wanted"
+fields = { heartbeat_period = "linear_mps" }
+"""))
+    assert code == 1
+    assert "this ROS 2 has no bond/msg/Status" in found["types"][1]
+
+
+def test_topics_on_dds_are_listed_shown_and_measured(capsys, monkeypatch):
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(ROS))
+    monkeypatch.setenv("ROS_DISTRO", "kilted")
+    monkeypatch.setenv("PATH", f"{SETUP.parent}{os.pathsep}{os.environ['PATH']}")
+    with Peer(PEER, "base") as peer:
+        peer.wait_for("up")
+        assert main(["topic", "list", "--ros", "rclpy", "--json"]) == 0
+        listed = json.loads(capsys.readouterr().out)
+        assert {"topic": "/odom", "types": ["nav_msgs/msg/Odometry"], "publishers": ["/base"],
+                "subscribers": []} in listed
+        assert main(["topic", "echo", "/base/name", "--ros", "rclpy", "-n", "1", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["message"] == {"data": "osmosis"}
+        assert main(["topic", "hz", "/odom", "--ros", "rclpy", "--json"]) == 0
+        measured, = json.loads(capsys.readouterr().out)
+        assert 5 < measured["rate_hz"] < 25
