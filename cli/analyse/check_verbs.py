@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -15,7 +15,8 @@ from rampart.actors.system.layout import Layout, Unit
 from rampart.cli import systems
 from rampart.cli.look import topic_catalogue as catalogue
 from rampart.cli.output import UsageError, print_json, print_table, say
-from rampart.cli.verbs import JSON, add_verb
+from rampart.cli.verbs import JSON, add_verb, flag
+from rampart.manager.analysis.pairs import Pair, pairs
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.escalation import succession
@@ -93,7 +94,8 @@ def add(verbs: Any) -> None:
     add_verb(verbs, "check", "check a system without running it", check,
              systems.choice(), JSON)
     add_verb(verbs, "explain", "list processes, topics and consequences of detections", run,
-             systems.choice(), JSON)
+             systems.choice(), flag("--pairs", "list what is decided for each ordered pair of "
+                                    "mechanisms, and what stays when one of them clears"), JSON)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -108,10 +110,19 @@ def run(options: argparse.Namespace) -> int:
       rampart explain
       rampart explain my_system.toml
       rampart explain paper --json
+      rampart explain --pairs
 
     exit code: 0 described, 2 `rampart check` refuses the system, or bad usage
     """
-    found = explain(systems.check(options.system))
+    layout = systems.check(options.system)
+    if options.pairs:
+        table = pairs(layout.spec)
+        if options.json:
+            print_json(table)
+        else:
+            _show_pairs(layout.spec, table)
+        return 0
+    found = explain(layout)
     if options.json:
         print_json(found)
     else:
@@ -188,6 +199,32 @@ def _consequences(spec: SystemSpec) -> Iterator[Consequence]:
                  if m.name in listening and m.name not in active}
         yield Consequence(name, detection.title, spec.latency_s(detection), listening, active,
                           needs, decision.recoveries, str(decision.rule), escalation)
+
+
+def _show_pairs(spec: SystemSpec, table: Sequence[Pair]) -> None:
+    """Print what runs for each pair, and the pairs in which more stays than one asks for alone."""
+    found = {(pair.first, pair.second): pair for pair in table}
+    names = [mechanism.name for mechanism in spec.mechanisms]
+    own = spec.build_mechanisms().recover
+    say(f"{spec.title} ({spec.name}), strategy {spec.strategy}")
+    say()
+    say("Recoveries in force while the mechanism of the row and then that of the column is active;")
+    say("on the diagonal, that of one mechanism alone")
+    print_table(("", *names), [(first, *(
+        _joined(own[first] if first == second else found[first, second].both)
+        for second in names)) for first in names])
+    say()
+    say("When one of two clears, the other's recovery stays alone, except here")
+    head = "active first", "then", "in force", "first clears", "second clears", "both clear"
+    print_table(head, [
+        (pair.first, pair.second, *map(_joined, (
+            pair.both, pair.first_clears, pair.second_clears, pair.both_clear)))
+        for pair in table
+        if (pair.first_clears, pair.second_clears) != (own[pair.second], own[pair.first])])
+
+
+def _joined(recoveries: Sequence[str]) -> str:
+    return " + ".join(recoveries) or "-"
 
 
 def _show(found: Explanation) -> None:
