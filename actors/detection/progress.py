@@ -1,4 +1,4 @@
-"""`Progress`: a task takes a wrong step, or too long for one (logical supervision)."""
+"""`Progress`: a task takes a wrong step, or one too long or too short (logical supervision)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import FieldName, OptionalFieldName, Suspects
 from rampart.manager.spec.tables import Positive
 
+ROUNDING_S = 1e-9
+
 
 class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A step of a task.
@@ -23,11 +25,13 @@ class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         within_s: Longest time that it takes, simulated seconds.
         to: Values of the steps that may follow. By default the next one in the list, and the first
             after the last.
+        at_least_s: Shortest time until the next step.
     """
 
     at: str | bool | float
     within_s: float = math.inf
     to: tuple[str | bool | float, ...] | None = None
+    at_least_s: float = 0.0
 
 
 class ProgressMonitor(Finding):
@@ -38,12 +42,15 @@ class ProgressMonitor(Finding):
         steps: All steps.
         busy_at_most_s: How much longer a step may take that reports to be busy.
         known_after_s: When to report idle without any input; -inf for at once.
+        each: Whether every message is a step, a check point that the task has passed. Otherwise
+            the same value again is the same step.
     """
 
     def __init__(self, what: str, steps: Sequence[Step], busy_at_most_s: float,
-                 known_after_s: float = -math.inf) -> None:
+                 known_after_s: float = -math.inf, *, each: bool = False) -> None:
         super().__init__(known_after_s)
         self._what = what
+        self._each = each
         self._steps = {step.at: step for step in steps}
         self._next = {step.at: (steps[(i + 1) % len(steps)].at,) if step.to is None else step.to
                       for i, step in enumerate(steps)}
@@ -72,15 +79,18 @@ class ProgressMonitor(Finding):
         self.known = True
         before = None if self._has_missed else self._at
         self._has_missed = False
-        if at == self._at:
+        if at == self._at and not self._each:
             self.expire(now_s)
             return
-        self._at, self._since_s = at, now_s
+        lasted_s, self._at, self._since_s = now_s - self._since_s, at, now_s
         if at not in self._steps:
             self._accuse(f"{self._what} is {at!r}, not one of its steps")
         elif before in self._steps and at not in self._next[before]:
             expected = " or ".join(map(repr, self._next[before])) or "nothing"
             self._accuse(f"{self._what} is {at!r} after {before!r}, expected {expected}")
+        elif before in self._steps and lasted_s < self._steps[before].at_least_s - ROUNDING_S:
+            self._accuse(f"{self._what} is {at!r} {lasted_s:.3g} s after {before!r}, expected at "
+                         f"least {self._steps[before].at_least_s:g} s")
         else:
             self.clear()
 
@@ -111,7 +121,8 @@ class Progress(DetectionModule):
 
         Attributes:
             value: the present step, as "topic:field".
-            steps: all steps: `at` with `within_s` and `to`, see `Step`.
+            steps: all steps: `at` with `within_s`, `at_least_s` and `to`, see `Step`.
+            each: whether every message is a step, a check point that the task has passed.
             busy_until: until when it is busy, in simulated seconds, as "topic:field"; "" if the
                 task does not report that.
             busy_at_most_s: by how much that may exceed `within_s`, s.
@@ -122,6 +133,7 @@ class Progress(DetectionModule):
         steps: Annotated[tuple[Step, ...], msgspec.Meta(min_length=2)]
         busy_until: OptionalFieldName = ""
         busy_at_most_s: Positive = 60.0
+        each: bool = False
         suspects: Suspects = ()
 
         def __post_init__(self) -> None:
@@ -132,6 +144,8 @@ class Progress(DetectionModule):
                     raise ValueError(f"steps: {step.at!r} is listed twice")
                 if not step.within_s > 0:
                     raise ValueError(f"steps: within_s of {step.at!r} must be above 0")
+                if not 0 <= step.at_least_s <= step.within_s:
+                    raise ValueError(f"steps: at_least_s of {step.at!r} must be from 0 to within_s")
                 for at in step.to or ():
                     if at not in known:
                         raise ValueError(f"steps: {step.at!r} leads to {at!r}, which is not a step")
@@ -142,7 +156,9 @@ class Progress(DetectionModule):
         super().__init__(context)
         chosen = self.parameters
         self.monitor = self.judged_by(ProgressMonitor(
-            chosen.value, chosen.steps, chosen.busy_at_most_s, self.known_after_s(1.0)))
+            chosen.value, chosen.steps, chosen.busy_at_most_s, self.known_after_s(1.0),
+            each=chosen.each))
+        self._incarnation_heard = 0
         if chosen.busy_until:
             self.hear_field(chosen.busy_until, self.busy)
         self.hear_field(chosen.value, self.heard)
@@ -154,6 +170,9 @@ class Progress(DetectionModule):
     def heard(self, value: Any, header: Header) -> None:
         """Note the present step."""
         self.note_absence()
+        if header.incarnation != self._incarnation_heard:  # a new process may begin at any step
+            self._incarnation_heard = header.incarnation
+            self.monitor.missed()
         self.monitor.accused = self.accused(self.parameters.suspects, header)
         self.monitor.heard(value, self.clock.now())
         self.follow()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import tomllib
 
 import msgspec
 import pytest
@@ -17,14 +18,21 @@ TEXT = (ROOT / "docs/how-to/ready-modules.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| `(\w+):(\w+)` \| (.*) \|$", TEXT, re.MULTILINE)
 
 
-def block(language: str) -> str:
-    (found,) = re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+def block(language: str, begin: str = "") -> str:
+    (found,) = re.findall(rf"^```{language}\n({begin}.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
     return found
+
+
+def test_the_check_points_are_supervised_in_their_order():
+    (row,) = tomllib.loads(block("toml", r"\[\[detection\]\]"))["detection"]
+    chosen = msgspec.convert(row["parameters"], load_class(row["actor"]).Parameters)
+    assert chosen.each
+    assert [step.at for step in chosen.steps] == ["measured", "checked", "commanded"]
 
 
 def test_the_system_detects_and_shuts_the_inlet(tmp_path, monkeypatch):
     (tmp_path / "tank.py").write_text(block("python"))
-    (tmp_path / "tank.toml").write_text(block("toml"))
+    (tmp_path / "tank.toml").write_text(block("toml", "name = "))
     monkeypatch.syspath_prepend(tmp_path)
 
     async def scenario() -> None:

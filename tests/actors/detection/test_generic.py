@@ -18,6 +18,7 @@ from rampart.actors.detection.progress import Progress, ProgressMonitor, Step
 from rampart.actors.detection.rate import Rate, RateMonitor
 from rampart.actors.detection.threshold import Threshold
 from rampart.actors.detection.unchanged import Unchanged, UnchangedMonitor
+from rampart.actors.ftm import topics
 from rampart.actors.machine.process_usage import ProcessCount
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.testing import Ear, VirtualSystem, play, run, table
@@ -116,6 +117,28 @@ STEPS = (Step("1", 0.4), Step("2", 0.3, ("3", "1")), Step("3"))
 }))
 def test_steps(events, expected):
     monitor = ProgressMonitor("task", STEPS, busy_at_most_s=1.0)
+    assert play(monitor, followed(monitor), events) == expected
+
+
+POINTS = (Step("1", 0.4, at_least_s=0.2), Step("2", 0.3), Step("3", 0.6))
+
+
+# A slot is 100 ms; each event is a check point that is passed.
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "in order": ("1.23.1.23", "---------"),
+    "too soon": ("12", "-A"),
+    "right again with the next one": ("123.", "-A--"),
+    "just late enough": ("1.2", "---"),
+    "left out": ("1..3", "---A"),
+    "swapped": ("1..32", "---AA"),
+    "repeated": ("1.22", "---A"),
+    "the first one again": ("1.1", "--A"),
+    "late": ("1....2", "----A-"),
+    "never": ("1.2......", "-----AAAA"),
+    "unknown": ("1.x", "--A"),
+}))
+def test_check_points(events, expected):
+    monitor = ProgressMonitor("point", POINTS, busy_at_most_s=1.0, each=True)
     assert play(monitor, followed(monitor), events) == expected
 
 
@@ -299,6 +322,23 @@ def test_a_pump_that_leaves_out_a_step():
     assert found[1][2] == "tank/pump:phase is 'draining' after 'idle', expected 'filling'"
 
 
+def test_a_new_process_begins_its_check_points_anywhere_and_is_held_to_their_order():
+    async def scenario() -> None:
+        async with VirtualSystem(topics=TOPICS) as system:
+            reported = system.hear(topics.DETECTION)
+            system.start("D", Progress, value="tank/pump:phase", each=True, steps=[
+                {"at": "idle"}, {"at": "filling"}, {"at": "draining"}])
+            await asyncio.sleep(0.1)
+            for phase, incarnation, state in (
+                    (Phase.FILLING, 1, "idle"), (Phase.IDLE, 2, "idle"), (Phase.IDLE, 2, "active"),
+                    (Phase.FILLING, 2, "idle")):
+                system.say(PUMP, Pump(phase), "pump", incarnation=incarnation)
+                await asyncio.sleep(0.05)
+                assert reported[-1].message.state.value == state, (phase, incarnation)
+
+    run(scenario)
+
+
 def test_a_list_that_is_too_short_for_a_parameter_s_index_is_reported():
     """The module was silent about it, and idle for the whole run."""
     async def scenario() -> None:
@@ -340,6 +380,8 @@ def test_suspects_are_named_by_the_incarnation_that_was_heard(kind, parameters, 
     (Rate, {"topic": "a", "at_least_hz": 5.0, "at_most_hz": 5.0}, "at_most_hz = 5.0: must be"),
     (Vote, {"values": ["a:b", "c:d"], "agree": 3}, "agree = 3: there are only 2 values"),
     (Progress, {"value": "a:b", "steps": [{"at": "x"}, {"at": "x"}]}, "'x' is listed twice"),
+    (Progress, {"value": "a:b", "steps": [{"at": "x", "within_s": 1.0, "at_least_s": 2.0},
+                                          {"at": "y"}]}, "at_least_s of 'x' must be from 0"),
     (Progress, {"value": "a:b", "steps": [{"at": "x", "to": ["z"]}, {"at": "y"}]},
      "'x' leads to 'z', which is not a step"),
     (ProcessUsage, {"watch": ["a"]}, "memory_mb: missing"),
