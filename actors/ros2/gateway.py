@@ -43,7 +43,7 @@ from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.relay_side import RelayError, RelaySide
 from rampart.actors.ros2.ros_clock import NS, RosClock
-from rampart.actors.ros2.side import Mode, Side
+from rampart.actors.ros2.side import Mode, Side, Tls
 from rampart.actors.ros2.stand_in import side_of, wall_ns
 from rampart.actors.ros2.translation.mapping import Inward, Outward
 from rampart.actors.ros2.translation.mirror import topic_of
@@ -57,6 +57,7 @@ from rampart.manager.spec.schema import SystemSpec
 _CLOCK, _CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
 _SETTLE_S = 0.05
 _PROBLEMS = 50
+_LINK_S = 2.0
 
 
 @cache
@@ -79,6 +80,7 @@ class Gateway(Actor):
             connect: endpoints of the routers of ROS 2.
             mode: "client", which works from any machine, or "peer", which works on the machine of
                 ROS 2 only and survives its router.
+            tls: PEM files for endpoints "tls/…", relative to the system's file.
             domain: ROS_DOMAIN_ID.
             distribution: name of the distribution.
             node: name of the gateway's node.
@@ -93,6 +95,7 @@ class Gateway(Actor):
         setup: str = ""
         connect: tuple[str, ...] = (ROUTER,)
         mode: Mode = "client"
+        tls: Tls | None = None
         domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
         distribution: Distribution = "jazzy"
         node: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,60}\Z")] = "rampart"
@@ -104,9 +107,13 @@ class Gateway(Actor):
         ros2: tuple[Ros2Link, ...] = ()
 
         def __post_init__(self) -> None:
-            """Refuse a setup that nothing would source."""
+            """Refuse a setup that nothing would source, TLS without files, and the reverse."""
             if self.setup and self.middleware != "rclpy":
                 raise ValueError('setup: is for middleware = "rclpy"')
+            for endpoint in self.connect:
+                if endpoint.startswith("tls/") != (self.tls is not None):
+                    raise ValueError(f"connect {endpoint!r}: expected " + (
+                        "'tls/…' with tls" if self.tls else "tls = { ca = 'FILE' } with 'tls/…'"))
 
     parameters: Parameters
     tables = ("ros2",)
@@ -122,7 +129,8 @@ class Gateway(Actor):
         self._relay: RelaySide | None = None  # the same, if it is one
         self._links: dict[tuple[str, str], Publication | ServiceCall | ActionCall] = {}
         self._graph_due = False
-        self._was_linked = False
+        self._was_linked: bool | None = None
+        self._due_s = self.clock.now() + _LINK_S
         self._diagnostics: Diagnostics | None = None
         self._newest: dict[str, tuple[msgspec.Struct, float] | None] = {
             link.beside: None for link in given.ros2 if link.beside}
@@ -198,7 +206,8 @@ class Gateway(Actor):
         if given.middleware == "rclpy" and not run.plan.virtual:
             self._side = self._relay = self._start_relay()
         else:
-            self._side = side_of(self, self._bus, given.connect, given.mode, self._recorder.take)
+            self._side = side_of(self, self._bus, given.connect, given.mode, self._recorder.take,
+                                 tls=given.tls)
         self.node = RosNode(self._side, self._types, given.node, wall_ns=partial(wall_ns, self),
                             refuse=self.refuse, namespace=given.namespace, domain=given.domain)
         if given.clock == "ros":
@@ -321,9 +330,7 @@ class Gateway(Actor):
         if self._side is None:
             return
         is_linked = self._side.is_linked()
-        if self._was_linked and not is_linked:  # a relay that is lost ends this process
-            self._note("graph", f"no router at {', '.join(self.parameters.connect)} any more")
-        self._was_linked = is_linked
+        self._follow_link(is_linked)  # a relay that is lost ends this process
         nodes = self.graph.nodes()
         bypassed = self._bypassed()
         problems = [f"{topic}: {who} publishes besides {self.node.full_name}"
@@ -333,6 +340,17 @@ class Gateway(Actor):
             is_linked, tuple(clip(one, NAME_CHARS) for one in list(nodes)[:MANY]),
             tuple(clip(name, NAME_CHARS) for name, count in nodes.items() if count > 1)[:MANY],
             len(bypassed), tuple(map(clip, problems[:_PROBLEMS])), self._rejected))
+
+    def _follow_link(self, is_linked: bool) -> None:
+        """Report that the router is lost, missing at the start, or back: once each."""
+        where, has_missed = ", ".join(self.parameters.connect), self._was_linked is False
+        if is_linked and has_missed:
+            self._note("router", f"linked to {where} again")
+        elif not is_linked and not has_missed:
+            if self._was_linked is None and self.clock.now() < self._due_s:
+                return
+            self._note("no router", f"no router at {where}; the gateway goes on dialling")
+        self._was_linked = is_linked
 
     def _bypassed(self) -> list[tuple[str, str]]:
         """Return topics of the gateway with another publisher, each with that publisher."""

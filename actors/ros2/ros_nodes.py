@@ -28,7 +28,8 @@ class RosNodes(DetectionModule):
     """Active while a node of ROS 2 is missing, or the gateway is bypassed, for long enough.
 
     No node is missing before the gateway has been linked once. A node that was never there is
-    missing only after the system has had time to start.
+    missing only after the system has had time to start, or a new router to collect its nodes. While
+    the gateway has lost its router, the module is active and accuses no node.
     """
 
     class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
@@ -65,6 +66,7 @@ class RosNodes(DetectionModule):
             given.for_s, given.clear_s, self.known_after_s(given.for_s + given.clear_s)))
         self._seen: set[str] = set()
         self._all_due_s = math.inf
+        self._was_linked = False
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:
@@ -75,12 +77,18 @@ class RosNodes(DetectionModule):
     def graph(self, report: RosGraphReport, _header: Header) -> None:
         """Look for missing nodes and other publishers."""
         given, now_s = self.parameters, self.clock.now()
-        if report.linked and self._all_due_s == math.inf:
-            self._all_due_s = now_s + self.grace_s(_GRACE_S)
-        self._seen.update(report.nodes)
+        self._was_linked = self._was_linked or report.linked
+        if report.linked:
+            self._all_due_s = min(self._all_due_s, now_s + self.grace_s(_GRACE_S))
+            self._seen.update(report.nodes)
+        else:  # a new router first has the nodes that find it first
+            self._all_due_s = math.inf
+            self._seen.clear()
         missing = [node for node in given.nodes if node not in report.nodes
                    and (node in self._seen or now_s >= self._all_due_s)]
         why = f"{', '.join(missing)}: not in the graph of ROS 2" if missing else ""
+        if self._was_linked and not report.linked:
+            why = f"{given.gateway} has no router of ROS 2: the nodes are unknown"
         if given.alone and report.bypassed:
             why = "; ".join(filter(None, (why, next(
                 (one for one in report.problems if "publishes besides" in one), "bypassed"))))

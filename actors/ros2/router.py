@@ -11,9 +11,13 @@ from typing import Any
 
 import zenoh
 
+from rampart.actors.bus.zenoh_session import FULL_US
 from rampart.actors.runtime.actor import Actor
 
 LISTEN = "tcp/127.0.0.1:7447"
+
+_CONGESTION = "transport/link/tx/queue/congestion_control"
+"""While a message waits for the full link of a lost machine, the router passes nothing on."""
 
 
 class RosRouter(Actor):
@@ -56,6 +60,8 @@ def _configured(listen: str) -> zenoh.Config:
     config = zenoh.Config()
     for name, value in {"mode": "router", "listen/endpoints": [listen],
                         "scouting/multicast/enabled": False, "scouting/gossip/enabled": True,
-                        "timestamping/enabled": True}.items():
+                        "timestamping/enabled": True,
+                        f"{_CONGESTION}/block/wait_before_close": FULL_US,
+                        f"{_CONGESTION}/drop/max_wait_before_drop_fragments": FULL_US}.items():
         config.insert_json5(name, json.dumps(value))
     return config

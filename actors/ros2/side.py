@@ -14,6 +14,7 @@ import asyncio
 import contextlib
 import json
 import secrets
+import ssl
 import threading
 import time
 from collections import deque
@@ -31,8 +32,53 @@ from rampart.actors.ros2.wire import Qos
 Mode = Literal["client", "peer"]
 """Mode of a session of Zenoh that is not a router."""
 
+class Tls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """PEM files for TLS with the routers of ROS 2.
+
+    Attributes:
+        ca: certificate of the authority that has issued the routers' certificates.
+        certificate: of this session, for routers that require one; "" for none.
+        key: private key of that certificate.
+    """
+
+    ca: str
+    certificate: str = ""
+    key: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a certificate without a key, and a key without a certificate."""
+        if bool(self.certificate) != bool(self.key):
+            raise ValueError("certificate and key: expected both or neither")
+
+    def context(self) -> ssl.SSLContext:
+        """Return a context of TLS with the files.
+
+        Raises:
+            ValueError: a file cannot be read, or is not a certificate or key in PEM.
+        """
+        files = f"ca = {self.ca!r}"
+        try:
+            context = ssl.create_default_context(cafile=self.ca)
+            if self.key:
+                files = f"certificate = {self.certificate!r}, key = {self.key!r}"
+                context.load_cert_chain(self.certificate, self.key, password="")  # never asked for
+        except OSError as error:
+            why = getattr(error, "reason", None) or error.strerror or error
+            raise ValueError(f"tls: {files}: {why}") from None
+        return context
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings of Zenoh; raises as `context`."""
+        self.context()
+        own = {"connect_certificate": self.certificate, "connect_private_key": self.key}
+        return {f"transport/link/tls/{name}": value for name, value in {
+            "root_ca_certificate": self.ca, **(own if self.key else {}),
+            "enable_mtls": bool(self.key)}.items()}
+
+
 NO_ANSWER = "no server answers"
 _AGAIN_S = 1.0
+_LOOKS, _LOOK_S = 20, 0.05
 
 Deliver = Callable[[bytes, bytes | None], None]
 """Called with payload and attachment of a message."""
@@ -90,16 +136,18 @@ class ZenohSide:
         loop: runs all callbacks.
         record: takes each message that is published or received, if given.
         mode: "client", with everything through the router, or "peer", with direct links.
+        tls: files for endpoints "tls/…".
 
     Raises:
-        ValueError: an endpoint is not valid; one line.
+        ValueError: an endpoint is not valid, or a file cannot be read; one line.
     """
 
     def __init__(self, dial: Sequence[str], loop: asyncio.AbstractEventLoop,
-                 record: Record | None = None, *, mode: Mode = "client") -> None:
+                 record: Record | None = None, *, mode: Mode = "client", tls: Tls | None = None
+                 ) -> None:
         self.id = f"{1 << 127 | secrets.randbits(127):032x}"
         try:
-            config = _configured(dial, mode, self.id)
+            config = _configured(dial, mode, self.id, tls)
         except zenoh.ZError as error:
             raise ValueError(f"connect = {list(dial)}: {' '.join(str(error).split())}") from None
         self._loop = loop
@@ -258,6 +306,19 @@ class ZenohSide:
             target=zenoh.QueryTarget.ALL_COMPLETE, consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s)
 
+    async def finds(self, key: str, *, service: bool = False) -> bool:
+        """Return whether a subscription to a key, or a server, is known here within a moment."""
+        if self._session is None:
+            return False
+        own: Any  # its `matching_status` is not what the stubs of Zenoh show
+        with (self._session.declare_querier(key, target=zenoh.QueryTarget.ALL_COMPLETE) if service
+              else self._session.declare_publisher(key)) as own:
+            for _ in range(_LOOKS):
+                if own.matching_status.matching:
+                    return True
+                await asyncio.sleep(_LOOK_S)
+        return False
+
     def is_linked(self) -> bool:
         """See `Side.is_linked`."""
         return bool(self.links())
@@ -301,7 +362,7 @@ def _direct(call: Callable[[Any], None]) -> Callback[Any]:
     return Callback(call, indirect=False)
 
 
-def _configured(dial: Sequence[str], mode: Mode, own_id: str) -> zenoh.Config:
+def _configured(dial: Sequence[str], mode: Mode, own_id: str, tls: Tls | None) -> zenoh.Config:
     """Return the default configuration of `rmw_zenoh`, except that routers may start later."""
     config = zenoh.Config()
     for name, value in {
@@ -309,7 +370,7 @@ def _configured(dial: Sequence[str], mode: Mode, own_id: str) -> zenoh.Config:
             "connect/exit_on_failure": False,
             "listen/endpoints": ["tcp/127.0.0.1:0"] if mode == "peer" else [],
             "scouting/multicast/enabled": False, "scouting/gossip/enabled": True,
-            "scouting/delay": 0, "timestamping/enabled": True,
+            "scouting/delay": 0, "timestamping/enabled": True, **(tls.settings() if tls else {}),
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000,
                               "period_increase_factor": 2}}.items():
         config.insert_json5(name, json.dumps(value))

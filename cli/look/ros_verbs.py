@@ -33,9 +33,11 @@ def check(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     """Check a system against the present graph of ROS 2.
 
     List for each [[ros2]] of a system the nodes on the other side, or the problem.
-    Problems are: no router, no relay, no node, another type, another definition of the type,
-    an incompatible quality of service, and a publisher that bypasses the gateway.
-    Nothing is published, and the system need not run.
+    Problems are: an unreachable router, TLS, no relay, another domain, no node,
+    another type, another definition of the type, an incompatible quality of service,
+    a publisher that bypasses the gateway, a peer on another machine than the router,
+    and an access rule of the router. Nothing is published, and the system need not
+    run.
 
     Examples:
       rampart ros2 check --system warehouse.toml

@@ -36,8 +36,10 @@ LARGEST, SMALLEST = 1e9, 1e-9
 LARGEST_INTEGER = 2 ** 63 - 1
 """Of MessagePack, by which parameters reach an actor."""
 
-INTERFACES, SETUP = "interfaces", "setup"
-"""Parameters of a node in a system with `[[ros2]]`: folders, and a file, relative to its file."""
+INTERFACES, SETUP, TLS = "interfaces", "setup", "tls"
+"""Parameters of a node in a system with `[[ros2]]`: a list of folders, a file, and a table of
+files, all relative to the system's file.
+"""
 
 
 def parse_specification(text: str, file: str) -> SystemSpec:
@@ -188,15 +190,19 @@ def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
 
 
 def _resolve_folders(spec: SystemSpec, file: str) -> SystemSpec:
-    """Make the folders of a ROS 2 gateway relative to the folder of the system's file."""
+    """Make folders and files of a ROS 2 gateway relative to the folder of the system's file."""
+
+    def beside(path: Any) -> Any:
+        return str(PurePath(file).parent / path) if path and isinstance(path, str) else path
 
     def resolved(node: NodeSpec) -> NodeSpec:
-        parent, given = PurePath(file).parent, node.parameters
-        found = {name: str(parent / given[name]) for name in (SETUP,)
-                 if isinstance(given.get(name), str) and given[name]}
-        folders = given.get(INTERFACES)
-        more = {INTERFACES: [str(parent / folder) if isinstance(folder, str) else folder
-                             for folder in folders]} if isinstance(folders, list) else {}
-        return replace(node, parameters={**given, **found, **more}) if found or more else node
+        given = dict(node.parameters)
+        if SETUP in given:
+            given[SETUP] = beside(given[SETUP])
+        if isinstance(folders := given.get(INTERFACES), list):
+            given[INTERFACES] = list(map(beside, folders))
+        if isinstance(files := given.get(TLS), dict):
+            given[TLS] = {name: beside(path) for name, path in files.items()}
+        return replace(node, parameters=given)
 
     return replace(spec, nodes=tuple(map(resolved, spec.nodes))) if spec.ros2 else spec

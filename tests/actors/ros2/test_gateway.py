@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from rampart.actors.bus.topics import DIAGNOSTIC
-from rampart.actors.ros2.messages import GRAPH
+from rampart.actors.ros2.messages import GRAPH, RosGraphReport
 from rampart.actors.ros2.wire import Qos
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
@@ -544,6 +544,26 @@ async def test_a_node_of_ros_2_whose_token_goes_is_detected_and_named(system):
     system.start_node("base")
     await asyncio.sleep(1.0)
     assert ear.states[-1] == "idle"
+
+
+@beside(WATCH)
+async def test_without_a_router_the_nodes_are_unknown_and_none_is_accused(system):
+    ear = system.start("ear", Ear)
+    module = system.start_node("D_ROS")
+
+    async def told(seconds, *nodes, linked=True):
+        for _ in range(round(seconds / 0.1)):
+            system.say(GRAPH, RosGraphReport(linked, nodes, (), 0, ()), "gateway")
+            await asyncio.sleep(0.1)
+        return ear.states[-1], module._report.reason, module._report.nodes
+
+    assert (await told(0.5, linked=False))[0] == "idle"  # there may be none yet
+    assert (await told(0.5, "/robot/base"))[0] == "idle"
+    assert await told(0.5, linked=False) == (
+        "active", "gateway has no router of ROS 2: the nodes are unknown", ())
+    assert (await told(2.0))[0] == "idle"  # a new router, which the node has not found yet
+    assert (await told(0.5, "/robot/base"))[0] == "idle"
+    assert await told(0.5) == ("active", "/robot/base: not in the graph of ROS 2", ("base",))
 
 
 @pytest.mark.parametrize(("more", "why"), [

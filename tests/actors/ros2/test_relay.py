@@ -191,6 +191,18 @@ against = { within_s = 5.0, hazard = "the robot stands" }
             run.wait_for("(D_ALONE): /cmd_vel: /rival publishes besides /rampart", 10)
 
 
+def test_messages_of_another_node_than_the_named_one_never_pass(tmp_path, system):
+    path = system()
+    path.write_text(path.read_text().replace('frame = "odom"\n',
+                                             'frame = "odom"\npublisher = "/base"\n'))
+    with RealRun(tmp_path, path) as run, Peer(PEER, "rival"):
+        run.wait_until(lambda: "published by /rival; expected /base" in run.tool(
+            "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3").stdout, 20,
+            "not refused")
+        with Peer(PEER, "base"):
+            assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
+
+
 # -- without a run ---------------------------------------------------------------------------------
 
 

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import datetime as dt
 import json
+import socket
 import threading
 import time
+from pathlib import Path
 
 import pytest
+import zenoh
 
+from rampart.actors.access.certificates import new_authority, new_certificate, public_part
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.side import ZenohSide
 from rampart.actors.ros2.translation.types import Types
@@ -19,11 +25,23 @@ from rampart.testing import free_port
 from tests.actors.ros2.test_gateway import SYSTEM
 
 
+def opened(settings):
+    """Open a router."""
+    config = zenoh.Config()
+    for name, value in {"mode": "router", "scouting/multicast/enabled": False,
+                        **settings}.items():
+        config.insert_json5(name, json.dumps(value))
+    return zenoh.open(config)
+
+
 class Robot:
     """A node of ROS 2 with a router, in a thread of its own."""
 
-    def __init__(self, port, publishes="nav_msgs/msg/Odometry", distribution="jazzy"):
+    def __init__(self, port, publishes="nav_msgs/msg/Odometry", distribution="jazzy", domain=0,
+                 router=None):
         self.where, self._stop = f"tcp/127.0.0.1:{port}", threading.Event()
+        self._domain, self._router = domain, router or {}
+        self.heard = 0
         self._publishes, self._types = publishes, Types(distribution)
         self._thread = threading.Thread(target=lambda: asyncio.run(self._live()))
         self._up = threading.Event()
@@ -37,18 +55,19 @@ class Robot:
         self._stop.set()
         self._thread.join()
 
-    async def _live(self):
-        import zenoh
+    def _take(self, *_):
+        self.heard += 1
 
-        config = zenoh.Config()
-        for name, value in {"mode": "router", "listen/endpoints": [self.where],
-                            "scouting/multicast/enabled": False}.items():
-            config.insert_json5(name, json.dumps(value))
-        router = zenoh.open(config)
+    async def _live(self):
+        with opened({"listen/endpoints": [self.where], **self._router}):
+            await self._publish()
+
+    async def _publish(self):
         side = ZenohSide([self.where], asyncio.get_running_loop(), mode="peer")
-        node = RosNode(side, self._types, "base", wall_ns=time.time_ns, refuse=lambda *_: None)
+        node = RosNode(side, self._types, "base", wall_ns=time.time_ns, refuse=lambda *_: None,
+                       domain=self._domain)
         say = node.publisher("/odom", self._publishes, Qos(depth=10))
-        node.subscribe("/cmd_vel", "geometry_msgs/msg/Twist", Qos(depth=10), lambda *_: None)
+        node.subscribe("/cmd_vel", "geometry_msgs/msg/Twist", Qos(depth=10), self._take)
         while not side.is_linked():
             await asyncio.sleep(0.01)
         self._up.set()
@@ -57,7 +76,6 @@ class Robot:
             say(blank)
             await asyncio.sleep(0.05)
         side.close()
-        router.close()
 
 
 @pytest.fixture(autouse=True)
@@ -68,12 +86,13 @@ def impatient(monkeypatch):
 
 @pytest.fixture
 def system(tmp_path):
-    def write(port, distribution="jazzy", mode="client"):
+    def write(port, distribution="jazzy", mode="client", protocol="tcp", more=""):
         path = tmp_path / "guarded.toml"
         path.write_text(SYSTEM.replace(
             'actor = "rampart.actors.ros2.gateway:Gateway"\n',
             'actor = "rampart.actors.ros2.gateway:Gateway"\nparameters = { connect = '
-            f'["tcp/127.0.0.1:{port}"], distribution = "{distribution}", mode = "{mode}" }}\n'))
+            f'["{protocol}/127.0.0.1:{port}"], distribution = "{distribution}", mode = "{mode}"'
+            f'{more} }}\n'))
         return str(path)
 
     return write
@@ -98,7 +117,9 @@ def test_a_robot_that_fits(capsys, system, mode):
 @pytest.mark.parametrize(("robot", "distribution", "why"), [
     ({"publishes": "std_msgs/msg/String"}, "jazzy",
      "/odom: /base has the type std_msgs/msg/String; expected nav_msgs/msg/Odometry"),
-    ({"distribution": "humble"}, "jazzy", "another definition of nav_msgs/msg/Odometry")])
+    ({"distribution": "humble"}, "jazzy", "another definition of nav_msgs/msg/Odometry"),
+    ({"distribution": "humble"}, "jazzy", "'humble' has this definition"),
+    ({"distribution": "jazzy"}, "humble", "'jazzy'")])
 def test_a_robot_that_does_not_fit(capsys, system, robot, distribution, why):
     port = free_port()
     with Robot(port, **robot):
@@ -106,6 +127,165 @@ def test_a_robot_that_does_not_fit(capsys, system, robot, distribution, why):
     assert code == 1
     assert found["subscribe /odom"][0] is False
     assert why in found["subscribe /odom"][1]
+
+
+def test_a_robot_in_another_domain(capsys, system):
+    port = free_port()
+    with Robot(port, domain=5):
+        code, found = checked(capsys, system(port))
+    assert code == 1
+    assert found["graph"] == (False, "no node in domain 0: ROS_DOMAIN_ID is 5 on the robot")
+
+
+def test_another_node_publishes_than_the_named_one(capsys, tmp_path, system):
+    port = free_port()
+    path = Path(system(port))
+    path.write_text(path.read_text().replace(
+        'frame = "odom"\n', 'frame = "odom"\npublisher = "/localization"\n'))
+    with Robot(port):
+        code, found = checked(capsys, str(path))
+    assert code == 1
+    assert found["subscribe /odom"] == (False, "published by /base; expected /localization")
+
+
+EVERYTHING = ["put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
+              "liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
+
+
+def rules(denied, names=None, *, inward=("interfaces", ["lo"])):
+    """Return the settings of a router that denies keys to some sessions: to all, or by name."""
+    subject = {"cert_common_names": names} if names else {inward[0]: inward[1]}
+    return {"access_control": {
+        "enabled": True, "default_permission": "allow",
+        "rules": [{"id": "no", "messages": EVERYTHING, "flows": ["ingress", "egress"],
+                   "permission": "deny", "key_exprs": denied}],
+        "subjects": [{"id": "them", **subject}],
+        "policies": [{"rules": ["no"], "subjects": ["them"]}]}}
+
+
+@pytest.mark.parametrize(("denied", "what", "why"), [
+    ("0/odom/**", "subscribe /odom", "an access rule of the router denies 0/odom/nav_msgs::"),
+    ("0/cmd_vel/**", "publish /cmd_vel", "an access rule of the router denies 0/cmd_vel/"),
+    ("@ros2_lv/**", "graph", "an access rule of the router denies liveliness on @ros2_lv/0/**")])
+def test_an_access_rule_of_the_router_is_named(capsys, system, denied, what, why):
+    port = free_port()
+    with Robot(port, router=rules([denied])):
+        code, found = checked(capsys, system(port))
+    assert code == 1
+    assert found[what][0] is False
+    assert why in found[what][1]
+    others = {"subscribe /odom", "publish /cmd_vel"} - {what} if what != "graph" else set()
+    assert all(found[other][0] for other in others)
+
+
+@pytest.mark.parametrize(("backlog", "why"), [
+    (0, "no answer; the machine is off, or a firewall drops packets"),  # the kernel drops packets
+    (50, "a program listens there, but not a router of Zenoh without TLS")])
+def test_a_machine_and_a_program_that_do_not_answer(capsys, system, backlog, why):
+    silent = socket.socket()
+    silent.bind(("127.0.0.1", 0))
+    silent.listen(backlog)
+    with silent:
+        _, found = checked(capsys, system(silent.getsockname()[1]))
+    assert why in found["router of gateway"][1]
+
+
+def test_a_name_that_no_machine_has(capsys, system):
+    path = Path(system(7447))
+    path.write_text(path.read_text().replace("127.0.0.1", "no-robot.invalid"))
+    _, found = checked(capsys, str(path))
+    assert "no-robot.invalid:7447: " in found["router of gateway"][1]
+    assert "not known" in found["router of gateway"][1] or "resolution" in (
+        found["router of gateway"][1])
+
+
+@pytest.fixture
+def credentials(tmp_path):
+    return make_credentials(tmp_path)
+
+
+def make_credentials(folder):
+    """Write files of two authorities: the robot's, and a stranger's."""
+    now = dt.datetime.now(dt.UTC)
+    for owner in ("robot", "stranger"):
+        authority = new_authority(now, 10)
+        (folder / f"{owner}-ca.pem").write_bytes(public_part(authority))
+        for name, kind in (("router", "router"), ("gateway", "node"), ("viewer", "node")):
+            (folder / f"{owner}-{name}.pem").write_bytes(new_certificate(
+                authority, name, kind, addresses=["127.0.0.1"] * (kind == "router"), now=now,
+                days=5))
+    return folder
+
+
+def secured(folder, port, **more):
+    """Return the settings of a router with TLS beside the plain port of its own machine."""
+    tls = "transport/link/tls"
+    return {"listen/endpoints": [f"tcp/127.0.0.1:{port}", f"tls/127.0.0.1:{port + 1}"],
+            f"{tls}/root_ca_certificate": str(folder / "robot-ca.pem"), f"{tls}/enable_mtls": True,
+            f"{tls}/listen_private_key": str(folder / "robot-router.pem"),
+            f"{tls}/listen_certificate": str(folder / "robot-router.pem"), **more}
+
+
+def shown(ca="robot", own="robot-gateway"):
+    own = f', certificate = "{own}.pem", key = "{own}.pem"' if own else ""
+    return f', tls = {{ ca = "{ca}-ca.pem"{own} }}'
+
+
+def ports():
+    """Return a free port whose successor is free, too."""
+    while True:
+        port = free_port()
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port + 1))
+            return port
+
+
+def test_a_router_with_tls_admits_the_gateway_and_says_whom_it_refuses(
+        capsys, credentials, system):
+    port = ports()
+    with Robot(port, router=secured(credentials, port)):
+        code, found = checked(capsys, system(port + 1, protocol="tls", more=shown()))
+        assert (code, found["subscribe /odom"][0], found["publish /cmd_vel"][0]) == (0, True, True)
+        for more, protocol, why in (
+                (shown(own=""), "tls", "certificate required"),
+                (shown(own="stranger-gateway"), "tls", "it refuses TLS: "),
+                (shown(ca="stranger"), "tls", "its certificate is refused: "),
+                ("", "tcp", "it requires TLS: expected connect = ['tls/…']")):
+            code, found = checked(capsys, system(port + 1, protocol=protocol, more=more))
+            assert (code, list(found)) == (1, ["router of gateway"])
+            assert why in found["router of gateway"][1]
+        code, found = checked(capsys, system(port, protocol="tls", more=shown()))
+        assert code == 1
+        assert "but not a router of Zenoh with TLS" in found["router of gateway"][1]
+
+
+def test_rules_of_a_router_by_the_name_in_the_certificate(capsys, credentials, system):
+    port = ports()
+    with Robot(port, router=secured(credentials, port, **rules(["0/cmd_vel/**"], ["viewer"]))):
+        code, _ = checked(capsys, system(port + 1, protocol="tls", more=shown()))
+        assert code == 0
+        code, found = checked(capsys, system(port + 1, protocol="tls",
+                                             more=shown(own="robot-viewer")))
+        assert (code, found["subscribe /odom"][0]) == (1, True)
+        assert "an access rule of the router denies" in found["publish /cmd_vel"][1]
+
+
+@pytest.mark.parametrize(("protocol", "more", "why"), [
+    ("tls", "", "connect 'tls/127.0.0.1:1': expected tls = { ca = 'FILE' } with 'tls/…'"),
+    ("tcp", shown(), "connect 'tcp/127.0.0.1:1': expected 'tls/…' with tls"),
+    ("tls", ', tls = { ca = "ca.pem", key = "key.pem" }', "certificate and key: expected both"),
+    ("tls", ', tls = { ca = "none.pem" }', "none.pem': No such file"),
+    ("tls", ', tls = { ca = "guarded.toml" }', "guarded.toml': NO_CERTIFICATE_OR_CRL_FOUND"),
+    ("tls", ', tls = { ca = "robot-ca.pem", certificate = "x", key = "x" }', "x': No such file"),
+    ("tls", ', tls = { ca = "robot-ca.pem", certificate = "robot-ca.pem", key = "robot-ca.pem" }',
+     "robot-ca.pem': [SSL] PEM"),
+    ("tls", ', tls = { CA = "ca.pem" }', "CA")])
+@pytest.mark.usefixtures("credentials")
+def test_files_and_endpoints_that_do_not_fit_are_refused(capsys, system, protocol, more, why):
+    assert main(["ros2", "check", "--system", system(1, protocol=protocol, more=more)]) == 2
+    error = capsys.readouterr().err
+    assert why in error
+    assert error.count("\n") == 1
 
 
 def test_without_a_router_it_is_said_once(capsys, system):

@@ -1,0 +1,146 @@
+"""A gateway at a router of ROS 2 with TLS and access rules, that ends and starts again."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import pytest
+
+from rampart.actors.ros2.node import RosNode
+from rampart.actors.ros2.side import Tls, ZenohSide
+from rampart.actors.ros2.translation.types import Types
+from rampart.actors.ros2.wire import Qos
+from rampart.testing import RealRun, wait_until
+from tests import ROOT
+from tests.actors.ros2.test_gateway import SYSTEM
+from tests.cli.look.test_ros_verbs import (
+    EVERYTHING,
+    Robot,
+    make_credentials,
+    opened,
+    ports,
+    rules,
+    secured,
+    shown,
+)
+
+pytestmark = pytest.mark.processes
+
+ODOM, TWIST, MAP = (
+    "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist", "nav_msgs/msg/OccupancyGrid")
+LIVELINESS = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
+LOST, BACK = "; the gateway goes on dialling", " again"
+
+
+def written(tmp_path, port, own="robot-gateway"):
+    """Write the system of a gateway at a router with TLS, without the stand-in of the robot."""
+    make_credentials(tmp_path)
+    path = tmp_path / "guarded.toml"
+    path.write_text(SYSTEM.replace('''
+[[node]]
+name = "base"
+actor = "tests.actors.ros2.robot:Base"
+kind = "world"
+''', "").replace('frame = "odom"\n', "").replace('''actor = "rampart.actors.ros2.gateway:Gateway"
+''', f'''actor = "rampart.actors.ros2.gateway:Gateway"
+parameters = {{ connect = ["tls/127.0.0.1:{port}"]{shown(own=own)} }}
+'''))
+    return path
+
+
+def in_ros2(run):
+    return next((line for line in run.tool("status").stdout.splitlines()
+                 if line.startswith("ros2 ")), "")
+
+
+def test_the_gateway_passes_and_finds_each_new_router(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    port = ports()
+    path = written(tmp_path, port + 1)
+    settings = secured(tmp_path, port)
+    with RealRun(tmp_path, path) as run:
+        wait_until(lambda: run.story.count(LOST) == 1, 20)
+        for number in range(1, 4):
+            with Robot(port, router=settings) as robot:
+                wait_until(lambda robot=robot: robot.heard > 20, 20)
+                wait_until(lambda: "linked, 2 nodes" in in_ros2(run), 20)
+                wait_until(lambda number=number: run.story.count(BACK) == number, 20)
+            wait_until(lambda number=number: run.story.count(LOST) == number + 1, 20)
+            assert run.pid("gateway") is not None
+    assert run.story.count(LOST) == 4  # a line for each change, none for each attempt
+
+
+def test_a_rule_by_the_name_in_the_certificate_stops_the_commands_of_another(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    port = ports()
+    path = written(tmp_path, port + 1, "robot-viewer")
+    settings = secured(tmp_path, port, **rules(["0/cmd_vel/**"], ["viewer"]))
+    with RealRun(tmp_path, path) as run, Robot(port, router=settings) as robot:
+        wait_until(lambda: "linked, 2 nodes" in in_ros2(run), 20)
+        assert robot.heard == 0
+
+
+TOPIC = ["put", "declare_subscriber"]
+SERVICE = ["query", "reply", "declare_queryable"]
+LISTED = {  # as docs/reference/ros2.md lists them
+    "graph": (LIVELINESS, ["@ros2_lv/0/**"]),
+    "topics": (TOPIC, ["0/odom/**", "0/cmd_vel/**"]),
+    "kept": ([*TOPIC, *SERVICE, *LIVELINESS], ["0/map/**", "0/map/**/@adv/**"]),
+    "services": (SERVICE, ["0/base/shut/**"])}
+
+
+def only(listed):
+    """Return the settings of a router that allows the gateway some messages, and tcp all."""
+    return {"access_control": {
+        "enabled": True, "default_permission": "deny",
+        "rules": [{"id": name, "messages": messages, "flows": ["ingress", "egress"],
+                   "permission": "allow", "key_exprs": keys}
+                  for name, (messages, keys) in listed.items()] + [
+                      {"id": "all", "messages": EVERYTHING, "flows": ["ingress", "egress"],
+                       "permission": "allow", "key_exprs": ["**", "@ros2_lv/**", "**/@adv/**"]}],
+        "subjects": [{"id": "gateway", "cert_common_names": ["gateway"]},
+                     {"id": "own", "link_protocols": ["tcp"]}],
+        "policies": [{"rules": list(listed), "subjects": ["gateway"]},
+                     {"rules": ["all"], "subjects": ["own"]}]}}
+
+
+@pytest.mark.parametrize("missing", ["", *LISTED])
+async def test_the_listed_rules_are_enough_and_each_is_needed(tmp_path, missing):
+    port = ports()
+    make_credentials(tmp_path)
+    listed = {name: rule for name, rule in LISTED.items() if name != missing}
+    loop, types, got = asyncio.get_running_loop(), Types("jazzy"), set()
+    with opened({**secured(tmp_path, port), **only(listed)}):
+        side = ZenohSide([f"tcp/127.0.0.1:{port}"], loop, mode="peer")
+        robot = RosNode(side, types, "base", wall_ns=time.time_ns, refuse=lambda *_: None)
+        pem = str(tmp_path / "robot-gateway.pem")
+        other = ZenohSide([f"tls/127.0.0.1:{port + 1}"], loop,
+                          tls=Tls(str(tmp_path / "robot-ca.pem"), pem, pem))
+        own = RosNode(other, types, "rampart", wall_ns=time.time_ns, refuse=lambda *_: None)
+        kept = robot.publisher("/map", MAP, Qos(transient_local=True, depth=1))
+        while not side.is_linked():
+            await asyncio.sleep(0.02)
+        kept(types.encode(MAP, types.blank(MAP)))
+        robot.subscribe("/cmd_vel", TWIST, Qos(depth=10), lambda *_: got.add("command"))
+        robot.serve("/base/shut", "std_srvs/srv/SetBool", lambda _: b"")
+        odometry = robot.publisher("/odom", ODOM, Qos(depth=10))
+        own.subscribe("/odom", ODOM, Qos(depth=10), lambda *_: got.add("odometry"))
+        command = own.publisher("/cmd_vel", TWIST, Qos(depth=10))
+        other.tokens("@ros2_lv/0/**", lambda token, _: got.update(
+            {"graph"} if "/base" in token else ()))
+        while not other.is_linked():
+            await asyncio.sleep(0.02)
+        await asyncio.sleep(0.3)
+        own.subscribe("/map", MAP, Qos(transient_local=True, depth=1), lambda *_: got.add("map"))
+        ask = own.client("/base/shut", "std_srvs/srv/SetBool")
+        for _ in range(10):
+            odometry(types.encode(ODOM, types.blank(ODOM)))
+            command(types.encode(TWIST, types.blank(TWIST)))
+            ask(b"", 0.5, lambda payload, _: got.update({"answer"} if payload is not None else ()))
+            await asyncio.sleep(0.1)
+        other.close()
+        side.close()
+    lost = {"": set(), "graph": {"graph"}, "topics": {"odometry", "command"}, "kept": {"map"},
+            "services": {"answer"}}
+    assert got == {"odometry", "command", "graph", "map", "answer"} - lost[missing]
