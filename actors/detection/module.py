@@ -147,17 +147,19 @@ class DetectionModule(Actor):
             self.publish(topics.DETECTION, self._report)
 
     def accused(self, suspects: tuple[str, ...], header: Header) -> tuple[str, ...]:
-        """Return the suspects, with the incarnation of the last message of each that has sent one.
+        """Return the suspects, each with the incarnation of its last message.
 
-        A recovery leaves a later incarnation alone, since it has done nothing wrong.
+        A suspect that has sent none has the incarnation that was issued last. A recovery leaves a
+        later incarnation alone, since it has done nothing wrong.
 
         Args:
             suspects: Names of nodes.
             header: Of the last message.
         """
         self._senders[header.source] = header.incarnation
-        return tuple(f"{name}#{self._senders[name]}" if name in self._senders else name
-                     for name in suspects)
+        latest = {name: self._senders.get(name) or self.context.register(name)
+                  for name in suspects}
+        return tuple(f"{name}#{number}" if number else name for name, number in latest.items())
 
     # -- the monitor ----------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ class UnchangedMonitor(Sustained):
     """Active when the value has been the same for `for_s`, until it changes.
 
     It decides when a message arrives: a sender that stops is silent, not unchanged. For a new
-    process of the sender the time starts again.
+    process of the sender, or of a suspect, the time starts again.
 
     Args:
         what: Name of the field, for the reason.
@@ -44,7 +44,7 @@ class UnchangedMonitor(Sustained):
         Args:
             value: A number, text or truth value.
             now_s: Present time.
-            renewed: Whether another process of the sender published the value before.
+            renewed: Whether the sender or a suspect was another process before.
         """
         if value in self._may_last or not self._is_the_same(value):
             if self._value is not _NOTHING or value in self._may_last:
@@ -101,7 +101,8 @@ class Unchanged(DetectionModule):
         """Note a value."""
         if value is None:
             return
-        before = self._senders.get(header.source, header.incarnation)
+        before = self._senders.get(header.source, header.incarnation), self.monitor.accused
         self.monitor.accused = self.accused(self.parameters.suspects, header)
-        self.monitor.heard(value, self.clock.now(), renewed=before != header.incarnation)
+        self.monitor.heard(value, self.clock.now(),
+                           renewed=before != (header.incarnation, self.monitor.accused))
         self.follow()

@@ -65,6 +65,7 @@ class RosNodes(DetectionModule):
         self.monitor = self.judged_by(Sustained(
             given.for_s, given.clear_s, self.known_after_s(given.for_s + given.clear_s)))
         self._seen: set[str] = set()
+        self._suspects = dict(zip(given.nodes, given.suspects, strict=False))
         self._all_due_s = math.inf
         self._was_linked = False
 
@@ -74,7 +75,7 @@ class RosNodes(DetectionModule):
         return (parameters.gateway,) if topic is GRAPH else super().names(topic, name, parameters)
 
     @on(GRAPH)
-    def graph(self, report: RosGraphReport, _header: Header) -> None:
+    def graph(self, report: RosGraphReport, header: Header) -> None:
         """Look for missing nodes and other publishers."""
         given, now_s = self.parameters, self.clock.now()
         self._was_linked = self._was_linked or report.linked
@@ -92,9 +93,12 @@ class RosNodes(DetectionModule):
         if given.alone and report.bypassed:
             why = "; ".join(filter(None, (why, next(
                 (one for one in report.problems if "publishes besides" in one), "bypassed"))))
-        self.monitor.accused = tuple(
-            suspect for node, suspect in zip(given.nodes, given.suspects, strict=True)
-            if node in missing) if len(given.nodes) == len(given.suspects) else (
-                given.suspects if missing else ())
+        accused = self.accused(given.suspects, header)
+        if len(given.nodes) == len(given.suspects):
+            # Accused is the process that ran the node while it was there, not its successor.
+            self._suspects |= {node: suspect for node, suspect in zip(
+                given.nodes, accused, strict=True) if node in report.nodes}
+            accused = tuple(self._suspects[node] for node in missing)
+        self.monitor.accused = accused if missing else ()
         self.monitor.note(why, now_s)
         self.follow()

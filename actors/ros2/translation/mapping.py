@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import msgspec
 import numpy as np
@@ -289,7 +289,8 @@ def _leaves(made: type[msgspec.Struct], above: str = ""
             ) -> Iterator[tuple[str, msgspec.structs.FieldInfo]]:
     """Yield path and description of each field of a struct, nested ones included."""
     for field in msgspec.structs.fields(made):
-        kind = field.type
+        parts = get_args(field.type)  # the fields of an answer are optional
+        kind = parts[0] if type(None) in parts else field.type
         path = f"{above}{field.name}"
         if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
             yield from _leaves(kind, f"{path}.")

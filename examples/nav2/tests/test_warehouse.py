@@ -14,7 +14,7 @@ SYSTEM = Path(__file__).resolve().parents[1] / "warehouse.toml"
 
 @pytest.mark.parametrize(("fault", "mechanism", "recovery"), [
     (None, None, None), ("localization-jump@12", "M_JUMP", "R_STOP"),
-    ("costmap-stale@10", "M_COSTMAP", "R_LIFECYCLE"),
+    ("costmap-stale@10", "M_COSTMAP", "R_RESTART"),
     ("drop:nav/command@10+5", "M_SILENT", "R_RESTART"),
     ("stuck:guard/velocity@10+inf", "M_GUARD_STUCK", "R_RESTART"),
     ("drop:guard/velocity@10+inf", "M_GUARD_SILENT", "R_RESTART"),

@@ -16,9 +16,11 @@ from warehouse import topics
 from warehouse.hall import DEPTH_M, WAY_M, WIDTH_M
 from warehouse.topics import Skew
 
-INACTIVE, ACTIVE = 2, 3
-CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
-"""Transitions of lifecycle_msgs/msg/Transition."""
+UNCONFIGURED, INACTIVE, ACTIVE = 1, 2, 3
+"""States of lifecycle_msgs/msg/State."""
+TRANSITIONS = {(UNCONFIGURED, 1): INACTIVE, (INACTIVE, 3): ACTIVE, (ACTIVE, 4): INACTIVE,
+               (INACTIVE, 2): UNCONFIGURED}
+"""State and transition (configure, activate, deactivate, clean up) to the next state."""
 
 SPEED_MPS = 0.7
 
@@ -28,7 +30,34 @@ def heading_rad(rotation: Any) -> float:
     return 2 * math.atan2(rotation.z, rotation.w)
 
 
-class Amcl(StandIn):
+class Lifecycle(StandIn):
+    """A lifecycle node. Nav2's lifecycle manager has activated it at the start of the system.
+
+    A process that is started later is unconfigured, and publishes nothing until it is active.
+    """
+
+    def declare(self) -> None:
+        """Declare the services of the life cycle."""
+        self._state = ACTIVE if self.context.incarnation == 1 else UNCONFIGURED
+        self.serve(f"/{self.node_name}/get_state", "lifecycle_msgs/srv/GetState", self._tell)
+        self.serve(f"/{self.node_name}/change_state", "lifecycle_msgs/srv/ChangeState",
+                   self._change)
+
+    @property
+    def is_active(self) -> bool:
+        """Whether it works."""
+        return self._state == ACTIVE
+
+    def _tell(self, _request: Any, response: Any) -> None:
+        response.current_state.id = self._state
+
+    def _change(self, request: Any, response: Any) -> None:
+        state = TRANSITIONS.get((self._state, request.transition.id))
+        response.success = state is not None
+        self._state = state or self._state
+
+
+class Amcl(Lifecycle):
     """Localization: /amcl_pose from /odom."""
 
     node_name = "amcl"
@@ -36,6 +65,7 @@ class Amcl(StandIn):
 
     def declare(self) -> None:
         """Declare topics."""
+        super().declare()
         self._odometry: Any = None
         self._publish = self.publisher("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped",
                                    Qos(transient_local=True, depth=1))
@@ -52,7 +82,7 @@ class Amcl(StandIn):
     @every(0.1)
     def pose(self) -> None:
         """Publish the pose."""
-        if self._odometry is not None:
+        if self.is_active and self._odometry is not None:
             message = self.types.blank("geometry_msgs/msg/PoseWithCovarianceStamped")
             message.header.frame_id = "map"
             message.pose.pose = self._odometry.pose.pose
@@ -61,24 +91,20 @@ class Amcl(StandIn):
             self._odometry = None
 
 
-class PlannerServer(StandIn):
-    """Planner, its costmap and its life cycle; a goal of the navigation can be cancelled."""
+class PlannerServer(Lifecycle):
+    """Planner and its costmap; a goal of the navigation can be cancelled."""
 
     node_name = "planner_server"
 
     def declare(self) -> None:
         """Declare topics and services."""
-        self._is_active, self._is_cancelled = True, False
+        super().declare()
+        self._is_cancelled = False
         self._publish_plan = self.publisher("/plan", "nav_msgs/msg/Path")
         self._publish_map = self.publisher("/global_costmap/costmap", "nav_msgs/msg/OccupancyGrid",
                                        Qos(transient_local=True, depth=1))
-        self.serve("/planner_server/change_state", "lifecycle_msgs/srv/ChangeState", self._change)
         self.serve("/navigate_to_pose/_action/cancel_goal", "action_msgs/srv/CancelGoal",
                    self._cancel)
-
-    def _change(self, request: Any, response: Any) -> None:
-        self._is_active = request.transition.id == ACTIVATE
-        response.success = True
 
     def _cancel(self, _request: Any, response: Any) -> None:
         self._is_cancelled = True
@@ -87,7 +113,7 @@ class PlannerServer(StandIn):
     @every(0.5)
     def plan(self) -> None:
         """Publish plan and costmap."""
-        if not self._is_active:
+        if not self.is_active:
             return
         path = self.types.blank("nav_msgs/msg/Path")
         path.header.frame_id = "map"
@@ -104,13 +130,14 @@ class PlannerServer(StandIn):
         self._publish_map(grid)
 
 
-class ControllerServer(StandIn):
+class ControllerServer(Lifecycle):
     """Controller: /cmd_vel_nav from /plan and /amcl_pose."""
 
     node_name = "controller_server"
 
     def declare(self) -> None:
         """Declare topics."""
+        super().declare()
         self._plan: list[tuple[float, float]] = []
         self._pose: tuple[float, float, float] | None = None
         self._next: int | None = None
@@ -143,6 +170,8 @@ class ControllerServer(StandIn):
     @every(0.05)
     def control(self) -> None:
         """Publish the velocity."""
+        if not self.is_active:
+            return
         message = self.types.blank("geometry_msgs/msg/Twist")
         if self._plan and self._pose is not None:
             if self._next is None:  # a new process continues where the robot is

@@ -372,6 +372,24 @@ def test_suspects_are_named_by_the_incarnation_that_was_heard(kind, parameters, 
     run(scenario)
 
 
+def test_a_suspect_that_sends_nothing_itself_is_named_by_the_incarnation_of_that_time():
+    """Named without one, a living suspect was reported as restarted although it was not."""
+    async def scenario() -> None:
+        async with VirtualSystem(topics=TOPICS) as system:
+            ear = system.start("ear", Ear)
+            system.start("D", Unchanged, value="tank/level:height_m", for_s=0.3, suspects=["pump"])
+            await asyncio.sleep(0.1)
+            for tick in range(9):
+                system.incarnations["pump"] = 3 if tick < 6 else 4  # it is replaced
+                system.say(LEVEL, Level(3.0), "gauge")
+                await asyncio.sleep(0.1)
+            named = [m.nodes for _, m in ear.heard if m.nodes]
+            # The new process has 0.3 s of its own before it is suspected.
+            assert set(named) == {("pump#3",)}
+
+    run(scenario)
+
+
 @pytest.mark.parametrize(("kind", "parameters", "words"), [
     (Threshold, {"value": "a:b"}, "above = *: missing; give above, below or both"),
     (Threshold, {"value": "a:b", "above": 1.0, "below": 2.0}, "below = 2.0: must be smaller"),
