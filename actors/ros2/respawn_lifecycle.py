@@ -1,6 +1,6 @@
-"""`RespawnLifecycle`: respawn nodes, and bring lifecycle nodes of ROS 2 back into the state active.
+"""`RespawnLifecycle`: respawn nodes, and bring lifecycle nodes of ROS 2 back into their state.
 
-A lifecycle node (package `lifecycle_msgs`) starts unconfigured, and works only after its transitions
+A lifecycle node (package `lifecycle_msgs`) starts unconfigured. It works only after its transitions
 *configure* and *activate*. The module asks each respawned node for its state and requests the next
 transition, until the node is active. So a node that activates itself is accepted, and a request or
 answer that is lost is repeated. So is a transition that the node refuses, until its time is over.
@@ -58,8 +58,8 @@ class RespawnLifecycle(Respawn):
                 raise ValueError(f"lifecycle: {', '.join(sorted(strangers))}: not among nodes")
             for name in ("ask", "state", "change"):
                 if len(getattr(self, name)) != len(self.lifecycle):
-                    raise ValueError(f"{name}: expected {len(self.lifecycle)} entries, one for each "
-                                     "node of lifecycle")
+                    raise ValueError(f"{name}: expected {len(self.lifecycle)} entries, one for "
+                                     "each node of lifecycle")
 
     parameters: Parameters
 
