@@ -33,12 +33,15 @@ def main() -> int:
     used: dict[str, float] = {}
     last: dict[int, float] = {}
     start = time.monotonic()
+    root = psutil.Process(run.pid)
     while run.poll() is None:
         names = {p.pid: "+".join(p.names) for p in find_processes(PORT)} | {run.pid: "launch.py"}
-        for pid, name in names.items():
+        for process in [root, *root.children(recursive=True)]:
+            pid = process.pid
             try:
-                times = psutil.Process(pid).cpu_times()
-            except psutil.Error:
+                name = names.get(pid) or process.cmdline()[0].partition(" ")[0]
+                times = process.cpu_times()
+            except (psutil.Error, IndexError):
                 continue
             total = times.user + times.system
             # The first sample of a process is its past: the imports, which its fork inherits not.
@@ -49,7 +52,7 @@ def main() -> int:
     elapsed = time.monotonic() - start
     assert run.stdout is not None
     result = json.loads(run.stdout.read().splitlines()[-1])
-    print(f"{sum(used.values()) / elapsed:.2f} cores on average over {elapsed:.0f} s")
+    print(f"{sum(used.values()) / elapsed:.3f} cores on average over {elapsed:.0f} s")
     for name, seconds in sorted(used.items(), key=lambda item: -item[1])[:8]:
         print(f"  {name:<18} {100 * seconds / elapsed:5.1f} % of a core")
     faulty = [light["name"] for light in result["lights"] if light["verdict"] in ("dim", "out")]

@@ -29,19 +29,19 @@ from rampart.cli.operate import (
     token_verbs,
 )
 from rampart.cli.output import NoEffectError, UsageError, say_text, warn
-from rampart.cli.record import record_verbs
+from rampart.cli.record import incident_verbs, record_verbs
 from rampart.cli.verbs import FORMATTER, PORT
 from rampart.files import interrupts, streams, working_folder
 
 _MODULES = (
     node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
-    record_verbs, keys_verb, token_verbs, bench_verb, check_verbs, cut_set_verbs, decide_verbs,
-    tree_verbs, verify_verb, doctor_verb, service_verb)
+    record_verbs, incident_verbs, keys_verb, token_verbs, bench_verb, check_verbs, cut_set_verbs,
+    decide_verbs, tree_verbs, verify_verb, doctor_verb, service_verb)
 """Each adds its verbs."""
 
 _GROUPS = {
     "start": ("new", "run", "record", "replay", "doctor"),
-    "look": ("status", "top", "node", "topic", "bag", "live", "ros2"),
+    "look": ("status", "top", "node", "topic", "bag", "incident", "live", "ros2"),
     "operate": ("reset", "inject", "adapt", "bench"),
     "analyse": ("check", "explain", "decide", "tree", "verify", "cut-sets", "campaign"),
     "administer": ("keys", "tokens", "service")}

@@ -22,6 +22,7 @@ from typing import Any, TextIO
 import msgspec
 
 from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.incidents import state_folder
 from rampart.actors.recording.other_hosts import others_of
 from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.virtual import VirtualRecording
@@ -40,6 +41,7 @@ from rampart.cli.run_options import ERROR_LOG, of_one_process, parse, plan_of, r
 from rampart.files import interrupts, streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec
+from rampart.manager.spec.tables import BlackBox
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import action_of, parse_fault
@@ -92,6 +94,10 @@ class Run:
         plan = msgspec.structs.replace(
             plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"),
             page=audited(plan.page, kept / f"audit-{plan.run_id}.jsonl"))
+        if options.black_box and spec.hosts:
+            raise UsageError("--black-box: not on several hosts; use --record")
+        if (options.black_box or spec.black_box) and not (options.virtual or spec.hosts):
+            plan = msgspec.structs.replace(plan, black_box=str(state_folder(spec.name)))
         self._kind, self._context = kind, replace(run, plan=plan)
         self._trial = self._made(plan, sys.stderr)
         self._plan = plan
@@ -188,7 +194,8 @@ class Run:
                     options.patience if kind.patient else options.duration, stream)
 
     async def _on_processes(self, run: ProcessRun) -> int:
-        with _recorded(self._options, self._plan, self._trial.run.system) as recorder:
+        with (_recorded(self._options, self._plan, self._trial.run.system) as recorder,
+              _black_box(self._plan, self._trial.run.system, _say) as run.keep_alive):
             if recorder is not None:
                 run.launcher.recording = lambda: (recorder.path, recorder.problem())
             record = await run.run()
@@ -312,6 +319,39 @@ def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
         yield recorder
     finally:
         recorder.end()
+
+
+@contextlib.contextmanager
+def _black_box(plan: RunPlan, spec: SystemSpec, say: Callable[[str], None]
+               ) -> Iterator[Callable[[], None]]:
+    """Start the black box; yield the function that keeps it alive, and reports its end once."""
+    box = RecorderProcess(Order(
+        plan.base_port, plan.black_box, os.getppid(), black_box=spec.black_box or BlackBox(),
+        checkpoints=plan.checkpoints if spec.layers.checkpoints else ""))
+    reported = ""
+
+    def report(problem: str) -> None:
+        nonlocal reported
+        if problem and not reported:
+            reported = problem
+            say(f"black box: {problem}")
+
+    def keep_alive() -> None:
+        try:
+            report(box.keep_alive())
+        except OSError as error:
+            report(f"cannot start: {in_words(error)}")
+
+    if not plan.black_box:
+        yield lambda: None
+        return
+    with contextlib.suppress(OSError):  # keep_alive tries again
+        box.start()
+    try:
+        yield keep_alive
+    finally:
+        box.end()
+        report(box.problem())
 
 
 @contextlib.contextmanager

@@ -101,6 +101,8 @@ _OPTIONS = (
     number("--duration", "S", "simulated seconds after which a system without a mission ends "
            "(default: that of [end], else on interruption)"),
     word("--record", "FILE", "record all messages to an MCAP file"),
+    flag("--black-box", "keep the time around faults, see `rampart incident`; [black_box] of the "
+         "specification does the same"),
     flag("--overwrite", "let --record replace an existing file"),
     flag("--no-keys", "run on several hosts without --keys: every client on the network has "
          "full control"),
@@ -311,6 +313,8 @@ def _check(options: argparse.Namespace) -> None:
     for name, port in (("--port", options.port), ("--hmi-port", options.hmi_port)):
         between(name, port, 1024, LAST_PORT,
                 ", below the ports that the kernel gives to outgoing connections")
+    if options.black_box and options.virtual:
+        raise UsageError("--black-box: not with --virtual: the same --seed gives the same run")
     if options.network != "measured" and not options.virtual:
         raise UsageError(f"--network {options.network}: only with --virtual; Zenoh carries the "
                          "messages of real processes")

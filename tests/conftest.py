@@ -62,6 +62,14 @@ def pytest_runtest_setup(item):
             (pytest.fail if os.environ.get(variable) else pytest.skip)(how)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def state_home(tmp_path_factory):
+    """Runs of the tests keep their incidents there, not with those of the user."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 class LastLine:
     """Says in the last line what was not tested for want of something."""
 

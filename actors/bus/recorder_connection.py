@@ -34,9 +34,13 @@ _HEAD = struct.Struct("<dH")
 _FLAGS = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
 
 
-def address(port: int) -> str:
-    """Return the abstract socket address of the recorder of the run on a base port."""
-    return f"\0rampart.{port}.recorder"
+RECORDERS = ("recorder", "black_box")
+"""A run may have one of each."""
+
+
+def address(port: int, which: str = RECORDERS[0]) -> str:
+    """Return the abstract socket address of a recorder of the run on a base port."""
+    return f"\0rampart.{port}.{which}"
 
 
 def frame(at_s: float, key: str, payload: bytes) -> bytes:
@@ -64,7 +68,7 @@ def parse_frame(data: bytes | memoryview) -> tuple[float, str, bytes]:
 
 
 class RecorderConnection:
-    """Connection of one bus to the recorder of its run.
+    """Connections of one bus to the recorders of its run.
 
     Args:
         port: Base port of the run.
@@ -72,49 +76,55 @@ class RecorderConnection:
     """
 
     def __init__(self, port: int, clock: Callable[[], float] = time.monotonic) -> None:
-        self._address = address(port)
+        self._addresses = [address(port, which) for which in RECORDERS]
         self._clock = clock
-        self._socket: socket.socket | None = None
+        self._sockets: dict[str, socket.socket] = {}
         self._next_look_s = 0.0
 
     def take(self, key: str, payload: bytes) -> None:
         """Record a message that is being sent. Never waits and never raises."""
         now_s = self._clock()
-        if self._socket is None and now_s >= self._next_look_s:
+        if now_s >= self._next_look_s and len(self._sockets) < len(self._addresses):
             self._next_look_s = now_s + RETRY_S
             self._look()
-        if self._socket is None:
+        if not self._sockets:
             return
         data = frame(now_s, key, payload)
         if len(data) > MAX_FRAME_BYTES:
             return
-        try:
-            self._socket.send(data, _FLAGS)
-        except (BlockingIOError, InterruptedError):
-            return  # the recorder is behind; the next message shows the gap
-        except OSError as error:
-            if error.errno != errno.EMSGSIZE:  # too long: lost, and the gap shows
-                self.close()
+        for where, connection in list(self._sockets.items()):
+            try:
+                connection.send(data, _FLAGS)
+            except (BlockingIOError, InterruptedError):
+                continue  # the recorder is behind; the next message shows the gap
+            except OSError as error:
+                if error.errno != errno.EMSGSIZE:  # too long: lost, and the gap shows
+                    self._sockets.pop(where).close()
 
     def close(self) -> None:
-        """Close the connection; the next message looks for a recorder again."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        """Close the connections; the next message looks for recorders again."""
+        while self._sockets:
+            self._sockets.popitem()[1].close()
 
     def _look(self) -> None:
-        try:
-            connection = socket.socket(
-                socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
-        except OSError:  # no descriptor left
-            return
-        try:
-            connection.connect(self._address)
-            if not is_same_user(connection):
-                raise PermissionError(self._address)
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-        except OSError:  # usually there is no recorder
-            connection.close()
-            return
-        self._socket = connection
+        for where in self._addresses:
+            if where not in self._sockets and (found := _connected(where)) is not None:
+                self._sockets[where] = found
 
+
+def _connected(where: str) -> socket.socket | None:
+    """Return a connection to a recorder; None if there is none, as usual."""
+    try:
+        connection = socket.socket(
+            socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+    except OSError:  # no descriptor left
+        return None
+    try:
+        connection.connect(where)
+        if not is_same_user(connection):
+            raise PermissionError(where)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+    except OSError:
+        connection.close()
+        return None
+    return connection

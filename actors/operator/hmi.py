@@ -29,6 +29,7 @@ from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.history import read_history
 from rampart.actors.ftm.keeping_up import LINE_S, KeepingUp
 from rampart.actors.operator.bounds import Bounds
 from rampart.actors.operator.camera_eye import CameraEye
@@ -64,6 +65,9 @@ REPEAT_S = 0.5
 
 TOKEN_HOLDER = "operator"  # noqa: S105 it is a name
 """Name of the visitor on a page with one token."""
+
+SHOWN_FAULTS = 20
+"""Most rows of the history of faults."""
 
 _PANELS = Bounds(text=200, items=max(MAX_PANELS, 40), room=40_000)
 
@@ -323,6 +327,9 @@ class Hmi(Actor):
         if self.clock.now() > self._behind_until_s:
             self._state.picture.put("behind", "")
         self._state.picture.put("usage", self._observer.look(self._table))
+        if folder := self.context.run.plan.black_box:
+            with contextlib.suppress(ValueError):  # the black box reports a damaged file
+                self._state.picture.put("history", read_history(Path(folder), SHOWN_FAULTS))
 
     def _show_system(self, system: SystemSpec, version: int) -> None:
         if self._port and system is not NO_SYSTEM and version > self._version:

@@ -99,6 +99,7 @@ class HmiState:
         picture.section("detections", [])
         picture.section("usage", {})
         picture.section("behind", "")
+        picture.section("history", [])
         picture.journal("decisions")
         picture.journal("events")
 

@@ -88,6 +88,21 @@ def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO
     return file
 
 
+def check_reserve(file: int | Path) -> None:
+    """Check that a disk has more than `RESERVE_BYTES` free.
+
+    Args:
+        file: a file or folder on it, as descriptor or path.
+
+    Raises:
+        OSError: it has not.
+    """
+    disk = os.statvfs(file)
+    reserve = min(RESERVE_BYTES, disk.f_blocks * disk.f_frsize // 20)
+    if disk.f_bavail * disk.f_frsize < reserve:
+        raise OSError(errno.ENOSPC, f"less than {reserve >> 20} MB are free on its disk")
+
+
 @contextlib.contextmanager
 def complete(path: Path) -> Iterator[None]:
     """Delete a new file or folder if writing it fails.
@@ -240,10 +255,7 @@ class BagWriter:
             OSError: the file cannot be written, or only `RESERVE_BYTES` of the disk are free.
         """
         self._writer.flush()
-        disk = os.fstatvfs(self._file.fileno())
-        reserve = min(RESERVE_BYTES, disk.f_blocks * disk.f_frsize // 20)
-        if disk.f_bavail * disk.f_frsize < reserve:
-            raise OSError(errno.ENOSPC, f"less than {reserve >> 20} MB are free on its disk")
+        check_reserve(self._file.fileno())
 
     @property
     def written_bytes(self) -> int:

@@ -13,6 +13,7 @@ import select
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import msgspec
@@ -21,24 +22,47 @@ import setproctitle
 from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in
 from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.black_box import BlackBox
 from rampart.actors.recording.other_hosts import OtherHosts
 from rampart.actors.recording.recorder import RUN_ENDED, Recorder
 from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.files import streams, working_folder
+from rampart.manager.spec.tables import BlackBox as Limits
 
 _READY = "ready"
 _PR_SET_PDEATHSIG = 1
 _START_S, _END_S = 30.0, 10.0
+_DIED = "the recorder has died"
+
+_AGAIN_S = 10.0
+"""Least real seconds between two starts of a black box."""
+
+_NICE = 5
+"""Niceness of a black box: it may be late by some hundred messages of a node."""
 
 
 class Order(msgspec.Struct, frozen=True):
-    """Order to record a run; `launcher` is the pid of its launcher, `others` the other hosts."""
+    """Order to record a run.
+
+    Attributes:
+        port: base port of the run.
+        path: file; of a black box the folder of the system.
+        launcher: pid of the launcher.
+        overwrite: whether the file may exist.
+        others: the other hosts.
+        black_box: limits of a black box; None for a recording.
+        checkpoints: folder of the checkpoints that a black box keeps; "" without.
+        again: whether a black box follows another one of this run, which has died.
+    """
 
     port: int
     path: str
     launcher: int
     overwrite: bool = False
     others: OtherHosts | None = None
+    black_box: Limits | None = None
+    checkpoints: str = ""
+    again: bool = False
 
 
 class RecorderProcess:
@@ -52,6 +76,7 @@ class RecorderProcess:
         self._order = order
         self._process: subprocess.Popen[str] | None = None
         self._problem = ""
+        self._again_s = 0.0
 
     @property
     def path(self) -> str:
@@ -61,7 +86,7 @@ class RecorderProcess:
     def problem(self) -> str:
         """Return why the recorder has ended too early; "" if it has not."""
         if self._process is not None and not self._problem and self._process.poll() is not None:
-            self._problem = self._answer() or "the recorder has died"
+            self._problem = self._answer() or _DIED
         return self._problem
 
     def _answer(self) -> str:
@@ -70,18 +95,33 @@ class RecorderProcess:
         assert self._process.stdout is not None  # noqa: S101
         return self._process.stdout.readline().strip().removeprefix("error: ")
 
+    def keep_alive(self) -> str:
+        """Start a black box that has died again; return why it has ended otherwise, or ""."""
+        if self.problem() != _DIED:
+            return self._problem
+        if time.monotonic() >= self._again_s:
+            self._let_go()
+            self._problem = ""
+            self._order = msgspec.structs.replace(self._order, again=True)
+            self.start()
+        return ""
+
     def start(self) -> None:
-        """Start it and wait until nodes can find it.
+        """Start it, and wait until nodes can find a recorder; a run does not wait for a black box.
 
         Raises:
             BagError: it cannot start.
+            OSError: no process can be started.
         """
+        self._again_s = time.monotonic() + _AGAIN_S
         self._process = subprocess.Popen(  # noqa: S603 our own interpreter and module
             [sys.executable, "-P", "-m", "rampart.actors.recording.process",
              msgspec.json.encode(self._order).decode()],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
             env=working_folder.environment())
         assert self._process.stdout is not None  # noqa: S101 for the type checker
+        if self._order.black_box is not None:
+            return
         if not select.select([self._process.stdout], [], [], _START_S)[0]:
             self._process.kill()
             self._let_go()
@@ -134,28 +174,39 @@ def record(order: Order) -> int:
     # If this process is stopped when the launcher dies, it must continue to notice that and end.
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT, 0, 0, 0)
     path = Path(order.path)
-    setproctitle.setproctitle(f"rampart-recorder[{order.port}/{order.launcher}] {path}")
+    name = "recorder" if order.black_box is None else "black-box"
+    setproctitle.setproctitle(f"rampart-{name}[{order.port}/{order.launcher}] {path}")
     stop = stop_pipe()
     for number in (signal.SIGINT, signal.SIGHUP):  # the launcher handles them; we see its end
         signal.signal(number, signal.SIG_IGN)
     signal.signal(RUN_ENDED, lambda *_: None)
-    recorder = Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher,
-                        others=order.others, credentials=_launchers)
+    recorder = _recorder(order, path)
     try:
         recorder.open()
     except BagError as error:
         _answer(f"error: {error}")
         return 1
-    _answer(_READY)
+    if order.black_box is None:
+        _answer(_READY)
     try:
         recorder.run(stop)
     except (BagError, ValueError, OSError) as error:
-        streams.complain(str(error))
+        if order.black_box is None:  # else its launcher prints the answer
+            streams.complain(str(error))
         _answer(f"error: {error}")
         return 1
-    if recorder.writer is not None:
+    if recorder.writer is not None and order.black_box is None:
         streams.complain(result_of(recorder))
     return 0
+
+
+def _recorder(order: Order, path: Path) -> Recorder:
+    if order.black_box is None:
+        return Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher,
+                        others=order.others, credentials=_launchers)
+    os.nice(_NICE)
+    return BlackBox(order.port, path, order.black_box, launcher=order.launcher, again=order.again,
+                    checkpoints=Path(order.checkpoints) if order.checkpoints else None)
 
 
 def _launchers(run: RunInfo) -> Credentials | None:

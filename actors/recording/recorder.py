@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable
 from operator import itemgetter
 from pathlib import Path
+from typing import ClassVar
 
 from rampart.actors.bus import recorder_connection
 from rampart.actors.bus.run_info import RunInfo, ask
@@ -61,6 +62,11 @@ _WAITING_FRAMES = 500_000
 class Recorder:
     """One recording of one run. Call `open`, then `run`, once.
 
+    Class attributes:
+        which: its name in `recorder_connection.RECORDERS`.
+        period_s: real seconds between two looks into the sockets.
+        flush_s: real seconds between two flushes; a crash loses so much at most.
+
     Args:
         port: base port of the run.
         path: path of the file.
@@ -70,6 +76,10 @@ class Recorder:
         others: the other hosts; None in a run on one.
         credentials: returns the recorder's credentials on the bus of a run, for other hosts.
     """
+
+    which: ClassVar[str] = "recorder"
+    period_s: ClassVar[float] = PERIOD_S
+    flush_s: ClassVar[float] = FLUSH_S
 
     def __init__(self, port: int, path: Path, *, overwrite: bool = False,
                  wants: Callable[[str], bool] = lambda _key: True,
@@ -103,7 +113,7 @@ class Recorder:
         """
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
-            listener.bind(recorder_connection.address(self._port))
+            listener.bind(recorder_connection.address(self._port, self.which))
         except OSError:
             listener.close()
             raise BagError(f"the run on port {self._port} is being recorded already") from None
@@ -193,7 +203,7 @@ class Recorder:
                 lambda at_s: (at_s - info.origin_s) * info.rate))
         now_s = time.monotonic()
         if now_s >= self._next_flush_s:
-            self._next_flush_s = now_s + FLUSH_S
+            self._next_flush_s = now_s + self.flush_s
             writer.flush()
             if writer.written_bytes > FILE_BYTES:
                 self._begin_file(info, now_s)
@@ -209,7 +219,7 @@ class Recorder:
 
     def _period_s(self) -> float:
         """Return the time to sleep; at a high rate sockets fill sooner."""
-        return min(PERIOD_S, 0.4 / self._info.rate) if self._info else PERIOD_S
+        return min(self.period_s, 0.4 / self._info.rate) if self._info else PERIOD_S
 
     # -- the run --------------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,7 +21,7 @@ from rampart.actors.system.members import application_class, import_class, load_
 from rampart.actors.system.topics import own_topics
 from rampart.files import working_folder
 from rampart.files.reading import FileError, read_bytes
-from rampart.manager.spec.specification import SystemSpec
+from rampart.manager.spec.specification import SystemSpec, check_document, read_document
 
 FORMAT = "1"
 SYSTEM = "system.toml"
@@ -149,6 +149,24 @@ def known_of(plan: Mapping[str, Any]) -> RunContents:
             msgspec.structs.replace(run, options=options), system))
     except (OSError, ValueError):
         return RunContents(system, kind)
+
+
+def recorded_system(files: Iterable[File]) -> tuple[dict[str, Any], RunContents]:
+    """Return the specification of a recording and its system, as far as they can be read.
+
+    Args:
+        files: those attached to the recording.
+    """
+    document: dict[str, Any] = {}
+    found = NO_SYSTEM
+    with contextlib.suppress(StopIteration, ValueError):
+        text = next(data for name, _, data in files if name == SYSTEM).decode()
+        document = read_document(text, SYSTEM)
+        found = check_document(document, SYSTEM)
+    try:
+        return document, RunContents(found, application_class(found))
+    except ValueError:  # an application that is not installed here
+        return document, RunContents(found)
 
 
 def restore(files: Sequence[File], directory: Path) -> None:

@@ -59,6 +59,7 @@ class RunPlan(msgspec.Struct, frozen=True):
         watchdog: device that the root feeds while supervisor and manager work, or "".
         part: number of times the run was resumed.
         begins_s: simulated time at which this part of the run begins, after start-up.
+        black_box: folder of the system's incidents and history; "" without a black box.
     """
 
     run_id: str = "run"
@@ -86,6 +87,7 @@ class RunPlan(msgspec.Struct, frozen=True):
     watchdog: str = ""
     part: int = 0
     begins_s: float = 0.0
+    black_box: str = ""
 
     @property
     def supervisor(self) -> str:

@@ -68,31 +68,35 @@ from rampart.files.plain_text import one_line
 
 _PORTS = (1024, 65535)
 
+_TOPICS: dict[str, Any] = {"metavar": "GLOB", "nargs": "+", "action": "extend", "default": []}
+
+PLAYING = (
+    number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
+    flag("--loop", "start again at the end; each pass has higher incarnations"),
+    option("--topics", **_TOPICS, help="play only keys that match a pattern"),
+    number("--start", "S", "start at simulated second S of the run"),
+    number("--delay", "S", "real seconds before the first message, so that readers can connect",
+           0.0),
+    whole("--hmi-port", "PORT", "serve the operator's page on this port of 127.0.0.1", 0),
+    flag("--viewer", "show the robot in MuJoCo's viewer"),
+    word("--video", "FILE.mp4", "write a video of the robot in MuJoCo instead of playing; "
+         "needs the extra `video`"),
+    whole("--port", "N", f"base port of the replay (default: {DEFAULT_PORT})", DEFAULT_PORT))
+"""Options of a replay."""
+
 
 def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    topics: dict[str, Any] = {"metavar": "GLOB", "nargs": "+", "action": "extend", "default": []}
     add_verb(verbs, "record", "record the run", record, PORT,
              option("file", metavar="FILE", nargs="?",
                     help="MCAP file (default: rampart-TIME.mcap)"),
-             option("--topics", **topics,
+             option("--topics", **_TOPICS,
                     help="record only keys that match a pattern"),
              number("--duration", "S", "end after S real seconds"),
              flag("--overwrite", "replace FILE if it exists"))
     add_verb(verbs, "replay", "play back a recording", replay,
              option("file", metavar="FILE", help="MCAP file"),
-             number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
-             flag("--loop", "start again at the end; each pass has higher incarnations"),
-             option("--topics", **topics, help="play only keys that match a pattern"),
-             number("--start", "S", "start at simulated second S of the run"),
-             number("--delay", "S",
-                    "real seconds before the first message, so that readers can connect", 0.0),
-             whole("--hmi-port", "PORT", "serve the operator's page on this port of 127.0.0.1", 0),
-             flag("--viewer", "show the robot in MuJoCo's viewer"),
-             word("--video", "FILE.mp4", "write a video of the robot in MuJoCo instead of playing; "
-                  "needs the extra `video`"),
-             whole("--port", "N", f"base port of the replay (default: {DEFAULT_PORT})",
-                   DEFAULT_PORT))
+             *PLAYING)
     bag = add_family(verbs, "bag", "inspect a recording; needs no run", __doc__)
     add_verb(bag, "info", "show run, duration, channels and damage", bag_info,
              option("file", metavar="FILE", help="MCAP file"), JSON)
@@ -106,7 +110,7 @@ def add(verbs: Any) -> None:
                     help="new folder (default: IN without its suffix)"),
              option("--to", choices=("csv", "parquet"), default="csv",
                     help="format (default: csv)"),
-             option("--topics", **topics, help="write only channels that match a pattern"), JSON)
+             option("--topics", **_TOPICS, help="write only channels that match a pattern"), JSON)
     add_verb(bag, "ros2", "convert to a bag of ROS 2", bag_ros2,
              option("file", metavar="IN", help="MCAP file"),
              option("out", metavar="FOLDER", help="new folder"),

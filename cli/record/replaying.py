@@ -34,18 +34,23 @@ from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.panels import Panel
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import Forms, header_of, renumbered
-from rampart.actors.recording.run_documents import NOT_CHOSEN, SYSTEM, RunContents, restore
+from rampart.actors.recording.run_documents import (
+    NOT_CHOSEN,
+    SYSTEM,
+    RunContents,
+    recorded_system,
+    restore,
+)
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
-from rampart.actors.runtime.run_context import NO_SYSTEM, RunContext
+from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
-from rampart.actors.system.members import application_class, load_class
+from rampart.actors.system.members import load_class
 from rampart.actors.web.page_plan import PagePlan
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.session import pause
 from rampart.manager.spec.schema import Kind
-from rampart.manager.spec.specification import check_document, read_document
 
 DEFAULT_PORT = 7400
 PAGE = "replay_page"
@@ -100,7 +105,7 @@ class RecordedRun:
     def __init__(self, path: Path, *, loop: bool = False, start_s: float | None = None,
                  wants: Callable[[str], bool] = lambda _key: True) -> None:
         self.summary = summary = Summary(BagReader(path))
-        self.document, self.known = recorded_system(summary)
+        self.document, self.known = recorded_system(summary.files)
         self.forms = Forms(self.known.topics)
         self.refused = 0
         self._path = path
@@ -318,20 +323,6 @@ class Replay(RecordedRun):
             PAGE, 1, clock, shared(bus), {"panels": tuple(
                 panel for panel in panels if not panel.stick)}, run,
             topics={topic.key: topic for topic in self.known.topics}))
-
-
-def recorded_system(summary: Summary) -> tuple[dict[str, Any], RunContents]:
-    """Return the specification of a recording and its system, as far as they can be read."""
-    document: dict[str, Any] = {}
-    found = NO_SYSTEM
-    with contextlib.suppress(StopIteration, ValueError):
-        text = next(data for name, _, data in summary.files if name == SYSTEM).decode()
-        document = read_document(text, SYSTEM)
-        found = check_document(document, SYSTEM)
-    try:
-        return document, RunContents(found, application_class(found))
-    except ValueError:  # an application that is not installed here
-        return document, RunContents(found)
 
 
 def page_of(known: RunContents) -> type[Hmi]:

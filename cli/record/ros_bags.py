@@ -9,12 +9,12 @@ import msgspec
 from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.ros_bag import RosBag
+from rampart.actors.recording.run_documents import recorded_system
 from rampart.actors.ros2.gateway import Gateway
 from rampart.actors.ros2.translation.tables import GATEWAY
 from rampart.actors.ros2.translation.types import Types
 from rampart.cli import systems
 from rampart.cli.output import UsageError, refusing
-from rampart.cli.record.replaying import recorded_system
 from rampart.manager.spec.schema import SystemSpec
 
 
@@ -41,7 +41,7 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
             raise UsageError(f"{file}: an MCAP file of {reader.library or 'others'}; expected a "
                              "recording of a run")
         if system is None:
-            _, known = recorded_system(summary)
+            _, known = recorded_system(summary.files)
             spec, topics = known.system, known.topics
         else:
             spec = systems.load(system)

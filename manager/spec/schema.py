@@ -22,6 +22,7 @@ from rampart.manager.spec.mobile_robot import Hazard, Robot
 from rampart.manager.spec.nodes import ClassPath, Kind, NodeSpec
 from rampart.manager.spec.tables import (
     DERIVED,
+    BlackBox,
     End,
     Layers,
     Name,
@@ -231,6 +232,7 @@ class SystemSpec(Table, frozen=True):
             none.
         order: Name of an order of the recoveries, or several; each decides what those before it
             leave open. The first defines which recovery is safer.
+        black_box: What a black box keeps around faults; None for no black box.
         panels: Additional panels of the operator's page (`rampart.actors.operator`).
         ros2: Links to ROS 2 (`rampart.actors.ros2`).
     """
@@ -249,6 +251,7 @@ class SystemSpec(Table, frozen=True):
     timing: Timing = Timing()
     layers: Layers = Layers()
     supervision: Supervision = Supervision()
+    black_box: BlackBox | None = None
     nodes: Rows[NodeSpec] = msgspec.field(name="node", default=())
     detections: Rows[DetectionSpec] = msgspec.field(name="detection", default=())
     recoveries: Rows[RecoverySpec] = msgspec.field(name="recovery", default=())

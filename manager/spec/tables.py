@@ -198,6 +198,21 @@ def numbered(table: str, rows: Iterable[Row]) -> Iterator[tuple[str, Row]]:
     return ((f"$.{table}[{index}]", row) for index, row in enumerate(rows))
 
 
+class BlackBox(Table, frozen=True):
+    """A black box, and what it keeps around faults. See `rampart.actors.recording.black_box`.
+
+    Attributes:
+        before_s: Simulated seconds that are kept before a decision on a fault, the failure of a
+            process, or the sudden end of a run.
+        after_s: Simulated seconds that are kept after it.
+        limit_mb: Largest size of all files of the system.
+    """
+
+    before_s: Annotated[float, msgspec.Meta(ge=1, le=600)] = 60.0
+    after_s: Annotated[float, msgspec.Meta(ge=1, le=600)] = 15.0
+    limit_mb: Annotated[float, msgspec.Meta(ge=0.5, le=1_000_000)] = 256.0
+
+
 class Supervision(Table, frozen=True):
     """Limits of restarts; real seconds. See `rampart.actors.supervision.supervised_process`.
 

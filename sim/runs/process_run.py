@@ -74,6 +74,7 @@ class ProcessRun:
         interrupted: Setting it ends the run for this reason.
         failure: Why the run could not continue; "" if it could.
         unrecorded: Why the recording ended early; "" if it did not.
+        keep_alive: Called some 20 times a second.
     """
 
     def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = (),
@@ -85,6 +86,7 @@ class ProcessRun:
         self.interrupted = ""
         self.failure = ""
         self.unrecorded = ""
+        self.keep_alive: Callable[[], None] = lambda: None
         self._trial = trial
         self._scenario = tuple(scenario)
         self._keep = keep
@@ -153,6 +155,7 @@ class ProcessRun:
                     self.unrecorded = problem
                     actors[0].report_diagnostic("recording", problem, recording)
                     trial.not_recorded(problem, clock.now())
+                self.keep_alive()
                 await self._keep_memory(clock.now())
                 why = trial.ended(clock.now())
             if launcher.failure:  # before its observer ends

@@ -19,6 +19,7 @@ from rampart.actors.system.topics import system_topics
 from rampart.manager.model.gates import GateError, detection_gate
 from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.schema import (
+    BlackBox,
     DetectionSpec,
     EventSpec,
     FaultSpec,
@@ -48,8 +49,8 @@ EXAMPLE = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 MODULES = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 
 
-@pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, Supervision, End, HostSpec,
-                                   Link, NodeSpec,
+@pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, Supervision, BlackBox, End,
+                                   HostSpec, Link, NodeSpec,
                                    DetectionSpec, RecoverySpec, MechanismSpec, EventSpec, FaultSpec,
                                    Within, Ros2Link])
 def test_every_field_is_described(table):
@@ -80,6 +81,7 @@ def section_of(heading: str) -> str:
 @pytest.mark.parametrize(("heading", "tables"), [
     ("Top level", (SystemSpec,)), ("`[end]`", (End,)), ("`[robot]`", (Robot,)),
     ("`[timing]`", (Timing,)), ("`[layers]`", (Layers,)), ("`[supervision]`", (Supervision,)),
+    ("`[black_box]`", (BlackBox,)),
     ("`[[host]]` and `[link]` (optional)", (HostSpec, Link)), ("`[[node]]`", (NodeSpec,)),
     ("`[[detection]]`", (DetectionSpec,)), ("`[[recovery]]`", (RecoverySpec,)),
     ("`[[mechanism]]`", (MechanismSpec,)), ("`[[event]]`", (EventSpec,)),

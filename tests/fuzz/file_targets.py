@@ -21,9 +21,8 @@ from rampart.actors.osmosis.airport.mask import allowed_area
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of, renumbered
-from rampart.actors.recording.run_documents import restore
+from rampart.actors.recording.run_documents import recorded_system, restore
 from rampart.cli.record.record_verbs import described
-from rampart.cli.record.replaying import recorded_system
 from rampart.files import toml
 from rampart.files.reading import FileError
 from rampart.manager.analysis.formula import formula_of
@@ -309,7 +308,7 @@ def _foreign(compression: CompressionType) -> bytes:
 def mcap_info(data: bytes) -> None:
     summary = Summary(BagReader(written("bag.mcap", data)))
     msgspec.json.encode(described(summary))
-    recorded_system(summary)
+    recorded_system(summary.files)
     restore([file for file in summary.files if len(file[2]) < 1 << 16], folder())
 
 

@@ -4,7 +4,7 @@ import { $, Memory, clock, element, pill, say } from "./dom.js";
 import { NOT_LOGGED_IN, Visitor, bar, barred } from "./access.js";
 import { Arrangement } from "./arrange.js";
 import { Camera } from "./camera.js";
-import { DecisionLog, EventLog, LINES } from "./log.js";
+import { DecisionLog, EventLog, LINES, showHistory } from "./log.js";
 import { Operating } from "./operate.js";
 import { ProcessTable } from "./nodes.js";
 import { Panels } from "./panels.js";
@@ -193,6 +193,7 @@ const PARTS = [
   }],
   [["nodes", "usage"], (s) => processes.show(s.nodes, s.usage)],
   [["usage"], credentials],
+  [["history"], (s) => showHistory($("history"), $("history-panel"), s.history)],
   [["behind"], (s) => {
     $("behind").hidden = !s.behind;
     say($("behind"), s.behind);

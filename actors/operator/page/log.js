@@ -1,5 +1,5 @@
 // The decision log with the certificates of decisions, and the event log. The newest line is on top.
-// Only new lines are added, so an open certificate stays open.
+// Only new lines are added, so an open certificate stays open. And the history of faults over all runs.
 
 import { clock, element } from "./dom.js";
 
@@ -56,4 +56,21 @@ export class DecisionLog extends Log {
     line.append(details);
     return line;
   }
+}
+
+const FAULT_DOTS = { suspected: "warn", confirmed: "bad", healed: "good", cleared: "" };
+
+/** Show the faults of all runs; the panel is hidden while there are none. */
+export function showHistory(body, panel, faults) {
+  panel.hidden = !faults.length;
+  body.replaceChildren(...faults.map((fault) => {
+    const line = element("tr");
+    const name = element("th", "", fault.mechanism);
+    name.scope = "row";
+    const state = element("td");
+    state.append(element("span", `dot ${FAULT_DOTS[fault.state]}`), element("span", "", fault.state));
+    line.append(name, element("td", "", fault.node), state, element("td", "num", String(fault.times)),
+      element("td", "quiet", new Date(1000 * fault.last_s).toLocaleString()), element("td", "quiet", fault.error));
+    return line;
+  }));
 }

@@ -9,6 +9,7 @@ import pytest
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
+from rampart.actors.ftm.history import Fault, History
 from rampart.testing import free_port
 from tests.actors.operator.browser import browser
 from tests.actors.operator.page import LIVE, SPEC, events, page, speaking_world
@@ -138,3 +139,26 @@ async def test_a_machine_that_does_not_keep_up_with_the_rate_is_a_banner(world):
             await tab.until("!document.getElementById('behind').hidden", 30)
         words = await tab.value("document.getElementById('behind').textContent")
         assert words.startswith("this machine keeps up with rate ")
+
+
+async def test_the_faults_of_all_runs_are_listed_with_their_states(world, tmp_path):
+    panel, rows = "document.getElementById('history-panel')", "#history tr"
+    history = History(tmp_path, "r0")
+    port = free_port()
+    async with world.hmi(hmi_port=port, system=SPEC, black_box=str(tmp_path)) as hmi, \
+            browser() as tab:
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until(LIVE)
+        assert await tab.value(f"{panel}.hidden") is True
+        history.put([Fault(mechanism="DM7", node="localization", error="<b>gone</b>",
+                           state="confirmed", times=3)], 1.8e9)
+        await tab.until(f"document.querySelectorAll('{rows}').length === 1")
+        assert await tab.value(f"{panel}.hidden") is False
+        cells = f"[...document.querySelectorAll('{rows} > *')].map((cell) => cell.textContent)"
+        shown = await tab.value(cells)
+        assert shown[:4] + shown[5:] == ["DM7", "localization", "confirmed", "3", "<b>gone</b>"]
+        history.put([Fault(mechanism="DM6", node="", error="late", state="healed", times=1)], 1.9e9)
+        await tab.until(f"document.querySelectorAll('{rows}').length === 2")
+        assert await tab.value(f"document.querySelector('{rows} th').textContent") == "DM6"
+        assert tab.errors == []
+    history.close()

@@ -1,0 +1,326 @@
+"""`rampart incident`: what the black box has kept of the time around faults.
+
+Inspect incidents: the time around each decision on a fault, each failed process,
+and the sudden end of a run. `rampart run --black-box`, or a run whose system has the
+table [black_box], keeps them in $XDG_STATE_HOME/rampart (~/.local/state/rampart).
+
+Examples:
+  rampart incident list
+  rampart incident show
+  rampart incident replay 20261127-0912 --hmi-port 8090
+  rampart incident export 20261127-0912 crash.mcap
+  rampart incident history
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from rampart.actors.bus.envelope import UNREADABLE, decode
+from rampart.actors.bus.run_info import find_runs
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm.history import Fault, clear_history, read_history
+from rampart.actors.ftm.narrator import Narrator
+from rampart.actors.recording import incidents
+from rampart.actors.recording.bag_reader import BagReader, Summary, key_of, time_zero_s
+from rampart.actors.recording.bag_writer import BagError, complete, open_target
+from rampart.actors.recording.incidents import Incident, incidents_in, state_folder
+from rampart.actors.recording.message_form import Forms
+from rampart.actors.recording.run_documents import recorded_system
+from rampart.cli.output import UsageError, print_json, print_table, refusing, say
+from rampart.cli.record.record_verbs import PLAYING, replay
+from rampart.cli.verbs import JSON, add_family, add_verb, flag, option, word
+from rampart.files.plain_text import one_line
+
+_SYSTEM = word("--system", "NAME", "only of this system")
+
+
+def names(**_: Any) -> list[str]:
+    """Return the names of all incidents."""
+    return [kept.incident.name for kept in _kept(None)]
+
+
+_NAME = option("name", metavar="NAME", nargs="?", completer=names,
+               help="name of the incident, or its beginning (default: the newest)")
+
+
+class Kept(NamedTuple):
+    """An incident, and its recording; the file is missing while the incident is not over."""
+
+    incident: Incident
+    path: Path
+
+    @property
+    def state(self) -> str:
+        """Whether its recording is whole."""
+        return self.incident.partial or ("" if self.path.exists() else "not over yet")
+
+
+def add(verbs: Any) -> None:
+    """Add the verbs to the parser."""
+    family = add_family(verbs, "incident", "show what was kept around faults", __doc__)
+    add_verb(family, "list", "list the incidents of all runs", incident_list, _SYSTEM, JSON)
+    add_verb(family, "show", "show the story of an incident", show, _NAME, JSON)
+    add_verb(family, "replay", "play an incident back", replay_incident, _NAME, *PLAYING)
+    add_verb(family, "export", "copy an incident to an MCAP file", export, _NAME,
+             option("out", metavar="OUT", nargs="?",
+                    help="new file (default: incident-NAME.mcap)"),
+             flag("--overwrite", "replace OUT if it exists"))
+    for where, name in ((family, "history"), (verbs, "incidents")):
+        add_verb(where, name, "list the faults of all runs", history, _SYSTEM,
+                 flag("--clear", "acknowledge healed faults: they become cleared"), JSON,
+                 hidden=where is verbs)
+
+
+def incident_list(options: argparse.Namespace) -> int:
+    """Print the incidents.
+
+    List the incidents of all runs, oldest first, also those of a run that was
+    killed. Times are simulated seconds of the run.
+
+    Examples:
+      rampart incident list
+      rampart incident list --system osmosis --json
+    """
+    found = _kept(options.system)
+    if options.json:
+        print_json({"incidents": [_data(kept) for kept in found]})
+    elif not found:
+        say(f"no incidents in {state_folder('')}")
+    else:
+        print_table(("name", "system", "run", "from s", "to s", "cause", "incomplete"), [
+            (kept.incident.name, kept.incident.system, kept.incident.run,
+             round(kept.incident.from_s, 1), round(kept.incident.to_s, 1),
+             one_line(kept.incident.cause, 80), kept.state) for kept in found])
+    return 0
+
+
+def show(options: argparse.Namespace) -> int:
+    """Print one incident.
+
+    Show what happened, in the words of the console: cause, events, each decision
+    with its certificate, and per node its messages, silences and restarts.
+
+    Examples:
+      rampart incident show
+      rampart incident show 20261127-0912 --json
+    """
+    with _recording(options.name) as kept:
+        story = Story(kept.path)
+        if options.json:
+            print_json({**_data(kept), **story.data()})
+            return 0
+        incident = kept.incident
+        say(f"incident  {incident.name} of {incident.system}, run {incident.run}, {incident.at}")
+        say(f"cause     {one_line(incident.cause)}")
+        say(f"recorded  {incident.from_s:.1f} to {incident.to_s:.1f} s, "
+            f"{story.messages} messages{incident.partial and f'; incomplete: {incident.partial}'}")
+        say()
+        for at_s, text in story.lines:
+            say(f"[{at_s:8.2f} s] {one_line(text)}")
+        for record in story.decisions:
+            say()
+            say(f"certificate of decision {record.decision}: rule {record.rule} of "
+                f"{record.strategy}")
+            say(f"  path      {'; '.join(record.path) or 'no comparison needed'}")
+            rejected = "; ".join(f"{name}: {why}" for name, why in record.rejected)
+            say(f"  rejected  {one_line(rejected) or 'no alternative'}")
+        say()
+        print_table(("node", "messages", "longest silence s", "last message s", "restarts"),
+                    [(name, *row) for name, row in story.nodes.items()])
+    return 0
+
+
+async def replay_incident(options: argparse.Namespace) -> int:
+    """Play an incident back.
+
+    Play back an incident as `rampart replay` does a recording: on a separate bus, or
+    with the operator's page, MuJoCo's viewer, or as a video.
+
+    Examples:
+      rampart incident replay --hmi-port 8090
+      rampart incident replay 20261127-0912 --rate 0.5 --loop
+    """
+    with _recording(options.name) as kept:
+        options.file = str(kept.path)
+        return await replay(options)
+
+
+def export(options: argparse.Namespace) -> int:
+    """Copy an incident.
+
+    Copy the recording of an incident: an MCAP file with all messages, and with
+    specification, versions, options, files and checkpoints attached. It opens in
+    viewers, and with `rampart bag` and `rampart replay` on any machine.
+
+    Examples:
+      rampart incident export
+      rampart incident export 20261127-0912 crash.mcap
+    """
+    with _recording(options.name) as kept, refusing(BagError):
+        out = Path(options.out or f"incident-{kept.incident.name}.mcap")
+        with open_target(out, overwrite=options.overwrite) as file, complete(out), (
+                kept.path.open("rb")) as source:
+            shutil.copyfileobj(source, file)
+    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {one_line(kept.incident.cause)}")
+    return 0
+
+
+def history(options: argparse.Namespace) -> int:
+    """Print the faults of all runs.
+
+    List the faults of all runs of each system, the last one first. A fault is
+    suspected when a detection module is active, confirmed by a decision or by the
+    supervisor, healed after 10 s without it, and cleared by --clear.
+
+    Examples:
+      rampart incident history
+      rampart incident history --system osmosis --clear
+    """
+    rows: list[tuple[str, Fault]] = []
+    for folder in _folders(options.system):
+        with refusing(ValueError):
+            if options.clear:
+                say(f"{folder.name}: {clear_history(folder)} faults cleared")
+            rows += ((folder.name, fault) for fault in read_history(folder))
+    if options.clear:
+        return 0
+    if options.json:
+        print_json({"faults": [{"system": system, **msgspec.structs.asdict(fault)}
+                               for system, fault in rows]})
+    elif not rows:
+        say(f"no faults in {state_folder('')}")
+    else:
+        print_table(("state", "system", "mechanism", "node", "times", "first", "last", "error"), [
+            (fault.state, system, one_line(fault.mechanism), one_line(fault.node), fault.times,
+             _day(fault.first_s), _day(fault.last_s), one_line(fault.error, 80))
+            for system, fault in rows])
+    return 0
+
+
+class Story:
+    """The story of a recording, as far as it can be read.
+
+    Args:
+        path: file of the recording.
+
+    Attributes:
+        messages: number of messages of the bus.
+        lines: simulated time and text of each event.
+        decisions: decisions on a fault, with their certificates.
+        nodes: by node, its messages, longest silence and last message (simulated seconds), and
+            restarts.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.messages = 0
+        self.lines: list[tuple[float, str]] = []
+        self.decisions: list[fm.DecisionRecord] = []
+        self.nodes: dict[str, tuple[int, float, float, int]] = {}
+        summary = Summary(BagReader(path))
+        _, known = recorded_system(summary.files)
+        forms, narrator = Forms(known.topics), Narrator(known.system.titles)
+        first: dict[str, int] = {}
+        reader = BagReader(path)
+        for channel, message in reader.messages():
+            if (key := key_of(channel)) is None:
+                continue
+            self.messages += 1
+            at_s = message.log_time / 1e9 + time_zero_s(summary.reader)
+            form = forms.of(key)
+            if form.topic is None:
+                continue
+            try:
+                header, body = decode(form.topic, form.payload(message.data))
+            except UNREADABLE:
+                continue
+            name = header.source
+            count, silence_s, last_s, _ = self.nodes.get(name, (0, 0.0, at_s, 0))
+            self.nodes[name] = (
+                count + 1, round(max(silence_s, at_s - last_s), 2), round(at_s, 2),
+                header.incarnation - first.setdefault(name, header.incarnation))
+            found = narrator.describe(body, header)
+            self.lines += ((at_s, line.text) for line in found)
+            if found and isinstance(body, fm.DecisionRecord) and body.active:
+                self.decisions.append(body)
+        self.nodes = dict(sorted(self.nodes.items()))
+
+    def data(self) -> dict[str, Any]:
+        """Return the story as plain data."""
+        return {
+            "messages": self.messages,
+            "events": [{"at_s": round(at_s, 3), "text": text} for at_s, text in self.lines],
+            "decisions": [msgspec.to_builtins(record) for record in self.decisions],
+            "nodes": {name: dict(zip(("messages", "longest_silence_s", "last_s", "restarts"), row,
+                                     strict=True)) for name, row in self.nodes.items()}}
+
+
+def _folders(system: str | None) -> list[Path]:
+    """Return the folders of the systems, or of one.
+
+    Raises:
+        UsageError: the system has none.
+    """
+    root = state_folder("")
+    found = sorted(path for path in root.glob("*") if path.is_dir())
+    if system is None:
+        return found
+    if not (chosen := [path for path in found if path.name == system]):
+        known = ", ".join(path.name for path in found) or "none"
+        raise UsageError(f"--system {system}: no run of it has kept anything in {root}; "
+                         f"known: {known}")
+    return chosen
+
+
+def _kept(system: str | None) -> list[Kept]:
+    """Return all incidents, oldest first, after those of runs that were cut off are written."""
+    living = {run.run_id for run in find_runs()}
+    found = []
+    for folder in _folders(system):
+        incidents.recover(folder, living)
+        found += [Kept(*one) for one in incidents_in(folder)]
+    return sorted(found, key=lambda kept: kept.incident.name)
+
+
+@contextlib.contextmanager
+def _recording(name: str | None) -> Iterator[Kept]:
+    """Yield an incident with its recording; if it is not over, with a temporary one.
+
+    Raises:
+        UsageError: it is not known, or cannot be read.
+    """
+    found = [kept for kept in _kept(None) if kept.incident.name.startswith(name or "")]
+    if not found:
+        raise UsageError(f"{name}: no such incident; `rampart incident list` lists them"
+                         if name else f"no incidents in {state_folder('')}")
+    if name and len(found) > 1:
+        raise UsageError(f"{name}: {len(found)} incidents begin so, from "
+                         f"{found[0].incident.name} to {found[-1].incident.name}")
+    kept = found[-1]
+    if kept.path.exists():
+        with refusing(BagError):
+            yield kept
+        return
+    with tempfile.TemporaryDirectory(prefix="rampart-incident-") as folder, refusing(
+            BagError, OSError):
+        path = Path(folder, kept.path.name)
+        yield Kept(incidents.write_recording(kept.path.parent, kept.incident, path), path)
+
+
+def _data(kept: Kept) -> dict[str, Any]:
+    shown = msgspec.to_builtins(kept.incident)
+    del shown["checkpoints"]
+    return {**shown, "partial": kept.state, "file": str(kept.path) if kept.path.exists() else None}
+
+
+def _day(at_s: float) -> str:
+    return datetime.datetime.fromtimestamp(at_s).astimezone().isoformat(" ", "seconds")[:19]

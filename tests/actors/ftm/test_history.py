@@ -1,0 +1,195 @@
+"""The history of faults over runs: debounced, and never a reason for a run to stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+
+import pytest
+
+from rampart.actors.bus.envelope import Header
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm.history import (
+    FILE,
+    HEALED_S,
+    Debounce,
+    Fault,
+    History,
+    clear_history,
+    read_history,
+)
+
+
+def detection(debounce, at_s, *nodes, name="DM7", active=True, reason="gone"):
+    state = fm.DetectionState.ACTIVE if active else fm.DetectionState.IDLE
+    debounce.take(fm.DetectionReport(state, reason, nodes, at_s), Header(name, 1, 1, at_s), at_s)
+
+
+def decision(debounce, at_s, *active):
+    debounce.take(fm.DecisionRecord(1, "safety-first", active, 1, (), (), (), at_s),
+                  Header("ftm_manager", 1, 1, at_s), at_s)
+
+
+def event(debounce, at_s, what):
+    debounce.take(fm.ProcessEvent("pump", what, 7, 1, "", ""), Header("supervisor", 1, 1, at_s),
+                  at_s)
+
+
+def states(debounce, now_s):
+    return [(f.mechanism, f.node, f.state, f.times) for f in debounce.changes(now_s)]
+
+
+def test_a_detection_is_suspected_a_decision_confirms_it_and_time_heals_it():
+    debounce = Debounce()
+    detection(debounce, 1.0, "pump")
+    assert states(debounce, 1.0) == [("DM7", "pump", "suspected", 1)]
+    detection(debounce, 1.2, "pump")  # repeated
+    decision(debounce, 1.3, "FTM7")
+    assert states(debounce, 1.3) == [("DM7", "pump", "confirmed", 0)]
+    detection(debounce, 2.0, active=False)
+    assert states(debounce, 2.0 + HEALED_S - 0.1) == []
+    assert states(debounce, 2.0 + HEALED_S) == [("DM7", "pump", "healed", 0)]
+    detection(debounce, 60.0, "pump")
+    assert states(debounce, 60.0) == [("DM7", "pump", "suspected", 1)]
+
+
+def test_a_detection_that_flaps_is_one_occurrence():
+    debounce = Debounce()
+    for i in range(10):
+        detection(debounce, float(i), "pump", active=i % 2 == 0)
+    assert states(debounce, 10.0) == [("DM7", "pump", "suspected", 1)]
+
+
+def test_a_decision_without_a_fault_confirms_nothing():
+    debounce = Debounce()
+    detection(debounce, 1.0)
+    decision(debounce, 1.1)
+    assert states(debounce, 2.0) == [("DM7", "", "suspected", 1)]
+
+
+def test_each_failure_of_a_process_counts():
+    debounce = Debounce()
+    event(debounce, 1.0, "crashed")
+    event(debounce, 1.1, "given up")
+    assert states(debounce, 1.1) == [("supervisor", "pump", "confirmed", 1)]
+    event(debounce, 1.2, "respawned")
+    event(debounce, 1.3, "wedged")
+    assert states(debounce, 1.3) == [("supervisor", "pump", "confirmed", 1)]
+    event(debounce, 1.4, "respawned")
+    assert states(debounce, float("inf")) == [("supervisor", "pump", "healed", 0)]
+
+
+def fault(state="confirmed", times=1, **other):
+    return Fault(**{"mechanism": "DM7", "node": "pump", "error": "gone", "state": state,
+                    "times": times, **other})
+
+
+def test_runs_add_up(tmp_path):
+    for run, at_s in (("r1", 100.0), ("r2", 200.0)):
+        history = History(tmp_path, run)
+        history.put([fault()], at_s)
+        history.put([fault("healed", 0)], at_s + 10)
+        history.close()
+    [row] = read_history(tmp_path)
+    assert (row.first_s, row.last_s, row.times, row.run, row.state) == (
+        100.0, 210.0, 2, "r2", "healed")
+    assert clear_history(tmp_path) == 1
+    assert read_history(tmp_path)[0].state == "cleared"
+
+
+def test_a_run_without_a_fault_heals_it_unless_its_run_lives(tmp_path):
+    for run in ("dead", "alive", "now"):
+        history = History(tmp_path, run)
+        history.put([fault(node=run)], 1.0)
+        if run == "now":
+            history.heal_others(["alive"])
+        history.close()
+    assert {f.node: f.state for f in read_history(tmp_path)} == {
+        "dead": "healed", "alive": "confirmed", "now": "confirmed"}
+
+
+def test_a_confirmed_fault_is_not_cleared(tmp_path):
+    history = History(tmp_path, "r1")
+    history.put([fault()], 1.0)
+    assert clear_history(tmp_path) == 0
+    history.close()
+
+
+def test_it_is_read_while_a_run_writes_it_and_after_the_run_was_killed(tmp_path):
+    writer = subprocess.Popen([sys.executable, "-c", (
+        "import sys; from pathlib import Path\n"
+        "from rampart.actors.ftm.history import Fault, History\n"
+        "history = History(Path(sys.argv[1]), 'r1'); at_s = 0\n"
+        "while True:\n"
+        "    history.put([Fault(mechanism='DM7', node='pump', error='', state='confirmed',"
+        " times=1)], at_s); at_s += 1\n"
+        "    if at_s == 100: print('ready', flush=True)\n"), str(tmp_path)],
+        stdout=subprocess.PIPE)
+    assert writer.stdout.readline()
+    during = read_history(tmp_path)[0].times
+    os.kill(writer.pid, signal.SIGKILL)
+    writer.wait()
+    writer.stdout.close()
+    assert read_history(tmp_path)[0].times >= during >= 100
+    history = History(tmp_path, "r2")
+    assert history.problem == ""
+    history.close()
+
+
+@pytest.mark.parametrize("damage", [
+    lambda file: file.write_bytes(b"this is no database, and long enough to be none" * 40),
+    lambda file: file.write_bytes(file.read_bytes()[:4096] + b"\xff" * 4096),
+    lambda file: (file.unlink(), sqlite3.connect(file).execute(
+        "CREATE TABLE fault (other TEXT)").connection.close())])
+def test_a_damaged_file_is_reported_in_one_line_and_never_raises(tmp_path, damage):
+    history = History(tmp_path, "r1")
+    history.put([fault()], 1.0)
+    history.close()
+    damage(tmp_path / FILE)
+    again = History(tmp_path, "r2")
+    again.put([fault()], 2.0)
+    assert again.problem
+    assert "\n" not in again.problem
+    again.close()
+
+
+def test_a_damaged_file_is_set_aside_and_a_new_history_begins(tmp_path):
+    (tmp_path / FILE).write_bytes(b"this is no database, and long enough to be none" * 40)
+    with pytest.raises(ValueError, match="not a database"):
+        read_history(tmp_path)
+    history = History(tmp_path, "r1")
+    history.put([fault()], 1.0)
+    history.close()
+    assert [row.times for row in read_history(tmp_path)] == [1]
+    assert "set aside" in history.problem or "kept as history.damaged" in history.problem
+
+
+def test_a_full_file_ends_the_history_with_one_line(tmp_path):
+    history = History(tmp_path, "r1")
+    history._data.execute("PRAGMA max_page_count=4")
+    for number in range(1000):
+        history.put([fault(node=f"n{number}", error="x" * 500)], 1.0)
+    assert "full" in history.problem
+    history.put([fault()], 2.0)  # nothing more is tried
+    history.close()
+    assert read_history(tmp_path)
+
+
+def test_a_folder_that_is_missing_ends_the_history_with_one_line(tmp_path):
+    history = History(tmp_path / "none", "r1")
+    history.put([fault()], 1.0)
+    assert "unable to open" in history.problem
+    assert read_history(tmp_path / "none") == []
+    assert clear_history(tmp_path / "none") == 0
+
+
+def test_the_rows_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr("rampart.actors.ftm.history.MOST_ROWS", 10)
+    history = History(tmp_path, "r1")
+    for number in range(30):
+        history.put([fault(node=f"n{number}")], float(number))
+    history.close()
+    assert [row.node for row in read_history(tmp_path)] == [f"n{n}" for n in range(29, 19, -1)]

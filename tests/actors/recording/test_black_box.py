@@ -1,0 +1,405 @@
+"""The black box: the time around a fault is kept, whatever dies, and the robot is undisturbed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.bus.recorder_connection import RecorderConnection
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.recording import incidents, ring
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.black_box import BlackBoxWriter
+from rampart.actors.recording.incidents import incidents_in
+from rampart.actors.recording.process import Order, RecorderProcess
+from rampart.manager.spec.tables import BlackBox as Limits
+from rampart.testing import free_base_port, wait_until
+from tests.actors.recording.samples import AnsweringLauncher, documents, pose
+
+LIMITS = Limits(before_s=20, after_s=5)
+
+
+def decision(number, at_s, active=("FTM6",)):
+    record = fm.DecisionRecord(number, "safety-first", active, 1, ("RM4",), ("FTM6",), (), at_s)
+    return at_s, ftm_topics.DECISION.at(), encode(Header("ftm_manager", 1, number, at_s), record)
+
+
+def crash(at_s, node="localization"):
+    event = fm.ProcessEvent(node, "crashed", 7, 1, "", "")
+    return at_s, ftm_topics.PROCESS_EVENT.at(), encode(Header("supervisor", 1, 1, at_s), event)
+
+
+class Box:
+    """A black box that is handed a second of messages at a time."""
+
+    def __init__(self, folder, limits=LIMITS, *, checkpoints=None, run="sample", again=False):
+        self.folder = folder / "paper"
+        self.now = 1_800_000_000.0
+        self.sent = 0
+        self.writer = BlackBoxWriter(self.folder, documents(run_id=run), limits, again=again,
+                                     checkpoints=checkpoints, wall=lambda: self.now)
+
+    def second(self, at_s, *messages, poses=20):
+        self.now += 1
+        for i in range(poses):
+            self.sent += 1
+            self.writer.take(*pose(self.sent, at_s + i / poses))
+        for message in messages:
+            self.writer.take(*message)
+        self.writer.flush()
+
+    def seconds(self, from_s, to_s):
+        for at_s in range(from_s, to_s):
+            self.second(float(at_s))
+
+    @property
+    def kept(self):
+        return [(i, path) for i, path in incidents_in(self.folder) if path.exists()]
+
+
+@pytest.fixture
+def box(tmp_path):
+    made = Box(tmp_path)
+    yield made
+    made.writer.abandon()
+
+
+def times(path):
+    return sorted(m.log_time / 1e9 for _, m in BagReader(path).messages())
+
+
+def size(folder):
+    return sum(path.stat().st_size for path in folder.glob("*/*"))
+
+
+def test_a_decision_keeps_the_time_before_and_after_it_in_a_recording(box):
+    box.seconds(0, 100)
+    box.second(100.0, decision(1, 100.5))
+    box.seconds(101, 140)
+    [(incident, path)] = box.kept
+    assert (incident.at_s, incident.run, incident.system) == (100.5, "sample", "paper")
+    assert "FTM6" in incident.cause
+    assert incident.partial == ""
+    assert times(path)[0] == pytest.approx(80.5, abs=0.1)
+    assert times(path)[-1] == pytest.approx(105.5, abs=0.1)
+    summary = Summary(BagReader(path))
+    assert summary.reader.closed
+    assert summary.end["cause"] == incident.cause
+    assert summary.run["mission"] == "AB"
+    assert summary.run["rampart_version"]
+    assert {"system.toml", "airport/vallombre.toml"} <= {name for name, _, _ in summary.files}
+    assert summary.counts.total() > 500
+
+
+def test_the_states_of_the_nodes_at_the_beginning_are_attached(tmp_path):
+    states = tmp_path / "checkpoints"
+    states.mkdir()
+    (states / "mission_manager.1.1").write_bytes(b"light A03 is out")
+    box = Box(tmp_path, checkpoints=states)
+    box.second(0.0, decision(1, 0.5))
+    (states / "mission_manager.1.1").write_bytes(b"later")
+    box.seconds(1, 30)
+    files = {name: data for name, _, data in Summary(BagReader(box.kept[0][1])).files}
+    assert files["checkpoints/mission_manager.1.1"] == b"light A03 is out"
+    box.writer.abandon()
+
+
+def test_a_healthy_run_and_the_end_of_a_fault_leave_nothing(box):
+    box.seconds(0, 20)
+    box.second(20.0, decision(1, 20.5, active=()))
+    box.seconds(21, 60)
+    box.writer.close()
+    assert incidents_in(box.folder) == []
+    assert not list(box.folder.glob("*/"))
+
+
+def test_a_failed_process_is_an_incident_without_any_decision(box):
+    box.second(5.0, crash(5.5))
+    box.writer.close()
+    [(incident, path)] = box.kept
+    assert incident.cause == "localization crashed, incarnation 1"
+    assert not ring.segments(path.parent)
+
+
+def test_overlapping_incidents_are_one_file(box):
+    box.seconds(0, 30)
+    box.second(30.0, decision(1, 30.0))
+    box.seconds(31, 50)
+    box.second(50.0, decision(2, 50.0))  # its time before reaches into the first one
+    box.seconds(51, 90)
+    [(incident, path)] = box.kept
+    assert (incident.at_s, times(path)[-1]) == (30.0, pytest.approx(55.0, abs=0.1))
+    box.seconds(90, 100)
+    box.second(100.0, decision(3, 100.0))
+    box.seconds(101, 140)
+    assert [i.at_s for i, _ in box.kept] == [30.0, 100.0]
+
+
+def test_a_thousand_decisions_in_a_row_are_bounded_in_length_and_size(tmp_path):
+    limits = Limits(before_s=20, after_s=5, limit_mb=1)
+    box = Box(tmp_path, limits)
+    most = 0
+    for number in range(1000):
+        box.second(float(number), decision(number + 1, number + 0.5), poses=8)
+        if number % 50 == 0:
+            most = max(most, size(box.folder))
+    box.writer.close()
+    assert len(box.kept) >= 3
+    assert all(i.to_s - i.from_s <= 31 for i, _ in box.kept)
+    ends = [(i.from_s, i.to_s) for i, _ in box.kept]
+    assert all(b[0] - a[1] < 1.0 for a, b in pairwise(ends))  # no gap
+    assert max(most, size(box.folder)) < 1.3e6  # the limit, and what one second adds
+
+
+def test_a_limit_below_the_size_of_an_incident_keeps_its_newest_part(tmp_path):
+    box = Box(tmp_path, Limits(before_s=600, after_s=5, limit_mb=0.6))
+    for at_s in range(400):
+        box.second(float(at_s), poses=100)
+        assert size(box.folder) < 0.8e6
+    box.second(400.0, decision(1, 400.0))
+    box.seconds(401, 405)
+    [(incident, path)] = incidents_in(box.folder)
+    done = incidents.write_recording(path.parent, incident, tmp_path / "part.mcap")
+    assert "began later" in done.partial
+    assert times(tmp_path / "part.mcap")[-1] > 404
+    box.writer.abandon()
+
+
+def test_after_a_kill_of_everything_the_last_second_is_readable(tmp_path):
+    box = Box(tmp_path)
+    box.seconds(0, 50)
+    box.second(50.0, decision(1, 50.5))
+    box.second(51.0)
+    box.writer.take(*pose(999, 52.0))  # was not synced
+    box.writer.abandon()  # the kernel closes files and lock of a killed process
+    incidents.recover(box.folder)
+    [(incident, path)] = box.kept
+    assert times(path)[-1] == pytest.approx(51.95, abs=0.01)
+    assert incident.partial == "the run was cut off, the ring ended earlier"
+    assert not ring.segments(path.parent)
+    incidents.recover(box.folder)  # twice is once
+    assert len(box.kept) == 1
+
+
+def test_a_run_that_is_cut_off_without_a_fault_leaves_its_last_seconds(tmp_path):
+    box = Box(tmp_path, Limits())
+    box.seconds(0, 100)
+    box.writer.abandon()
+    incidents.recover(box.folder)
+    [(incident, path)] = box.kept
+    assert incident.cause == "the run was cut off"
+    assert (times(path)[0], times(path)[-1]) == (
+        pytest.approx(39.95, abs=0.1), pytest.approx(99.95, abs=0.1))
+
+
+@pytest.mark.parametrize("cut", [1, 20, 300])
+def test_a_torn_or_damaged_block_costs_only_itself(tmp_path, cut):
+    box = Box(tmp_path)
+    box.seconds(0, 9)
+    box.writer.abandon()
+    [segment] = ring.segments(box.folder / "sample")
+    data = segment.read_bytes()
+    segment.write_bytes(data[:-cut])
+    read = [at_s for at_s, _, _ in ring.read(segment.parent, -1e9, 1e9)]
+    assert read == [i / 20 for i in range(160)]
+    segment.write_bytes(bytes([*data[:100], data[100] ^ 255, *data[101:]]))
+    assert len(list(ring.read(segment.parent, -1e9, 1e9))) == 160
+
+
+def test_a_restarted_black_box_continues_the_incident(tmp_path):
+    box = Box(tmp_path)
+    box.seconds(0, 30)
+    box.second(30.0, decision(1, 30.5))
+    box.writer.abandon()
+    after = Box(tmp_path, again=True)
+    after.sent = box.sent + 40  # two seconds were lost
+    after.seconds(33, 70)
+    [(incident, path)] = after.kept
+    assert (incident.at_s, incident.to_s) == (30.5, pytest.approx(35.5, abs=0.1))
+    summary = Summary(BagReader(path))
+    assert summary.end["lost"] == '{"localization": 40}'
+    assert times(path)[0] == pytest.approx(10.5, abs=0.1)
+    after.writer.abandon()
+
+
+def test_two_runs_at_a_time_keep_their_incidents_apart(tmp_path):
+    one, other = Box(tmp_path), Box(tmp_path, run="other")
+    one.second(0.0, decision(1, 0.5))
+    other.second(0.0, crash(0.5))
+    incidents.recover(one.folder)  # both live: their rings stay
+    assert ring.segments(one.folder / "sample")
+    assert ring.segments(one.folder / "other")
+    one.seconds(1, 30)
+    other.seconds(1, 30)
+    assert sorted(i.run for i, _ in one.kept) == ["other", "sample"]
+    with pytest.raises(BagError, match="another black box"):
+        Box(tmp_path, run="other", again=True)
+    one.writer.close()
+    other.writer.close()
+
+
+def test_the_reserve_of_the_disk_costs_the_oldest_first_then_ends_with_one_line(
+        tmp_path, monkeypatch):
+    box = Box(tmp_path)
+    for start in (0, 100):
+        box.second(float(start), decision(start + 1, start + 0.5))
+        box.seconds(start + 1, start + 40)
+    assert len(box.kept) == 2
+    newest = box.kept[1][0].name
+    full_below = size(box.folder) - 1000
+
+    def check(_file):
+        if size(box.folder) > full_below:
+            raise OSError(28, "less than 256 MB are free on its disk")
+
+    monkeypatch.setattr("rampart.actors.recording.black_box.check_reserve", check)
+    box.second(140.0)
+    assert [i.name for i, _ in box.kept] == [newest]
+    full_below = 0
+    with pytest.raises(OSError, match="less than 256 MB"):
+        box.second(141.0)
+    box.writer.abandon()
+
+
+def test_a_wall_clock_that_jumps_back_disorders_nothing(box):
+    box.second(0.0, decision(1, 0.5))
+    box.seconds(1, 40)
+    box.now -= 3600
+    box.second(100.0, decision(2, 100.5))
+    box.seconds(101, 140)
+    assert sorted(i.at_s for i, _ in box.kept) == [0.5, 100.5]
+
+
+def test_a_flood_of_garbage_on_watched_keys_begins_nothing(box):
+    for number in range(100):
+        box.writer.take(0.5, ftm_topics.DECISION.at(), b"\xc1 garbage")
+        box.writer.take(0.5, ftm_topics.DETECTION.at(f"DM{number}"), b"")
+    box.second(1.0)
+    box.writer.close()
+    assert incidents_in(box.folder) == []
+
+
+def test_a_damaged_description_hides_only_itself(box):
+    box.second(0.0, decision(1, 0.5))
+    box.seconds(1, 40)
+    (box.folder / "sample" / "20200101-000000-000.json").write_text('{"name": 1}')
+    assert len(incidents_in(box.folder)) == 1
+
+
+# -- the process ----------------------------------------------------------------------------
+
+
+def box_pid(port):
+    """Return the pid of the black box of the run on a port; None if there is none."""
+    title = f"rampart-black-box[{port}/".encode()
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(title):
+                return int(entry.name)
+    return None
+
+
+class Launcher:
+    """A run of one node with a black box."""
+
+    def __init__(self, folder):
+        self.port = free_base_port()
+        self.folder = folder
+        self.process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+        self.box = RecorderProcess(Order(self.port, str(folder), self.process.pid,
+                                         black_box=LIMITS))
+
+    def end(self):
+        self.box.end()
+        self.process.kill()
+        self.process.wait()
+        self.process.stdin.close()
+
+
+@pytest.fixture
+def run(tmp_path):
+    made = Launcher(tmp_path / "paper")
+    origin_s = time.monotonic()
+    made.connection = RecorderConnection(made.port)
+    made.sent = 0
+
+    def send(*messages):
+        made.sent += 1
+        made.connection.take(*pose(made.sent, time.monotonic() - origin_s)[1:])
+        for message in messages:
+            made.connection.take(*message[1:])
+
+    made.send = send
+    with AnsweringLauncher(made.port, origin_s, made.process.pid):
+        made.box.start()
+        yield made
+        made.end()
+        made.connection.close()
+
+
+def kept(run):
+    return [i for i, path in incidents_in(run.folder)]
+
+
+def test_a_killed_black_box_is_back_and_the_incident_goes_on(run, monkeypatch):
+    monkeypatch.setattr("rampart.actors.recording.process._AGAIN_S", 0.0)
+    told = iter([decision(1, 0.1)])
+
+    def begun():
+        run.send(*([] if run.sent != 20 else [next(told)]))
+        time.sleep(0.05)
+        return kept(run)
+
+    wait_until(lambda: (run.send(), time.sleep(0.05), (run.folder / "sample").exists())[-1], 30,
+               "the black box does not begin")
+    run.sent = 10
+    wait_until(begun, 30, "no incident begins")
+    killed = box_pid(run.port)
+    os.kill(killed, signal.SIGKILL)
+
+    def back():
+        run.send()
+        time.sleep(0.05)
+        assert run.box.keep_alive() == ""
+        return box_pid(run.port) not in {None, killed} and len(
+            ring.segments(run.folder / "sample")) > 1
+
+    wait_until(back, 30, "it is not back")
+    run.box.end()
+    [incident] = kept(run)
+    assert incident.to_s > incident.at_s
+    assert not ring.segments(run.folder / "sample")
+    assert Summary(BagReader(run.folder / "sample" / f"{incident.name}.mcap")).messages > 5
+
+
+def test_the_death_of_the_launcher_keeps_the_last_seconds(run):
+    wait_until(lambda: (run.send(), time.sleep(0.05), ring.segments(run.folder / "sample"))[-1],
+               30, "the black box does not begin")
+    run.process.kill()
+    wait_until(lambda: [i for i, path in incidents_in(run.folder) if path.exists()], 20,
+               "nothing is kept")
+    assert [i.cause for i in kept(run)] == ["the run was cut off"]
+
+
+def test_a_folder_that_cannot_be_made_ends_it_with_one_line(run, tmp_path):
+    run.box.end()
+    (tmp_path / "file").write_text("")
+    run.box = RecorderProcess(Order(run.port, str(tmp_path / "file" / "paper"), run.process.pid,
+                                    black_box=LIMITS))
+    run.box.start()
+    wait_until(run.box.keep_alive, 30, "it does not end")
+    problem = run.box.keep_alive()
+    assert "Not a directory" in problem
+    assert "\n" not in problem
+    run.send()  # the robot is undisturbed

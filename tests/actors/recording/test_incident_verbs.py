@@ -1,0 +1,181 @@
+"""`rampart incident`: what a user sees of incidents, also after everything was killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+
+import pytest
+
+from rampart.actors.recording import ring
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.actors.recording.incidents import incidents_in, state_folder
+from rampart.actors.supervision.process_title import find_processes
+from rampart.cli.main import main
+from rampart.cli.record.incident_verbs import names
+from rampart.cli.run import main as run_main
+from rampart.testing import RealRun, wait_until
+from tests import ROOT
+from tests.actors.recording.test_black_box import Box, box_pid, crash, decision
+from tests.two_hosts import two_hosts
+
+CELL = ROOT / "tests" / "systems" / "cell.toml"
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path / "rampart"
+
+
+@pytest.fixture
+def box(home):
+    made = Box(home)
+    made.seconds(0, 30)
+    made.second(30.0, decision(1, 30.5))
+    made.seconds(31, 60)
+    made.second(100.0, crash(100.5))
+    yield made
+    made.writer.abandon()
+
+
+def printed(capsys, *arguments):
+    assert main(["incident", *arguments]) == 0
+    return capsys.readouterr().out
+
+
+def test_the_list_has_finished_incidents_and_those_that_are_not_over(box, capsys):
+    text = printed(capsys, "list")
+    assert "localization crashed, incarnation 1" in text
+    assert "not over yet" in text
+    found = json.loads(printed(capsys, "list", "--system", "paper", "--json"))["incidents"]
+    assert [(row["at_s"], row["file"] is None) for row in found] == [(30.5, False), (100.5, True)]
+    assert names() == [row["name"] for row in found]
+
+
+def test_the_story_has_cause_certificate_and_what_each_node_did(box, capsys):
+    [first, second] = names()
+    text = printed(capsys, "show", first)
+    assert "certificate of decision 1: rule 1 of safety-first" in text
+    assert "[   30.50 s] decision 1" in text
+    story = json.loads(printed(capsys, "show", first, "--json"))
+    assert story["nodes"]["localization"]["messages"] > 400
+    assert story["decisions"][0]["path"] == ["FTM6"]
+    assert "localization crashed" in printed(capsys, "show")  # the newest, so far
+    assert second > first
+
+
+def test_an_export_is_a_recording_with_all_that_a_replay_needs(box, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    [first, second] = names()
+    printed(capsys, "export", first, "out.mcap")
+    assert main(["bag", "info", "out.mcap"]) == 0
+    assert "attached   system.toml" in capsys.readouterr().out
+    assert main(["incident", "export", first, "out.mcap"]) == 2
+    assert "exists already" in capsys.readouterr().err
+    printed(capsys, "export", second, "out.mcap", "--overwrite")
+    printed(capsys, "export", second)
+    assert (tmp_path / f"incident-{second}.mcap").exists()
+
+
+def test_an_incident_is_played_back(box, capsys):
+    first = names()[0]
+    assert "played" in printed(capsys, "replay", first, "--rate", "200", "--port", "7391")
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["show", "nothing"], "nothing: no such incident"),
+    (["show", "2027"], "2027: 2 incidents begin so"),
+    (["list", "--system", "nothing"], "--system nothing: no run of it has kept anything")])
+def test_an_unknown_name_is_refused_in_one_line(box, capsys, arguments, words):
+    assert main(["incident", *arguments]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_without_incidents_the_verbs_are_clear(home, capsys):
+    assert "no incidents in" in printed(capsys, "list")
+    assert "no faults in" in printed(capsys, "history")
+    assert main(["incident", "show"]) == 2
+    assert "no incidents in" in capsys.readouterr().err
+
+
+def test_the_history_is_listed_and_cleared(box, capsys):
+    box.writer.close()
+    text = printed(capsys, "history")
+    assert "supervisor" in text
+    assert "crashed" in text
+    assert main(["incidents", "--json"]) == 0
+    [fault] = json.loads(capsys.readouterr().out)["faults"]
+    assert (fault["system"], fault["state"], fault["times"]) == ("paper", "confirmed", 1)
+    assert "paper: 0 faults cleared" in printed(capsys, "history", "--clear")
+
+
+def test_incidents_of_a_folder_that_cannot_be_written_are_still_readable(box, capsys, monkeypatch):
+    box.writer.abandon()
+
+    def refused(*_args, **_fields):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("rampart.actors.recording.incidents.describe", refused)
+    monkeypatch.setattr("rampart.actors.recording.incidents.record", refused)
+    assert "localization crashed" in printed(capsys, "show")
+
+
+# -- real runs ------------------------------------------------------------------------------
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+def test_after_a_kill_of_a_whole_run_its_incident_is_read_to_the_last_second(
+        home, tmp_path, capsys):
+    with RealRun(tmp_path, "osmosis", "--mission", "A", "--black-box") as run:
+        run.sleep_until(6.0)
+        run.kill("localization")
+        run.sleep_until(12.0)
+        box = box_pid(run.port)
+        killed_s = (time.monotonic() - run.info.origin_s) * run.info.rate
+        os.kill(box, signal.SIGKILL)
+        os.kill(run.info.pid, signal.SIGKILL)
+        wait_until(lambda: not find_processes(run.port), 10, "processes are left")
+    found = json.loads(printed(capsys, "list", "--json"))["incidents"]
+    [incident] = [row for row in found if "localization crashed" in row["cause"]]
+    assert incident["to_s"] > killed_s - 3.0  # sync, turn, and a busy machine
+    summary = Summary(BagReader(incidents_in(home / "osmosis")[0][1]))
+    assert "DM7" in {name.partition("/")[2] for name in (
+        channel.topic for channel in summary.reader.channels.values())}
+    assert any(name.startswith("checkpoints/") for name, _, _ in summary.files)
+    assert "respawned by RM4" in printed(capsys, "show")
+    assert not ring.segments(home / "osmosis" / incident["run"])
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+def test_a_state_folder_that_cannot_be_used_does_not_disturb_the_run(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    assert state_folder("x").parts[-2:] == ("rampart", "x")
+    with RealRun(tmp_path, CELL, "--duration", "6", "--black-box") as run:
+        code, result = run.result()
+    assert run.story.count("black box: ") == 1
+    assert "Not a directory" in run.story
+    assert code == 0, result
+
+
+def test_virtual_time_and_several_hosts_have_none(capsys, tmp_path):
+    assert run_main(["--virtual", "--black-box", "--report", str(tmp_path)]) == 2
+    assert "--black-box: not with --virtual" in capsys.readouterr().err
+    spec = tmp_path / "two.toml"
+    spec.write_text(two_hosts({"robot": "127.0.0.1", "ground": "127.0.0.2"}), encoding="utf-8")
+    assert run_main(["--system", str(spec), "--no-keys", "--black-box", "--report",
+                     str(tmp_path)]) == 2
+    assert "--black-box: not on several hosts" in capsys.readouterr().err
+
+
+@pytest.mark.processes
+@pytest.mark.alone
+def test_a_run_without_a_black_box_keeps_nothing(home, tmp_path):
+    with RealRun(tmp_path, CELL, "--duration", "3") as run:
+        run.result()
+    assert not home.exists()
