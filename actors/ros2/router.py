@@ -17,7 +17,9 @@ from rampart.actors.runtime.actor import Actor
 LISTEN = "tcp/127.0.0.1:7447"
 
 _CONGESTION = "transport/link/tx/queue/congestion_control"
-"""While a message waits for the full link of a lost machine, the router passes nothing on."""
+"""While a message waits for the full link of a lost machine, the router passes nothing on. In ROS 2
+that lasts 5 s.
+"""
 
 
 class RosRouter(Actor):
@@ -44,7 +46,7 @@ class RosRouter(Actor):
         if self.context.run.plan.virtual:
             return
         try:
-            self._session = zenoh.open(_configured(self.parameters.listen))
+            self._session = zenoh.open(router_config(self.parameters.listen))
         except zenoh.ZError as error:
             raise ValueError(f"listen = {self.parameters.listen!r}: cannot listen; another router "
                              f"may be running; {' '.join(str(error).split())}") from None
@@ -56,7 +58,8 @@ class RosRouter(Actor):
             asyncio.get_running_loop().run_in_executor(None, session.close)
 
 
-def _configured(listen: str) -> zenoh.Config:
+def router_config(listen: str) -> zenoh.Config:
+    """Return the configuration of a router that listens at an endpoint."""
     config = zenoh.Config()
     for name, value in {"mode": "router", "listen/endpoints": [listen],
                         "scouting/multicast/enabled": False, "scouting/gossip/enabled": True,
