@@ -122,10 +122,10 @@ class FtmManager(Actor):
             message.decision, message.reason))
 
     @on(topics.RESET)
-    def reset(self, message: m.Reset, _header: Header) -> None:
+    def reset(self, message: m.Reset, header: Header) -> None:
         """Reset a latched recovery for the operator; names of other latches are ignored."""
         if any(recovery.name == message.recovery for recovery in self._system.recoveries):
-            self._step(ResetAsked(message.recovery, message.by))
+            self._step(ResetAsked(message.recovery, message.by, header.stamp))
 
     @on(topics.ADAPT)
     def adapt(self, message: m.AdaptationRequest, _header: Header) -> None:
@@ -219,7 +219,7 @@ class FtmManager(Actor):
                         output.number, output.strategy, output.decision.active,
                         output.decision.rule, output.decision.recoveries, output.taken))
                 case ResetAnswered(granted=False):
-                    self.report_diagnostic("reset refused", output.reason, output.recovery)
+                    self.report_diagnostic(m.RESET_REFUSED, output.reason, output.recovery)
         if self._status() != self._shown:
             self._show()
         if (self.arbiter_state.number, self.arbiter_state.latched) != self._remembered:

@@ -171,6 +171,10 @@ class ManagerStatus(Message, frozen=True):
     detections: Many[DetectionView] = ()
 
 
+RESET_REFUSED = "reset refused"
+"""Context of the manager's error report about a reset that it refuses; the offender is its name."""
+
+
 class Reset(Message, frozen=True):
     """Operator's word to release a latched recovery, e.g. the emergency stop."""
 

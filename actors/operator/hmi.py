@@ -57,6 +57,7 @@ from rampart.actors.web.gate import Gate
 from rampart.actors.web.tls import Tls, TlsError
 from rampart.actors.web.visitors import Register, Role, Visitor, digest
 from rampart.files.plain_text import one_line
+from rampart.manager.spec.clearing import reset_role
 from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.specification import SystemSpec, check_document
 
@@ -167,6 +168,7 @@ class Hmi(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         run, plan = context.run, context.run.plan
+        self._system = run.system
         self._port: int = plan.page.port
         self._panels = self.parameters.panels
         self._state = self._make_state()
@@ -235,6 +237,12 @@ class Hmi(Actor):
         self.publish(ftm_topics.RESET, fm.Reset(request.recovery, self.name))
         return f"reset of {request.recovery} requested"
 
+    def _role(self, request: Request) -> Role:
+        """Return the least role for a request; mechanisms may name a higher one for a reset."""
+        if isinstance(request, ResetRequest):
+            return Role(reset_role(self._system, request.recovery))
+        return request.role
+
     @every(REPEAT_S)
     def _repeat(self) -> None:
         """Repeat unanswered messages."""
@@ -302,7 +310,7 @@ class Hmi(Actor):
         return PageServer(
             access, Feed(self._state, self.clock.now, self._hello, self._look),
             Handlers(self.requests, operating.introduction, self._fulfil, operating.left,
-                     self.refuses),
+                     self.refuses, self._role),
             lambda port: Gate(register, secret, port, owner=owner,
                               tls=tls is not None or page.behind.startswith("https:")), audit,
             tls=tls, camera=self._camera, files=self.files, complain=complain)
@@ -334,6 +342,7 @@ class Hmi(Actor):
     def _show_system(self, system: SystemSpec, version: int) -> None:
         if self._port and system is not NO_SYSTEM and version > self._version:
             self._version = version
+            self._system = system
             self._state.narrator.titles = system.titles
             self._state.picture.put("system", draw_system(system))
 

@@ -37,7 +37,7 @@ from rampart.actors.web.door import Door, address_of, login_routes, visitor_of
 from rampart.actors.web.gate import Gate
 from rampart.actors.web.server import WebServer
 from rampart.actors.web.tls import Tls
-from rampart.actors.web.visitors import Visitor
+from rampart.actors.web.visitors import Role, Visitor
 from rampart.files.plain_text import one_line
 from rampart.files.streams import complain as to_stderr
 
@@ -83,6 +83,7 @@ class Handlers(msgspec.Struct, frozen=True):
         fulfil: acts on a request of a page and returns the answer; raises RefusedError.
         left: called when a page was closed.
         refuses: why all requests are refused; "" if they are not.
+        role: returns the least role for a request; by default that of its type.
     """
 
     requests: Sequence[type[Request]]
@@ -90,6 +91,7 @@ class Handlers(msgspec.Struct, frozen=True):
     fulfil: Callable[[Request, int], str | dict[str, Any]]
     left: Callable[[int], None]
     refuses: str = ""
+    role: Callable[[Request], Role] = lambda request: request.role
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -239,12 +241,12 @@ class PageServer:
                 "logs_out": self._gate.asks,
                 "barred": {str(kind.__struct_config__.tag): why
                            for kind in self._handlers.requests
-                           if (why := self._bars(kind, visitor))}}
+                           if (why := self._bars(kind.role, visitor))}}
 
-    def _bars(self, kind: type[Request], visitor: Visitor) -> str:
-        """Return why a visitor may not make a request; "" if it may."""
-        return self._handlers.refuses or ("" if visitor.role.may(kind.role) else (
-            f"Needs the role {kind.role}; {visitor.name} has the role {visitor.role}"))
+    def _bars(self, role: Role, visitor: Visitor) -> str:
+        """Return why a visitor may not make a request that needs a role; "" if it may."""
+        return self._handlers.refuses or ("" if visitor.role.may(role) else (
+            f"Needs the role {role}; {visitor.name} has the role {visitor.role}"))
 
     async def _talk(self, socket_: WebSocket, fed: PageFeed, page: _Page) -> None:
         while (message := await socket_.receive())["type"] != "websocket.disconnect":
@@ -271,7 +273,7 @@ class PageServer:
             request = self._reader.read(text)
             if not self._gate.still(page.visitor):
                 raise RefusedError(_REVOKED)
-            if why := self._bars(type(request), page.visitor):
+            if why := self._bars(self._handlers.role(request), page.visitor):
                 raise RefusedError(why)
             answer = self._handlers.fulfil(request, page.number)
         except RefusedError as error:

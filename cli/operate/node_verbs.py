@@ -46,6 +46,7 @@ from rampart.cli.run_picture import manager_in_words
 from rampart.cli.session import connect, first_to_expire
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag, option, whole
 from rampart.files.plain_text import printable
+from rampart.manager.spec.clearing import clearing_in_words
 
 MOST_LINES = 1_000_000
 _LONGEST_LINE = 1 << 16
@@ -172,7 +173,7 @@ async def status(options: argparse.Namespace) -> int:
     """
     async with connect(options.port) as session:
         run, held = session.run, Holdings(session)
-        lines, has_gateway = _lines(session.run)
+        lines, has_gateway, clearing = _lines(session.run)
         wanted = (*lines.status_read, ftm_topics.MANAGER_STATUS, ftm_topics.NODES,
                   *[GRAPH] * has_gateway)
         found, _ = await asyncio.gather(
@@ -202,6 +203,9 @@ async def status(options: argparse.Namespace) -> int:
         say(f"{label:<9} {text}")
     if manager is not None or "manager" in kinds:
         say(f"manager   {manager_in_words(manager)}")
+    for name in (*manager.active, *manager.latched) if manager else ():
+        if words := clearing.get(name):
+            say(f"clearing  {name} {words}")
     for name, what in held.holders.items():
         say(f"held      {' and '.join(what)} by {name}, not a recovery module of this system; "
             f"rampart reset {name} releases it")
@@ -236,13 +240,14 @@ def top(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
     return top_screen.top(options)
 
 
-def _lines(run: RunInfo) -> tuple[RobotLines, bool]:
-    """Return the lines of the robot, and whether it has a gateway to ROS 2."""
+def _lines(run: RunInfo) -> tuple[RobotLines, bool, dict[str, str]]:
+    """Return the lines of the robot, whether it has a gateway to ROS 2, and what clears how."""
     try:
         spec = systems.load(run.system_file)
-        return systems.lines_of(spec), any(node.actor == GATEWAY for node in spec.nodes)
+        return (systems.lines_of(spec), any(node.actor == GATEWAY for node in spec.nodes),
+                clearing_in_words(spec))
     except UsageError:  # for example a run from another folder: show the engine's lines
-        return RobotLines(), False
+        return RobotLines(), False, {}
 
 
 def _in_ros2(graph: RosGraphReport | None) -> str:

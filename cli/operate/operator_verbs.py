@@ -6,6 +6,8 @@ import argparse
 import asyncio
 from typing import Any
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.ftm import messages as fm
@@ -42,10 +44,12 @@ def add(verbs: Any) -> None:
 async def reset(options: argparse.Namespace) -> int:
     """Release a latched recovery.
 
-    Release a recovery that stays in force until an operator resets it. While its
-    cause persists it is not released, and the exit code is 1. The verb also ends
-    the hold of a client that is not a recovery module, for example on the brake;
-    `rampart status` lists such holders.
+    Release a recovery that stays in force until an operator resets it: it is
+    latched, or one of its mechanisms clears by operator. While its cause persists,
+    or if a mechanism never clears, it is not released, and the exit code is 1.
+    `rampart status` shows how each clears. The verb also ends the hold of a client
+    that is not a recovery module, for example on the brake; `rampart status` lists
+    such holders.
 
     Examples:
       rampart reset RM1
@@ -64,11 +68,23 @@ async def reset(options: argparse.Namespace) -> int:
         if options.recovery not in status.latched:
             waiting = ", ".join(status.latched) or "none"
             raise NoEffectError(f"no effect: {options.recovery} is not latched; latched: {waiting}")
-        released = await session.command(
+        refusals: list[str] = []
+
+        def keep(_key: str, _header: Header, body: bm.Diagnostic) -> None:
+            if body.context == fm.RESET_REFUSED and body.offender == options.recovery:
+                refusals.append(body.reason)
+
+        session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, keep)
+
+        def is_released() -> bool:
+            return latched.value is not None and options.recovery not in latched.value.latched
+
+        await session.command(
             ftm_topics.RESET, fm.Reset(options.recovery, session.name),
-            lambda: latched.value is not None and options.recovery not in latched.value.latched,
-            session.real_s(_RESET_WAIT_S))
-    if not released:
+            lambda: is_released() or bool(refusals), session.real_s(_RESET_WAIT_S))
+    if refusals:
+        raise NoEffectError(f"{options.recovery} was not released: {refusals[0]}")
+    if not is_released():
         active = ", ".join(latched.value.active) if latched.value else ""
         raise NoEffectError(f"{options.recovery} was not released; active: {active or 'none'}")
     say(f"{options.recovery} released")

@@ -24,9 +24,10 @@ class Pair(msgspec.Struct, frozen=True):
 
     Attributes:
         both: The recoveries in force while both are active.
-        first_clears: Those in force when only the first one has cleared.
-        second_clears: Those in force when only the second one has cleared.
-        both_clear: Those in force when both have: they are latched.
+        first_clears: Those in force when only the error of the first one is gone.
+        second_clears: Those in force when only the error of the second one is gone.
+        both_clear: Those in force when both errors are gone: they are latched, or a mechanism has
+            not cleared.
     """
 
     first: str

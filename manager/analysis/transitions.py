@@ -42,7 +42,7 @@ from rampart.manager.arbitration.arbiter_state import (
     Tick,
 )
 from rampart.manager.arbitration.detection_track import DetectionRules, DetectionTrack
-from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryPhase
+from rampart.manager.model.mechanisms import Clears, Contract, Mechanism, Mechanisms, RecoveryPhase
 from rampart.manager.model.order import PartialOrder, Tree
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision, Late
@@ -54,6 +54,7 @@ Violations = dict[str, tuple[str, ...]]
 _OVER = -1e9
 _OLD, _CURRENT = 5, 10
 _NUMBER = 100
+_IS_RESET = " is reset"
 _EXCUSE, _EXCUSED = "D_excuse", "F_excuse"
 """The detection module and the mechanism that stand for whatever excuses a latch."""
 
@@ -109,13 +110,15 @@ class Transitions:
         asked: Sets of recoveries that the strategy may ask for; the empty set is always added.
         exclusive: The strategy runs one recovery at a time.
         urgent: Last resorts, which must never wait.
+        clears: What ends the mechanism of each recovery.
         with_modules: Explore the modules themselves; else modules may report anything.
         deaths: Modules may die and come back.
     """
 
     def __init__(self, contracts: Iterable[Contract], order: PartialOrder,
                  asked: Iterable[frozenset[str]], urgent: Iterable[str] = (), *,
-                 exclusive: bool, with_modules: bool = False, deaths: bool = True) -> None:
+                 exclusive: bool, clears: Clears = Clears.BY_ITSELF, with_modules: bool = False,
+                 deaths: bool = True) -> None:
         inside = {c.name: c for c in contracts}
         self.contracts = {n: replace(c, needs=frozenset(), escalate_to=(
             c.escalate_to if c.escalate_to in inside else ""), excused_by=(
@@ -132,7 +135,8 @@ class Transitions:
         answers = {f"F_{n}": (f"D_{n}", n) for n in self.names}
         if any(c.excused_by for c in self.contracts.values()):
             answers[_EXCUSED] = _EXCUSE, top
-        mechanisms = Mechanisms([Mechanism(f, d, n) for f, (d, n) in answers.items()],
+        mechanisms = Mechanisms([Mechanism(f, d, n, clears=(
+            clears if f != _EXCUSED else Clears.BY_ITSELF)) for f, (d, n) in answers.items()],
                                 list(self.contracts.values()))
         tree = Tree({f: None if f == f"F_{top}" else f"F_{top}" for f in answers})
         self.arbiter = Arbiter(Arrangement(mechanisms, tree, local), AsAsked(exclusive=exclusive),
@@ -168,8 +172,8 @@ class Transitions:
             runs = track.letting_go or (track.wanted and not track.failure)
             if runs and track.ordered_s == 0.0:
                 yield f"{name}'s deadline passes", self.pass_deadline(now, index)
-            if track.latched:
-                yield f"{name} is reset", self._step(now, now.state, ResetAsked(name))
+            if name in now.state.latched:
+                yield f"{name}{_IS_RESET}", self._step(now, now.state, ResetAsked(name))
 
     def _reports(self, now: Situation, index: int, name: str) -> Steps:
         """Yield every report that a module could send."""
@@ -260,7 +264,8 @@ class Transitions:
             for t in state.recoveries)
         decision = replace(state.decision, rejected=tuple(
             (name, "") for name, _ in state.decision.rejected))
-        return Situation(replace(state, detections=detections, recoveries=recoveries,
+        held = tuple(replace(h, since_s=0.0, seen_s=0.0) for h in state.held)
+        return Situation(replace(state, detections=detections, recoveries=recoveries, held=held,
                                  number=_NUMBER, decision=decision), modules)
 
     # -- properties -----------------------------------------------------------------------------
@@ -304,6 +309,18 @@ class Transitions:
                 now = self.pass_deadline(now, index)
         return now.state.recoveries[waiting].wanted \
             or self.names[waiting] not in now.state.decision.recoveries
+
+    def cleared(self, before: Situation, event: str, after: Situation) -> str:
+        """Return the mechanism that a step clears although it must not, "" if none."""
+        contents = self.arbiter.mechanisms
+        detected = contents.detected_by(t.name for t in after.state.detections if t.active)
+        for name in set(before.state.active).difference(after.state.active):
+            clears = contents.by_name[name].clears
+            is_reset = event in {f"{r}{_IS_RESET}" for r in contents.recover[name]}
+            if clears is Clears.NEVER or (clears is Clears.BY_OPERATOR and (
+                    name in detected or not is_reset)):
+                return name
+        return ""
 
     def cut_off(self, before: Situation, after: Situation) -> str:
         """Return the recovery that a step releases half-way, "" if none.
@@ -354,6 +371,9 @@ def explore(system: Transitions) -> tuple[int, Violations]:
             victim = system.cut_off(now, after)
             if victim and "none-cut-off" not in found:
                 found["none-cut-off"] = (*trace(now, event), f"{victim} is released half-way")
+            cleared = system.cleared(now, event, after)
+            if cleared and "cleared-as-specified" not in found:
+                found["cleared-as-specified"] = (*trace(now, event), f"{cleared} is cleared")
             if after not in came_from:
                 came_from[after] = (now, event)
                 waiting.append(after)

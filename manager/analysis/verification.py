@@ -22,6 +22,7 @@ from rampart.manager.analysis.active_sets import (
     subsets,
 )
 from rampart.manager.analysis.transitions import Transitions, Violations, explore
+from rampart.manager.model.mechanisms import Clears
 from rampart.manager.spec.budget import patience_s
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.arrangement import Arrangement
@@ -37,6 +38,7 @@ MEANING = {
     "escalation-ends": "if everything fails, the last resort is tried",
     "recovery-ends": "every recovery that was started ends or escalates",
     "none-cut-off": "no recovery is released half-way",
+    "cleared-as-specified": "what clears by operator waits for a reset; what never clears stays",
     "monotone": "one more active mechanism never leads to a less safe recovery",
     "no-harm": "no recovery disables what it or another one needs",
     "repairs-run": "a needed repair runs at some time, unless the last resort latches",
@@ -124,7 +126,7 @@ def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
 
 
 _OF_STATES = ("one-decision", "no-conflicting-claims", "emergency-stop-at-once", "recovery-ends",
-              "none-cut-off")
+              "none-cut-off", "cleared-as-specified")
 
 
 def _merge(strategy: str, statically: dict[str, Property], states: int,
@@ -155,27 +157,31 @@ class _Explorer:
         asked = _askable(sets)
         names = self.arrangement.mechanisms.recoveries
         exclusive = sets.strategy.exclusive and not self.arrangement.compound
+        mechanisms = self.arrangement.mechanisms
         for name, deaths in product(names, (True, False)):
-            yield self._explore((name,), asked, exclusive=exclusive, with_modules=True,
-                                deaths=deaths)
+            # Whether a mechanism clears as specified concerns it and its recovery alone.
+            for clears in {mechanisms.by_name[user].clears: None for user in sorted(
+                    mechanisms.users[name])} or (Clears.BY_ITSELF,):
+                yield self._explore((name,), asked, exclusive=exclusive, clears=clears,
+                                    with_modules=True, deaths=deaths)
         size = min(self.together, len(names))
         for chosen in combinations(names, size) if size > 1 else ():
             yield self._explore(chosen, asked, exclusive=exclusive)
 
     def _explore(self, names: tuple[str, ...], asked: frozenset[frozenset[str]], *,
-                 exclusive: bool, with_modules: bool = False, deaths: bool = True
-                 ) -> tuple[str, int, Violations]:
+                 exclusive: bool, clears: Clears = Clears.BY_ITSELF, with_modules: bool = False,
+                 deaths: bool = True) -> tuple[str, int, Violations]:
         mechanisms, order = self.arrangement.mechanisms, self.arrangement.order
         # A recovery outside may make one of these wait, as if it were not asked for yet.
         here = frozenset(
             frozenset(part) for taken in asked for part in subsets(taken.intersection(names)))
         shape = _shape(names, here, self._urgent, self.arrangement)
-        key = (shape, exclusive, with_modules, deaths)
+        key = (shape, exclusive, clears, with_modules, deaths)
         if key not in self._explored:
             contracts = [mechanisms.contracts[n] for n in names]
             self._explored[key] = explore(Transitions(
                 contracts, order, here, self._urgent.intersection(names), exclusive=exclusive,
-                with_modules=with_modules, deaths=deaths))
+                clears=clears, with_modules=with_modules, deaths=deaths))
             self.states += self._explored[key][0]
         return " and ".join(names), *self._explored[key]
 

@@ -16,6 +16,9 @@ recoveries run; the arbiter decides *how*:
   safer one takes its place meanwhile. A reset is refused while the cause persists. A cause that
   another detection explains, such as an overload of the machine, neither counts nor latches
   (`Mechanism.explains`, `Contract.excused_by`) unless it outlasts the explanation.
+* A mechanism that clears by operator, never, or after a time stays active when its error is gone,
+  so the strategy decides as if it were detected. A reset of its recovery ends it, not earlier than
+  the reset of a latched recovery. Who may reset is checked where the operator is known.
 * A recovery fails by its own report, by its deadline, or if it needs a node that is reported
   failed. It escalates to the one that its contract names, else to that of the mechanism above. A
   repair also fails if it is done but its cause persists. A failed recovery that is still acting may
@@ -32,8 +35,10 @@ from msgspec.structs import replace
 
 from rampart.manager.arbitration import detection_track
 from rampart.manager.arbitration.arbiter_state import (
+    LONG_AGO_S,
     Command,
     DecisionMade,
+    Held,
     Input,
     Output,
     RecoveryHeard,
@@ -49,7 +54,7 @@ from rampart.manager.arbitration.detection_track import (
     DetectionTrack,
     reporting,
 )
-from rampart.manager.model.mechanisms import RecoveryPhase
+from rampart.manager.model.mechanisms import Clears, RecoveryPhase
 from rampart.manager.spec.budget import patience_s
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.arrangement import Arrangement
@@ -142,7 +147,7 @@ class Arbiter:
             case RecoveryHeard() if event.recovery in self._recovery:
                 state = self._hear_recovery(state, event, now)
             case ResetAsked():
-                state, answers = self._reset(state, event)
+                state, answers = self._reset(state, event, now)
         if self._is_quiet(state, now):
             return state, answers
         late_before = state.late
@@ -161,7 +166,8 @@ class Arbiter:
 
         This is nearly always so, while seventy reports arrive a second.
         """
-        if not state.oriented or state.decision is not NOTHING_ACTIVE or state.since or state.late:
+        if not state.oriented or state.decision is not NOTHING_ACTIVE or state.since \
+                or state.late or state.held:
             return False
         oldest_s = now - self.rules.silence_timeout_s
         return not (any(t.active or t.heard_s < oldest_s for t in state.detections)
@@ -191,20 +197,42 @@ class Arbiter:
             track = replace(track, failed_for=self._sakes(track.name, state.decision.active))
         return self._with_recovery(replace(state, number=number), track)
 
-    def _reset(self, state: State, event: ResetAsked) -> tuple[State, tuple[ResetAnswered]]:
-        unlatched = self._choose(state)[1]
+    def _refusal(self, state: State, event: ResetAsked, now: float) -> str:
+        """Return why a reset is refused, or ""."""
+        held = [h for h in state.held if _resets(event, h)]
+        decision = self._choose(replace(
+            state, held=tuple(h for h in state.held if h not in held)))[1]
+        never = [h.mechanism for h in held if h.clears is Clears.NEVER]
+        causes = [h.mechanism for h in held if h.mechanism in decision.active] or (
+            list(decision.active) if event.recovery in decision.recoveries else [])
+        early = [(h.mechanism, after_s) for h in held
+                 for after_s in [self.mechanisms.by_name[h.mechanism].clear_after_s]
+                 if now - h.seen_s < after_s]
         refusal = ""
         if event.recovery not in self._recovery:
             refusal = "the recovery module is unknown"
-        elif not self._track(state, event.recovery).latched:
+        elif event.recovery not in state.latched:
             refusal = "it is not latched"
         elif not state.oriented:
             refusal = "not all modules have reported yet"
-        elif event.recovery in unlatched.recoveries:
-            refusal = f"the cause persists: {', '.join(unlatched.active)} active"
-        else:
-            state = self._with_recovery(state, replace(
-                self._track(state, event.recovery), latched=False, adopted=False))
+        elif event.stamp_s < max(self._track(state, event.recovery).latched_s,
+                                 *(h.since_s for h in held), LONG_AGO_S):
+            refusal = "the reset is older than the latch"
+        elif never:
+            refusal = f"{', '.join(never)} never clears; only a new run ends it"
+        elif causes:
+            refusal = f"the cause persists: {', '.join(causes)} active"
+        elif early:
+            refusal = f"{early[0][0]} clears when its error has been gone for {early[0][1]:g} s"
+        return refusal
+
+    def _reset(self, state: State, event: ResetAsked, now: float
+               ) -> tuple[State, tuple[ResetAnswered]]:
+        refusal = self._refusal(state, event, now)
+        if not refusal:
+            state = self._with_recovery(
+                replace(state, held=tuple(h for h in state.held if not _resets(event, h))),
+                replace(self._track(state, event.recovery), latched=False, adopted=False))
         return state, (ResetAnswered(event.recovery, not refusal, refusal or (
             f"reset by {event.by}" if event.by else "reset")),)
 
@@ -212,7 +240,9 @@ class Arbiter:
         detections = tuple(detection_track.pass_time(t, self._rules_of(state, t.name), now)
                            for t in state.detections)
         believed = {track.name: track for track in detections}
-        active, reported = self._active(detections), reporting(detections)
+        reported = reporting(detections)
+        held = self._hold(state.held, self._detected(detections), now)
+        active = self._active(detections, held)
         recoveries = tuple(
             self._excuse(self._judge(t, believed, active, now), believed, reported)
             for t in state.recoveries)
@@ -222,7 +252,8 @@ class Arbiter:
                 or now - state.started_s > self.rules.startup_grace_s))
         if oriented and not state.oriented:
             recoveries = tuple(replace(t, adopted=False) for t in recoveries)
-        state = replace(state, detections=detections, recoveries=recoveries, oriented=oriented)
+        state = replace(state, detections=detections, recoveries=recoveries, oriented=oriented,
+                        held=held)
         return self._with_late(state, active, now) if self._patient else state
 
     def _sakes(self, recovery: str, active: tuple[str, ...]) -> tuple[str, ...]:
@@ -289,14 +320,38 @@ class Arbiter:
             if name in state.late or (now - since_s > mechanisms.by_name[name].patience_s
                                       and not in_force.issuperset(mechanisms.recover[name]))))
 
-    def _active(self, detections: tuple[DetectionTrack, ...]) -> tuple[str, ...]:
+    def hold(self, mechanism: str, since_s: float, seen_s: float) -> Held:
+        """Return a mechanism that stays active when its error is gone."""
+        return Held(mechanism, self.mechanisms.recover[mechanism],
+                    self.mechanisms.by_name[mechanism].clears, since_s, seen_s)
+
+    def _hold(self, held: tuple[Held, ...], detected: tuple[str, ...], now: float
+              ) -> tuple[Held, ...]:
+        """Return what is held as of `now`: errors are noted, and what clears by itself is gone."""
+        if not self.mechanisms.outlasting:
+            return ()
+        found = {h.mechanism: h for h in held}
+        for name in self.mechanisms.outlasting.intersection(detected):
+            found[name] = replace(found.get(name) or self.hold(name, now, now), seen_s=now)
+        return tuple(
+            found[name] for name in self.mechanisms.names if name in found and not (
+                found[name].clears is Clears.BY_ITSELF and now - found[name].seen_s
+                > self.mechanisms.by_name[name].clear_after_s))
+
+    def _active(self, detections: tuple[DetectionTrack, ...], held: tuple[Held, ...]
+                ) -> tuple[str, ...]:
+        detected = self._detected(detections)
+        return self.mechanisms.sort((*detected, *(h.mechanism for h in held))) if held else detected
+
+    def _detected(self, detections: tuple[DetectionTrack, ...]) -> tuple[str, ...]:
         active = self.mechanisms.detected_by(
             (t.name for t in detections if t.active), (t.name for t in detections if t.silent))
         return self.mechanisms.unexplained(active, reporting(detections))
 
     def _choose(self, state: State) -> tuple[Decision, Decision, Decision]:
         """Return the strategy's decision, the one after escalation, and the one after latching."""
-        chosen = decision = self.decider.choose(self._active(state.detections), state.late)
+        active = self._active(state.detections, state.held)
+        chosen = decision = self.decider.choose(active, state.late)
         failures = self._unmet(state) if self._needy and chosen.active else {}
         failures |= {t.name: t.failure for t in state.recoveries if t.failure}
         if failures:
@@ -423,7 +478,7 @@ class Arbiter:
         causes = self._causes(state, track.name)
         nodes = tuple(dict.fromkeys(node for cause in causes for node in cause.nodes))
         reason = "; ".join(f"{cause.name}: {cause.reason}" if cause.reason else cause.name
-                           for cause in causes)
+                           for cause in causes) or _kept(state.held)
         return replace(
             activated, command=Command(track.name, True, state.number, nodes, reason),
             ordered_s=ordered_s, cause=frozenset((cause.name, cause.rises) for cause in causes),
@@ -446,6 +501,16 @@ class Arbiter:
         if other.name in chosen or not busy or not self.decider.strategy.exclusive:
             return False
         return not self.order.is_above(name, other.name)
+
+
+def _resets(event: ResetAsked, held: Held) -> bool:
+    """Return whether a granted reset ends what is held."""
+    return held.clears is not Clears.BY_ITSELF and event.recovery in held.recoveries
+
+
+def _kept(held: tuple[Held, ...]) -> str:
+    """Return the reason of a recovery without a detection that is active."""
+    return f"not cleared: {', '.join(h.mechanism for h in held)}" if held else ""
 
 
 def _without_incarnation(node: str) -> str:

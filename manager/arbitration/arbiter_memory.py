@@ -3,8 +3,9 @@
 An arbiter that starts learns from the modules what is detected and in force, and adopts it. Four
 facts are known only to the arbiter:
 
-* *Latches.* If the manager dies together with a recovery module that cannot read its state from
-  the world, as RM1 can from the brakes, no other process knows that the robot must stay stopped.
+* *Latches* of recoveries, and mechanisms that outlast their errors. If the manager dies together
+  with a recovery module that cannot read its state from the world, as RM1 can from the brakes, no
+  other process knows that the robot must stay stopped.
 * *That a recovery does not latch*, because its cause is explained for a while.
 * *How much a detection module has flapped*, which delays the release of its mechanisms.
 * *The number of the last decision*, so that no number is used twice.
@@ -45,11 +46,14 @@ class Memory(msgspec.Struct, frozen=True):
         latches: Latched recoveries, and recoveries in force that are excused from latching.
         buckets: Name, content in s and time in s of the bucket of each module that has flapped;
             see `rampart.manager.arbitration.detection_track`.
+        held: Name, time of activation and time of the last detection, in s, of each mechanism that
+            outlasts its error.
     """
 
     number: int
     latches: tuple[Latch, ...] = ()
     buckets: tuple[tuple[str, float, float], ...] = ()
+    held: tuple[tuple[str, float, float], ...] = ()
 
 
 def remember(state: State, arbiter: Arbiter) -> Memory:
@@ -59,7 +63,8 @@ def remember(state: State, arbiter: Arbiter) -> Memory:
                for t in state.recoveries
                if t.latched or (t.wanted and contracts[t.name].excused_by))
     buckets = ((t.name, t.bucket_s, t.bucket_at_s) for t in state.detections if t.bucket_s > 0)
-    return Memory(state.number, tuple(latches), tuple(buckets))
+    held = tuple((h.mechanism, h.since_s, h.seen_s) for h in state.held)
+    return Memory(state.number, tuple(latches), tuple(buckets), held)
 
 
 def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
@@ -72,6 +77,9 @@ def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
     detections = {t.name: t for t in state.detections}
     kept = [replace(detections[name], bucket_s=bucket_s, bucket_at_s=min(at_s, now))
             for name, bucket_s, at_s in memory.buckets if name in detections]
+    state = replace(state, held=tuple(
+        arbiter.hold(name, min(since_s, now), min(seen_s, now))
+        for name, since_s, seen_s in memory.held if name in arbiter.mechanisms.outlasting))
     return _with_tracks(state, kept, [
         RecoveryTrack(latch.command, ordered_s=now, cause=frozenset(latch.cause),
                       adopted=not latch.latched, latched=latch.latched,
@@ -105,4 +113,7 @@ def objection(memory: Memory) -> str:
     for name, bucket_s, at_s in memory.buckets:
         if not (math.isfinite(bucket_s) and math.isfinite(at_s) and bucket_s >= 0):
             return f"bucket of {name} holds {bucket_s} s"
+    for name, since_s, seen_s in memory.held:
+        if not (math.isfinite(since_s) and math.isfinite(seen_s)):
+            return f"{name} is held since {since_s} s, seen at {seen_s} s"
     return ""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 from msgspec.structs import replace
 
 from rampart.manager.arbitration.detection_track import DetectionHeard, DetectionTrack
-from rampart.manager.model.mechanisms import RecoveryPhase
+from rampart.manager.model.mechanisms import Clears, RecoveryPhase
 from rampart.manager.strategies.decision import Decision
 
 LONG_AGO_S = -1e12
@@ -117,11 +119,30 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
         return after
 
 
+class Held(msgspec.Struct, frozen=True):
+    """A mechanism that stays active when its error is gone.
+
+    Attributes:
+        mechanism: Its name.
+        recoveries: Recoveries that it runs; a reset of one of them clears it.
+        clears: What ends it.
+        since_s: When it became active.
+        seen_s: When its error was last detected.
+    """
+
+    mechanism: str
+    recoveries: tuple[str, ...]
+    clears: Clears
+    since_s: float
+    seen_s: float
+
+
 class ResetAsked(msgspec.Struct, frozen=True, tag=True):
-    """Input: an operator request to release a latched recovery."""
+    """Input: an operator request, made at `stamp_s`, to release a latched recovery."""
 
     recovery: str
     by: str = ""
+    stamp_s: float = math.inf
 
 
 class Tick(msgspec.Struct, frozen=True, tag=True):
@@ -183,6 +204,7 @@ class State(msgspec.Struct, frozen=True):
         oriented: Every module has reported, or the grace time has passed; adoption is over.
         since: Active mechanisms, each with the time since when it has its turn.
         late: Mechanisms whose recovery has not ended the error within its patience.
+        held: Mechanisms that stay active when their error is gone.
     """
 
     detections: tuple[DetectionTrack, ...]
@@ -193,6 +215,7 @@ class State(msgspec.Struct, frozen=True):
     oriented: bool = False
     since: tuple[tuple[str, float], ...] = ()
     late: frozenset[str] = frozenset()
+    held: tuple[Held, ...] = ()
 
     @property
     def desired(self) -> dict[str, Command]:
@@ -217,10 +240,14 @@ class State(msgspec.Struct, frozen=True):
     @property
     def busy(self) -> tuple[str, ...]:
         """Names of the recovery modules that are under orders, letting go or latched."""
+        latched = self.latched
         return tuple(track.name for track in self.recoveries
-                     if track.wanted or track.letting_go or track.latched)
+                     if track.wanted or track.letting_go or track.name in latched)
 
     @property
     def latched(self) -> tuple[str, ...]:
-        """Names of the latched recovery modules."""
-        return tuple(track.name for track in self.recoveries if track.latched)
+        """Names of the recovery modules that are latched, or run for a mechanism that is."""
+        kept = {name for held in self.held if held.clears is not Clears.BY_ITSELF
+                for name in held.recoveries}
+        return tuple(track.name for track in self.recoveries
+                     if track.latched or track.name in kept)

@@ -44,6 +44,15 @@ class RecoveryPhase(StrEnum):
     FAILED = "failed"
 
 
+class Clears(StrEnum):
+    """What ends a mechanism whose error is gone."""
+
+    BY_ITSELF = "by itself"
+    BY_OPERATOR = "by operator"
+    NEVER = "never"
+    """Only a new run ends it."""
+
+
 class Contract(msgspec.Struct, frozen=True):
     """What a recovery module promises the arbiter.
 
@@ -82,6 +91,8 @@ class Mechanism(msgspec.Struct, frozen=True):
         patience_s: How long its recovery may take before the next barrier has to act.
         explains: Mechanisms whose detections are its consequences. They do not count while its
             detection modules report, not while these are merely silent.
+        clears: What ends it; until then it stays active although its error is gone.
+        clear_after_s: How long its error must have been gone, in addition to the hold.
     """
 
     name: str
@@ -89,6 +100,13 @@ class Mechanism(msgspec.Struct, frozen=True):
     recover: str
     patience_s: float = math.inf
     explains: frozenset[str] = frozenset()
+    clears: Clears = Clears.BY_ITSELF
+    clear_after_s: float = 0.0
+
+    @property
+    def outlasts(self) -> bool:
+        """Whether it stays active when its error is gone."""
+        return self.clears is not Clears.BY_ITSELF or self.clear_after_s > 0
 
 
 class Mechanisms:
@@ -105,6 +123,7 @@ class Mechanisms:
         causes: Recovery → detection modules that it answers to.
         repairs: Detection module → recoveries that answer to it, if all of them repair.
         explaining: The mechanisms that explain others.
+        outlasting: The mechanisms that stay active when their error is gone.
 
     Raises:
         GateError: A gate cannot be read.
@@ -132,6 +151,7 @@ class Mechanisms:
             for detection in self.detect[name]:
                 run_for[detection] += self.recover[name]
         self.explaining = tuple(m.name for m in mechanisms if m.explains)
+        self.outlasting = frozenset(m.name for m in mechanisms if m.outlasts)
         self.repairs = {detection: run for detection, run in run_for.items()
                         if all(self.contracts[recovery].kind.repairs for recovery in run)}
 

@@ -14,6 +14,7 @@ from rampart.manager.model.fault_tree import FaultTreeError
 from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
 from rampart.manager.model.order import CycleError, contradictions, find_cycle
 from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
+from rampart.manager.spec.clearing import find_wrong_clearing
 from rampart.manager.spec.hosts import PORTS
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
 from rampart.manager.spec.schema import MechanismSpec, SystemSpec
@@ -425,5 +426,5 @@ def _wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
 
 VALIDATORS: tuple[Validator, ...] = (
     find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, _hosts,
-    _mechanisms, _reachability, _faults, _wrong_tree, _wrong_policy, _wrong_orders,
-    _contradictions, _wrong_compounds, _wrong_precedence, find_wrong_budget)
+    _mechanisms, find_wrong_clearing, _reachability, _faults, _wrong_tree, _wrong_policy,
+    _wrong_orders, _contradictions, _wrong_compounds, _wrong_precedence, find_wrong_budget)

@@ -15,7 +15,13 @@ import msgspec
 
 from rampart.manager.model.fault_tree import Event, FaultTree
 from rampart.manager.model.gates import detection_gate, recovery_gate
-from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
+from rampart.manager.model.mechanisms import (
+    Clears,
+    Contract,
+    Mechanism,
+    Mechanisms,
+    RecoveryKind,
+)
 from rampart.manager.model.order import PartialOrder, Tree, refine
 from rampart.manager.spec.hosts import HostSpec, Link
 from rampart.manager.spec.mobile_robot import Hazard, Robot
@@ -132,6 +138,10 @@ class MechanismSpec(Table, frozen=True):
         against: The hazard that it must forestall.
         explains: Mechanisms whose detections are its consequences, as many are of an overloaded
             machine; they do not act while it is detected.
+        clears: What ends the mechanism when its error is gone; None for by operator if each of its
+            recoveries is latched, and by itself otherwise.
+        clear_after_s: How long the error must have been gone, seconds.
+        cleared_by: Least role of the operator who may reset it.
         enabled: False leaves the mechanism out, as does a disabled module.
     """
 
@@ -143,6 +153,10 @@ class MechanismSpec(Table, frozen=True):
         "one of drift, runaway, intrusion, parent, or { within_s = ..., hazard = '...' }"
         ))] = Hazard.DRIFT
     explains: frozenset[Name] = frozenset()
+    clears: Annotated[Clears | None, msgspec.Meta(
+        description="'by itself', 'by operator' or 'never'")] = None
+    clear_after_s: NonNegative = 0.0
+    cleared_by: Literal["drive", "inject"] = "drive"
     enabled: bool = True
 
     @property
@@ -341,8 +355,8 @@ class SystemSpec(Table, frozen=True):
                          ) -> Mechanisms:
         """Build the registry of mechanisms and contracts; see `budget.patience_s` for patience."""
         return Mechanisms(
-            [Mechanism(m.name, m.detect, m.recover, patience_s.get(m.name, math.inf), m.explains)
-             for m in self.mechanisms],
+            [Mechanism(m.name, m.detect, m.recover, patience_s.get(m.name, math.inf), m.explains,
+                       m.clears or Clears.BY_ITSELF, m.clear_after_s) for m in self.mechanisms],
             [Contract(r.name, r.kind, r.claims, r.interruptible, r.latched, r.deadline_s,
                       r.escalate_to, r.needs, r.disables, r.excused_by) for r in self.recoveries])
 

@@ -42,6 +42,7 @@ class Everything(Actor):
         super().__init__(context)
         self.latched: tuple[str, ...] = ("RM1",)
         self.obstinate = False
+        self.refusal = ""
         self.holders: tuple[str, ...] = ()
         self.obstacles: dict[str, m.ObstacleCommand] = {}
         self.resets = 0
@@ -88,7 +89,9 @@ class Everything(Actor):
     @on(ftm_topics.RESET)
     def reset(self, message: fm.Reset, _header: Header) -> None:
         self.resets += 1
-        if not self.obstinate:
+        if self.refusal:
+            self.report_diagnostic(fm.RESET_REFUSED, self.refusal, message.recovery)
+        elif not self.obstinate:
             self.latched = ()
             self.holders = tuple(name for name in self.holders if name != message.recovery)
             self.publish(ftm_topics.HOLDS, fm.Holds("brake", self.holders))
@@ -417,6 +420,19 @@ async def test_a_reset_while_the_cause_is_there_says_that_nothing_was_released(r
     code, _, err = await run.call(capsys, "reset", "RM1")
     assert code == 1
     assert err == "rampart: RM1 was not released; active: FTM1\n"
+
+
+async def test_a_refused_reset_prints_the_manager_s_reason(run, capsys):
+    run.node.refusal = "FTM1 never clears; only a new run ends it"
+    code, _, err = await run.call(capsys, "reset", "RM1")
+    assert code == 1
+    assert err == ("rampart: RM1 was not released: FTM1 never clears; only a new run ends it\n")
+
+
+async def test_status_shows_how_each_active_mechanism_clears(run, capsys):
+    _, out, _ = await run.call(capsys, "status")
+    for name in ("FTM1", "RM1"):
+        assert f"clearing  {name} clears by operator (role drive) once its error is gone" in out
 
 
 async def test_obstacles_come_move_and_go(run, capsys):

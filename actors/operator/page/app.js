@@ -267,6 +267,12 @@ function named(name) {
   return title && title !== name ? `${title} (${name})` : name;
 }
 
+/** How mechanisms or recoveries clear, in words. */
+function clearing(names) {
+  const words = picture.system?.clearing ?? {};
+  return [...new Set(names)].filter((name) => words[name]).map((name) => `${name} ${words[name]}.`).join(" ");
+}
+
 function manager(heard) {
   const m = heard && heard.value;
   const facts = [["Manager", !m ? "no message yet" : heard.stale ? "silent" : "alive"]];
@@ -283,7 +289,8 @@ function manager(heard) {
   say($("alarm-title"), latched.length
     ? `${latched.map(named).join(", ")}: latched until you reset it.` : acting
       ? m.activated.length ? m.activated.map(named).join(", ") : "A fault is detected." : "");
-  say($("alarm-text"), m && m.active.length ? `${m.active.map(named).join(", ")}.` : "");
+  say($("alarm-text"), acting
+    ? `${m.active.map(named).join(", ")}${m.active.length ? ". " : ""}${clearing([...m.active, ...latched])}` : "");
   document.title = `${latched.length ? "⚠ stopped · " : acting ? "▲ recovery · " : ""}Rampart`;
   memory.once("latched", latched, () => $("resets").replaceChildren(...latched.map((name) => {
     const button = element("button", "", `Reset ${named(name)}`);

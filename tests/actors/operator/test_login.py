@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+
 import httpx
+import msgspec
 import pytest
 import websockets
 
@@ -11,6 +14,7 @@ from rampart.actors.web.visitors import Role, issue, revoke
 from rampart.testing import eventually, free_port
 from tests.actors.operator.test_operating import RELEASED, TOKEN, Hand, ask, open_page
 from tests.actors.operator.world import hear, served
+from tests.osmosis_system import shipped_system
 
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
@@ -152,6 +156,31 @@ async def test_a_withdrawn_token_closes_its_pages_and_a_changed_role_has_them_co
             await turned_away(other)
         await eventually(lambda: bool(world.others.diagnostics))
         assert "it admits no visitors" in world.others.diagnostics[0].reason
+
+
+@pytest.mark.usefixtures("patient")
+async def test_a_reset_needs_the_role_that_a_mechanism_names(world, tmp_path):
+    system = shipped_system()
+    system = msgspec.structs.replace(system, mechanisms=tuple(
+        msgspec.structs.replace(m, cleared_by="inject") if m.name == "FTM1" else m
+        for m in system.mechanisms))
+    file = tmp_path / "page.tokens"
+    tokens = {role: issue(file, role.value, role) for role in Role}
+    world.say_latched("RM1", "RM2")
+    async with world.hmi(hmi_port=free_port(), hmi_token_file=str(file), system=system) as hmi:
+        at = await served(hmi)
+        await eventually(lambda: hmi._state.latched == ("RM1", "RM2"))
+        for role, recovery, refusal in (
+                (Role.LOOK, "RM2", "Needs the role drive; look has the role look"),
+                (Role.DRIVE, "RM1", "Needs the role inject; drive has the role drive"),
+                (Role.DRIVE, "RM2", ""), (Role.INJECT, "RM1", "")):
+            headers = {"Authorization": f"Bearer {tokens[role]}"}
+            async with open_page(at, additional_headers=headers) as page:
+                await hear(page, "operating")
+                await page.send(json.dumps({"type": "reset", "recovery": recovery}))
+                answer = await hear(page, "error" if refusal else "done")
+                assert answer["text"] == (refusal or f"reset of {recovery} requested")
+        await eventually(lambda: [r.recovery for r in world.others.resets] == ["RM2", "RM1"])
 
 
 @pytest.mark.usefixtures("patient")

@@ -1,0 +1,263 @@
+"""How mechanisms clear: by themselves, by an operator, or never."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from rampart.actors.detection.stub import StubDetection
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.recovery.stub import StubRecovery
+from rampart.actors.runtime.actor import Actor, Header, on
+from rampart.manager.actor import FtmManager
+from rampart.manager.analysis.pairs import pairs
+from rampart.manager.analysis.verification import verify
+from rampart.manager.arbitration import arbiter as arbiter_module
+from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
+from rampart.manager.arbitration.arbiter_state import ResetAnswered, ResetAsked
+from rampart.manager.model.mechanisms import Clears
+from rampart.manager.spec.clearing import clearing_in_words, reset_role
+from rampart.manager.spec.specification import parse_specification
+from rampart.manager.spec.tables import SpecificationError
+from rampart.testing import VirtualSystem, run
+from tests.manager.bench import PAPER, Bench, full_system, paper
+from tests.osmosis_system import run_context
+
+
+def clearing(**fields):
+    """The paper's system with other mechanisms: `FTM2=dict(clears=Clears.NEVER)`."""
+    return replace(paper(), mechanisms=tuple(
+        replace(m, **fields.get(m.name, {})) for m in paper().mechanisms))
+
+
+def bench(**fields) -> Bench:
+    return Bench(clearing(FTM2=fields))
+
+
+STOPPED = "DM2 osmosis_control > +RM2; RM2 done; -DM2; wait 1.0"
+
+
+def test_by_operator_it_stays_until_it_is_reset():
+    run = bench(clears=Clears.BY_OPERATOR)
+    run.play("DM2 > +RM2; RM2 done; latched: RM2; refused RM2")
+    run.play("-DM2; wait 20 = RM2; active: FTM2; latched: RM2")
+    run.play("reset RM2; wait 0.1 =; active:; latched:")
+    run.play("refused RM2")  # the same reset a second time finds nothing
+
+
+def test_a_refused_reset_names_the_cause():
+    run = bench(clears=Clears.BY_OPERATOR)
+    run.play("DM2; RM2 done")
+    assert run.reset("RM2").reason == "the cause persists: FTM2 active"
+    run = bench(clears=Clears.BY_OPERATOR)
+    run.play("DM2; DM3; RM2 done; -DM2; wait 1.0")
+    assert run.reset("RM2").reason == "the cause persists: FTM3 active"
+
+
+def test_it_clears_after_the_time_without_its_error():
+    run = bench(clears=Clears.BY_OPERATOR, clear_after_s=5.0)
+    run.play(f"{STOPPED}; wait 3; refused RM2")
+    assert run.reset("RM2").reason == "FTM2 clears when its error has been gone for 5 s"
+    run.play("DM2; -DM2; wait 4.5; refused RM2; wait 10; reset RM2; wait 0.1 =")
+
+
+def test_by_itself_it_clears_after_the_time_without_its_error():
+    run = bench(clear_after_s=5.0)
+    run.play(f"{STOPPED}; wait 3 = RM2; latched:; refused RM2; wait 3 =; active:")
+
+
+def test_never_is_not_reset():
+    run = bench(clears=Clears.NEVER)
+    run.play(f"{STOPPED}; wait 60; refused RM2 = RM2")
+    assert run.reset("RM2").reason == "FTM2 never clears; only a new run ends it"
+
+
+def test_a_mechanism_whose_recovery_a_safer_one_replaces_is_not_cleared_by_that_one_s_reset():
+    run = bench(clears=Clears.BY_OPERATOR)
+    run.play("DM2 > +RM2; RM2 done; DM1; RM1 done; -DM2; -DM1; wait 1.0; latched: RM1 RM2")
+    run.play("reset RM1; RM1 idle; wait 0.1 = RM2; active: FTM2")
+    run.play("RM2 done; reset RM2; wait 0.1 =")
+
+
+def test_it_is_remembered_although_its_recovery_never_ran():
+    """A safer recovery was in force already, and ends first."""
+    run = Bench(clearing(FTM1={"clears": None}, FTM4={"clears": Clears.BY_OPERATOR}))
+    run.play("DM1 > +RM1; RM1 done; DM4; -DM4; wait 1.0; -DM1; wait 1.0; reset RM1; wait 0.1")
+    run.play("active: FTM4; latched: RM3; reset RM3; active:")
+
+
+def test_a_reset_that_is_older_than_the_latch_has_no_effect():
+    run = bench(clears=Clears.BY_OPERATOR)
+    asked_s = run.now
+    run.play(f"wait 1.0; {STOPPED}")
+    answer = next(o for o in run.send(ResetAsked("RM2", "late", asked_s))
+                  if isinstance(o, ResetAnswered))
+    assert (answer.granted, answer.reason) == (False, "the reset is older than the latch")
+    run.play("latched: RM2")
+    assert not run.send(ResetAsked("RM2", "now", run.now))[0].activate
+
+
+def test_a_late_reset_does_not_release_an_emergency_stop():
+    run = Bench()
+    run.play("wait 1.0; DM1; RM1 done; -DM1; wait 1.0")
+    run.send(ResetAsked("RM1", "late", 0.5))
+    run.play("latched: RM1")
+
+
+@pytest.mark.parametrize("fields", [
+    {"clears": Clears.BY_OPERATOR, "clear_after_s": 5.0}, {"clears": Clears.NEVER},
+    {"clear_after_s": 5.0}], ids=["by operator", "never", "by itself"])
+def test_a_manager_that_is_started_again_knows_what_has_not_cleared(fields):
+    run = bench(**fields)
+    run.play(STOPPED)
+    memory = msgspec.json.decode(msgspec.json.encode(remember(run.state, run.arbiter)), type=Memory)
+    assert objection(memory) == ""
+    later = bench(**fields)
+    later.now = run.now
+    later.state = recall(later.arbiter, memory, run.now, 10_000)
+    later.play("wait 0.1 = RM2; active: FTM2")  # though RM2 died too, and the error is gone
+    for rm in ("RM1", "RM2", "RM3", "RM4", "RM5"):
+        later.play(f"{rm} {'done' if rm == 'RM2' else 'idle'}")
+    later.play("wait 2 = RM2; refused RM2; wait 3")
+    later.play("wait 0.1 =" if "clears" not in fields else "refused RM2 = RM2" if len(fields) == 1
+               else "reset RM2; wait 0.1 =")
+
+
+def test_a_memory_with_an_impossible_time_is_refused():
+    assert objection(Memory(1, held=(("FTM2", math.nan, 0.0),))) == \
+        "FTM2 is held since nan s, seen at 0.0 s"
+
+
+def written(fields: str, name: str = "FTM2") -> str:
+    head, _, rest = PAPER.partition(f'name = "{name}"\n')
+    text = f'{head}name = "{name}"\n{fields}\n{rest}'
+    return text.replace("checkpoints = false", "checkpoints = true")
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    (written('clears = "sometimes"'), "clears = 'sometimes'"),
+    (written('clears = "by itself"', "FTM1"), "RM1 is latched; expected 'by operator' or 'never'"),
+    (written('cleared_by = "inject"'), "expected only if it clears by operator"),
+    (written('cleared_by = "look"'), "expected 'drive' or 'inject'"),
+    (written('clears = "never"\nclear_after_s = 3'), "expected only if it clears"),
+    (written("clear_after_s = -1"), "expected a number, 0 or more"),
+    (written('clears = "never"').replace("checkpoints = true", "checkpoints = false"),
+     "expected checkpoints = true in [layers]"),
+])
+def test_contradictions_are_refused_at_load(text, words):
+    with pytest.raises(SpecificationError) as refused:
+        parse_specification(text, "paper.toml")
+    assert words in str(refused.value)
+
+
+def test_words_about_clearing():
+    words = clearing_in_words(parse_specification(written(
+        'clears = "by operator"\ncleared_by = "inject"\nclear_after_s = 5'), "paper.toml"))
+    assert words["FTM2"] == "clears by operator (role inject) once its error is gone for 5 s"
+    assert words["FTM1"] == words["RM1"] == "clears by operator (role drive) once its error is gone"
+    assert words["FTM4"] == "clears by itself once its error is gone"
+    assert clearing_in_words(clearing(FTM2={"clears": Clears.NEVER}))["FTM2"] == \
+        "never clears; only a new run ends it"
+
+
+def test_a_recovery_needs_the_highest_role_of_its_mechanisms():
+    spec = clearing(FTM2={"clears": Clears.BY_OPERATOR, "cleared_by": "inject"})
+    assert [reset_role(spec, name) for name in ("RM1", "RM2")] == ["drive", "inject"]
+    assert reset_role(full_system(), "RM1") == "drive"
+
+
+CLEARED = {"FTM1": {"clears": Clears.NEVER}, "FTM2": {"clears": Clears.BY_OPERATOR},
+           "FTM3": {"clears": Clears.NEVER}, "FTM4": {"clears": Clears.BY_OPERATOR}}
+
+
+def property_of(report):
+    return next(p for p in report.properties if p.name == "cleared-as-specified")
+
+
+@pytest.mark.parametrize("strategy", ["guarded-repair", "safety-first"])
+def test_verification_covers_what_clears(strategy):
+    found = property_of(verify(clearing(**CLEARED), [strategy]))
+    assert found.holds
+    assert found.cases > property_of(verify(paper(), [strategy])).cases
+
+
+@pytest.mark.parametrize(("name", "wrong"), [
+    ("_hold", lambda *_: ()),
+    ("_refusal", lambda self, state, event, now: ""),
+])
+def test_verification_finds_an_arbiter_that_clears_too_early(monkeypatch, name, wrong):
+    monkeypatch.setattr(arbiter_module.Arbiter, name, wrong)
+    found = property_of(verify(clearing(**CLEARED), ["guarded-repair"]))
+    assert not found.holds
+    assert found.counterexamples[0][-1].endswith("is cleared")
+
+
+def full_with(name: str, clears: Clears):
+    return replace(full_system(), mechanisms=tuple(
+        replace(m, clears=clears) if m.name == name else m for m in full_system().mechanisms))
+
+
+def test_the_table_of_pairs_shows_what_has_not_cleared():
+    pair = next(p for p in pairs(full_with("FTM13", Clears.BY_OPERATOR))
+                if (p.first, p.second) == ("FTM2", "FTM13"))
+    assert (pair.both, pair.first_clears, pair.second_clears, pair.both_clear) == (
+        ("RM3", "RM8"), ("RM8",), ("RM3", "RM8"), ("RM8",))
+
+
+class Observer(Actor):
+    """Triggers stand-ins, resets, and keeps the last status of the manager."""
+
+    outputs = (ftm_topics.STUB_TRIGGER, ftm_topics.RESET)
+    status: fm.ManagerStatus | None = None
+
+    @on(ftm_topics.MANAGER_STATUS)
+    def see(self, message: fm.ManagerStatus, _header: Header) -> None:
+        self.status = message
+
+    def detect(self, name: str, *, active: bool) -> None:
+        self.publish(ftm_topics.STUB_TRIGGER, fm.StubTrigger(name, active, "played"))
+
+
+@pytest.mark.parametrize("clears", [Clears.BY_OPERATOR, Clears.NEVER])
+def test_a_manager_that_dies_with_all_recovery_modules_has_not_cleared(clears):
+    """Nothing but its checkpoint knows that RM8 has to stay in force."""
+    spec = full_with("FTM13", clears)
+    modules = ("ftm_manager", *(r.name for r in spec.recoveries))
+
+    def start(system: VirtualSystem) -> None:
+        for name in modules:
+            if name == "ftm_manager":
+                system.start(name, FtmManager)
+            else:
+                system.start(name, StubRecovery, takes_s=0.02, ends="done")
+
+    async def scenario() -> None:
+        async with VirtualSystem(run_context(system=spec), keeps_checkpoints=True) as system:
+            observer = system.start("observer", Observer)
+            start(system)
+            for detection in spec.detections:
+                system.start(detection.name, StubDetection)
+            await asyncio.sleep(0.5)
+            for detection in spec.detections:
+                observer.detect(detection.name, active=detection.name == "DM13")
+            await asyncio.sleep(1.0)
+            observer.detect("DM13", active=False)
+            await asyncio.sleep(1.0)
+            for name in modules:
+                await system.kill(name)
+            start(system)
+            await asyncio.sleep(2.0)
+            status = observer.status
+            assert (status.active, status.activated, status.latched) == (
+                ("FTM13",), ("RM8",), ("RM8",))
+            observer.publish(ftm_topics.RESET, fm.Reset("RM8", "operator"))
+            await asyncio.sleep(1.0)
+            assert observer.status.activated == (
+                () if clears is Clears.BY_OPERATOR else ("RM8",))
+
+    run(scenario)
