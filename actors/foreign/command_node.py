@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -23,7 +22,13 @@ from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.zenoh_session import endpoints
 from rampart.actors.foreign.channel import Channel
 from rampart.actors.foreign.output_log import OutputLog
-from rampart.actors.foreign.program import find_program, folder_of, log_folder, make_log_folder
+from rampart.actors.foreign.program import (
+    find_program,
+    folder_of,
+    inherited_environment,
+    log_folder,
+    make_log_folder,
+)
 from rampart.actors.foreign.program_process import ProgramProcess
 from rampart.actors.foreign.pulse import NotifySocket, Pulse, extension_s
 from rampart.actors.ftm.messages import ProcessEvent, ProgramEnd
@@ -155,12 +160,7 @@ class CommandNode(Actor):
                 asyncio.get_running_loop().add_reader(self._notify.socket, self._notified)
 
     def _environment(self, channel: int) -> Mapping[str, str]:
-        """Return the variables of this process, of the node, and of the run.
-
-        PYTHONPATH is left out: it leads to this Rampart, and the program may have another virtual
-        environment.
-        """
-        inherited = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        """Return the variables of this process, of the node, and of the run."""
         plan = self.context.run.plan
         own = {"RAMPART_NODE": self.name, "RAMPART_INCARNATION": str(self._incarnation),
                "RAMPART_ORIGIN_S": repr(self.clock.source_time(0.0)),
@@ -176,7 +176,7 @@ class CommandNode(Actor):
             self._notify = NotifySocket(self.name, self._refuse)
             own |= {"NOTIFY_SOCKET": self._notify.name, "WATCHDOG_USEC": str(
                 math.ceil(self._heartbeat.timeout_s / self.clock.rate * 1e6))}
-        return {**inherited, **self.parameters.env, **own}
+        return {**inherited_environment(), **self.parameters.env, **own}
 
     def _ended(self, how: str) -> None:
         self._log.note(f"{self.name} #{self._incarnation} {how}")

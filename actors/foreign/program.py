@@ -47,6 +47,18 @@ def find_program(name: str, folder: Path, path: str | None = None) -> str | None
     return shutil.which(name, path=path)
 
 
+def inherited_environment() -> dict[str, str]:
+    """Return the variables of this process for a program.
+
+    Entries of PYTHONPATH that lead to a Rampart are left out: the program may have another virtual
+    environment. The others may be those of a ROS 2.
+    """
+    found = dict(os.environ)
+    entries = [one for one in found.pop("PYTHONPATH", "").split(os.pathsep)
+               if one and not Path(one, "rampart").is_dir()]
+    return {**found, **({"PYTHONPATH": os.pathsep.join(entries)} if entries else {})}
+
+
 def log_folder(plan: RunPlan) -> Path:
     """Return the folder for the output of commands: beside the report, if there is one."""
     return (Path(plan.error_log).parent if plan.error_log else Path(plan.folder)) / LOGS

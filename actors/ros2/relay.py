@@ -16,7 +16,6 @@ to report the endpoints of all topics, 0 for those of topics with an endpoint of
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib
 import itertools
@@ -134,22 +133,26 @@ class Relay:
         channel.send("ready", os.environ.get("ROS_DISTRO", ""))
 
     def spin(self) -> None:
-        """Run the node until the gateway has closed the socket."""
-        threading.Thread(target=self._read, daemon=True).start()
-        with contextlib.suppress(rclpy.executors.ExternalShutdownException):
-            rclpy.spin(self._node)
+        """Run the node until the gateway has closed the socket; then leave the graph."""
+        reader = threading.Thread(target=self._read, daemon=True)
+        reader.start()
+        executor = rclpy.executors.SingleThreadedExecutor()
+        executor.add_node(self._node)
+        while reader.is_alive():
+            executor.spin_once(LOOK_S)
+        self._node.destroy_node()
+        rclpy.shutdown()
 
     def _read(self) -> None:
         try:
             while frame := self._channel.receive():
                 (word, *header), payload = frame
                 getattr(self, f"_on_{word}")(*header, payload)
+            for waiting in list(self._answers.values()):
+                waiting.put(None)
             for (kind, _), endpoint in self._endpoints.items():
                 if kind == PUBLISHER and hasattr(endpoint, "wait_for_all_acked"):
                     endpoint.wait_for_all_acked(rclpy.duration.Duration(seconds=ACKNOWLEDGED_S))
-            for waiting in list(self._answers.values()):
-                waiting.put(None)
-            rclpy.shutdown()  # ends the other thread
         except BaseException:  # a half of the relay is no use
             traceback.print_exc()
             os._exit(1)
@@ -347,6 +350,7 @@ def main() -> None:
     descriptor, name, namespace, whole = sys.argv[1:]
     rclpy.init(args=[])
     Relay(Channel(int(descriptor)), name, namespace, whole == "1").spin()
+    os._exit(0)  # tearing the interpreter down takes longer than leaving the graph
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ the supervisor restarts both.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import os
 import shutil
@@ -19,13 +18,14 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import count
 from pathlib import Path
 from typing import IO, Any, cast
 
 import msgspec
 
+from rampart.actors.foreign.program import inherited_environment
 from rampart.actors.foreign.pulse import Pulse
 from rampart.actors.ros2.side import (
     NO_ANSWER,
@@ -105,18 +105,16 @@ class RelaySide:
         self._tokens: dict[str, None] | None = None  # of other nodes, in order
         self._in, self._out, self._tail = bytearray(), bytearray(), b""
         self._is_over = False
-        self._is_answered = asyncio.Event()
         self._start(setup_file(setup, distribution), name, namespace, whole=whole)
 
     def _start(self, setup: str, name: str, namespace: str, *, whole: bool) -> None:
         self._socket, theirs = socket.socketpair()
         command = (["bash", "-c", '. "$0" && exec python3 "$@"', setup] if setup else ["python3"])
-        environment = _environment(self._domain, is_sourced=not setup)
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603 the user's own ROS 2
                 [shutil.which("setpriv") or "setpriv", "--pdeathsig", "KILL", *command, str(RELAY),
                  str(theirs.fileno()), name, namespace, str(int(whole))],
-                env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                env=_environment(self._domain), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT, pass_fds=[theirs.fileno()], start_new_session=True)
         self._printed = cast("IO[bytes]", self._process.stdout)
         for file in (self._socket, self._printed):
@@ -187,15 +185,10 @@ class RelaySide:
         self._fail(f"hung: no answer for {self._pulse.limit_s:g} s")
         return False
 
-    async def known(self, types: Iterable[str]) -> list[str]:
-        """Look for types in the environment of the relay; return `problems`."""
+    def look_for(self, types: Iterable[str]) -> None:
+        """Look for types in the environment of the relay; a missing one is one of `problems`."""
         for ros_type in types:
             self._send("declare", "", "", ros_type, "", None)
-        self._is_answered.clear()
-        self._send("ping", next(self._numbers))
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._is_answered.wait(), 10 * HANG_S)
-        return self.problems
 
     def close(self) -> None:
         """See `Side.close`: publish what waits, and leave the graph."""
@@ -301,14 +294,12 @@ class RelaySide:
     # -- from the relay --------------------------------------------------------------------------
 
     def _on_ready(self, distribution: str, _payload: bytes) -> None:
-        self._pulse.beat()
         if distribution not in {"", self._distribution}:
             self.problems.append(f"this ROS 2 is {distribution}, the gateway has "
                                  f"distribution = '{self._distribution}'")
 
     def _on_pong(self, _payload: bytes) -> None:
         self._pulse.beat()
-        self._is_answered.set()
 
     def _on_problem(self, why: str, _payload: bytes) -> None:
         self.problems.append(why)
@@ -383,16 +374,13 @@ def setup_file(setup: str, distribution: str) -> str:
     return usual
 
 
-def _environment(domain: int, *, is_sourced: bool) -> Mapping[str, str]:
+def _environment(domain: int) -> dict[str, str]:
     """Return the environment of the relay: without our own virtual environment."""
-    found = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
-    found.pop("VIRTUAL_ENV", None)
-    if not is_sourced:
-        found.pop("PYTHONPATH", None)  # it leads to this Rampart
+    found = inherited_environment() | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
     if sys.prefix != sys.base_prefix:
-        own = Path(sys.prefix, "bin")
-        found["PATH"] = os.pathsep.join(
-            one for one in found.get("PATH", os.defpath).split(os.pathsep) if Path(one) != own)
+        found.pop("VIRTUAL_ENV", None)
+        found["PATH"] = os.pathsep.join(one for one in found.get("PATH", "").split(os.pathsep)
+                                        if Path(one) != Path(sys.prefix, "bin"))
     return found
 
 

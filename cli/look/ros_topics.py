@@ -301,9 +301,9 @@ async def check(options: argparse.Namespace) -> int:
         if node.actor == GATEWAY:
             try:
                 gateway: Any = load_member(node, spec, spec.name).parameters
+                found += await _checked(node.name, gateway, spec)
             except ValueError as error:
                 raise UsageError(str(error)) from None
-            found += await _checked(node.name, gateway, spec)
     if options.json:
         print_json({"system": spec.name, "findings": found,
                     "well": all(one.well for one in found)})
@@ -322,8 +322,9 @@ async def _checked(name: str, gateway: Gateway.Parameters, spec: SystemSpec) -> 
             found = [Finding(f"{'relay' if relay else 'router'} of {name}", True,
                              ", ".join(connect))]
             if isinstance(there.side, RelaySide):
-                found += [Finding("types", False, why)
-                          for why in await there.side.known(one.type for one in gateway.ros2)]
+                there.side.look_for(one.type for one in gateway.ros2)
+                await asyncio.sleep(_GRAPH_S)
+                found += [Finding("types", False, why) for why in there.side.problems]
             found += [Finding("graph", False, odd) for odd in sorted(there.odd)]
             types = types_of(gateway.distribution, gateway.interfaces)
             found += [Finding(kind, True, note) for kind, note in types.notes.items()]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -23,6 +24,7 @@ from rclpy.action import ActionServer
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from test_msgs.action import Fibonacci
@@ -111,12 +113,19 @@ def wrong():
 
 
 def main():
-    rclpy.init()
+    is_over = threading.Event()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, lambda *_: is_over.set())
     executor = MultiThreadedExecutor(2)
-    for node in {"base": base, "rival": rival, "wrong": wrong}[sys.argv[1]]():
+    nodes = {"base": base, "rival": rival, "wrong": wrong}[sys.argv[1]]()
+    for node in nodes:
         executor.add_node(node)
     say(up=sys.argv[1])
-    executor.spin()
+    while not is_over.is_set():
+        executor.spin_once(0.1)
+    for node in nodes:
+        node.destroy_node()
+    rclpy.shutdown()
 
 
 if __name__ == "__main__":

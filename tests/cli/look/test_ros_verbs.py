@@ -300,6 +300,17 @@ def test_a_system_without_ros_2_is_refused(capsys):
     assert "paper has no [[ros2]]" in capsys.readouterr().err
 
 
+def test_a_type_that_is_not_known_is_refused(capsys, system):
+    port = free_port()
+    path = system(port)
+    with Path(path).open("a") as file:
+        file.write('[[ros2]]\ncall = "/base/go"\ntype = "base_msgs/srv/Go"\n'
+                   'from = "base/go"\nto = "base/gone"\n')
+    with Robot(port):
+        assert main(["ros2", "check", "--system", path]) == 2
+    assert "type 'base_msgs/srv/Go' is not known to jazzy" in capsys.readouterr().err
+
+
 def test_topics_are_listed_shown_and_measured(capsys):
     port = free_port()
     with Robot(port) as robot:
