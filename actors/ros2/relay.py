@@ -139,7 +139,7 @@ class Relay:
         executor = rclpy.executors.SingleThreadedExecutor()
         executor.add_node(self._node)
         while reader.is_alive():
-            executor.spin_once(LOOK_S)
+            executor.spin_once()
         self._node.destroy_node()
         rclpy.shutdown()
 

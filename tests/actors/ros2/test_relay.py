@@ -162,7 +162,7 @@ def test_topics_services_actions_states_and_parameters_over_dds(tmp_path, system
 def test_a_relay_that_is_killed_or_stopped_comes_back_with_its_gateway(
         tmp_path, system, number, line):
     with Peer(PEER, "base") as peer, RealRun(tmp_path, system()) as run:
-        run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
+        run.wait_until(lambda: len(peer.said("heard")) > 40, 30, "no command")
         before, relay = run.pid("gateway"), relay_of(run)
         relay.send_signal(number)
         run.wait_for(line, 10)
