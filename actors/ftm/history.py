@@ -94,7 +94,8 @@ class Debounce:
             at_s: simulated time.
         """
         if isinstance(message, fm.DetectionReport):
-            nodes = (message.nodes or ("",)) if message.state is fm.DetectionState.ACTIVE else ()
+            names = (name.partition("#")[0] for name in message.nodes or ("",))
+            nodes = tuple(names) if message.state is fm.DetectionState.ACTIVE else ()
             before = self._active.get(header.source, ())
             self._active[header.source] = nodes
             for node in nodes:

@@ -41,7 +41,7 @@ def message_of(link: Ros2Link, types: Types) -> type[msgspec.Struct]:
     if link.datum and link.type == "sensor_msgs/msg/NavSatFix":
         ready |= ON_PLANE
     if not ready and not link.fields:
-        return _mirrored(link.type, types)
+        return _mirrored(link.type, types, {})
     if link.type != TF:
         fields = TypeFields(types, link.type)
         plane = Plane(link.datum) if link.datum else None
@@ -91,23 +91,34 @@ def _base(kind: str) -> type | None:
     return {"string": str, "bool": bool}.get(kind, float if kind.startswith("float") else int)
 
 
-def _mirrored(name: str, types: Types) -> type[msgspec.Struct]:
-    """Return a struct with the fields of a type of ROS 2."""
+def _mirrored(name: str, types: Types, made: dict[str, type[msgspec.Struct]]
+              ) -> type[msgspec.Struct]:
+    """Return a struct with the fields of a type of ROS 2.
+
+    Args:
+        name: of the type.
+        types: all types.
+        made: structs of the message so far; a JSON schema needs one class for each name.
+    """
+    if name in made:
+        return made[name]
     fields = []
     for field, what in types.fields(name):
         kind, detail = what
         if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE} and detail[0][1][0] in BULK:
             fields.append((f"{field}{LEN}", Count))
         else:
-            fields.append((field, _type_of(what, types)))
-    return msgspec.defstruct(name.rpartition("/")[2], fields, bases=(Message,), frozen=True)
+            fields.append((field, _type_of(what, types, made)))
+    made[name] = msgspec.defstruct(
+        name.rpartition("/")[2], fields, bases=(Message,), frozen=True)
+    return made[name]
 
 
-def _type_of(what: Any, types: Types) -> Any:
+def _type_of(what: Any, types: Types, made: dict[str, type[msgspec.Struct]]) -> Any:
     kind, detail = what
     if kind == Nodetype.NAME:
-        return _mirrored(detail, types)
+        return _mirrored(detail, types, made)
     if kind == Nodetype.BASE:
         return _BOUNDED[_base(detail[0])]
     inner, _ = detail
-    return _listed(_type_of(inner, types))
+    return _listed(_type_of(inner, types, made))

@@ -56,6 +56,13 @@ def test_a_detection_is_suspected_a_decision_confirms_it_and_time_heals_it():
     assert states(debounce, 60.0) == [("DM7", "pump", "suspected", 1)]
 
 
+def test_the_incarnation_of_a_suspect_makes_no_new_fault():
+    debounce = Debounce()
+    detection(debounce, 1.0, "pump#1")
+    detection(debounce, 2.0, "pump#2")
+    assert states(debounce, 2.0) == [("DM7", "pump", "suspected", 1)]
+
+
 def test_a_detection_that_flaps_is_one_occurrence():
     debounce = Debounce()
     for i in range(10):

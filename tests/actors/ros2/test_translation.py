@@ -12,6 +12,7 @@ import pytest
 
 from rampart.actors.bus.bounds import Floats32
 from rampart.actors.bus.messages import Message
+from rampart.actors.recording.json_schema import plain_schema
 from rampart.actors.ros2.translation.forms import READY, WRITTEN
 from rampart.actors.ros2.translation.mapping import Inward, NotMeantError, Outward
 from rampart.actors.ros2.translation.mirror import message_of, topic_of
@@ -165,6 +166,12 @@ def test_of_transforms_the_one_that_is_meant():
     assert (made, stamp_ns) == (Pose(1.0, 2.0, pytest.approx(0.3)), 5)
     with pytest.raises(NotMeantError):
         heard(TF, Pose, frame="map", child="base_link")(there)
+
+
+def test_a_message_that_has_a_type_twice_has_a_schema_for_recordings():
+    link = Ros2Link(type="nav_msgs/msg/OccupancyGrid", subscribe="/costmap", to="nav/costmap")
+    schema = msgspec.json.decode(plain_schema(message_of(link, JAZZY)))  # header.stamp and info
+    assert schema["properties"]["info"]["properties"]["map_load_time"]["type"] == "object"
 
 
 @pytest.mark.parametrize("kind", sorted(READY))
