@@ -383,6 +383,22 @@ def test_a_killed_black_box_is_back_and_the_incident_goes_on(run, monkeypatch):
     assert Summary(BagReader(run.folder / "sample" / f"{incident.name}.mcap")).messages > 5
 
 
+def test_a_recording_and_a_black_box_run_side_by_side(run, tmp_path):
+    recorder = RecorderProcess(Order(run.port, str(tmp_path / "run.mcap"), run.process.pid))
+    recorder.start()
+    wait_until(lambda: (run.send(), time.sleep(0.05), ring.segments(run.folder / "sample"))[-1],
+               30, "the black box does not begin")
+    run.send(decision(1, 0.1), crash(0.2))
+    recorder.end()
+    run.send()
+    run.box.end()
+    assert recorder.problem() == run.box.problem() == ""
+    assert Summary(BagReader(tmp_path / "run.mcap")).keys[ftm_topics.DECISION.at()] == 1
+    [incident] = kept(run)
+    found = Summary(BagReader(run.folder / "sample" / f"{incident.name}.mcap"))
+    assert found.keys[ftm_topics.DECISION.at()] == 1
+
+
 def test_the_death_of_the_launcher_keeps_the_last_seconds(run):
     wait_until(lambda: (run.send(), time.sleep(0.05), ring.segments(run.folder / "sample"))[-1],
                30, "the black box does not begin")
