@@ -330,28 +330,25 @@ def _black_box(plan: RunPlan, spec: SystemSpec, say: Callable[[str], None]
         checkpoints=plan.checkpoints if spec.layers.checkpoints else ""))
     reported = ""
 
-    def report(problem: str) -> None:
+    def look(problem: Callable[[], str | None]) -> None:
         nonlocal reported
-        if problem and not reported:
-            reported = problem
-            say(f"black box: {problem}")
-
-    def keep_alive() -> None:
         try:
-            report(box.keep_alive())
+            found = problem()
         except OSError as error:
-            report(f"cannot start: {in_words(error)}")
+            found = f"cannot start: {in_words(error)}"
+        if found and not reported:
+            reported = found
+            say(f"black box: {found}")
 
     if not plan.black_box:
         yield lambda: None
         return
-    with contextlib.suppress(OSError):  # keep_alive tries again
-        box.start()
+    look(box.start)
     try:
-        yield keep_alive
+        yield lambda: look(box.keep_alive)
     finally:
         box.end()
-        report(box.problem())
+        look(box.problem)
 
 
 @contextlib.contextmanager

@@ -187,8 +187,10 @@ class BlackBoxWriter:
                 incidents.describe(self._folder, incident)
                 self._written[name] = incident
             if incident.to_s < over_s - self._limits.before_s:  # nothing can extend it any more
+                is_cut = self.is_cut_off and incident.to_s > self._now_s
                 incidents.record(self._folder, msgspec.structs.replace(
-                    incident, to_s=min(incident.to_s, self._now_s)))
+                    incident, to_s=min(incident.to_s, self._now_s),
+                    partial="the run was cut off" if is_cut else ""))
                 del self._open[name], self._written[name]
                 self._tidied_s = -math.inf
         self._history.put(self._debounce.changes(over_s), self._wall())

@@ -192,6 +192,14 @@ def test_after_a_kill_of_everything_the_last_second_is_readable(tmp_path):
     assert len(box.kept) == 1
 
 
+def test_an_incident_that_the_death_of_the_launcher_cuts_off_is_marked(box):
+    box.seconds(0, 30)
+    box.second(30.0, decision(1, 30.5))
+    box.writer.is_cut_off = True
+    box.writer.close()
+    assert [(i.at_s, i.partial) for i, _ in box.kept] == [(30.5, "the run was cut off")]
+
+
 def test_a_run_that_is_cut_off_without_a_fault_leaves_its_last_seconds(tmp_path):
     box = Box(tmp_path, Limits())
     box.seconds(0, 100)

@@ -12,13 +12,16 @@ import pytest
 from rampart.actors.recording import ring
 from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.actors.recording.incidents import incidents_in, state_folder
+from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
 from rampart.cli.main import main
 from rampart.cli.record.incident_verbs import names
+from rampart.cli.run import _black_box
 from rampart.cli.run import main as run_main
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
 from tests.actors.recording.test_black_box import Box, box_pid, crash, decision
+from tests.osmosis_system import shipped_system
 from tests.two_hosts import two_hosts
 
 CELL = ROOT / "tests" / "systems" / "cell.toml"
@@ -171,6 +174,19 @@ def test_virtual_time_and_several_hosts_have_none(capsys, tmp_path):
     assert run_main(["--system", str(spec), "--no-keys", "--black-box", "--report",
                      str(tmp_path)]) == 2
     assert "--black-box: not on several hosts" in capsys.readouterr().err
+
+
+def test_a_black_box_that_cannot_start_is_one_line(monkeypatch):
+    lines = []
+
+    def refused(_self):
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("rampart.actors.recording.process.RecorderProcess.start", refused)
+    plan = RunPlan(black_box="/nowhere")
+    with _black_box(plan, shipped_system(), lines.append) as keep_alive:
+        keep_alive()
+    assert lines == ["black box: cannot start: Resource temporarily unavailable"]
 
 
 @pytest.mark.processes
