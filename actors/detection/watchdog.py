@@ -8,7 +8,9 @@ that only waits for a processor (`rampart.actors.machine.patience`).
 
 Incarnations distinguish the processes of a node. The end of one may be reported when the next one
 works already, and a heartbeat of the old one may arrive after that report; neither counts for the
-new one. Only a heartbeat proves that a node is back.
+new one. Only a heartbeat proves that a node is back. A node that its supervisor calls unstable has
+failed until that supervisor, or its successor, reports otherwise: each of its processes may work
+for a while.
 """
 
 from __future__ import annotations
@@ -42,6 +44,12 @@ class _Watched:
     stamp_s: float = -math.inf
     failed_s: float = -math.inf
     failure: str = ""
+    unstable_by: tuple[str, int] | None = None
+
+    @property
+    def why(self) -> str:
+        """Why the node has failed; "" if it works."""
+        return self.failure or ("unstable, it ends again and again" if self.unstable_by else "")
 
 
 class WatchdogCore:
@@ -64,18 +72,17 @@ class WatchdogCore:
     @property
     def active(self) -> bool:
         """Whether a node has failed."""
-        return any(watched.failure for watched in self._watched.values())
+        return any(watched.why for watched in self._watched.values())
 
     @property
     def nodes(self) -> tuple[str, ...]:
         """The failed nodes."""
-        return tuple(node for node, watched in self._watched.items() if watched.failure)
+        return tuple(node for node, watched in self._watched.items() if watched.why)
 
     @property
     def reason(self) -> str:
         """Failure of each failed node."""
-        return "; ".join(
-            f"{node}: {self._watched[node].failure}" for node in self.nodes)
+        return "; ".join(f"{node}: {self._watched[node].why}" for node in self.nodes)
 
     @property
     def known(self) -> bool:
@@ -101,11 +108,16 @@ class WatchdogCore:
         watched.heard, watched.stamp_s, watched.failure = True, stamp_s, ""
         watched.due_s = now_s + self.timeout_s
 
-    def event(self, node: str, event: str, incarnation: int, stamp_s: float, now_s: float) -> None:
-        """Note an event of a process that the supervisor published at `stamp_s`."""
+    def event(self, node: str, event: str, incarnation: int, stamp_s: float, now_s: float,
+              *, by: tuple[str, int] = ("", 1)) -> None:
+        """Note an event of a process that the supervisor `by` published at `stamp_s`."""
         watched = self._watched.get(node)
         if watched is None or incarnation < watched.incarnation:
             return
+        if event == "unstable":
+            watched.unstable_by = by
+        elif event == "stable" or by != watched.unstable_by:  # a new supervisor starts to count
+            watched.unstable_by = None
         if event in NEW_PROCESSES and incarnation > watched.incarnation:
             first = watched.incarnation == 0
             self._succeed(watched, incarnation)
@@ -170,5 +182,5 @@ class Watchdog(DetectionModule):
     def process_event(self, message: ProcessEvent, header: Header) -> None:
         """Note an event that a supervisor has published."""
         self.monitor.event(message.node, message.event, message.incarnation, header.stamp,
-                           self.clock.now())
+                           self.clock.now(), by=(header.source, header.incarnation))
         self.follow()

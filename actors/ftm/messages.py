@@ -198,9 +198,9 @@ class NodeInfo(Message, frozen=True, omit_defaults=True):
     """One row of the supervisor's table.
 
     `late_s` is the greatest lateness of its loop in the last half or whole second, simulated
-    seconds; left out for none. `host` is where it runs; "" is the first. `failing`: each of its
-    last processes worked for a short time only. `heard_s` is the stamp of its last heartbeat, which
-    carries the numbers of refused payloads and overflows.
+    seconds; left out for none. `host` is where it runs; "" is the first. `failing`: unstable, its
+    processes end again and again. `heard_s` is the stamp of its last heartbeat, which carries the
+    numbers of refused payloads and overflows. `next_attempt_s`: when its next start is due.
     """
 
     name: Name
@@ -215,6 +215,7 @@ class NodeInfo(Message, frozen=True, omit_defaults=True):
     heard_s: Seconds = 0.0
     rejected_payloads: Count = 0
     overflowed: Count = 0
+    next_attempt_s: Seconds = 0.0
 
 
 class NodeTable(Message, frozen=True):
@@ -267,7 +268,8 @@ class SignalOrder(Message, frozen=True):
 class ProcessEvent(Message, frozen=True):
     """Something happened to a process: crashed, stopped, wedged, respawned, refused, given up.
 
-    And *signalled*, `by` the id of the order.
+    And *signalled*, `by` the id of the order; *unstable* after each end while its processes end
+    again and again, and then *stable*.
     """
 
     node: Name
@@ -302,7 +304,7 @@ NEW_PROCESSES = ("started", "respawned")
 """Events of a process that exists and has not worked yet."""
 
 _ROUTINE = ("started", "running")
-_GOOD_NEWS = ("respawned", "resumed", "adopted", "back")
+_GOOD_NEWS = ("stable", "respawned", "resumed", "adopted", "back")
 
 _Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]
 

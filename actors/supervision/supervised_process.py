@@ -4,12 +4,13 @@
 `rampart.actors.supervision.supervisor` carries out the actions.
 
 Restarts follow OTP's restart intensity, with backoff, by the numbers of `[supervision]` in the
-system spec. Up to half of `intensity` restarts within `period_s` happen at once. Each further one
-waits longer, doubling from `backoff_s`. After `intensity` restarts the policy gives up. The process
-may work again later, when a disk has room or a device is plugged in. So single attempts follow, at
-growing intervals. If one of them lasts for a whole period, the process counts as healthy again.
-Until then its silence has its usual effect: a silent detection module counts as active, a silent
-manager stops the Safety Pilot, and a silent Safety Pilot trips the dead man.
+system spec, or of the node's `restart`. Up to half of `intensity` restarts within `period_s` happen
+at once. Each further one waits longer, doubling from `backoff_s`. After `intensity` restarts the
+policy gives up. The process may work again later, when a disk has room or a device is plugged in.
+So single attempts follow, at growing intervals. If one of them lasts for a whole period, the
+process counts as healthy again. Until then its silence has its usual effect: a silent detection
+module counts as active, a silent manager stops the Safety Pilot, and a silent Safety Pilot trips
+the dead man.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rampart.actors.bus.run_folder import restarts_of
 from rampart.actors.ftm.messages import NodeInfo, NodeState
@@ -192,13 +193,20 @@ FAILING = ((3, 1.0), (20, 10.0))
 wall seconds: that is neither an accident nor a single fault."""
 
 
+WELL_PERIODS = 10
+"""A process that works for this number of periods is well: what was before does not count."""
+
+
 class Lives:
     """How long the last processes of a node worked. Pure; times are seconds of the caller's clock.
 
-    A process works from its first heartbeat on.
+    A process works from its first heartbeat on. A node whose processes die more slowly than restart
+    intensity notices fails too: after `intensity` restarts since a process was last well.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, limits: Supervision = _USUAL) -> None:
+        self._intensity, self._well_s = limits.intensity, WELL_PERIODS * limits.period_s
+        self._slow_deaths = 0
         self._began_s: float | None = None
         self._worked_s: deque[float] = deque(maxlen=max(count for count, _ in FAILING))
 
@@ -211,15 +219,23 @@ class Lives:
         if self._began_s == math.inf:
             self._began_s = now_s
 
-    def ended(self, now_s: float) -> None:
-        """Note the end of the process; a repetition has no effect."""
-        if self._began_s is not None:
-            self._worked_s.append(max(0.0, now_s - self._began_s))
-            self._began_s = None
+    def ended(self, now_s: float) -> bool:
+        """Note the end of the process; return False for a repetition, which has no effect."""
+        if self._began_s is None:
+            return False
+        worked_s, self._began_s = max(0.0, now_s - self._began_s), None
+        self._worked_s.append(worked_s)
+        if worked_s >= self._well_s:
+            self._slow_deaths = 0
+        elif worked_s >= FAILING[-1][1]:
+            self._slow_deaths += 1
+        return True
 
     def failing(self, now_s: float) -> bool:
         """Whether the last processes, and the present one so far, worked for too short a time."""
         present_s = 0.0 if self._began_s is None else now_s - self._began_s
+        if self._slow_deaths >= self._intensity and present_s < self._well_s:
+            return True
         worked_s = [*self._worked_s, present_s]
         return any(len(worked_s) > count and max(worked_s[-count - 1:]) < least_s
                    for count, least_s in FAILING)
@@ -242,7 +258,9 @@ class SupervisedProcess:
         requested_by: The module that requested the process, until its first heartbeat.
         is_requested: Whether a request to the root has no answer yet.
         stays: Whether the process lives and is to restart its program, which has ended.
+        unstable: Whether it is published as failing.
         delay_s: The wait before the restart that was granted last.
+        due_s: When that restart is due, simulated seconds; 0 for at once.
         heard_s: When the last heartbeat of each node, and the last status of the manager, came.
         handle: The hold on the present process.
         next_step: The timer of a restart under way; there is never more than one.
@@ -259,7 +277,9 @@ class SupervisedProcess:
     requested_by: str = ""
     is_requested: bool = False
     stays: bool = False
+    unstable: bool = False
     delay_s: float = 0.0
+    due_s: float = 0.0
     started_s: float = 0.0
     heard_s: dict[str, float] = field(default_factory=dict)
     lives: Lives = field(default_factory=Lives)
@@ -333,9 +353,11 @@ class SupervisedProcess:
     def rows(self, late_s: Callable[[str], float], now_s: float) -> Iterator[NodeInfo]:
         """Return the rows of its nodes in the node table; `late_s` returns a node's lateness."""
         failing = self.lives.failing(now_s)
+        due: dict[str, Any] = (
+            {"next_attempt_s": self.due_s} if self.waits and self.due_s else {})
         for node in self.unit.nodes:
             yield NodeInfo(node.name, node.kind.value, self.pid, self.shown, self.incarnation,
-                           restarts_of(self.incarnation), late_s(node.name), failing=failing)
+                           restarts_of(self.incarnation), late_s(node.name), failing=failing, **due)
 
     def is_late(self, now_s: float, timeout_s: float) -> bool:
         """Whether a heartbeat is overdue."""

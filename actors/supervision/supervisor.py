@@ -52,6 +52,7 @@ from rampart.actors.supervision.supervised_process import (
     STATUS,
     Action,
     Event,
+    Lives,
     RestartPolicy,
     State,
     SupervisedProcess,
@@ -115,9 +116,10 @@ class Supervisor(Actor):
     def _held(self, unit: Unit) -> SupervisedProcess:
         known = self.context.run.known_incarnations
         highest = max((known.get(node.name, 0) for node in unit.nodes), default=0)
-        return SupervisedProcess(unit, RestartPolicy(self._spec.supervision),
-                           Patience(2 * _CHECK_S / self._plan.rate),
-                           incarnation=highest, highest=highest)
+        limits = unit.nodes[0].restart.within(self._spec.supervision)
+        return SupervisedProcess(
+            unit, RestartPolicy(limits), Patience(2 * _CHECK_S / self._plan.rate),
+            incarnation=highest, highest=highest, lives=Lives(limits))
 
     def _process_of(self, node: str) -> SupervisedProcess | None:
         return self._processes.get(
@@ -247,7 +249,7 @@ class Supervisor(Actor):
             process.unit = self._layout.units[unit]
             if process.step(Event.ADAPTED):  # it was given up, and may work now
                 process.forget_step()
-                process.policy = RestartPolicy(self._spec.supervision)
+                process.policy = RestartPolicy(process.policy.limits)
             self._report(process, "adapted", self.name, message.change)
             self._restart(process, self.name)
 
@@ -325,7 +327,11 @@ class Supervisor(Actor):
 
     @every(0.5)
     def repeat(self) -> None:
-        """Repeat the node table for late subscribers."""
+        """Repeat the node table for late subscribers, and report what is stable again."""
+        for process in self._processes.values():
+            if process.unstable and not process.lives.failing(self._loop.time()):
+                process.unstable = False
+                self._report(process, "stable", self.name)
         self.publish_table()
         self._lateness.turn()
 
@@ -356,8 +362,11 @@ class Supervisor(Actor):
         step, by = process.step(event), by or self.name
         if step is None:
             return
-        if process.waits or process.state is State.CRASHED:
-            process.lives.ended(self._loop.time())
+        now_s = self._loop.time()
+        died = (process.waits or process.state is State.CRASHED) and process.lives.ended(now_s)
+        if died and process.lives.failing(now_s):
+            process.unstable = True
+            self._report(process, "unstable", self.name, "its processes end again and again")
         for action in step.actions:
             if process.state is not step.state:  # the last action has changed it again
                 return
@@ -374,12 +383,16 @@ class Supervisor(Actor):
                     self._fork(process, by)
                 case Action.FORK_WHEN_GONE:  # attempts after giving up are the supervisor's
                     by = self.name if process.state is State.GIVEN_UP else by
+                    process.due_s = process.delay_s and (
+                        self.clock.now() + process.delay_s * self.clock.rate)
                     self._fork_when_gone(process, by, process.delay_s)
                 case Action.HOLD:
                     self._hold(process, process.pid)
 
     def _recover(self, process: SupervisedProcess) -> None:
-        if self._owns(process) or process.policy.attempts or process.requested_by:
+        # The recovery module of an unstable process has failed, and is not commanded any more.
+        if (self._owns(process) or process.policy.attempts or process.requested_by
+                or process.unstable):
             self._restart(process, process.requested_by or self.name)
 
     def _restart(self, process: SupervisedProcess, by: str) -> None:

@@ -151,7 +151,8 @@ def _decisions(frame: Frame, count: int) -> list[Text]:
 def _row(node: fm.NodeInfo) -> dict[str, Any]:
     """Return the shown fields of a node."""
     row = msgspec.structs.asdict(node)
-    for counted in ("heard_s", "rejected_payloads", "overflowed"):  # in the metrics
+    # These are in the metrics and the status.
+    for counted in ("heard_s", "rejected_payloads", "overflowed", "next_attempt_s"):
         del row[counted]
     return row
 

@@ -89,8 +89,9 @@ print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"
     if options.json:
         print_json(table.nodes)
     else:
-        fields = [name for name in fm.NodeInfo.__struct_fields__ if name not in {"host", "failing"}
-                  or any(getattr(node, name) for node in table.nodes)]
+        rare = {"host", "failing", "next_attempt_s"}
+        fields = [name for name in fm.NodeInfo.__struct_fields__
+                  if name not in rare or any(getattr(node, name) for node in table.nodes)]
         print_table(fields, [[round(value, 2) if isinstance(value, float) else value
                               for value in (getattr(node, name) for name in fields)]
                              for node in table.nodes])
@@ -216,7 +217,7 @@ async def status(options: argparse.Namespace) -> int:
             f"{left['not_after'][:16].replace('T', ' ')} UTC")
     if run.recording:
         say(f"recording {run.recording_in_words}")
-    say(f"nodes     {_nodes(nodes)}")
+    say(f"nodes     {_nodes(nodes, time_s, run.rate)}")
     return 0
 
 
@@ -258,11 +259,14 @@ def _in_ros2(graph: RosGraphReport | None) -> str:
             f"{graph.refused} messages refused{problems}")
 
 
-def _nodes(table: fm.NodeTable | None) -> str:
+def _nodes(table: fm.NodeTable | None, time_s: float, rate: float) -> str:
     if table is None:
         return "silent (supervisor)"
-    bad = [f"{n.name} {n.state.value}" for n in table.nodes if n.state is not fm.NodeState.RUNNING]
+    bad = [f"{n.name} {n.state.value}" + (
+        f" (next attempt in {max(0.0, n.next_attempt_s - time_s) / rate:.0f} s)"
+        if n.next_attempt_s else "")
+        for n in table.nodes if n.state is not fm.NodeState.RUNNING]
     restarts = sum(n.restarts for n in table.nodes)
     text = f"{len(table.nodes) - len(bad)} of {len(table.nodes)} running, {restarts} restarts"
-    bad += [f"{n.name} fails again and again" for n in table.nodes if n.failing]
+    bad += [f"{n.name} is unstable" for n in table.nodes if n.failing]
     return f"{text}; {', '.join(bad)}" if bad else text

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from rampart.manager.spec.tables import Finding, Name, OptionalName, Positive, Table
+from rampart.manager.spec.tables import Finding, Name, OptionalName, Positive, Supervision, Table
 
 _A_CLASS = "'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
 ClassPath = Annotated[str, msgspec.Meta(
@@ -68,6 +68,31 @@ class ChildLimits(Table, frozen=True):
     file_mb: Positive | None = None
 
 
+class RestartLimits(Table, frozen=True):
+    """Limits of the restarts of one node, in place of those in `[supervision]`; real seconds.
+
+    Attributes:
+        intensity: Restarts within `period_s`; at one more it is given up.
+        period_s: The window in which restarts are counted.
+        backoff_s: Wait before a restart once half of `intensity` is used up; doubles each time.
+        at_most_s: Longest wait, also of single attempts after it was given up.
+    """
+
+    intensity: Annotated[int, msgspec.Meta(ge=1, le=10_000)] | None = None
+    period_s: Positive | None = None
+    backoff_s: Positive | None = None
+    at_most_s: Positive | None = None
+
+    def within(self, general: Supervision) -> Supervision:
+        """Return the limits of `[supervision]` with these in their place."""
+        given = {field: value for field in ("intensity", "period_s", "backoff_s")
+                 if (value := getattr(self, field)) is not None}
+        if (most_s := self.at_most_s) is not None:
+            given |= {"backoff_max_s": most_s, "attempt_max_s": most_s,
+                      "attempt_s": min(most_s, general.attempt_s)}
+        return msgspec.structs.replace(general, **given)
+
+
 _KEY = re.compile(r"([^\s/*$?#]+(/[^\s/*$?#]+)*)?")
 
 RESERVED_VARIABLES = ("RAMPART_", "NOTIFY_SOCKET", "WATCHDOG_")
@@ -84,6 +109,7 @@ class NodeSpec(Table, frozen=True):
         process: Name of its OS process; "" for the name of the node.
         host: Name of the host on which it runs; "" for the first.
         respawn: What restarts it: a recovery module, or "supervisor".
+        restart: Limits of its restarts; those of the first node of a process count for all.
         spare: Source of its next process. "pool": a process of the pool. "none": a new process.
             "" means "none" for the world, else "pool", as do "warm", "own" and "hot".
         parameters: Of the actor, or of the command's stand-in. If a key ends in `_s`, its value
@@ -105,6 +131,7 @@ class NodeSpec(Table, frozen=True):
     process: OptionalName = ""
     host: OptionalName = ""
     respawn: Name = "supervisor"
+    restart: RestartLimits = RestartLimits()
     spare: Literal["", "none", "pool", "warm", "own", "hot"] = ""
     parameters: dict[str, Any] = {}
     command: tuple[str, ...] = ()

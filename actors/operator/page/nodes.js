@@ -41,7 +41,8 @@ export class ProcessTable {
       row.dot.className = `dot ${node.failing ? "bad" : STATES[node.state] || ""}`;
       row.line.classList.toggle("troubled", node.state !== "running" || Boolean(node.failing));
       row.line.title = `${node.kind}, incarnation ${node.incarnation}`;
-      say(row.state, node.failing ? "failing" : node.state);
+      const next = node.next_attempt_s ? ` until ${node.next_attempt_s.toFixed(0)} s` : "";
+      say(row.state, (node.failing ? "unstable" : node.state) + next);
       say(row.pid, node.pid ? String(node.pid) : "–");
       say(row.restarts, String(node.restarts));
       say(row.age, age(used?.age_s));

@@ -54,6 +54,21 @@ def test_with_a_low_battery_the_goal_is_cancelled_and_the_robot_stands_still():
     assert [d.recoveries for d in done.record.decisions] == [("R_CANCEL",)]
 
 
+@pytest.mark.parametrize("limits", ["", "restart = { intensity = 2, period_s = 5.0 }\n"])
+def test_a_node_that_ends_again_and_again_is_unstable_and_the_robot_is_stopped(
+        tmp_path, monkeypatch, limits):
+    """Each of its processes works for a while, so the crash itself is over at once each time."""
+    monkeypatch.syspath_prepend(SYSTEM.parent)
+    head = 'name = "controller_server"\n'
+    (tmp_path / "warehouse.toml").write_text(
+        SYSTEM.read_text(encoding="utf-8").replace(head, head + limits, 1))
+    done = virtual_run(tmp_path / "warehouse.toml", "kill:controller_server@11.5",
+                       "kill:controller_server@23", seconds=30.0)
+    assert done.judgement.safe is True
+    assert done.record.restarts == {"controller_server": 2}
+    assert any("R_STOP" in decision.recoveries for decision in done.record.decisions) is bool(limits)
+
+
 def test_without_the_mechanisms_a_jump_of_the_localization_does_harm():
     assert virtual_run(SYSTEM, "localization-jump@3+inf", seconds=60.0, ftm=False,
                        ).judgement.success is False

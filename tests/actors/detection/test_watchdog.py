@@ -16,7 +16,7 @@ from tests.osmosis_system import System
 
 # One node. b heartbeat of the first process, B of the second, g one sent before the last event;
 # what the supervisor publishes: p the first is started, x it has crashed, s it is stopped, w it
-# hangs; P and X of the second.
+# hangs, u it is unstable; P, X and U of the second; S it is stable, N a new supervisor adopts it.
 TIMELINES = {
     "it lives": ("pbbbbbbb", "--------"),
     "it hangs, and goes on": ("pbb....bb", "-----AA--"),
@@ -37,11 +37,15 @@ TIMELINES = {
     "it is stopped, and goes on": ("pbbs.b", "---AA-"),
     "it hangs, and goes on sooner than its own timeout": ("pbwb", "--A-"),
     "it hangs and is replaced": ("pbw.PB", "--AAA-"),
+    "unstable: a new process does not clear it": ("pbbxuPBBBB", "---AAAAAAA"),
+    "unstable, until it is stable": ("pbbxuPBBSBB", "---AAAAA---"),
+    "unstable, and the supervisor is replaced": ("pbbxuPBBNBB", "---AAAAA---"),
+    "unstable by the new supervisor, too": ("pbbxuPBBNUB", "---AAAAA-AA"),
     "a heartbeat of the old life after the new one's": ("pbxPB.b..", "--AA---AA"),
 }
 
 
-EVENTS = {"p": "respawned", "x": "crashed", "s": "stopped", "w": "wedged"}
+EVENTS = {"p": "respawned", "x": "crashed", "s": "stopped", "w": "wedged", "u": "unstable"}
 
 
 def watch(core: WatchdogCore):
@@ -53,6 +57,10 @@ def watch(core: WatchdogCore):
                 core.beat("node", 1 if event == "b" else 2, now_s, now_s)
             case "g":
                 core.beat("node", 1, last["change"] - 0.001, now_s)
+            case "S":
+                core.event("node", "stable", 2, now_s, now_s)
+            case "N" | "n":  # a new supervisor adopts the process
+                core.event("node", "adopted", 2, now_s, now_s, by=("supervisor", 2))
             case _:
                 last["change"] = now_s
                 core.event("node", EVENTS[event.lower()], 1 if event.islower() else 2, now_s, now_s)

@@ -14,6 +14,7 @@ from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.runtime.run_plan import load_document
 from rampart.actors.supervision.supervised_process import Lives, RestartPolicy
 from rampart.manager.spec.adaptation import Action, Change, adapt
+from rampart.manager.spec.nodes import RestartLimits
 from rampart.manager.spec.tables import Supervision
 from rampart.sim.campaign.job import Job, run_virtually
 from rampart.sim.faults.scenario import parse_fault
@@ -122,6 +123,80 @@ def test_a_node_is_failing_whose_last_processes_worked_for_a_short_time_only(
     one.forked()
     one.worked(now_s)
     assert one.failing(now_s + present_s) == failing
+
+
+# Three restarts within a minute are too many; a process is well after ten minutes.
+@pytest.mark.parametrize(("works", "present_s", "failing"), [
+    ([70.0] * 3, 0.0, True), ([70.0] * 2, 0.0, False), ([70.0] * 3, 599.0, True),
+    ([70.0] * 3, 600.0, False), ([70.0, 70.0, 601.0, 70.0], 0.0, False),
+    ([70.0, 0.5, 70.0, 0.5, 70.0], 2.0, True),  # short lives between count for intensity only
+    ([900.0] * 40, 0.0, False)])  # killed four times an hour
+def test_a_node_that_dies_more_slowly_than_its_window_is_failing_until_it_is_well(
+        works, present_s, failing):
+    one, now_s = Lives(Supervision(intensity=3, period_s=60)), 0.0
+    for worked_s in works:
+        one.forked()
+        one.worked(now_s)
+        now_s += worked_s
+        assert one.ended(now_s)
+        assert not one.ended(now_s)
+    one.forked()
+    one.worked(now_s)
+    assert one.failing(now_s + present_s) == failing
+
+
+def test_a_node_may_have_limits_of_its_own():
+    general = Supervision(intensity=50, attempt_s=10.0, attempt_max_s=60.0)
+    limits = RestartLimits(intensity=3, at_most_s=5.0).within(general)
+    assert (limits.intensity, limits.period_s, limits.backoff_s) == (3, 60.0, 0.05)
+    assert (limits.backoff_max_s, limits.attempt_s, limits.attempt_max_s) == (5.0, 5.0, 5.0)
+    assert RestartLimits().within(general) == general
+
+
+@within(partial(played, Supervision(intensity=3, period_s=20.0)))
+async def test_an_unstable_node_is_reported_at_each_end_and_restarted_without_a_request(world):
+    """No recovery module requests it any more: its own has failed, and a safer one acts."""
+    for incarnation in range(1, 4):
+        await asyncio.sleep(25.0)
+        assert world.failing == set()
+        world.kill("osmosis_control")  # of RM3
+        await asyncio.sleep(0.02)
+        world.respawn("osmosis_control", incarnation)
+        await eventually(lambda: world.row("osmosis_control")[0] == "running", 1)
+    await asyncio.sleep(25.0)
+    assert world.failing == {"osmosis_control"}
+    world.kill("osmosis_control")
+    await asyncio.sleep(1.0)
+    assert world.row("osmosis_control")[:2] == ("running", 5)
+    told = [event for node, event, _ in world.events if node == "osmosis_control"]
+    assert told.count("unstable") == 2
+    await asyncio.sleep(199.0)
+    assert world.failing == {"osmosis_control"}
+    await asyncio.sleep(2.0)
+    assert world.failing == set()
+    assert [event for node, event, _ in world.events if node == "osmosis_control"][-1] == "stable"
+
+
+@within(partial(played, SOON))
+async def test_the_table_shows_when_a_process_is_tried_again(world):
+    def sick(names, incarnation, **how):
+        process = add(names, incarnation, **how)
+        if "DM2" in names:
+            process.bound = False
+            asyncio.get_running_loop().call_later(0.03, world.machine.kill, process)
+        return process
+
+    add, world.machine.add = world.machine.add, sick
+    world.kill("DM2")
+    await eventually(lambda: world.row("DM2")[0] == "given up", 20)
+    await asyncio.sleep(0.6)
+    (row,) = (row for row in world.supervisor.rows() if row.name == "DM2")
+    forks, now_s = len(world.machine.forks), world.clock.now()
+    assert row.next_attempt_s > now_s
+    await asyncio.sleep(row.next_attempt_s - now_s - 0.01)
+    assert len(world.machine.forks) == forks
+    await asyncio.sleep(0.03)
+    assert len(world.machine.forks) == forks + 1
 
 
 @pytest.mark.parametrize("ends", ["dies after 1.3 s", "is never heard", "well"])
