@@ -1,0 +1,133 @@
+"""A lifecycle node in rclpy, over DDS, is killed again and again, and is active again each time.
+
+With `pytest -s` it prints the times from the SIGKILL to `on_activate` of the new process. After 20
+kills in a row the node would be unstable.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import statistics
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from rampart.testing import RealRun
+from tests import ROOT
+from tests.actors.ros2.test_against_ros import ROS
+
+pytestmark = [pytest.mark.ros, pytest.mark.processes, pytest.mark.slow]
+
+KILLS = 10
+PAUSE_S = 1.0
+SYSTEM = """
+name = "filmed"
+title = "A camera with a life cycle"
+
+[[node]]
+name = "camera"
+command = ["{python}", "{program}", "{log}"]
+kind = "control"
+respawn = "R_RESTART"
+
+[[node]]
+name = "gateway"
+actor = "rampart.actors.ros2.gateway:Gateway"
+kind = "non-control"
+parameters = {{ middleware = "rclpy", setup = "{setup}", domain = {domain}, \
+distribution = "kilted" }}
+
+[[node]]
+name = "manager"
+actor = "rampart.manager.actor:FtmManager"
+kind = "manager"
+
+[[ros2]]
+call = "/camera/get_state"
+type = "lifecycle_msgs/srv/GetState"
+from = "camera/ask"
+to = "camera/state"
+
+[[ros2]]
+call = "/camera/change_state"
+type = "lifecycle_msgs/srv/ChangeState"
+from = "camera/change"
+to = "camera/changed"
+
+[[detection]]
+name = "D_CRASH"
+title = "The camera has crashed"
+actor = "rampart.actors.detection.watchdog:Watchdog"
+parameters = {{ watch = ["camera"], timeout_s = "heartbeat_timeout_s" }}
+
+[[recovery]]
+name = "R_RESTART"
+title = "Restart it"
+actor = "rampart.actors.ros2.respawn_lifecycle:RespawnLifecycle"
+kind = "masking"
+deadline_s = 15.0
+
+[recovery.parameters]
+lifecycle = ["camera"]
+ask = ["camera/ask"]
+state = ["camera/state:current_state.id"]
+change = ["camera/change"]
+
+[[mechanism]]
+name = "M_CRASH"
+detect = "D_CRASH"
+recover = "R_RESTART"
+event = "crash"
+against = {{ within_s = 60.0, hazard = "no pictures" }}
+
+[[event]]
+name = "crash"
+
+[orders.safer]
+"""
+
+
+def test_a_lifecycle_node_is_active_again_after_each_kill(tmp_path, monkeypatch):
+    domain = os.getpid() % 100 + 1  # killed nodes stay in a graph for 20 s
+    for name, value in {"ROS_DOMAIN_ID": str(domain), "PYTHONPATH": str(ROOT),
+                        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}.items():
+        monkeypatch.setenv(name, value)
+    log = tmp_path / "transitions"
+    log.touch()
+    path = tmp_path / "filmed.toml"
+    path.write_text(SYSTEM.format(
+        python=ROS / "bin/python", program=Path(__file__).with_name("rclpy_camera.py"), log=log,
+        setup=ROS.resolve() / "bin/activate", domain=domain))
+
+    def active():
+        return [(int(pid), float(at_s)) for pid, state, at_s in map(
+            str.split, log.read_text().splitlines()) if state == "active"]
+
+    with RealRun(tmp_path, path, "--rate", "1") as run:
+        run.wait_until(lambda: run.pid("camera"), 20, "it does not run")
+        program = first_program(run)
+        times_s = []
+        for kill in range(KILLS):
+            killed_s = time.time()
+            os.kill(program, signal.SIGKILL)
+            run.wait_until(lambda kill=kill: len(active()) > kill, 20,
+                           f"kill {kill + 1}: it is not active")
+            assert len(active()) == kill + 1
+            program, at_s = active()[-1]
+            times_s.append(at_s - killed_s)
+            time.sleep(PAUSE_S)
+    times_s.sort()
+    print(f"{len(times_s)} kills: median {statistics.median(times_s):.2f} s, "
+          f"most {times_s[-1]:.2f} s; all: {' '.join(f'{each:.2f}' for each in times_s)}")
+
+
+def first_program(run):
+    def programs():
+        return [p.pid for p in psutil.Process(run.pid("camera")).children(recursive=True)
+                if any("rclpy_camera" in word for word in p.cmdline())]
+
+    run.wait_until(programs, 20, "the program does not run")
+    return programs()[-1]
