@@ -58,6 +58,7 @@ _CLOCK, _CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
 _SETTLE_S = 0.05
 _PROBLEMS = 50
 _LINK_S = 2.0
+"""Without a router for so long after its start, the gateway reports it."""
 
 
 @cache
@@ -330,7 +331,8 @@ class Gateway(Actor):
         if self._side is None:
             return
         is_linked = self._side.is_linked()
-        self._follow_link(is_linked)  # a relay that is lost ends this process
+        if self._relay is None:  # a relay that is lost ends this process
+            self._follow_link(is_linked)
         nodes = self.graph.nodes()
         bypassed = self._bypassed()
         problems = [f"{topic}: {who} publishes besides {self.node.full_name}"

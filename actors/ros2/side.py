@@ -32,6 +32,7 @@ from rampart.actors.ros2.wire import Qos
 Mode = Literal["client", "peer"]
 """Mode of a session of Zenoh that is not a router."""
 
+
 class Tls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """PEM files for TLS with the routers of ROS 2.
 
