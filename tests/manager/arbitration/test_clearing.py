@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import math
 
 import msgspec
@@ -13,7 +14,9 @@ from rampart.actors.detection.stub import StubDetection
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.recovery.stub import StubRecovery
-from rampart.actors.runtime.actor import Actor, Header, on
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.checkpoint_file import FileCheckpoints
+from rampart.actors.supervision.node_process import OF_A_PART
 from rampart.manager.actor import FtmManager
 from rampart.manager.analysis.pairs import pairs
 from rampart.manager.analysis.verification import verify
@@ -261,3 +264,32 @@ def test_a_manager_that_dies_with_all_recovery_modules_has_not_cleared(clears):
                 () if clears is Clears.BY_OPERATOR else ("RM8",))
 
     run(scenario)
+
+
+@pytest.mark.parametrize("clears", [Clears.BY_OPERATOR, Clears.NEVER])
+def test_a_resumed_run_has_not_cleared(tmp_path, clears):
+    """Its nodes have higher incarnations of the same checkpoints; its time is another one."""
+    spec = full_with("FTM13", clears)
+
+    async def part(number: int, errors: tuple[str, ...]) -> fm.ManagerStatus:
+        def manager(context: Context) -> FtmManager:
+            return FtmManager(dataclasses.replace(context, checkpoints=FileCheckpoints(
+                tmp_path, "ftm_manager", "run", number * OF_A_PART + context.incarnation)))
+
+        async with VirtualSystem(run_context(system=spec)) as system:
+            observer = system.start("observer", Observer)
+            system.start("ftm_manager", manager)
+            for detection in spec.detections:
+                system.start(detection.name, StubDetection)
+            for recovery in spec.recoveries:
+                system.start(recovery.name, StubRecovery, takes_s=0.02, ends="done")
+            await asyncio.sleep(0.5)
+            for detection in spec.detections:
+                observer.detect(detection.name, active=detection.name in errors)
+            await asyncio.sleep(2.0)
+            return observer.status
+
+    assert run(lambda: part(0, ())).latched == ()
+    assert run(lambda: part(1, ("DM13",))).latched == ("RM8",)
+    status = run(lambda: part(2, ()))
+    assert (status.active, status.activated, status.latched) == (("FTM13",), ("RM8",), ("RM8",))
