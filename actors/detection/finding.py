@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 
@@ -64,6 +65,47 @@ class Finding:
         """Become idle and accuse no node."""
         self.reason = ""
         self.nodes = ()
+
+
+class Recurrent(Finding):
+    """Active from the `count`-th event within `within_s`, until there was none for `clear_s`.
+
+    Args:
+        count: How many events make it active.
+        within_s: Within how long, simulated seconds.
+        clear_s: How long without an event until it is idle again.
+        known_after_s: When to report idle without any input; -inf for at once.
+
+    Attributes:
+        accused: Nodes to name while it is active; set by the owner.
+    """
+
+    def __init__(self, count: int, within_s: float, clear_s: float,
+                 known_after_s: float = -math.inf) -> None:
+        super().__init__(known_after_s)
+        self._within_s, self._clear_s = within_s, clear_s
+        self._events: deque[float] = deque(maxlen=count)
+        self.accused: tuple[str, ...] = ()
+
+    @property
+    def due_s(self) -> float:
+        """When it is idle again, or the wait for a first input ends."""
+        return self._events[-1] + self._clear_s if self.active else super().due_s
+
+    def happened(self, what: str, now_s: float) -> None:
+        """Note an event, with its description."""
+        self._events.append(now_s)
+        count = self._events.maxlen
+        if len(self._events) == count and now_s - self._events[0] <= self._within_s:
+            self.known, self.nodes = True, self.accused
+            self.reason = what if count == 1 else (
+                f"{count} within {self._within_s:g} s, the last: {what}")
+
+    def expire(self, now_s: float) -> None:
+        """Conclude from the time without an event."""
+        super().expire(now_s)
+        if self.active and now_s >= self.due_s - 1e-9:
+            self.clear()
 
 
 class Sustained(Finding):

@@ -43,6 +43,7 @@ class RosNode:
         self._node = Endpoint(domain, side.id, _NODE_ID, _NODE_ID, EndpointKind.NODE, name,
                               namespace)
         self._ids = count(1)
+        self._published: set[bytes] = set()
         side.token(self._node.token)
 
     @property
@@ -65,6 +66,7 @@ class RosNode:
         """
         mine = self._endpoint(EndpointKind.PUBLISHER, topic, ros_type, qos)
         put, gid, numbers = self._side.publisher(mine.key, qos), mine.gid, count(1)
+        self._published.add(gid)
         self._side.token(mine.token)
 
         def publish(payload: bytes) -> None:
@@ -74,7 +76,10 @@ class RosNode:
 
     def subscribe(self, topic: str, ros_type: str, qos: Qos,
                   handle: Callable[[bytes, Attachment], None]) -> None:
-        """Call `handle` with each message of a topic; one without an attachment is refused.
+        """Call `handle` with each message of a topic that other nodes publish.
+
+        A message without an attachment is refused. Messages of this node are left out, or a
+        detection on `/diagnostics` would be active because of its own report.
 
         Raises:
             ValueError: the type is not known.
@@ -87,7 +92,8 @@ class RosNode:
             except ValueError as error:
                 self._refuse(topic, str(error))
                 return
-            handle(payload, attachment)
+            if attachment.gid not in self._published:
+                handle(payload, attachment)
 
         self._side.subscribe(mine.key, qos, deliver)
         self._side.token(mine.token)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
+from rampart.actors.bus.bounds import clip
 from rampart.actors.ros2.translation.expressions import steps
 from rampart.actors.ros2.translation.types import Types
 
@@ -99,20 +100,24 @@ def near(name: str, known: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return a value of ROS 2 as numbers, texts, lists and dictionaries."""
+    """Return a value of ROS 2 as numbers, texts, lists and dictionaries; long texts are cut."""
+    if isinstance(value, str):
+        return clip(value)
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list):
         return [plain(item) for item in value]
-    names = getattr(value, "__dataclass_fields__", None)
-    if names is None:
+    fields = getattr(value, "__dataclass_fields__", None)
+    if fields is None:
         return value
     found = {}
-    for name in names:
+    for name, field in fields.items():
+        if field.type.startswith("ClassVar"):  # a constant
+            continue
         inner = getattr(value, name)
         if isinstance(inner, np.ndarray) and inner.dtype in _ONE_BYTE:
             found[f"{name}{LEN}"] = len(inner)
-        elif name != "__msgtype__":
+        else:
             found[name] = plain(inner)
     return found
 

@@ -30,7 +30,10 @@ def topic_of(link: Ros2Link, types: Types) -> Topic[Any]:
     Raises:
         ValueError: the type is not known, or a field is wrong; one line.
     """
-    qos = Qos.STATE if link.transient_local else Qos.SENSOR
+    if link.publishers == "any":  # the latest message of one says nothing about the others
+        qos = Qos.COMMAND
+    else:
+        qos = Qos.STATE if link.transient_local else Qos.SENSOR
     return Topic(link.to, message_of(link, types), qos, link.rate_hz or 0.0, link.frame,
                  f"{link.name} of ROS 2, {link.type}.")
 

@@ -93,6 +93,47 @@ class Base(StandIn):
         return super().wall_ns() + self.offset_ns
 
 
+class Reporter(StandIn):
+    """Reports statuses, lines of a log, and goals of an action, as nodes of ROS 2 do."""
+
+    def declare(self) -> None:
+        """Declare its topics."""
+        self.statuses = {"arm": (0, "ok")}
+        self.is_silent = False
+        self._diagnostics = self.publisher("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        self._log = self.publisher("/rosout", "rcl_interfaces/msg/Log")
+        self._goals = self.publisher(f"{GOAL}/_action/status", "action_msgs/msg/GoalStatusArray")
+
+    @every(0.1)
+    def repeat(self) -> None:
+        """Report the statuses."""
+        if not self.is_silent:
+            self.report(self.statuses)
+
+    def report(self, statuses) -> None:
+        """Report statuses: level and message by name."""
+        message = self.types.blank("diagnostic_msgs/msg/DiagnosticArray")
+        for name, (level, text) in statuses.items():
+            status = self.types.blank("diagnostic_msgs/msg/DiagnosticStatus")
+            status.name, status.level, status.message = name, level, text
+            message.status.append(status)
+        self._diagnostics(message)
+
+    def log(self, name, level, text) -> None:
+        """Log a line."""
+        message = self.types.blank("rcl_interfaces/msg/Log")
+        message.name, message.level, message.msg = name, level, text
+        self._log(message)
+
+    def goals(self, states) -> None:
+        """Report the states of goals, in the order of their acceptance."""
+        message = self.types.blank("action_msgs/msg/GoalStatusArray")
+        for number, state in enumerate(states):
+            status = self.types.blank("action_msgs/msg/GoalStatus")
+            status.goal_info.stamp.sec, status.status = number, state
+            message.status_list.append(status)
+        self._goals(message)
+
 
 class Stranger(StandIn):
     """Publishes an odometry that is not the robot's."""
