@@ -20,7 +20,7 @@ from rampart.actors.ros2.translation.mapping import TF, Inward, NotMeantError
 from rampart.actors.ros2.translation.mirror import topic_of
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
-from rampart.actors.ros2.wire import Attachment, Endpoint, EndpointKind, Qos
+from rampart.actors.ros2.wire import Attachment, Endpoint, EndpointKind, Qos, gid_of
 from tests.fuzz.file_targets import folder, recordings, written
 from tests.fuzz.target import target
 
@@ -72,7 +72,7 @@ def ros_token(data: bytes) -> None:
     """A liveliness token: it comes, it is told, and it goes."""
     token, graph = data.decode(errors="replace"), RosGraph()
     found = graph.changed(token, alive=True)
-    if found is None or graph.endpoint(found.gid) is not found:
+    if found is None or graph.endpoint(gid_of(token)) is not found:
         raise AssertionError("came, and is not there")
     list(misfits(graph.of(*EndpointKind), graph.of(*EndpointKind)))
     if graph.changed(token, alive=False) is not found or graph.nodes():

@@ -41,5 +41,5 @@ def test_a_wrong_specification_is_judged_so(tmp_path, right, wrong):
 
 def test_every_property_of_the_arbitration_holds():
     found = verify(parse_specification(TEXT, "failsafe.toml"), ["guarded-repair"])
-    assert len(found.properties) == 11
+    assert len(found.properties) == 12
     assert all(found_one.holds for found_one in found.properties)
