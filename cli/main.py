@@ -55,7 +55,6 @@ Start a fault-tolerant robot controller, inspect it, inject faults, verify decis
 examples:
   rampart run --virtual --seed 7      # a mission in virtual time, in seconds
   rampart run                         # on processes; then, in another shell:
-  rampart top                         # watch processes, topics and decisions
   kill-node localization              # crash a process; it is restarted
 `rampart VERB --help` shows options and examples.
 """

@@ -293,7 +293,8 @@ def test_the_help_of_each_verb_teaches_with_examples(path, parser, capsys):
         assert f"rampart {path[0]} --" in capsys.readouterr().out.partition("examples:")[2]
         return
     text = parser.format_help()
-    new_names = {"trigger": "inject trigger:", "metrics": "live metrics", "table": "decide"}
+    new_names = {"trigger": "inject trigger:", "metrics": "live metrics", "table": "decide",
+                 "incidents": "incident history"}
     assert f"rampart {new_names.get(path[0], path[0])}" in text.partition("examples:")[2]
     assert parser.description
 

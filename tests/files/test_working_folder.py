@@ -60,7 +60,7 @@ def test_a_folder_that_is_gone_is_not_searched(tmp_path, monkeypatch):
 
 TANK = (ROOT / "docs/how-to/ready-modules.md").read_text(encoding="utf-8")
 TANK_ACTORS = TANK.split("```python\n")[1].split("```")[0]
-TANK_TOML = TANK.split("```toml\n")[1].split("```")[0]
+TANK_TOML = "name = " + TANK.split("```toml\nname = ")[1].split("```")[0]
 
 
 @pytest.mark.parametrize(("mode", "code"), [(0o755, 0), (0o757, 2)])

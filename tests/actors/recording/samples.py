@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import threading
@@ -91,5 +92,5 @@ class AnsweringLauncher:
                 connection, _ = self._socket.accept()
             except TimeoutError:
                 continue
-            with connection:
+            with connection, contextlib.suppress(BrokenPipeError):  # the client was killed
                 connection.send(msgspec.json.encode(self.info))

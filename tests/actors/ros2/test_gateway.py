@@ -540,7 +540,7 @@ async def test_a_node_of_ros_2_whose_token_goes_is_detected_and_named(system):
     assert ear.states[-1] == "active"
     report = module._report
     assert report.reason == "/robot/base: not in the graph of ROS 2"
-    assert report.nodes == ("base",)
+    assert report.nodes == ("base#1",)
     system.start_node("base")
     await asyncio.sleep(1.0)
     assert ear.states[-1] == "idle"

@@ -54,6 +54,6 @@ def test_the_help_lists_every_verb_but_old_names_on_one_screen(capsys):
     assert max(map(len, told.splitlines())) < 90
     verbs = build_parser().verbs
     listed = [action.dest for action in verbs._choices_actions]
-    assert set(verbs.choices) - set(listed) == {"table", "trigger", "metrics"}
+    assert set(verbs.choices) - set(listed) == {"table", "trigger", "metrics", "incidents"}
     for verb in listed:
         assert f" {verb} " in told or f"{verb:<10}" in told
