@@ -47,7 +47,7 @@ _GROUPS = {
     "administer": ("keys", "tokens", "service")}
 """Groups of the help. Verbs of other packages come last, under `robots`."""
 
-_HELP = """usage: rampart VERB ...
+_HELP = """usage: rampart VERB ...       (rampart VERB --help: options and examples)
 
 Start a fault-tolerant robot controller, inspect it, inject faults, verify decisions.
 
@@ -56,7 +56,6 @@ examples:
   rampart run --virtual --seed 7      # a mission in virtual time, in seconds
   rampart run                         # on processes; then, in another shell:
   kill-node localization              # crash a process; it is restarted
-`rampart VERB --help` shows options and examples.
 """
 
 
