@@ -19,8 +19,13 @@ COMMAND = ROOT / ".ci/release"
 
 
 @pytest.fixture
-def release(monkeypatch):
-    monkeypatch.chdir(ROOT)
+def release(tmp_path, monkeypatch):
+    """The command, in a folder with the files that it changes; something is to be released."""
+    for name in ("pyproject.toml", "CITATION.cff", "CHANGELOG.md"):
+        (tmp_path / name).write_text((ROOT / name).read_text())
+    changelog = tmp_path / "CHANGELOG.md"
+    changelog.write_text(changelog.read_text().replace("## Unreleased\n", "## Unreleased\n\n- x\n"))
+    monkeypatch.chdir(tmp_path)
     loader = SourceFileLoader("release", str(COMMAND))
     module = module_from_spec(spec_from_loader("release", loader))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -61,3 +66,11 @@ def test_the_licences_of_all_pinned_packages_are_listed():
     listed = {canonicalize_name(row.split("|")[1].strip()) + "==" + row.split("|")[2].strip()
               for row in rows if row.startswith("| ")}
     assert [pin for pin in pins if "==" in pin and pin not in listed] == []
+
+
+def test_nothing_to_release_is_refused(release):
+    text = release.Path("CHANGELOG.md").read_text()
+    head, _, rest = text.partition("## Unreleased\n")
+    release.Path("CHANGELOG.md").write_text(f"{head}## Unreleased\n\n## {rest.partition('## ')[2]}")
+    with pytest.raises(ValueError, match="at least one line"):
+        release.edited("99.0.1", datetime.date(2030, 1, 2))

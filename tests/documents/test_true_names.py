@@ -24,8 +24,8 @@ TO_COME = {"run"}
 PAGES = {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8")
          for file in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
          if file.parent.name != "log"}
-PAGES["CHANGELOG.md"] = (ROOT / "CHANGELOG.md").read_text(
-    encoding="utf-8").partition("## Unreleased")[2].partition("\n## ")[0]
+SECTIONS = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n## ")[1:]
+PAGES["CHANGELOG.md"] = next(text for text in SECTIONS if text.count("\n") > 2)
 KEYS = set(re.findall(r"^\| `([^`]+)` \|", (ROOT / "topics.md").read_text(encoding="utf-8"),
                       re.MULTILINE))
 
