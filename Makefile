@@ -7,9 +7,7 @@ BIN := .venv/bin
 run: setup
 	$(BIN)/python launch.py
 
-# What is compiled is kept, even where the environment says otherwise: the tests start a thousand
-# interpreters. Without Chromium the operator's page is not tested, which the last line says.
-unexport PYTHONDONTWRITEBYTECODE
+# Without Chromium the operator's page is not tested, which the last line says.
 test: setup
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy

@@ -15,6 +15,10 @@ from rampart.actors.bus.zenoh_session import endpoint
 from tests import ROOT
 from tests.actors.operator.browser import CHROMIUM
 
+# A thousand interpreters are started: each keeps what it compiles, whatever the environment says.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # What waits for a processor at the lowest priority is not slow. `make test-nightly` tries more.
 hypothesis.settings.register_profile("patient", deadline=None, max_examples=30,
                                        derandomize=True)
