@@ -14,7 +14,7 @@ import msgspec
 
 from rampart.manager.drawing.diagram import Diagram, Situation, draw
 from rampart.manager.drawing.placing import place
-from rampart.manager.spec.clearing import clearing_in_words
+from rampart.manager.spec.clearing import clearing_in_words, never_cleared
 from rampart.manager.spec.schema import SystemSpec
 
 MAX_BOXES = 300
@@ -87,7 +87,7 @@ def draw_system(spec: SystemSpec) -> dict[str, Any]:
     note = (f"The fault tree has {len(tree.boxes)} events, too many to draw (at most {MAX_BOXES})."
             if len(tree.boxes) > MAX_BOXES else "")
     return {"title": spec.title or spec.name, "titles": spec.titles,
-            "clearing": clearing_in_words(spec),
+            "clearing": clearing_in_words(spec), "never_cleared": never_cleared(spec),
             "strategy": spec.strategy, "criteria": spec.criteria, "note": note,
             "tree": _fault_tree(spec, tree) if 0 < len(tree.boxes) <= MAX_BOXES else None,
             "order": _order(ranks) if 0 < len(ranks.boxes) <= MAX_BOXES else None}

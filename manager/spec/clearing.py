@@ -44,6 +44,15 @@ def clearing_in_words(spec: SystemSpec) -> dict[str, str]:
     return found
 
 
+def never_cleared(spec: SystemSpec) -> dict[str, list[str]]:
+    """Return the mechanisms that never clear by recovery; no reset ends one that is active."""
+    found: dict[str, list[str]] = {}
+    for m in spec.mechanisms:
+        for name in m.recoveries if clears(spec, m) is Clears.NEVER else ():
+            found.setdefault(name, []).append(m.name)
+    return found
+
+
 def find_wrong_clearing(spec: SystemSpec) -> Iterator[Finding]:
     """Find fields about clearing that contradict each other or have no effect."""
     for path, m in numbered("mechanism", spec.mechanisms):

@@ -283,16 +283,18 @@ function manager(heard) {
   }
   $("manager").replaceChildren(...facts.flatMap(([k, v]) => [element("dt", "", k), element("dd", "", v)]));
   const latched = m ? m.latched : [];
+  const lasting = picture.system?.never_cleared ?? {};
+  const resettable = latched.filter((name) => !(lasting[name] ?? []).some((mechanism) => m.active.includes(mechanism)));
   const acting = m ? m.active.length + m.activated.length : 0;
   $("alarm").hidden = !latched.length && !acting;
   $("alarm").classList.toggle("mild", !latched.length);
   say($("alarm-title"), latched.length
-    ? `${latched.map(named).join(", ")}: latched until you reset it.` : acting
+    ? `${latched.map(named).join(", ")}: latched${resettable.length ? " until you reset it" : ""}.` : acting
       ? m.activated.length ? m.activated.map(named).join(", ") : "A fault is detected." : "");
   say($("alarm-text"), acting
     ? `${m.active.map(named).join(", ")}${m.active.length ? ". " : ""}${clearing([...m.active, ...latched])}` : "");
   document.title = `${latched.length ? "⚠ stopped · " : acting ? "▲ recovery · " : ""}Rampart`;
-  memory.once("latched", latched, () => $("resets").replaceChildren(...latched.map((name) => {
+  memory.once("resettable", resettable, () => $("resets").replaceChildren(...resettable.map((name) => {
     const button = element("button", "", `Reset ${named(name)}`);
     button.onclick = () => send({ type: "reset", recovery: name });
     return button;

@@ -69,9 +69,9 @@ async def speaking_world():
 
 
 @asynccontextmanager
-async def page(world, airport=AIRPORT, **look):
+async def page(world, airport=AIRPORT, system=SPEC, **look):
     """A page on an HMI that knows the system and an airport."""
-    async with (world.hmi(hmi_port=free_port(), system=SPEC, airport=airport) as hmi,
+    async with (world.hmi(hmi_port=free_port(), system=system, airport=airport) as hmi,
                 browser() as tab):
         await tab.show(f"http://{await served(hmi)}/", **look)
         await tab.until(LIVE)

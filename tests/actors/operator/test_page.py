@@ -6,10 +6,12 @@ import math
 import os
 
 import pytest
+from msgspec.structs import replace
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.history import Fault, History
+from rampart.manager.model.mechanisms import Clears
 from rampart.testing import free_port
 from tests.actors.operator.browser import browser
 from tests.actors.operator.page import LIVE, SPEC, events, page, speaking_world
@@ -43,6 +45,20 @@ async def test_the_fault_tree_is_lit_when_a_detection_comes_and_dark_when_it_goe
             await tab.until(f"{events('active')} === ''")
             assert await tab.value("document.querySelectorAll('#tree .line.lit').length") == 0
             assert await tab.value("document.querySelectorAll('#order .running').length") == 0
+
+
+async def test_no_reset_is_offered_for_a_mechanism_that_never_clears(world):
+    spec = replace(SPEC, mechanisms=tuple(
+        replace(x, clears=Clears.NEVER) if x.name == "FTM1" else x for x in SPEC.mechanisms))
+    buttons = "document.querySelectorAll('#resets button').length"
+    title = "document.getElementById('alarm-title').textContent"
+    async with page(world, system=spec) as tab:
+        async with repeated(lambda: world.others.manager("FTM1", latched=("RM1",))):
+            await tab.until(f"{title} === 'Emergency stop (RM1): latched.'")
+            assert await tab.value(buttons) == 0
+        async with repeated(lambda: world.others.manager("FTM2", latched=("RM1",))):
+            await tab.until(f"{buttons} === 1")
+            assert await tab.value(title) == "Emergency stop (RM1): latched until you reset it."
 
 
 async def test_the_laser_is_drawn_in_the_robots_frame_and_vanishes_when_it_is_not_heard(world):
