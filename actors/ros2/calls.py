@@ -78,6 +78,22 @@ def _part(link: Ros2Link, part: str, fields: Mapping[str, Any] | None = None) ->
         link, type=f"{link.type}{part}", fields=link.fields if fields is None else fields)
 
 
+def _encoded(translate: Outward, message: Any, header: Header, link: Ros2Link, gateway: Gateway
+             ) -> bytes:
+    """Return an encoded request or goal.
+
+    Raises:
+        ValueError: it is out of date, e.g. after a stop of the gateway, or cannot be translated.
+    """
+    try:
+        age_s, most_s = gateway.clock.now() - header.stamp, max(link.max_age_s, link.within_s)
+        if age_s > most_s:
+            raise ValueError(f"{age_s:.3g} s old; expected at most {most_s:g} s")
+        return translate(message, gateway.time.stamp_ns(header.stamp), header)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"request of {header.source}: {error}") from None
+
+
 class ServiceCall:
     """Calls a service of ROS 2 with each message of a topic of the system.
 
@@ -101,14 +117,10 @@ class ServiceCall:
         """Call the service, unless a call is under way: the system repeats its requests."""
         if self._is_under_way:
             return
-        if self._gateway.clock.now() - header.stamp > max(
-                self._link.max_age_s, self._link.within_s):
-            self._gateway.refuse(self._link.name, f"request of {header.source} is too old")
-            return
         try:
-            payload = self._request(message, self._gateway.time.stamp_ns(header.stamp), header)
-        except (ValueError, TypeError, OverflowError) as error:
-            self._publish(None, f"request of {header.source}: {error}")
+            payload = _encoded(self._request, message, header, self._link, self._gateway)
+        except ValueError as error:
+            self._publish(None, str(error))
             return
         self._is_under_way = True
         self._ask(payload, self._link.within_s, lambda answer, why: self._gateway.enqueue(
@@ -214,10 +226,10 @@ class ActionCall:
         self._number += 1
         number = self._number
         try:
-            goal = types.decode(f"{kind}{_GOAL}", self._goal(
-                message, gateway.time.stamp_ns(header.stamp), header))
-        except (ValueError, TypeError, OverflowError) as error:
-            self._publish(number, "rejected", f"goal of {header.source}: {error}")
+            goal = types.decode(f"{kind}{_GOAL}", _encoded(
+                self._goal, message, header, self._link, gateway))
+        except ValueError as error:
+            self._publish(number, "rejected", str(error))
             return
         request = types.blank(f"{kind}{_SEND}{_REQUEST}")
         request.goal = goal

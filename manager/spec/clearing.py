@@ -45,7 +45,7 @@ def clearing_in_words(spec: SystemSpec) -> dict[str, str]:
 
 
 def never_cleared(spec: SystemSpec) -> dict[str, list[str]]:
-    """Return the mechanisms that never clear by recovery; no reset ends one that is active."""
+    """Return the mechanisms that never clear, by recovery; no reset ends them while active."""
     found: dict[str, list[str]] = {}
     for m in spec.mechanisms:
         for name in m.recoveries if clears(spec, m) is Clears.NEVER else ():

@@ -18,6 +18,7 @@ import math
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.requests import REQUESTS, Name, Pending, RefusedError, Request
 from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.control.mission.mission_state import first_id
 from rampart.actors.web.visitors import Role
 
 RESPAWN_WINDOW_S = 8.0
@@ -89,7 +90,7 @@ class Submission(Pending[m.MissionRequest]):
 
 def first_request(run_id: str, name: str, goals: tuple[m.Goal, ...]) -> m.MissionRequest:
     """Return the request for the first mission of a run."""
-    return m.MissionRequest(f"{run_id}/first", name, goals)
+    return m.MissionRequest(first_id(run_id), name, goals)
 
 
 NO_REASON = "asked for on the page"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from pathlib import Path
 
 import pytest
 
-from rampart.testing import RealRun, free_port, virtual_run
+from rampart.testing import RealRun, VirtualSystem, free_port, run, virtual_run
 
 SYSTEM = Path(__file__).resolve().parents[1] / "warehouse.toml"
 
@@ -68,6 +69,42 @@ def test_a_node_that_ends_again_and_again_is_unstable_and_the_robot_is_stopped(
     assert done.record.restarts == {"controller_server": 2}
     stopped = any("R_STOP" in decision.recoveries for decision in done.record.decisions)
     assert stopped is bool(limits)
+
+
+def test_what_was_commanded_during_a_stop_is_not_executed_at_its_end(monkeypatch):
+    """Neither if it is late, nor if the guard was restarted meanwhile."""
+    monkeypatch.syspath_prepend(SYSTEM.parent)
+    from warehouse import topics
+
+    async def scenario():
+        async with VirtualSystem.load(SYSTEM) as system:
+            guard = system.start_node("guard")
+            command, scan = map(guard.chosen_topic, ("nav/command", "nav/scan"))
+            checked = system.hear(topics.CHECKED)
+
+            async def commanded(before_s=0.0):
+                system.say(scan, scan.type(
+                    angle_min_rad=0.0, angle_increment_rad=0.1, range_min_m=0.0, range_max_m=6.0,
+                    ranges_f32=b"", nearest_m=5.0))
+                await asyncio.sleep(0.02)
+                system.say(command, command.type(
+                    linear_mps=0.5, lateral_mps=0.0, angular_radps=0.0),
+                    stamp_s=system.clock.now() - before_s)
+                await asyncio.sleep(0.02)
+                return checked[-1].message.linear_mps
+
+            assert await commanded() == 0.5
+            system.say(topics.ORDER, topics.Order(True), "R_STOP")
+            assert await commanded() == 0.0
+            system.say(topics.ORDER, topics.Order(False), "R_STOP")
+            assert await commanded(before_s=0.1) == 0.0
+            assert await commanded() == 0.5
+            system.say(topics.ORDER, topics.Order(True), "R_STOP")
+            await system.kill("guard")
+            system.start_node("guard")
+            assert await commanded() == 0.0
+
+    run(scenario)
 
 
 def test_without_the_mechanisms_a_jump_of_the_localization_does_harm():

@@ -40,7 +40,7 @@ class Guard(Actor):
         super().__init__(context)
         given = self.parameters
         self._nearest_m, self._seen_s = math.nan, -math.inf
-        self._commanded_s = -math.inf
+        self._commanded_s = self._released_s = -math.inf
         self._stop, self._why = False, "no command"
         self._linear_mps = 0.0
         self.hear_topic(given.command, self._command)
@@ -50,8 +50,10 @@ class Guard(Actor):
         self._nearest_m, self._seen_s = message.nearest_m, header.stamp
 
     @on(topics.ORDER)
-    def order(self, message: Order, _header: Header) -> None:
+    def order(self, message: Order, header: Header) -> None:
         """Stop or release the robot, as a recovery orders."""
+        if self._stop and not message.stop:
+            self._released_s = header.stamp
         self._stop = message.stop
 
     def _command(self, message: Any, header: Header) -> None:
@@ -61,6 +63,8 @@ class Guard(Actor):
         self._why = ""
         if self._stop:
             self._why = "stopped by a recovery"
+        elif header.stamp < self._released_s:
+            self._why = "commanded during a stop"
         elif not (math.isfinite(linear) and math.isfinite(angular)):
             self._why = f"{linear} m/s, {angular} rad/s"
         elif now_s - self._seen_s > bounds.stale_s:

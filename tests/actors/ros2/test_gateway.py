@@ -333,6 +333,25 @@ async def test_an_action_is_given_a_goal_and_says_how_it_goes(system):
     assert len(set(base.goals)) == 2
 
 
+@pytest.mark.parametrize(("key", "what", "told"), [
+    ("nav/goal", {}, ("phase", "rejected")), ("base/shut", {"data": True}, ("done", False))])
+@beside(GOAL + CALL.replace("asker", "shutter"))
+async def test_a_goal_or_request_that_comes_late_is_not_executed(system, key, what, told):
+    """One that has waited for a hanging gateway, or for a stop to end, is out of date."""
+    base = system.start_node("base")
+    gateway = system.start_node("gateway")
+    answers = system.hear(gateway.chosen_topic({"nav/goal": "nav/state"}.get(key, "base/is_shut")))
+    await asyncio.sleep(0.1)
+    topic = gateway.chosen_topic(key)
+    system.say(topic, msgspec.convert(blank(topic.type) | what, topic.type),
+               stamp_s=system.clock.now() - 1.1)
+    await asyncio.sleep(0.5)
+    assert (base.goals, base.shut) == ([], 0)
+    (answer,) = answers
+    assert getattr(answer.message, told[0]) == told[1]
+    assert answer.message.why.startswith("request of tester: 1.1 s old; expected at most")
+
+
 def blank(made):
     """Return a message with zeros, as a dictionary."""
     return {f.name: blank(f.type) if issubclass(f.type, msgspec.Struct) else f.type()

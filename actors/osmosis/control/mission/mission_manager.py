@@ -54,7 +54,8 @@ class MissionManager(Actor):
     @on(topics.MISSION_REQUEST)
     def request(self, message: m.MissionRequest, _header: Header) -> None:
         """Take a mission, unless it was accepted before."""
-        self._become(mission_state.accept(self.state, message, self.clock.now()))
+        first = message.mission_id == mission_state.first_id(self.context.run.plan.run_id)
+        self._become(mission_state.accept(self.state, message, self.clock.now(), first=first))
 
     @on(topics.MISSION_ORDER)
     def order(self, message: m.MissionOrder, _header: Header) -> None:

@@ -9,6 +9,9 @@ A mission is paused by an order, by a recovery that holds the robot, or both, so
 whether the robot may move. Orders that are not possible in a phase are refused with a reason; the
 table of transitions catches programming errors.
 
+The end of a hold continues what was under way before it, and starts nothing: a mission that is
+ordered during a hold waits for an order to resume, and an order to resume is refused.
+
 The state is one frozen struct that msgspec can serialise, so a checkpoint is its encoding. Each
 function takes a state and returns the next one.
 
@@ -119,8 +122,18 @@ def enter(state: MissionState, phase: m.MissionPhase, reason: str = "") -> Missi
     return replace(state, phase=phase, reason=reason)
 
 
-def accept(state: MissionState, request: m.MissionRequest, now: float) -> MissionState:
-    """Accept a mission, which replaces one under way; a known id changes nothing."""
+def first_id(run_id: str) -> str:
+    """Return the id of a run's first mission."""
+    return f"{run_id}/first"
+
+
+def accept(state: MissionState, request: m.MissionRequest, now: float, *, first: bool = False
+           ) -> MissionState:
+    """Accept a mission, which replaces one under way; a known id changes nothing.
+
+    One that comes while a recovery holds the robot waits for an order to resume, unless it is the
+    `first` of the run, which was ordered before.
+    """
     if request.mission_id in state.accepted:
         return state
     before = replace(state, phase=P.CANCELLED) if state.phase in ACTIVE else state
@@ -129,7 +142,8 @@ def accept(state: MissionState, request: m.MissionRequest, now: float) -> Missio
     return _settle(MissionState(
         request.mission_id, request.name, started.phase, request.goals, step_started_s=now,
         reason=started.reason, accepted=(*state.accepted, request.mission_id)[-ACCEPTED_KEPT:],
-        held=state.held, answers=state.answers))
+        held=state.held, answers=state.answers,
+        paused="" if first or not state.held else "ordered during a stop: resume it"))
 
 
 def progress(state: MissionState, report: m.ControlStatus, now: float) -> MissionState:
@@ -214,15 +228,16 @@ def _refusal(state: MissionState, action: m.MissionAction) -> str:
         last = f", the last one is {state.phase.value}" if state.mission_id else ""
         return f"no mission is under way{last}"
     unknown_home = "" if state.home else "the start of the mission is unknown"
+    later = f"{state.held}; resume it when the robot is released"
     return {
         A.PAUSE: state.paused and f"the mission is already paused, {state.paused}",
-        A.RESUME: "" if state.paused else
-        f"{state.held}; it continues when the robot is released",
+        A.RESUME: state.held and (later if state.paused else
+                                  f"{state.held}; it continues when the robot is released"),
         A.REPLAN: "the mission is paused; it is replanned when it continues" if paused else "",
         A.SKIP: state.homing and "there is no goal to skip on the way home",
         A.CANCEL: "",
         A.HOME: f"the robot is already on its way home, {state.homing}" if state.homing
-        else unknown_home,
+        else unknown_home or (later if state.held and state.paused else ""),
     }[action]
 
 

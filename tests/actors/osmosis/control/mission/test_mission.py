@@ -130,7 +130,7 @@ OBEDIENCE = [
     ("running, nowhere known",  (Z,    None, R,    R,    C,    None)),
     ("paused",                  (None, R,    None, Z,    C,    H)),
     ("held",                    (Z,    None, None, Z,    C,    Z)),
-    ("held and paused",         (None, Z,    None, Z,    C,    Z)),
+    ("held and paused",         (None, None, None, Z,    C,    None)),
     ("returning",               (Z,    None, H,    None, C,    None)),
     ("cancelled",               (None, None, None, None, None, None)),
 ]
@@ -171,10 +171,21 @@ def test_while_a_recovery_holds_the_robot_the_mission_is_paused_with_its_reason(
 def test_a_pause_that_was_asked_for_outlasts_a_recovery_and_the_other_way_round():
     paused = obeyed(ms.hold(running(), "held by RM2"), A.PAUSE)
     assert ms.status(paused).reason == "held by RM2; operator: a reason"
-    assert ms.hold(paused, "").phase is MissionPhase.PAUSED
-    resumed = obeyed(paused, A.RESUME, 2)
-    assert (resumed.phase, resumed.reason) == (MissionPhase.PAUSED, "held by RM2")
-    assert ms.hold(resumed, "").phase is MissionPhase.RUNNING
+    free = ms.hold(paused, "")
+    assert free.phase is MissionPhase.PAUSED
+    assert obeyed(free, A.RESUME, 2).phase is MissionPhase.RUNNING
+
+
+def test_no_mission_that_is_ordered_during_a_stop_starts_at_its_end():
+    idle = ms.hold(MissionState(), "held by RM1")
+    request = m.MissionRequest("id-2", "second", running().goals)
+    ordered = ms.accept(idle, request, 3.0)
+    assert ms.status(ordered).reason == "held by RM1; ordered during a stop: resume it"
+    free = ms.hold(ordered, "")
+    assert (free.phase, ms.goal_order(free).active) == (MissionPhase.PAUSED, False)
+    assert obeyed(free, A.RESUME).phase is MissionPhase.RUNNING
+    launched = ms.accept(idle, request, 3.0, first=True)  # by the command that began the run
+    assert ms.hold(launched, "").phase is MissionPhase.RUNNING
 
 
 def test_a_skipped_goal_is_told_to_the_end():
