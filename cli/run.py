@@ -34,7 +34,6 @@ from rampart.actors.supervision.root import Root
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import load_application
 from rampart.actors.system.topics import system_topics
-from rampart.cli.host import HostRun
 from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.page_options import audited
 from rampart.cli.run_options import ERROR_LOG, of_one_process, parse, plan_of, refuse
@@ -382,6 +381,8 @@ def _in_child(run: Callable[[], Coroutine[Any, Any, int]]) -> int:
 def _on_another_host(options: argparse.Namespace, plan: RunPlan, reports: Path) -> int:
     directory = Path(options.report) if options.report else (
         reports / f"{time.strftime('%Y%m%d-%H%M%S')}-{plan.host}")
+    from rampart.cli.host import HostRun  # noqa: PLC0415 few runs have several hosts
+
     with _kept(directory):
         host, root = HostRun(options, plan, directory), Root()
         code = root.run(lambda link: _in_child(lambda: host.run(link)))

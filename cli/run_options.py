@@ -216,7 +216,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
     """
     _check(options)
     system_file = _system_file(options.system)
-    host = _host(options, load_system(RunPlan(system_file=str(system_file))))
+    host = _host(options, system_file) if options.host is not None else ""
     token = page_options.own_token(options)
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port,
@@ -244,10 +244,9 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
     return msgspec.structs.replace(plan, page=page_options.page_of(options, token, note)), spec
 
 
-def _host(options: argparse.Namespace, spec: SystemSpec) -> str:
-    """Return the name of this host, "" for the first."""
-    if options.host is None:
-        return ""
+def _host(options: argparse.Namespace, system_file: Path) -> str:
+    """Return the name of the host that --host names, "" for the first."""
+    spec = load_system(RunPlan(system_file=str(system_file)))
     names = [host.name for host in spec.hosts]
     if options.host not in names:
         raise UsageError(f"--host {options.host}: " + (

@@ -35,15 +35,18 @@ _RETRY_S = 0.2
 class FirstLauncher(Launcher):
     """The first host's launcher, which starts when all hosts are ready.
 
-    Attributes:
-        say: Takes a line with the hosts that it waits for.
+    Args:
+        run: The run.
+        title: Of the run, for people.
+        link: Connection to the root; None to start a root.
         is_unwanted: Whether the user has interrupted the run.
+        say: Takes a line with the hosts that it waits for.
     """
 
-    def __init__(self, run: RunContext, title: str, link: socket.socket | None = None) -> None:
+    def __init__(self, run: RunContext, title: str, link: socket.socket | None,
+                 is_unwanted: Callable[[], bool], say: Callable[[str], None]) -> None:
         super().__init__(run.plan, title, link)
-        self.say: Callable[[str], None] = lambda _line: None
-        self.is_unwanted: Callable[[], bool] = lambda: False
+        self._is_unwanted, self._say = is_unwanted, say
         self._run = run
         self._meeting: Meeting | None = None
 
@@ -58,7 +61,7 @@ class FirstLauncher(Launcher):
             await self._meeting.open(*hosts.meeting_place(), self.plan.credentials(DOOR))
         except (MeetingError, OSError) as error:
             raise LaunchError(str(error)) from None
-        if not await self._meeting.all_ready(self.say, self.is_unwanted):
+        if not await self._meeting.all_ready(self._say, self._is_unwanted):
             raise LaunchError("interrupted while it waited for the other hosts")
         await super().start()
         self._meeting.begin(self.plan.origin_s)

@@ -21,8 +21,6 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mcap.writer import CompressionType, Writer
-
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT, Topic
@@ -193,6 +191,8 @@ class BagWriter:
         self._schemas: dict[Any, int] = {}
         self._channels: dict[str, int | None] = {}
         self._view_channels: dict[str, int] = {}
+        from mcap.writer import CompressionType, Writer  # noqa: PLC0415 few runs are recorded
+
         self._writer = Writer(file, compression=CompressionType.LZ4)
         self._writer.start(PROFILE, f"rampart {documents.version}")
         self._writer.add_metadata(RUN, {**documents.metadata(), "time_zero_s": f"{time_zero_s:g}"})

@@ -48,8 +48,8 @@ class Stage:
         if not path:
             raise UsageError(f"{summary.reader.path}: the robot has no model for MuJoCo; expected "
                              "a class as `model` of its application")
-        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            os.environ.setdefault("MUJOCO_GL", "egl")  # renders without a screen
+        screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        os.environ.setdefault("MUJOCO_GL", "glfw" if screen else "egl")
         try:
             from rampart.sim.runs.physics import RobotModel  # noqa: PLC0415 chooses MUJOCO_GL
 

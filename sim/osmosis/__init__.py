@@ -1,1 +1,14 @@
-"""The world of Osmosis in MuJoCo: Summit XL, sensors, judge, report."""
+"""The world of Osmosis in MuJoCo: Summit XL, sensors, judge, report.
+
+A run opens no window, so MuJoCo is imported without a way to render: GLFW would start a process to
+look for its library. The camera and `rampart replay` choose a way with `MUJOCO_GL` before they
+import this package.
+"""
+
+import os
+
+if "MUJOCO_GL" not in os.environ:
+    os.environ["MUJOCO_GL"] = "disable"
+    import mujoco as mujoco
+
+    del os.environ["MUJOCO_GL"]  # processes of the run may render

@@ -13,7 +13,6 @@ from pathlib import Path
 from rampart.actors.access.register import KeysError
 from rampart.actors.bus.bus import shared
 from rampart.actors.bus.run_folder import register_of
-from rampart.actors.hosts.launchers import FirstLauncher
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import OBSERVER
@@ -80,8 +79,14 @@ class ProcessRun:
     def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = (),
                  link: socket.socket | None = None,
                  keep: Callable[[bytes], None] | None = None) -> None:
-        self.launcher = (FirstLauncher(trial.run, trial.title, link) if trial.run.system.hosts
-                         else Launcher(trial.run.plan, trial.title, link))
+        if trial.run.system.hosts:
+            from rampart.actors.hosts.launchers import FirstLauncher  # noqa: PLC0415 few have
+
+            self.launcher: Launcher = FirstLauncher(
+                trial.run, trial.title, link, lambda: bool(self.interrupted),
+                trial.console.say if trial.console else lambda _line: None)
+        else:
+            self.launcher = Launcher(trial.run.plan, trial.title, link)
         self.launcher.on_interrupt = self.interrupt
         self.interrupted = ""
         self.failure = ""
@@ -104,10 +109,6 @@ class ProcessRun:
         """
         try:
             await self.launcher.load()
-            if isinstance(self.launcher, FirstLauncher):
-                self.launcher.is_unwanted = lambda: bool(self.interrupted)
-                if self._trial.console:
-                    self.launcher.say = self._trial.console.say
             await self.launcher.start()
             return await self._observe()
         finally:

@@ -13,13 +13,15 @@ import tempfile
 from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jinja2
 import msgspec
 from markupsafe import Markup
 
 from rampart.sim.runs.record import Interval, RunRecord
+
+if TYPE_CHECKING:
+    import jinja2
 
 _LANES = {"injection": "Injected", "down": "Node down", "detection": "Detected",
           "recovery": "Recovery", "stop": "Stopped"}
@@ -117,6 +119,8 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def environment() -> jinja2.Environment:
     """Return the environment of all reports: templates in `sim/`, all text escaped."""
+    import jinja2  # noqa: PLC0415 not needed before the end of a run
+
     made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parents[1]), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -35,3 +36,11 @@ def test_a_module_that_swallows_an_interrupt_does_not_keep_the_run_from_ending(
                            "--duration", "1"], cwd=tmp_path, capture_output=True, text=True,
                           timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
+
+
+def test_a_world_is_loaded_without_glfw_which_would_start_a_process_in_the_middle_of_the_start():
+    code = ("import os, sys, rampart.sim.osmosis.world; "
+            "print('glfw' in sys.modules, 'MUJOCO_GL' in os.environ)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
+                          env={k: v for k, v in os.environ.items() if k != "MUJOCO_GL"})
+    assert done.stdout == "False False\n"

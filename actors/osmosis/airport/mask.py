@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import shapely
-from PIL import Image
 from shapely.geometry import MultiPolygon, Polygon
 
 from rampart.actors.osmosis.airport.errors import AirportError, readable
@@ -69,6 +68,8 @@ def allowed_area(path: Path) -> Any:
 
 def _decoded(path: Path) -> tuple[npt.NDArray[np.uint8], bool]:
     """Return the image as rows x columns x RGB, and whether its compression is lossy."""
+    from PIL import Image  # noqa: PLC0415 few airports have an image
+
     with readable(path, "expected a smaller one", "area image"):
         data = read_bytes(path, MAX_IMAGE_BYTES)
     try:
