@@ -17,17 +17,14 @@ from rampart.cli.main import main
 from rampart.sim.campaign.plan import fault_groups
 from rampart.sim.faults.faults import PROCESS_FAULTS
 from rampart.sim.faults.topic_faults import NONSENSE
-from tests import ROOT
+from tests.documents.page import Page
 
-DOCUMENT = (ROOT / "docs/how-to/campaigns.md").read_text(encoding="utf-8")
-COMMANDS = [line.partition("  #")[0].strip()
-            for block in re.findall(r"^```sh\n(.*?)^```", DOCUMENT, re.DOTALL | re.MULTILINE)
-            for line in block.splitlines()]
+PAGE = Page("how-to/campaigns")
 FAULTS = dict(re.findall(r"^\| (`.*?) \| .* \| (\w+) \|$",
-                         DOCUMENT.partition("## Choose faults\n")[2], re.MULTILINE))
+                         PAGE.section("## Choose faults"), re.MULTILINE))
 
 
-@pytest.mark.parametrize("line", COMMANDS)
+@pytest.mark.parametrize("line", PAGE.commands)
 def test_a_command_is_accepted(line):
     rampart, verb, *arguments = shlex.split(line)
     assert rampart == "rampart"

@@ -6,45 +6,26 @@ three minutes; the commands of the second terminal are run beside a run of the s
 
 from __future__ import annotations
 
-import os
 import re
-import shlex
-import subprocess
-import sys
-from pathlib import Path
+from itertools import takewhile
 
 import pytest
 
 from rampart.testing import RealRun
-from tests import ROOT
+from tests.documents.page import Page, execute, succeed
 
-TEXT = (ROOT / "docs/tutorials/first-run.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
-COMMANDS = [line for language, block in BLOCKS if language == "sh" for line in block.splitlines()]
-VIRTUAL = [line for line in COMMANDS if "--virtual" in line]
-SECOND_TERMINAL = next(block for language, block in BLOCKS
-                       if language == "sh" and "kill-node" in block).splitlines()[1:]
+PAGE = Page("tutorials/first-run")
+VIRTUAL = [line for line in PAGE.commands if "--virtual" in line]
+SECOND_TERMINAL = next(block for block in PAGE.of("sh") if "kill-node" in block).splitlines()[1:]
 EXPORT = 'export PATH="$PWD/.venv/bin:$PATH"'
 NOT_RUN = {"make setup", "python launch.py", EXPORT}
 
 
-def execute(line: str, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
-    """Run a command of the page in a folder of its own."""
-    words = [str(ROOT / word) if word == "launch.py" else word for word in shlex.split(line)]
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    return subprocess.run(words, cwd=folder, env={**os.environ, "PATH": path, **more}, check=False,
-                          text=True, capture_output=True, timeout=600)
-
-
 def shown_after(line: str) -> str:
     """Return the output that the page shows of a command."""
-    at = next(i for i, (_, block) in enumerate(BLOCKS) if line in block.splitlines())
-    texts = []
-    for language, block in BLOCKS[at + 1:]:
-        if language == "sh":
-            break
-        texts.append(block)
-    return "".join(texts)
+    at = next(i for i, (_, block) in enumerate(PAGE.blocks) if line in block.splitlines())
+    return "".join(block for _, block in takewhile(
+        lambda block: block[0] != "sh", PAGE.blocks[at + 1:]))
 
 
 def without_numbers(text: str) -> str:
@@ -52,11 +33,11 @@ def without_numbers(text: str) -> str:
 
 
 def test_each_command_is_run_or_exempt():
-    assert set(COMMANDS) - NOT_RUN - set(VIRTUAL) - set(SECOND_TERMINAL) == {"rampart doctor"}
+    assert set(PAGE.commands) - NOT_RUN - set(VIRTUAL) - set(SECOND_TERMINAL) == {"rampart doctor"}
 
 
 def test_doctor_finds_what_a_run_needs(tmp_path):
-    assert execute("rampart doctor", tmp_path).returncode == 0
+    succeed("rampart doctor", tmp_path)
 
 
 @pytest.mark.virtual
@@ -78,6 +59,6 @@ def test_nodes_that_are_killed_from_the_second_terminal_are_back(tmp_path):
         real.sleep_until(5)
         *kills, status = SECOND_TERMINAL
         for line in kills:
-            assert execute(line, tmp_path, RAMPART_PORT=str(real.port)).returncode == 0
-        real.wait_until(lambda: "35 of 35 running, 2 restarts" in execute(
-            status, tmp_path, RAMPART_PORT=str(real.port)).stdout, 20, "they are not back")
+            succeed(line, tmp_path, RAMPART_PORT=str(real.port))
+        real.wait_until(lambda: "35 of 35 running, 2 restarts" in succeed(
+            status, tmp_path, RAMPART_PORT=str(real.port)), 20, "they are not back")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -17,20 +16,11 @@ from rampart.actors.foreign.channel import MAX_PACKET
 from rampart.actors.foreign.program_process import GRACE_S
 from rampart.manager.spec.nodes import COMMAND_FIELDS, ChildLimits
 from rampart.testing import RealRun, VirtualSystem, run
-from tests import ROOT
 from tests.actors.access.keyed import layout_of, make_keys
+from tests.documents.page import Page
 
-TEXT = (ROOT / "docs/how-to/any-language.md").read_text(encoding="utf-8")
-
-
-def block(language: str, begins: str = "") -> str:
-    blocks = re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
-    return next(found for found in blocks if found.startswith(begins))
-
-
-TUG = block("toml", "name = \"tug\"")
-
-
+PAGE = Page("how-to/any-language")
+TUG = PAGE.block("toml", 'name = "tug"')
 COMPILERS = {"c": ["gcc", "-Wall", "-Wextra", "-Werror"],
              "c++": ["g++", "-x", "c++", "-Wall", "-Wextra", "-Werror"],
              "rust": ["rustc", "-Dwarnings"]}
@@ -39,23 +29,23 @@ COMPILERS = {"c": ["gcc", "-Wall", "-Wextra", "-Werror"],
 def write_tug(folder, language: str = "") -> None:
     """Write the system of the page into a folder, with the wheels in a language."""
     (folder / "tug.toml").write_text(TUG)
-    (folder / "cart.py").write_text(block("python", "from rampart"))
+    (folder / "cart.py").write_text(PAGE.block("python", "from rampart"))
     if language == "bash":
-        (folder / "wheels").write_text(block("bash"))
+        (folder / "wheels").write_text(PAGE.block("bash"))
         (folder / "wheels").chmod(0o755)
     elif language:
         source = "wheels.rs" if language == "rust" else "wheels.c"
-        (folder / source).write_text(block(language.removesuffix("++")))
+        (folder / source).write_text(PAGE.block(language.removesuffix("++")))
         subprocess.run([*COMPILERS[language], "-o", "wheels", source], cwd=folder, check=True)
 
 
 def test_each_field_and_each_number_is_on_the_page():
     for field in (*COMMAND_FIELDS, *ChildLimits.__struct_fields__):
-        assert f"`{field}`" in TEXT
-    assert f"{MAX_PACKET:,} bytes" in TEXT
-    assert f"{GRACE_S} s later SIGKILL" in TEXT
+        assert f"`{field}`" in PAGE.text
+    assert f"{MAX_PACKET:,} bytes" in PAGE.text
+    assert f"{GRACE_S} s later SIGKILL" in PAGE.text
     assert (f"{output_log.LOG_BYTES_PER_S // 10**6} MB per second in two files of "
-            f"{output_log.LOG_BYTES // 10**6} MB") in " ".join(TEXT.split())
+            f"{output_log.LOG_BYTES // 10**6} MB") in " ".join(PAGE.text.split())
 
 
 def test_the_stand_in_plays_the_command_in_virtual_time(tmp_path, monkeypatch):
@@ -92,7 +82,7 @@ def test_the_program_is_a_node_and_faults_can_be_put_into_its_messages(tmp_path,
 @pytest.mark.parametrize("with_keys", [False, True])
 def test_the_plain_zenoh_program_is_a_node(tmp_path, monkeypatch, with_keys):
     write_tug(tmp_path)
-    (tmp_path / "wheels.py").write_text(block("python", "import json"))
+    (tmp_path / "wheels.py").write_text(PAGE.block("python", "import json"))
     (tmp_path / "tug.toml").write_text(TUG.replace(
         '["./wheels"]', f'[{json.dumps(sys.executable)}, "wheels.py"]').replace(
         'topic = "tug/wheels"', 'key = "wheels/alive"'))

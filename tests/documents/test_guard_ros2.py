@@ -7,10 +7,6 @@ of its own, where the page has the usual one.
 from __future__ import annotations
 
 import asyncio
-import os
-import re
-import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,42 +14,28 @@ import pytest
 
 from rampart.actors.bus.topics import DIAGNOSTIC
 from rampart.testing import RealRun, VirtualSystem, free_port, run
-from tests import ROOT
+from tests.documents.page import Page, succeed
 from tests.documents.test_authors import follow
 
-TEXT = (ROOT / "docs/tutorials/guard-a-ros2-robot.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
-COMMANDS = [line for language, block in BLOCKS if language == "sh" for line in block.splitlines()]
-RUN = "rampart run --system guarded.toml"
-SECOND_TERMINAL = COMMANDS[COMMANDS.index(RUN) + 1:]
+PAGE = Page("tutorials/guard-a-ros2-robot")
+RUN = PAGE.commands.index("rampart run --system guarded.toml")
 
 
 def write(folder: Path) -> None:
     """Write the files of the page into a new folder."""
     folder.mkdir()
-    for language, block in BLOCKS:
+    for language, block in PAGE.blocks:
         if language != "sh":
             first, _, rest = block.partition("\n")
             follow(folder, first, rest)
 
 
-def execute(line: str, folder: Path, **more: str) -> str:
-    """Run a command of the page, and return what it prints."""
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    done = subprocess.run(shlex.split(line), cwd=folder, check=False, text=True,
-                          env={**os.environ, "PATH": path, **more},
-                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=100)
-    assert done.returncode == 0, f"{line}\n{done.stdout}"
-    return done.stdout
-
-
 def test_the_guarded_robot_is_sound_and_its_navigation_restarted_in_virtual_time(tmp_path):
     write(tmp_path / "guarded")
-    make, enter, *rest = COMMANDS[:COMMANDS.index(RUN)]
+    make, enter, check, begin = PAGE.commands[:RUN]
     assert (make, enter) == ("mkdir guarded", "cd guarded")
-    check, begin = rest
-    assert "sound" in execute(check, tmp_path / "guarded")
-    assert "navigation respawned by R_RESTART" in execute(begin, tmp_path / "guarded")
+    assert "sound" in succeed(check, tmp_path / "guarded")
+    assert "navigation respawned by R_RESTART" in succeed(begin, tmp_path / "guarded")
 
 
 @pytest.mark.parametrize("field", ["linear_mps", "angular_radps"])
@@ -93,13 +75,13 @@ def test_on_processes_the_base_gets_the_guarded_command(tmp_path):
         assert f'"{row}"' in text
         text = text.replace(f'"{row}"', f'"{row}"\nparameters = {{ {parameter} }}')
     file.write_text(text)
-    check, echo, kill, status = SECOND_TERMINAL
+    check, echo, kill, status = PAGE.commands[RUN + 1:]
     with RealRun(folder, "guarded.toml") as real:
         real.sleep_until(3)
         here = {"RAMPART_PORT": str(real.port)}
-        assert "/base, geometry_msgs/msg/Twist" in execute(check, folder, **here)
-        velocity = execute(echo.replace("--ros", f"--ros tcp/localhost:{port}"), folder, **here)
+        assert "/base, geometry_msgs/msg/Twist" in succeed(check, folder, **here)
+        velocity = succeed(echo.replace("--ros", f"--ros tcp/localhost:{port}"), folder, **here)
         assert "0.8" in velocity
-        execute(kill, folder, **here)
-        real.wait_until(lambda: "1 restarts" in execute(status, folder, **here), 20,
+        succeed(kill, folder, **here)
+        real.wait_until(lambda: "1 restarts" in succeed(status, folder, **here), 20,
                         "the navigation is not back")

@@ -13,26 +13,22 @@ from rampart.actors.ftm import topics
 from rampart.actors.system.members import load_class
 from rampart.testing import VirtualSystem, run
 from tests import ROOT
+from tests.documents.page import Page
 
-TEXT = (ROOT / "docs/how-to/ready-modules.md").read_text(encoding="utf-8")
-ROWS = re.findall(r"^\| `(\w+):(\w+)` \| (.*) \|$", TEXT, re.MULTILINE)
-
-
-def block(language: str, begin: str = "") -> str:
-    (found,) = re.findall(rf"^```{language}\n({begin}.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
-    return found
+PAGE = Page("how-to/ready-modules")
+ROWS = re.findall(r"^\| `(\w+):(\w+)` \| (.*) \|$", PAGE.text, re.MULTILINE)
 
 
 def test_the_check_points_are_supervised_in_their_order():
-    (row,) = tomllib.loads(block("toml", r"\[\[detection\]\]"))["detection"]
+    (row,) = tomllib.loads(PAGE.block("toml", "[[detection]]"))["detection"]
     chosen = msgspec.convert(row["parameters"], load_class(row["actor"]).Parameters)
     assert chosen.each
     assert [step.at for step in chosen.steps] == ["measured", "checked", "commanded"]
 
 
 def test_the_system_detects_and_shuts_the_inlet(tmp_path, monkeypatch):
-    (tmp_path / "tank.py").write_text(block("python"))
-    (tmp_path / "tank.toml").write_text(block("toml", "name = "))
+    (tmp_path / "tank.py").write_text(PAGE.block("python"))
+    (tmp_path / "tank.toml").write_text(PAGE.block("toml", "name = "))
     monkeypatch.syspath_prepend(tmp_path)
 
     async def scenario() -> None:

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shlex
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-from tests import ROOT
+from tests.documents.page import Page, execute, succeed
 
-DOCUMENT = (ROOT / "docs/how-to/mujoco-world.md").read_text(encoding="utf-8")
-FILES = re.findall(r"^```\w+\n(?:# |<!-- )(\S+)[^\n]*\n(.*?)^```", DOCUMENT,
+PAGE = Page("how-to/mujoco-world")
+FILES = re.findall(r"^```\w+\n(?:# |<!-- )(\S+)[^\n]*\n(.*?)^```", PAGE.text,
                    re.DOTALL | re.MULTILINE)
-COMMANDS = re.findall(r"^```sh\n(.*?)^```", DOCUMENT, re.DOTALL | re.MULTILINE)[0].splitlines()
 BEHAVIOUR = '''
 import asyncio
 from pathlib import Path
@@ -57,16 +51,9 @@ def test_the_world():
 '''
 
 
-def call(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore",
-                   "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    return subprocess.run(shlex.split(line), cwd=folder, env=environment, text=True,
-                          capture_output=True, check=False)
-
-
 @pytest.fixture
 def robot(tmp_path):
-    assert call("rampart new courier", tmp_path).returncode == 0
+    succeed("rampart new courier", tmp_path)
     assert [name for name, _ in FILES] == ["courier/rail.xml", "courier/world.py"]
     for name, text in FILES:
         (tmp_path / "courier" / name).write_text(text, encoding="utf-8")
@@ -75,16 +62,15 @@ def robot(tmp_path):
 
 def test_the_commands_succeed_and_actuators_obey(robot):
     (robot / "tests/test_world.py").write_text(BEHAVIOUR, encoding="utf-8")
-    for line in COMMANDS:
-        done = call(line, robot)
-        assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
-    assert "15 passed" in done.stdout
+    for line in PAGE.of("sh")[0].splitlines():
+        printed = succeed(line, robot)
+    assert "15 passed" in printed
 
 
 def test_an_unstable_world_ends_the_run(robot):
     model = robot / "courier/rail.xml"
     text = model.read_text(encoding="utf-8")
     model.write_text(re.sub(r'kv="100" forcerange="[^"]*"', 'kv="-1e9"', text), encoding="utf-8")
-    done = call("rampart run --system courier.toml --virtual --json", robot)
+    done = execute("rampart run --system courier.toml --virtual --json", robot)
     assert done.returncode == 4
     assert "physics unstable" in json.loads(done.stdout)["reasons"][0]

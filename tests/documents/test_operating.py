@@ -17,13 +17,12 @@ from rampart.cli.main import build_parser, main
 from rampart.cli.operate import kill_node
 from rampart.cli.run import main as run_main
 from tests import ROOT, system_file, two_hosts
+from tests.documents.page import Page
 
-HOW_TO = {name: (ROOT / f"docs/how-to/{name}.md").read_text(encoding="utf-8") for name in (
+HOW_TO = {name: Page(f"how-to/{name}") for name in (
     "operator-page", "terminal", "recordings", "several-machines", "credentials",
     "troubleshooting", "zero-velocity")}
-COMMANDS = [(page, line.partition("  #")[0].strip()) for page, text in HOW_TO.items()
-            for block in re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-            for line in block.splitlines()]
+COMMANDS = [(name, line) for name, page in HOW_TO.items() for line in page.commands]
 ELSEWHERE = {"pip": "needs an index", "scp": "needs another machine",
              "make": "compiles what tests/stop compiles"}
 ALONE = re.compile(r"rampart (keys|tokens|bag|doctor|service)\b")
@@ -97,9 +96,8 @@ def test_doctor_is_the_first_thing_to_try(capsys):
 
 
 def test_the_mechanism_for_a_lost_link_is_the_tested_one():
-    blocks = re.findall(r"^```toml\n(.*?)^```", HOW_TO["several-machines"],
-                        re.DOTALL | re.MULTILINE)
-    assert tomllib.loads(blocks[1]) == tomllib.loads(two_hosts.HOME_WHEN_LOST)
+    shown = HOW_TO["several-machines"].of("toml")[1]
+    assert tomllib.loads(shown) == tomllib.loads(two_hosts.HOME_WHEN_LOST)
 
 
 def test_the_symptoms_are_words_of_the_code():
@@ -108,8 +106,8 @@ def test_the_symptoms_are_words_of_the_code():
                         for file in (ROOT / top).rglob("*")
                         if file.suffix in {".py", ".js"})
     code = re.sub(r"[^a-z]+", " ", re.sub(r'"\s*\n\s*f?"', "", sources.lower()))
-    rows = re.findall(r"^\| (.*?) \|", HOW_TO["troubleshooting"] + HOW_TO["credentials"].partition(
-        "## What a refused certificate looks like")[2], re.MULTILINE)
+    refused = HOW_TO["credentials"].section("## What a refused certificate looks like")
+    rows = re.findall(r"^\| (.*?) \|", HOW_TO["troubleshooting"].text + refused, re.MULTILINE)
     symptoms = [part for row in rows for part in re.findall(r"`([^`]+)`|\*([^*]+)\*", row)]
     unknown = []
     for symptom in filter(None, (" ".join(part).strip() for part in symptoms)):

@@ -2,39 +2,31 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from rampart import testing
-from tests import ROOT
+from tests import TANK
+from tests.documents.page import Page, succeed
 
-DOCUMENT = (ROOT / "docs/how-to/testing.md").read_text(encoding="utf-8")
-EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n(?:(?!^## ).)*?```python\n(.*?)```", DOCUMENT,
+PAGE = Page("how-to/testing")
+ACTORS = Page("reference/specification").of("python")[0]
+EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n(?:(?!^## ).)*?```python\n(.*?)```", PAGE.text,
                            re.DOTALL | re.MULTILINE))
-TANK = (ROOT / "docs/reference/specification.md").read_text(encoding="utf-8")
 GAUGE = '[[node]]\nname = "gauge"\nactor = "tank_actors:Gauge"\nkind = "non-control"\n\n'
 
 
 def outcome(folder: Path, *sections: str) -> str:
     """Return what pytest says of the examples of some sections, in a folder with the tank."""
-    (folder / "tank_actors.py").write_text(
-        re.findall(r"```python\n(.*?)```", TANK, re.DOTALL)[0])
-    system = re.findall(r"```toml\n(.*?)```", TANK, re.DOTALL)[0]
-    system = system.replace("rampart.actors.detection.stub:StubDetection",
-                            "tank_actors:LevelTooHigh")
+    (folder / "tank_actors.py").write_text(ACTORS)
+    system = TANK.replace("rampart.actors.detection.stub:StubDetection",
+                          "tank_actors:LevelTooHigh")
     (folder / "tank.toml").write_text(system.replace("[[node]]", GAUGE + "[[node]]", 1))
     (folder / "test_tank.py").write_text("\n\n".join(EXAMPLES[name] for name in sections))
     (folder / "pytest.ini").write_text("[pytest]\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], cwd=folder, text=True,
-        env={**os.environ, "PYTHONPATH": f"{folder}:{ROOT}"}, capture_output=True, check=False)
-    assert done.returncode == 0, done.stdout
-    return done.stdout.splitlines()[-1]
+    return succeed("python -m pytest -q -p no:cacheprovider", folder).splitlines()[-1]
 
 
 def test_what_runs_in_virtual_time(tmp_path):
@@ -48,5 +40,5 @@ def test_what_runs_on_processes(tmp_path):
 
 
 def test_everything_there_is_has_its_place():
-    assert [name for name in testing.__all__ if f"`{name}`" not in DOCUMENT
+    assert [name for name in testing.__all__ if f"`{name}`" not in PAGE.text
             and name not in {"Heard", "HEEDS_SIGNALS", "turns"}] == []
