@@ -364,7 +364,7 @@ class Chaos:
         return beat.pid if header.stamp >= since_s else None
 
 
-def complaints(run: RealRun, code: int, result: dict[str, Any], rows: str,
+def complaints(run: RealRun, code: int, result: dict[str, Any], lights: tuple[str, ...],
                struck: Sequence[Struck]) -> list[str]:
     """Return what is wrong with a run that has ended; empty if all is as it has to be.
 
@@ -372,7 +372,7 @@ def complaints(run: RealRun, code: int, result: dict[str, Any], rows: str,
         run: The run.
         code: Exit code of `launch.py`.
         result: What it printed with --json.
-        rows: Letters of the rows of lights that the mission passes.
+        lights: How the names of the lights begin that the mission passes.
         struck: What was done to it.
     """
     wrong = [f"not back: {done}" for done in struck if done.back_s is None]
@@ -383,16 +383,16 @@ def complaints(run: RealRun, code: int, result: dict[str, Any], rows: str,
     wrong += [f"printed: {line}" for line in run.story.splitlines()
               if "UNSAFE" in line or "given up" in line]
     if result["mission"] == "success":  # else lights are missing
-        wrong += _lights_wrong(Path(result["report"]).parent, result, rows)
+        wrong += _lights_wrong(Path(result["report"]).parent, result, lights)
     return wrong
 
 
-def _lights_wrong(report: Path, result: dict[str, Any], rows: str) -> list[str]:
+def _lights_wrong(report: Path, result: dict[str, Any], passed: tuple[str, ...]) -> list[str]:
     """Compare the three records of lights: the result, and both nodes' checkpoints.
 
     A light that was measured twice has two intensities, and one of the three has the other one.
     """
-    expected = sorted(x["name"] for x in result["lights"] if x["row"] in rows)
+    expected = sorted(x["name"] for x in result["lights"] if x["name"].startswith(passed))
     run_id = Path(result["report"]).stem.removeprefix("inspection-")
     state = _newest(report / "checkpoints", "mission_manager", run_id, MISSION_STATE)
     kept = _newest(report / "checkpoints", "osmosis_control", run_id, CONTROL_STATE)

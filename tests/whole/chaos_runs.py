@@ -58,6 +58,7 @@ ROUTER_HITS = 50
 DEATHS = 200
 MINUTES = 10.0
 LAPS = 3
+ROWS = ("A", "B")
 MISSION_S = 1200.0
 
 Record = dict[str, Any]
@@ -142,7 +143,7 @@ def _in_one_mission(name: str, root: Path, rate: float, strikes: Sequence[Strike
         chaos = Chaos(run, say)
         left = chaos.carry_out(strikes)
         code, result = run.result(MISSION_S)
-    wrong = complaints(run, code, result, "AB", chaos.struck)
+    wrong = complaints(run, code, result, ROWS, chaos.struck)
     if left:
         wrong.append(f"{len(left)} strikes of {len(strikes)} were left when the mission ended")
     return _concluded(name, run, chaos.struck, result, wrong)
@@ -169,7 +170,7 @@ def deaths(root: Path, seed: int, rate: float) -> list[str]:
             after = count(run, survivors)
             say(f"after: {after}")
         code, result = run.result(MISSION_S)
-    wrong = complaints(run, code, result, "AB", chaos.struck) + leaks(before, after)
+    wrong = complaints(run, code, result, ROWS, chaos.struck) + leaks(before, after)
     if len(chaos.struck) < DEATHS or took_s > 60 * MINUTES:
         wrong.append(f"{len(chaos.struck)} of {DEATHS} deaths in {took_s:.0f} s")
     wrong += [f"shared memory: {name}" for name in sorted(shared_memory() - memory_before)]
@@ -187,7 +188,8 @@ def _concluded(name: str, run: RealRun, struck: Sequence[Struck], result: Record
     return [f"{name}: {line}" for line in wrong]
 
 
-def pairs_in_a_mission(run: RealRun, todo: dict[int, Strike], log: Log, rows: str = "AB") -> None:
+def pairs_in_a_mission(run: RealRun, todo: dict[int, Strike], log: Log,
+                       lights: tuple[str, ...] = ROWS) -> None:
     """Hit pairs as long as a run's mission lasts; what is done is kept and taken from `todo`."""
     with run:
         run.wait_for("goal 1/", 60)
@@ -205,7 +207,7 @@ def pairs_in_a_mission(run: RealRun, todo: dict[int, Strike], log: Log, rows: st
                 break
         code, result = run.result(MISSION_S)
     verdict = {key: result[key] for key in ("mission", "safety", "duration_s", "reasons")}
-    wrong = complaints(run, code, result, rows, [])
+    wrong = complaints(run, code, result, lights, [])
     log.add("mission", **verdict, wrong=wrong, resets=chaos.resets, pairs=len(chaos.struck),
             story=run.story if wrong else "")
     say(f"mission: {result['mission']}, {result['safety']}, after {len(chaos.struck)} pairs and "

@@ -30,17 +30,17 @@ LASTS_S = 21.0
 STATES = ("mission_manager", "graph_planner", "osmosis_control", "simulator", "ftm_manager")
 
 
-def started(folder: Path, port: int, *options: str) -> subprocess.Popen[str]:
+def started(folder: Path, port: int, *options: str, **how: Any) -> subprocess.Popen[str]:
     """Start a run, or go on with one."""
     return subprocess.Popen(
         [sys.executable, str(ROOT / "launch.py"), "--no-hmi", "--json", "--port", str(port),
-         *options], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+         *options], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **how)
 
 
-def first_part(folder: Path, port: int, report: Path | None = None) -> subprocess.Popen[str]:
-    """Start the first part of a run, with its report in `folder/report` if nowhere else."""
+def first_part(folder: Path, port: int) -> subprocess.Popen[str]:
+    """Start the first part of a run, with its report in `folder/report`."""
     return started(folder, port, "--mission", str(write_short_mission(folder)), "--rate", str(RATE),
-                   "--report", str(report or folder / "report"))
+                   "--report", str(folder / "report"))
 
 
 def resumed(folder: Path, port: int, which: str) -> tuple[int, dict[str, Any], str]:

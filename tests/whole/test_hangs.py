@@ -42,7 +42,7 @@ class Loop(Actor):
 
     def on_start(self) -> None:
         if self._incarnation == 1:
-            self.call_later(3.0, self.hang)
+            self.call_later(1.0, self.hang)
 
     @every(0.02)
     def count(self) -> None:
@@ -114,7 +114,7 @@ title = "Crash"
 def test_a_loop_that_hangs_is_found_and_replaced(tmp_path: Path, how):
     (tmp_path / "loops_nodes.py").write_text(NODES)
     (tmp_path / "loops.toml").write_text(SYSTEM.format(how=how))
-    with RealRun(tmp_path, tmp_path / "loops.toml", "--duration", "6") as run:
+    with RealRun(tmp_path, tmp_path / "loops.toml", "--duration", "4") as run:
         run.wait_for("(D): loop: process of incarnation 1 is hung")
         run.wait_for("loop respawned")
         assert run.process.wait(30) == 0, run.story

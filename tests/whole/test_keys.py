@@ -24,16 +24,12 @@ def keys(tmp_path):
     return make_keys(tmp_path / "keys", layout_of("paper"))
 
 
-def kill(run, *words):
+def kill(run, name):
+    """Kill a node and wait for its second process; what is told of it may be lost with a router."""
     done = subprocess.run([sys.executable, "-P", "-m", "rampart.cli.operate.kill_node",
-                           *words, "--port", str(run.port)], capture_output=True, text=True,
+                           name, "--port", str(run.port)], capture_output=True, text=True,
                           timeout=30, check=False)
     assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def back(run, name):
-    """Wait for its second process; what is told of it may be lost with a router."""
     run.wait_until(lambda: any(name in process.names and process.incarnation == 2
                                for process in find_processes(run.port)), 30, f"{name} is not back")
 
@@ -51,7 +47,6 @@ def test_nodes_and_routers_that_are_killed_come_back_with_their_keys(tmp_path, k
         run.wait_for("goal 1/3", 60)
         for victim in ("osmosis_control", "router_a", "localization", "router_b", "ftm_manager"):
             kill(run, victim)
-            back(run, victim)
         pids = [run.process.pid, *(p.pid for p in find_processes(run.port))]
         listening = {c.laddr for pid in pids for c in psutil.Process(pid).net_connections("inet")
                      if c.status == psutil.CONN_LISTEN}
@@ -61,7 +56,10 @@ def test_nodes_and_routers_that_are_killed_come_back_with_their_keys(tmp_path, k
         assert "payload rejected" not in run.story
 
 
-def test_tools_may_what_their_certificate_says(tmp_path, keys):
+def test_tools_may_what_their_certificate_says_and_a_module_whose_own_expires_stops_the_robot(
+        tmp_path, keys):
+    """The module is deaf from then on, and must not look as if it had detected nothing."""
+    key_folder.issue(keys, ("DM3",), "node", days=15 / 86_400)
     with RealRun(tmp_path, "paper", "--mission", "A", "--keys", str(keys)) as run:
         run.wait_for("goal 1/3", 60)
         assert rampart(run, "node", "list").returncode == 0
@@ -77,6 +75,10 @@ def test_tools_may_what_their_certificate_says(tmp_path, keys):
         missing = rampart(run, "status", key=keys / "none.pem")
         assert missing.returncode == 2
         assert "RAMPART_KEY=" in missing.stderr
+        run.wait_for(f"{keys / 'DM3.pem'}: the certificate of DM3 expired at", 60)
+        assert "`rampart keys rotate DM3` renews it" in run.story
+        run.wait_for("(DM3) silent: it counts as active", 20)
+        assert "Controlled stop (RM2)" in run.story
 
 
 def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
@@ -87,11 +89,9 @@ def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
         stolen.chmod(0o600)
         key_folder.rotate(keys, [])
         kill(run, "osmosis_control")
-        back(run, "osmosis_control")
         key_folder.revoke(keys, ["ada"])
         for router in ("router_a", "router_b"):
             kill(run, router)
-            back(run, router)
         refused = rampart(run, "inject", "drop:localization/pose", key=stolen)
         assert refused.returncode != 0
         for words in (("status",), ("node", "list"), ("top", "--once")):
@@ -109,17 +109,6 @@ def test_rotation_and_revocation_while_it_runs(tmp_path, keys):
         assert early.returncode == 1
         assert "send eve no messages: it was issued after the routers started" in early.stderr
         assert run.process.poll() is None
-
-
-def test_a_module_whose_certificate_expires_stops_the_robot_and_is_named_with_its_file(
-        tmp_path, keys):
-    """It is deaf from then on, and must not look as if it had detected nothing."""
-    key_folder.issue(keys, ("DM3",), "node", days=20 / 86_400)
-    with RealRun(tmp_path, "paper", "--mission", "A", "--keys", str(keys)) as run:
-        run.wait_for(f"{keys / 'DM3.pem'}: the certificate of DM3 expired at", 60)
-        assert "`rampart keys rotate DM3` renews it" in run.story
-        run.wait_for("(DM3) silent: it counts as active", 20)
-        assert "Controlled stop (RM2)" in run.story
 
 
 @pytest.mark.parametrize(("spoil", "words"), [

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import jinja2
@@ -23,6 +21,7 @@ from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port
 from tests import ROOT
 from tests.actors.recording.samples import pose
 from tests.whole.checkpoint_runs import write_short_mission
+from tests.whole.hunger import small_files
 
 UNSAFE = 3
 
@@ -131,11 +130,6 @@ def test_the_toolbox_keeps_its_exit_code_too(tmp_path, arguments, redirected, co
 
 
 # -- the report ----------------------------------------------------------------------------------
-
-
-def small_files(size: int) -> Callable[[], None]:
-    """Have no file of a process be larger: as on a full disk, writing fails."""
-    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
 @pytest.mark.parametrize("size", [0, 5000])

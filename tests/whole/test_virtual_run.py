@@ -281,9 +281,9 @@ def test_a_job_survives_the_way_to_another_process_and_back():
 @pytest.mark.alone
 @pytest.mark.timeout(180)
 def test_virtual_and_real_runs_take_the_same_decisions_and_come_to_the_same_verdict(tmp_path):
-    faults = ("kill:osmosis_control@4", "command-out-of-bounds@7+2", "wedge:graph_planner@12",
-              "localization-not-updated@16+3", "kill:localization@22", "stop:hmi@25+3",
-              "kill:mission_manager@29")
+    faults = ("kill:osmosis_control@3", "command-out-of-bounds@5+1", "wedge:graph_planner@8.5",
+              "localization-not-updated@11+2", "kill:localization@15.5", "stop:hmi@17.5+2",
+              "kill:mission_manager@20")
     virtual = run_job(job(*faults))
     arguments = [x for fault in faults for x in ("--fault", fault)]
     with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "1", *arguments) as run:
