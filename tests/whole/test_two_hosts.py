@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import Forms, header_of
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun
+from tests import ROOT
 from tests.actors.access.keyed import every_key, layout_of, shown_by_strangers, try_all
 from tests.two_hosts import home_when_lost, two_hosts
 from tests.whole.network import Line, Network, network, why_not
@@ -93,10 +95,33 @@ def recorded(file: Path) -> tuple[Counter[str], Summary]:
     return sources, Summary(BagReader(file))
 
 
+def counted(file: Path) -> dict[int, tuple[int, int]]:
+    """Return by incarnation how far the camera had come at first, and before there was a higher."""
+    found: dict[int, tuple[int, int]] = {}
+    for channel, message in BagReader(file).messages():
+        if channel.topic == "counting/counted":
+            told = json.loads(message.data)
+            incarnation, number = told["incarnation"], told["body"]["number"]
+            if incarnation >= max(found, default=0):
+                found[incarnation] = found.get(incarnation, (number, 0))[0], number
+    return found
+
+
+def with_a_camera_that_counts(net: Network, folder: Path) -> Path:
+    """Return the specification of a cell whose camera keeps how far it has counted."""
+    spec = specification(net, folder, CELL_ON_GROUND, "cell", 0.1)
+    spec.write_text(spec.read_text(encoding="utf-8").replace(
+        'actor = "rampart.actors.runtime.stub_node:StubNode"',
+        'actor = "counting_actor:Counting"', 1), encoding="utf-8")
+    shutil.copy(ROOT / "tests" / "counting_actor.py", folder)
+    return spec
+
+
 @pytest.mark.parametrize("keyed", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_back(
+def test_what_a_host_ran_that_cannot_be_reached_goes_on_on_the_first_until_it_is_back(
         net, tmp_path, keyed):
-    spec = specification(net, tmp_path, CELL_ON_GROUND, "cell", 0.1)
+    """From its checkpoint, each time: on the first host, and at home from that one's."""
+    spec = with_a_camera_that_counts(net, tmp_path)
     own = with_keys(tmp_path, spec) if keyed else dict.fromkeys(net.addresses, ("--no-keys",))
     file = tmp_path / "run.mcap"
     with (host(net, "ground", tmp_path / "g", spec, *own["ground"]) as ground,
@@ -147,15 +172,18 @@ def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_ba
         ground.wait_for("camera respawned")
         robot.wait_until(lambda: not any(map(robot.pid, CELL_ON_GROUND)), 5, "not given back")
         net.line = Line()
+        time.sleep(2.0)  # for the copies of states that waited for the line
         before = len(robot.story)
-        ground.process.send_signal(signal.SIGKILL)
+        ground.process.send_signal(signal.SIGKILL)  # as a whole: its disk is gone with it
         robot.wait_until(lambda: "supervisor_ground unreachable" in robot.story[before:], 10,
                          "the loss of the other host was not told")
         robot.wait_until(lambda: None not in map(robot.pid, CELL_ON_GROUND), 5, "not taken over")
+        time.sleep(1.0)
         with host(net, "ground", tmp_path / "again", spec, *own["ground"]) as again:
             again.wait_for("takes part in run")
             again.wait_for("camera respawned")
             robot.wait_until(lambda: not any(map(robot.pid, CELL_ON_GROUND)), 5, "not given back")
+            time.sleep(1.0)
             robot.process.send_signal(signal.SIGINT)
             code, _ = robot.result(20)
             assert again.result(20)[0] == 0
@@ -173,6 +201,14 @@ def test_what_a_host_ran_that_cannot_be_reached_runs_on_the_first_until_it_is_ba
     assert 0.6 < max(cut) < 20
     assert not {"gripper", "supervisor", "cell_manager"} & json.loads(summary.end["lost"]).keys()
     assert "; ground was silent for a time" in robot.story
+    numbers = counted(file)
+    assert [incarnation // 1_000_000 for incarnation in numbers] == [0] * 4 + [1, 1, 2, 2], numbers
+    (_, last), *later = numbers.values()
+    for first, end in later:  # twenty a second: what was under way when the line was cut is lost
+        assert last - 10 < first <= last + 10, numbers
+        last = end
+    assert last > 100, numbers
+    assert "camera: checkpoint" not in robot.story  # nothing was wrong with one
 
 
 def test_the_manager_survives_its_machine_and_never_are_two_obeyed(net, tmp_path):
