@@ -5,7 +5,8 @@
 *In a crowd*, one worker more than cores: many of these wait more than they compute. What fails in
 that crowd, as a wait of half a second may, is run once more by itself, and counts then.
 
-*Alone*, one after the other: what has a mission of the real robot against the clock.
+*In pairs*, two files at a time: what has a mission of the real robot against the clock. A mission
+takes less than a core. What fails beside another is run once more alone, and counts then.
 
 *Beside both*, at the lowest priority, what only computes: it takes what is left, and does not care
 when. What fails there is run once more when the machine is free. (Not a job of a shell: that would
@@ -43,9 +44,10 @@ def main() -> int:
         cache = ("-o", f"cache_dir={folder}/beside")
         computing = [*_PYTEST, _COMPUTES, "--numprocesses", "logical", *cache, *VIRTUAL]
         with beside(computing) as virtual:
-            crowd = twice(folder, _CROWD, "--numprocesses", str((os.cpu_count() or 1) + 1))
-            alone = subprocess.run([*_PYTEST, _ALONE, *having("mark.alone")],
-                                   check=False).returncode
+            crowd = twice(f"{folder}/crowd", _CROWD,
+                          "--numprocesses", str((os.cpu_count() or 1) + 1))
+            alone = twice(f"{folder}/alone", _ALONE, *having("mark.alone"),
+                          "--numprocesses", "2", "--dist", "loadfile")
             computes = virtual.wait()
         if computes == _SOME_FAILED:
             computes = once_more(_COMPUTES, *cache, *VIRTUAL)
@@ -54,7 +56,7 @@ def main() -> int:
 
 def twice(folder: str, which: str, *arguments: str) -> int:
     """Run tests, and once more by themselves those that failed; return the exit code."""
-    cache = ("-o", f"cache_dir={folder}/twice")
+    cache = ("-o", f"cache_dir={folder}")
     code = subprocess.run([*_PYTEST, which, *arguments, *cache], check=False).returncode
     return once_more(which, *cache) if code == _SOME_FAILED else code
 

@@ -20,7 +20,7 @@ from rampart.sim.runs.virtual_run import LEAD_S
 from rampart.testing import HEEDS_SIGNALS, RealRun
 from tests import ROOT
 from tests.actors.recording.samples import pose
-from tests.whole.checkpoint_runs import write_short_mission
+from tests.whole.checkpoint_runs import write_near_mission, write_short_mission
 
 SHORT = parse_fault("kill:mission_manager@6")
 """Loses the mission, so the run is over after ten simulated seconds."""
@@ -33,17 +33,17 @@ def job(*faults: str, options=None, **changes) -> Job:
 
 
 @pytest.fixture
-def short(tmp_path):
-    """Options of a job: a mission of a minute over three lights, a third of mission A."""
-    return {"mission": str(write_short_mission(tmp_path))}
+def near(tmp_path):
+    """Options of a job: a mission of half a minute, a sixth of mission A."""
+    return {"mission": str(write_near_mission(tmp_path))}
 
 
 def decisions(result):
     return [(d.active, d.recoveries) for d in result.decisions]
 
 
-def test_a_mission_without_a_fault_succeeds_without_a_decision():
-    result = run_job(job())
+def test_a_mission_without_a_fault_succeeds_without_a_decision(tmp_path):
+    result = run_job(job(options={"mission": str(write_short_mission(tmp_path))}))
     assert (result.success, result.safe, result.decisions) == (True, True, ())
     assert (result.false_alarms, result.failures) == (0, ())
     assert result.detected_after_s is None
@@ -58,10 +58,13 @@ def test_the_same_seed_gives_the_same_run_to_the_byte_and_another_seed_another()
     assert len(first.trace) == 64
 
 
-@pytest.mark.parametrize(("system", "code"), [("paper", 1), ("osmosis", 0)])
-def test_the_trace_does_not_depend_on_the_process_it_is_made_in(tmp_path, system, code):
+@pytest.mark.parametrize(("system", "write", "code"), [
+    ("osmosis", write_near_mission, 0),
+    *(pytest.param(system, write_short_mission, code, marks=pytest.mark.nightly)
+      for system, code in (("paper", 1), ("osmosis", 0)))])
+def test_the_trace_does_not_depend_on_the_process_it_is_made_in(tmp_path, system, write, code):
     traces = set()
-    mission = write_short_mission(tmp_path)
+    mission = write(tmp_path)
     for seed in ("0", "4711"):
         done = subprocess.run(
             [sys.executable, "launch.py", "--virtual", "--system", system,
@@ -134,13 +137,13 @@ def test_a_second_signal_ends_a_run_at_once_and_what_was_recorded_can_be_read(tm
 
 
 @pytest.mark.parametrize("fault", [
-    "drop:detection/DM1@20+inf", "slow:DM1@20",
+    "drop:detection/DM1@10+inf", "slow:DM1@10",
     *(pytest.param(fault, marks=pytest.mark.slow) for fault in (
-        "freeze:manager/status@20+inf",
-        "freeze:detection/DM1@20+inf", "delay:detection/DM2@20+inf",
-        "drop:manager/status@20+inf"))])
-def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing(short, fault):
-    result = run_job(job(fault, options=short))
+        "freeze:manager/status@10+inf",
+        "freeze:detection/DM1@10+inf", "delay:detection/DM2@10+inf",
+        "drop:manager/status@10+inf"))])
+def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing(near, fault):
+    result = run_job(job(fault, options=near))
     assert (result.success, result.safe, result.decisions) == (True, True, ())
     assert result.effective
 
@@ -153,7 +156,7 @@ def test_a_frozen_report_hides_no_fault():
 
 def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
     stale = "command-not-updated@8+inf"
-    bare, guarded = run_job(job(stale, ftm=False)), run_job(job(stale))
+    bare, guarded = (run_job(job(stale, ftm=ftm, patience_s=15.0)) for ftm in (False, True))
     assert (bare.safe, guarded.safe) == (False, True)
     assert bare.unsafe_s > 8
     assert decisions(guarded)[0] == (("FTM2",), ("RM2",))
@@ -161,8 +164,8 @@ def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
     assert 0.9 < guarded.detected_after_s < 1.1
 
 
-def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on(short):
-    result = run_job(job("kill:osmosis_control@20", options=short))
+def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on(near):
+    result = run_job(job("kill:osmosis_control@10", options=near))
     assert (result.success, result.safe) == (True, True)
     assert decisions(result) == [(("FTM4",), ("RM3",)), ((), ())]
     assert 0 < result.detected_after_s < 0.1
@@ -170,25 +173,25 @@ def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on(short):
 
 
 @pytest.mark.parametrize("fault", ["stop:graph_planner@12", "wedge:osmosis_control@12"])
-def test_a_stopped_or_wedged_process_is_detected_by_its_silence_and_replaced(short, fault):
-    result = run_job(job(fault, options=short))
+def test_a_stopped_or_wedged_process_is_detected_by_its_silence_and_replaced(near, fault):
+    result = run_job(job(fault, options=near))
     assert decisions(result)[0] == (("FTM4",), ("RM3",))
     assert 0.3 < result.detected_after_s < 0.6
     assert result.recovered_after_s < result.detected_after_s + 0.2
 
 
-def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_afterwards(short):
-    record = run_virtually(job("slow:all:0.025@20+30", system="osmosis", options=short)).record
+def test_a_machine_that_is_overloaded_is_one_fault_and_the_mission_goes_on_afterwards(near):
+    record = run_virtually(job("slow:all:0.025@8+8", system="osmosis", options=near)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
     assert [(d.active, d.recoveries) for d in record.decisions] == [
         (("FTM14",), ("RM2",)), ((), ())]
 
 
 @pytest.mark.parametrize(("faults", "restarts"), [
-    (("drop:detection/DM2@25+8",), {"DM2": 1}),
-    pytest.param(("slow:all:0.025@20+30", "drop:detection/DM2@25+8"), {}, marks=pytest.mark.slow)])
-def test_a_module_that_is_not_heard_is_restarted_but_not_for_being_late(short, faults, restarts):
-    record = run_virtually(job(*faults, system="osmosis", options=short)).record
+    (("drop:detection/DM2@10+8",), {"DM2": 1}),
+    pytest.param(("slow:all:0.025@5+20", "drop:detection/DM2@10+8"), {}, marks=pytest.mark.slow)])
+def test_a_module_that_is_not_heard_is_restarted_but_not_for_being_late(near, faults, restarts):
+    record = run_virtually(job(*faults, system="osmosis", options=near)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", restarts)
 
 
@@ -201,39 +204,39 @@ def test_an_overload_in_which_nearly_nothing_arrives_leaves_no_latch_behind():
     assert record.decisions[-1].active == ()
 
 
-def test_killed_detection_modules_know_the_state_again_before_their_silence_counts(short):
-    kills = [f"kill:DM{n}@{3 * n}" for n in range(1, 15)]
-    result = run_job(job(*kills, system="osmosis", options=short))
+def test_killed_detection_modules_know_the_state_again_before_their_silence_counts(near):
+    kills = [f"kill:DM{n}@{1.5 * n}" for n in range(1, 15)]
+    result = run_job(job(*kills, system="osmosis", options=near))
     assert (result.success, result.safe, decisions(result)) == (True, True, [])
 
 
-def test_killed_guards_come_back_and_the_mission_goes_on(short):
+def test_killed_guards_come_back_and_the_mission_goes_on(near):
     record = run_virtually(job("kill:supervisor@12", "kill:ftm_manager@14", "kill:safety_pilot@16",
                                "kill:supervisor@18", "kill:graph_planner@18.01",
-                               options=short)).record
+                               options=near)).record
     assert (record.mission, record.safety) == ("success", "safe")
     assert record.restarts == {"supervisor": 2, "ftm_manager": 1, "safety_pilot": 1,
                                "graph_planner": 1}
 
 
 @pytest.mark.parametrize("lasts_s", [1, 30])
-def test_after_a_pause_of_everybody_nothing_is_restarted_and_the_mission_goes_on(short, lasts_s):
-    record = run_virtually(job(f"stop:all@20+{lasts_s}", system="osmosis", options=short)).record
+def test_after_a_pause_of_everybody_nothing_is_restarted_and_the_mission_goes_on(near, lasts_s):
+    record = run_virtually(job(f"stop:all@10+{lasts_s}", system="osmosis", options=near)).record
     assert (record.mission, record.safety, record.restarts) == ("success", "safe", {})
     assert not [d for d in record.decisions if "RM1" in d.recoveries]
 
 
-def test_what_dies_during_a_pause_of_everybody_is_restarted_after_it(short):
-    record = run_virtually(job("stop:all@20+5", "kill:localization@22", "wedge:graph_planner@25.1",
-                               system="osmosis", options=short)).record
+def test_what_dies_during_a_pause_of_everybody_is_restarted_after_it(near):
+    record = run_virtually(job("stop:all@10+5", "kill:localization@12", "wedge:graph_planner@15.1",
+                               system="osmosis", options=near)).record
     assert (record.mission, record.safety) == ("success", "safe")
     assert record.restarts == {"localization": 1, "graph_planner": 1}
 
 
-def test_a_manager_that_hangs_after_each_start_stops_the_robot_until_it_works(short):
-    lost = run_job(job("hang:ftm_manager@12+inf", options=short, patience_s=30.0))
+def test_a_manager_that_hangs_after_each_start_stops_the_robot_until_it_works(near):
+    lost = run_job(job("hang:ftm_manager@12+inf", options=near, patience_s=30.0))
     assert (lost.success, lost.safe, lost.stopped_for_good) == (False, True, True)
-    record = run_virtually(job("hang:ftm_manager@12+6", options=short)).record
+    record = run_virtually(job("hang:ftm_manager@12+6", options=near)).record
     assert (record.mission, record.safety) == ("success", "safe")
     assert record.restarts["ftm_manager"] > 4
 
