@@ -6,6 +6,7 @@ import asyncio
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rampart.testing import RealRun, VirtualSystem, free_port, run, virtual_run
@@ -19,7 +20,9 @@ SYSTEM = Path(__file__).resolve().parents[1] / "warehouse.toml"
     ("drop:nav/command@10+5", "M_SILENT", "R_RESTART"),
     ("stuck:guard/velocity@10+inf", "M_GUARD_STUCK", "R_RESTART"),
     ("drop:guard/velocity@10+inf", "M_GUARD_SILENT", "R_RESTART"),
-    ("corrupt:guard/velocity@10+inf", "M_DAMAGED", "R_RESTART"),
+    ("corrupt:guard/velocity@10+inf", "M_SPEED", "R_RESTART"),
+    ("drop:nav/scan@10+inf", "M_BLIND", "R_RESTART"),
+    ("battery-low@10", "M_BATTERY", "R_SLOW"),
     ("kill:controller_server@10", "M_CRASH", "R_RESTART"),
     pytest.param("kill:amcl@10", "M_CRASH", "R_RESTART", marks=pytest.mark.slow),
     pytest.param("wedge:planner_server@10", "M_CRASH", "R_RESTART", marks=pytest.mark.slow)])
@@ -36,10 +39,29 @@ def test_the_round_is_made_all_the_same_and_the_mechanism_against_it_acts(
         assert recovery in first.recoveries
 
 
-def test_a_command_that_is_stuck_ends_before_the_next_obstacle_and_is_told():
-    done = virtual_run(SYSTEM, "stuck:nav/command@10+inf", seconds=40.0)
-    assert done.judgement.safe is True
+def test_a_command_that_is_stuck_ends_before_the_next_obstacle_and_the_round_is_made():
+    done = virtual_run(SYSTEM, "stuck:nav/command@28.24+inf")
+    assert (done.judgement.safe, done.judgement.success) == (True, True)
     assert any("M_STANDS" in decision.active for decision in done.record.decisions)
+
+
+@pytest.mark.parametrize("wrong", ["{ linear_mps = -0.6, angular_radps = 0.0 }",
+                                   "{ linear_mps = 0.8, angular_radps = 0.3 }"])
+def test_a_command_that_is_wrong_within_its_bounds_leads_into_no_obstacle(
+        wrong, tmp_path, monkeypatch):
+    """Nothing compares it with what the controller sent."""
+    monkeypatch.syspath_prepend(SYSTEM.parent)
+    (tmp_path / "warehouse.toml").write_text(
+        SYSTEM.read_text(encoding="utf-8") + '[[fault]]\nname = "wrong"\ntopic = "nav/command"\n'
+        f'mode = "corrupt"\nduration_s = 1000.0\nset = {wrong}\n')
+    done = virtual_run(tmp_path / "warehouse.toml", "wrong@10", seconds=40.0)
+    assert done.judgement.safe is True
+
+
+def test_the_robot_drives_on_after_a_long_jump_of_the_localization():
+    """The stop that the jump ordered is no refusal of the guard: it ends when the pose is right."""
+    done = virtual_run(SYSTEM, "localization-jump@20+11")
+    assert (done.judgement.safe, done.judgement.success) == (True, True)
 
 
 @pytest.mark.parametrize("node", ["gateway", "guard"])
@@ -49,10 +71,15 @@ def test_what_stands_between_may_die_and_nobody_notices(node):
     assert done.record.restarts == {node: 1}
 
 
-def test_with_a_low_battery_the_goal_is_cancelled_and_the_robot_stands_still():
-    done = virtual_run(SYSTEM, "battery-low@10", seconds=30.0)
+def test_with_an_empty_battery_the_goal_is_cancelled_and_the_robot_stands_still(
+        tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(SYSTEM.parent)
+    head = 'name = "base"\n'
+    (tmp_path / "warehouse.toml").write_text(SYSTEM.read_text(encoding="utf-8").replace(
+        head, head + "parameters = { charge = 0.03 }\n", 1))
+    done = virtual_run(tmp_path / "warehouse.toml", seconds=30.0)
     assert done.judgement.safe is True
-    assert [d.recoveries for d in done.record.decisions] == [("R_CANCEL",)]
+    assert done.record.decisions[-1].recoveries == ("R_CANCEL",)
 
 
 @pytest.mark.parametrize("limits", ["", "restart = { intensity = 2, period_s = 5.0 }\n"])
@@ -85,7 +112,7 @@ def test_what_was_commanded_during_a_stop_is_not_executed_at_its_end(monkeypatch
             async def commanded(before_s=0.0):
                 system.say(scan, scan.type(
                     angle_min_rad=0.0, angle_increment_rad=0.1, range_min_m=0.0, range_max_m=6.0,
-                    ranges_f32=b"", nearest_m=5.0))
+                    ranges_f32=np.full(60, 5.0, np.float32).tobytes(), nearest_m=5.0))
                 await asyncio.sleep(0.02)
                 system.say(command, command.type(
                     linear_mps=0.5, lateral_mps=0.0, angular_radps=0.0),

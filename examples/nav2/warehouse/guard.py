@@ -5,10 +5,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from rampart import Actor, Context, Header, TopicHeard, every, on
 from rampart.manager.spec.tables import Positive
 from warehouse import topics
-from warehouse.topics import GuardState, Order, Velocity
+from warehouse.topics import GuardState, Limit, Order, Velocity
+
+TURNED_S = 0.4
+"""Time in which a command is replaced or the robot brakes: it then drives in another direction."""
 
 
 class Guard(Actor):
@@ -19,10 +24,13 @@ class Guard(Actor):
 
         Attributes:
             command: topic of the navigation's velocity.
-            scan: topic of the laser, with a field `nearest_m`.
+            scan: topic of the laser, translated from a LaserScan.
             top_mps, top_radps: largest velocities.
-            stop_m: smallest distance of an obstacle from the robot's centre: its radius of 0.3 m,
-                the way in 0.2 s, the age of a sweep, and the braking distance from 0.8 m/s.
+            slow_mps: largest speed while a recovery limits it.
+            ahead_m: smallest distance of an obstacle in the direction of the drive: the robot's
+                radius of 0.3 m, the way in 0.3 s, the age of a sweep, and the braking distance from
+                0.8 m/s.
+            beside_m: smallest distance of an obstacle to the side.
             stale_s: an older command or sweep stops the robot.
         """
 
@@ -30,7 +38,9 @@ class Guard(Actor):
         scan: TopicHeard
         top_mps: Positive = 0.8
         top_radps: Positive = 1.5
-        stop_m: Positive = 0.8
+        slow_mps: Positive = 0.5
+        ahead_m: Positive = 0.9
+        beside_m: Positive = 0.4
         stale_s: Positive = 0.3
 
     parameters: Parameters
@@ -39,15 +49,19 @@ class Guard(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         given = self.parameters
-        self._nearest_m, self._seen_s = math.nan, -math.inf
-        self._commanded_s = self._released_s = -math.inf
-        self._stop, self._why = False, "no command"
-        self._linear_mps = 0.0
+        self._angles_rad = self._ranges_m = np.empty(0)
+        self._seen_s = self._commanded_s = self._released_s = -math.inf
+        self._stop = self._slow = False
+        self._why = "no command"
+        self._passed = (0.0, 0.0)
         self.hear_topic(given.command, self._command)
         self.hear_topic(given.scan, self._scan)
 
     def _scan(self, message: Any, header: Header) -> None:
-        self._nearest_m, self._seen_s = message.nearest_m, header.stamp
+        self._ranges_m = np.nan_to_num(np.frombuffer(message.ranges_f32, np.float32), nan=0.0)
+        self._angles_rad = (message.angle_min_rad
+                            + message.angle_increment_rad * np.arange(len(self._ranges_m)))
+        self._seen_s = header.stamp
 
     @on(topics.ORDER)
     def order(self, message: Order, header: Header) -> None:
@@ -55,6 +69,11 @@ class Guard(Actor):
         if self._stop and not message.stop:
             self._released_s = header.stamp
         self._stop = message.stop
+
+    @on(topics.LIMIT)
+    def limit(self, message: Limit, _header: Header) -> None:
+        """Limit the speed or release it, as a recovery orders."""
+        self._slow = message.slow
 
     def _command(self, message: Any, header: Header) -> None:
         bounds, now_s = self.parameters, self.clock.now()
@@ -67,17 +86,28 @@ class Guard(Actor):
             self._why = "commanded during a stop"
         elif not (math.isfinite(linear) and math.isfinite(angular)):
             self._why = f"{linear} m/s, {angular} rad/s"
-        elif now_s - self._seen_s > bounds.stale_s:
+        elif now_s - self._seen_s > bounds.stale_s or not len(self._ranges_m):
             self._why = "no sweep of the laser"
-        elif not self._nearest_m > bounds.stop_m and linear > 0:
-            self._why = f"{self._nearest_m:.2f} m to the next obstacle"
         if self._why:
-            linear, angular = 0.0, angular if self._why.endswith("obstacle") else 0.0
-        linear = max(-bounds.top_mps, min(bounds.top_mps, linear))
+            linear = angular = 0.0
+        top_mps = bounds.slow_mps if self._slow else bounds.top_mps
+        linear = max(-top_mps, min(top_mps, linear))
         angular = max(-bounds.top_radps, min(bounds.top_radps, angular))
-        self._linear_mps = linear
-        self.publish(topics.CHECKED, Velocity(linear, angular, header.stamp),
-                     stamp=header.stamp)
+        if linear and self._is_blocked(linear, angular):
+            linear, self._why = 0.0, "an obstacle is too near"
+        self._pass(Velocity(linear, angular, header.stamp), header.stamp)
+
+    def _is_blocked(self, linear: float, angular: float) -> bool:
+        """Return whether an obstacle is too near for this velocity, now or after the turn."""
+        ahead_rad = 0.0 if linear > 0 else math.pi
+        aside_rad = self._angles_rad - ahead_rad - np.array([[0.0], [angular * TURNED_S]])
+        needed_m = np.maximum(self.parameters.ahead_m * np.cos(aside_rad),
+                              np.where(np.cos(aside_rad) >= 0, self.parameters.beside_m, 0.0))
+        return bool((self._ranges_m < needed_m).any())
+
+    def _pass(self, velocity: Velocity, stamp_s: float) -> None:
+        self._passed = velocity.linear_mps, velocity.angular_radps
+        self.publish(topics.CHECKED, velocity, stamp=stamp_s)
 
     @every(0.1)
     def look(self) -> None:
@@ -85,6 +115,7 @@ class Guard(Actor):
         now_s = self.clock.now()
         if now_s - self._commanded_s > self.parameters.stale_s:
             self._why = "the navigation is silent"
-            self._linear_mps = 0.0
-            self.publish(topics.CHECKED, Velocity(0.0, 0.0, now_s))
-        self.publish(topics.STATE, GuardState(bool(self._why), self._why, self._linear_mps))
+            self._pass(Velocity(0.0, 0.0, now_s), now_s)
+        self.publish(topics.STATE, GuardState(
+            bool(self._why), bool(self._why) and not self._stop, self._slow, self._why,
+            *self._passed))

@@ -22,12 +22,29 @@ class Order(Message, frozen=True):
     stop: bool
 
 
+class Limit(Message, frozen=True):
+    """Order to the guard to pass at most its slow speed."""
+
+    slow: bool
+
+
 class GuardState(Message, frozen=True):
-    """Whether and why the guard stops the robot, and the speed that it decided on, m/s."""
+    """What the guard passes, and why not more.
+
+    Attributes:
+        stopped: whether it passes no speed.
+        refusing: whether it does so by its own judgement, without an order.
+        slow: whether it passes at most its slow speed.
+        reason: why it is stopped, "" if it is not.
+        linear_mps, angular_radps: the velocity that it passes.
+    """
 
     stopped: bool
+    refusing: bool
+    slow: bool
     reason: str
     linear_mps: float
+    angular_radps: float
 
 
 class Truth(Message, frozen=True):
@@ -48,6 +65,7 @@ class Skew(Message, frozen=True):
 CHECKED = Topic("guard/velocity", Velocity, Qos.SENSOR, 20, "base_link",
                 "The navigation's command within the guard's limits.")
 ORDER = Topic("guard/order", Order, Qos.STATE, 5, "", "Orders of a recovery to the guard.")
+LIMIT = Topic("guard/limit", Limit, Qos.STATE, 5, "", "Orders of a recovery to drive slowly.")
 STATE = Topic("guard/state", GuardState, Qos.STATE, 5, "", "State of the guard.")
 TRUTH = Topic("world/truth", Truth, Qos.STATE, 10, "map", "Ground truth, for the judge only.")
 SKEW = Topic("hall/skew", Skew, Qos.STATE, 10, "map", "For faults of the localization.")
