@@ -20,7 +20,7 @@ SYSTEM = Path(__file__).resolve().parents[1] / "warehouse.toml"
     ("drop:nav/command@10+5", "M_SILENT", "R_RESTART"),
     ("stuck:guard/velocity@10+inf", "M_GUARD_STUCK", "R_RESTART"),
     ("drop:guard/velocity@10+inf", "M_GUARD_SILENT", "R_RESTART"),
-    ("corrupt:guard/velocity@10+inf", "M_SPEED", "R_RESTART"),
+    ("corrupt:guard/velocity@10+inf", "M_TURN", "R_RESTART"),
     ("drop:nav/scan@10+inf", "M_BLIND", "R_RESTART"),
     ("battery-low@10", "M_BATTERY", "R_SLOW"),
     ("kill:controller_server@10", "M_CRASH", "R_RESTART"),
@@ -45,17 +45,21 @@ def test_a_command_that_is_stuck_ends_before_the_next_obstacle_and_the_round_is_
     assert any("M_STANDS" in decision.active for decision in done.record.decisions)
 
 
-@pytest.mark.parametrize("wrong", ["{ linear_mps = -0.6, angular_radps = 0.0 }",
-                                   "{ linear_mps = 0.8, angular_radps = 0.3 }"])
-def test_a_command_that_is_wrong_within_its_bounds_leads_into_no_obstacle(
-        wrong, tmp_path, monkeypatch):
-    """Nothing compares it with what the controller sent."""
+@pytest.mark.parametrize(("topic", "wrong", "mechanism"), [
+    ("nav/command", "{ linear_mps = -0.6, angular_radps = 0.0 }", None),
+    ("nav/command", "{ linear_mps = 0.8, angular_radps = 0.3 }", None),
+    ("guard/velocity", "{ linear_mps = -0.5 }", "M_SPEED")])
+def test_a_velocity_that_is_wrong_within_its_bounds_leads_into_no_obstacle(
+        topic, wrong, mechanism, tmp_path, monkeypatch):
+    """Nothing compares `nav/command` with what was sent, but the guard looks where it drives."""
     monkeypatch.syspath_prepend(SYSTEM.parent)
     (tmp_path / "warehouse.toml").write_text(
-        SYSTEM.read_text(encoding="utf-8") + '[[fault]]\nname = "wrong"\ntopic = "nav/command"\n'
-        f'mode = "corrupt"\nduration_s = 1000.0\nset = {wrong}\n')
+        SYSTEM.read_text(encoding="utf-8") + '[[fault]]\nname = "wrong"\ntitle = "Wrong"\n'
+        f'topic = "{topic}"\nmode = "corrupt"\nduration_s = 1000.0\nset = {wrong}\n')
     done = virtual_run(tmp_path / "warehouse.toml", "wrong@10", seconds=40.0)
     assert done.judgement.safe is True
+    active = {name for decision in done.record.decisions for name in decision.active}
+    assert mechanism is None or mechanism in active
 
 
 def test_the_robot_drives_on_after_a_long_jump_of_the_localization():
