@@ -105,8 +105,8 @@ class Watch:
         self.reported_s: float | None = None
         self.braked_s: float | None = None
         self._released = 0
-        session.listen(ftm_topics.DETECTION, ftm_topics.DETECTION.at("DM1"), self._report)
-        session.listen(topics.BRAKE, topics.BRAKE.at(), self._brake)
+        session.listen(ftm_topics.DETECTION, self._report, ftm_topics.DETECTION.at("DM1"))
+        session.listen(topics.BRAKE, self._brake)
 
     def _report(self, _key: str, header: Header, body: fm.DetectionReport) -> None:
         if header.source == "DM1" and body.state is fm.DetectionState.ACTIVE \

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from rampart.actors.system.members import application_class
@@ -14,28 +15,8 @@ from rampart.cli import run_options, systems
 from rampart.cli.analyse import campaign_verb
 from rampart.cli.main import build_parser
 from rampart.cli.operate import kill_node
-from rampart.cli.output import say_text
+from rampart.cli.output import rendered, say_text
 
-_HEAD = """\
-# Commands
-
-This page lists all commands with their options, for operators and authors of systems. It is made
-from the help texts by `python -m rampart.cli.commands_page > docs/reference/commands.md`.
-
-A command finds the run of this machine by itself. With several runs, choose one with `--port N` or
-the variable `RAMPART_PORT`. `--port` and `--json` may stand before or after the verb of a family:
-`rampart adapt --port 9450 set strategy guarded-repair`. [JSON output](json.md) lists the fields.
-Errors are one line on standard error.
-
-Exit codes, unless a command lists its own:
-
-| code | meaning |
-|---|---|
-| 0 | success |
-| 1 | no effect, or no answer |
-| 2 | bad usage, unknown name, no run found, or output that cannot be written |
-| 130 | interrupted by Ctrl-C, unless this ends the command in order |
-"""
 _WITHOUT_VALUE = (argparse._StoreTrueAction, argparse._StoreConstAction)
 
 
@@ -45,7 +26,7 @@ def markdown() -> str:
     own = {"run": run_options.parser("rampart run", application_class(spec), spec.application),
            "campaign": campaign_verb.parser("rampart campaign", systems.DEFAULT.stem,
                                             campaign_verb.named_campaigns())}
-    parts = [_HEAD]
+    parts = [""]
     for title, names in main.groups.items():
         parts.append(f"## {title.capitalize()}\n")
         for name in names:
@@ -54,7 +35,7 @@ def markdown() -> str:
     parts += _section(kill_node.build_parser(), "kill-node", 3)
     parts += ["### launch.py\n",
               "`python launch.py` takes the options of [`rampart run`](#rampart-run).\n"]
-    return "\n".join(parts)
+    return rendered(Path(__file__).with_name("commands.md.jinja"), body="\n".join(parts))
 
 
 def _section(parser: argparse.ArgumentParser, name: str, level: int) -> Iterator[str]:

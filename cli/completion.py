@@ -12,7 +12,6 @@ from typing import Any
 from rampart.actors.bus.run_info import find_runs
 from rampart.actors.system.layout import published_keys
 from rampart.cli import systems
-from rampart.cli.output import UsageError
 from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
 
 
@@ -23,14 +22,14 @@ def nodes(**_: Any) -> list[str]:
 
 def topics(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
     """Return the keys that the nodes of the run, or of the shipped system, publish."""
-    with contextlib.suppress(UsageError, ValueError):
+    with contextlib.suppress(ValueError):
         return sorted(published_keys(systems.at_hand(None, getattr(parsed_args, "port", None))))
     return []
 
 
 def faults(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
     """Return the named faults of the run, or of the shipped system, and those of processes."""
-    with contextlib.suppress(UsageError, ValueError):
+    with contextlib.suppress(ValueError):
         known = faults_of(systems.at_hand(None, getattr(parsed_args, "port", None)))
         return [*known.named, *(fault.name for fault in known.offered()),
                 *(f"{kind}:{node}" for kind in PROCESS_FAULTS for node in nodes())]

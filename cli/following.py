@@ -13,6 +13,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.supervision.process_title import process_state
+from rampart.actors.system.topics import declared_topics, own_topics
 from rampart.cli import systems
 from rampart.cli.output import NoEffectError, UsageError, warn
 from rampart.cli.run_picture import DECODED, RunPicture
@@ -96,7 +97,7 @@ def draw(session: Session, picture: RunPicture) -> None:
 
     def subscribe(topic: Topic[Any]) -> None:
         if topic in (*DECODED, *picture.lines.read):
-            session.listen(topic, topic.pattern, lambda _key, header, body: picture.heard(
+            session.listen(topic, lambda _key, header, body: picture.heard(
                 topic, header, body, clock.now()))
         else:
             session.overhear(topic, lambda _key, _load: picture.count(topic))
@@ -105,9 +106,9 @@ def draw(session: Session, picture: RunPicture) -> None:
     try:
         spec = systems.load(session.run.system_file)
         picture.lines = systems.lines_of(spec)
-        known = systems.declared(spec)
-        known += systems.own_topics_of(spec)
-    except UsageError as error:  # for example a run from another folder
+        known = declared_topics(spec)
+        known += own_topics(spec)
+    except ValueError as error:  # for example a run from another folder
         warn(f"{error}; only topics of the engine are counted")
     for topic in known:
         subscribe(topic)

@@ -10,6 +10,10 @@ from typing import Any
 
 import argcomplete
 
+from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.run_info import NoRunError
+from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.supervision.kill_node import SignalError
 from rampart.cli import new, service_verb
 from rampart.cli.analyse import (
     check_verbs,
@@ -28,7 +32,7 @@ from rampart.cli.operate import (
     operator_verbs,
     token_verbs,
 )
-from rampart.cli.output import NoEffectError, UsageError, say_text, warn
+from rampart.cli.output import NoEffectError, say_text, warn
 from rampart.cli.record import incident_verbs, record_verbs
 from rampart.cli.verbs import FORMATTER, PORT
 from rampart.files import interrupts, streams, working_folder
@@ -158,14 +162,17 @@ def _run(arguments: Sequence[str]) -> int:
                 return 0
             options = parser.parse_args(_as_if_last(parser, arguments))
         return int(options.run(options))
-    except (UsageError, NoEffectError) as error:
+    except NoEffectError as error:
         warn(str(error))
-        return 2 if isinstance(error, UsageError) else 1
+        return 1
+    except OSError as error:
+        warn(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return 2
+    except (ValueError, BagError, BusError, NoRunError, SignalError) as error:
+        warn(str(error))
+        return 2
     except KeyboardInterrupt:
         return 130
-    except OSError as error:  # of a disk; wrong names are a UsageError
-        warn(" ".join(str(error).split()))
-        return 2
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from rampart.cli.output import UsageError, say, using
+from rampart.cli.output import UsageError, say
 from rampart.cli.verbs import add_verb, option
 
 PLACES = {
@@ -47,16 +47,15 @@ def new(options: argparse.Namespace) -> int:
     name = options.name
     check(name)
     folder = Path(name)
-    with using(folder):
-        try:
-            folder.mkdir()
-        except FileExistsError:
-            raise UsageError(f"{name}: exists already; nothing was changed") from None
-        try:
-            fill(folder, name)
-        except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        raise UsageError(f"{name}: exists already; nothing was changed") from None
+    try:
+        fill(folder, name)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
     say(f"{name}/ contains a robot that runs: cd {name}, then make run, make test; see README.md")
     return 0
 

@@ -17,8 +17,8 @@ from rampart.files.reading import FileError
 _WARNING_CHARS = 4000
 
 
-class UsageError(Exception):
-    """The request cannot be fulfilled; one line. Exit code 2."""
+class UsageError(ValueError):
+    """The request cannot be fulfilled; one line. Exit code 2, as for every `ValueError`."""
 
 
 class NoEffectError(Exception):
@@ -60,17 +60,18 @@ def refusing(*kinds: type[Exception]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def using(file: object) -> Iterator[None]:
-    """Turn errors of a file into a `UsageError` with the name of the file.
+def using(file: object, *kinds: type[Exception]) -> Iterator[None]:
+    """Turn errors of a file, and others of some kinds, into a `UsageError` with its name.
 
     Raises:
         UsageError: instead of an error of the operating system, or of the contents.
     """
+    refused: tuple[type[Exception], ...] = (FileError, *kinds)
     try:
         yield
     except OSError as error:
         raise UsageError(f"{file}: {error.strerror}") from None
-    except FileError as error:
+    except refused as error:
         raise UsageError(f"{file}: {error}") from None
 
 
@@ -153,9 +154,19 @@ def print_json(data: Any, *, indent: bool = True, names: bool = False) -> None:
     say_text((msgspec.json.format(text, indent=2) if indent else text).decode())
 
 
+def print_rows(head: Sequence[str], rows: Sequence[Sequence[Any]], data: Any, *, as_json: bool
+               ) -> None:
+    """Print rows as a table, or with --json the data that they show."""
+    if as_json:
+        print_json(data)
+    else:
+        print_table(head, rows)
+
+
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print rows in aligned columns, numbers to the right."""
-    table = [[printable(str(cell)) for cell in row] for row in (head, *rows)]
+    """Print rows in aligned columns, numbers to the right and with two decimals at most."""
+    table = [[printable(str(round(cell, 2) if isinstance(cell, float) else cell)) for cell in row]
+             for row in (head, *rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(head))]
     right = [bool(rows) and all(isinstance(row[i], (int, float)) for row in rows)
              for i in range(len(head))]

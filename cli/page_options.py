@@ -7,7 +7,6 @@ strangers, is refused in one line.
 from __future__ import annotations
 
 import argparse
-import errno
 import os
 import secrets
 import socket
@@ -18,6 +17,7 @@ import msgspec
 
 from rampart.actors.web.access import ANY, Access, AccessError, check_token, is_loopback, new_token
 from rampart.actors.web.page_plan import PagePlan
+from rampart.actors.web.server import PortError, listen
 from rampart.actors.web.tls import Certificate, TlsError, days_left, holds_key, load
 from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.actors.web.visitors import VisitorError, lists_visitors, read_visitors
@@ -96,7 +96,12 @@ def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
     except AccessError as error:
         which = f"--hmi-behind {options.hmi_behind}" if options.hmi_behind else f"--hmi-host {host}"
         raise UsageError(f"{which}: {error}") from None
-    _check_address(host, options.hmi_port)
+    try:
+        listen(host, options.hmi_port).close()
+    except PortError as error:
+        which = f"--hmi-port {options.hmi_port}" if error.is_taken else (
+            f"--hmi-host {host}: expected an address of this machine, or 0.0.0.0 for all")
+        raise UsageError(f"{which}: {error}") from None
     return PagePlan(
         options.hmi_port, host, token, is_new, listed,
         cert=str(Path(options.hmi_cert).resolve()) if certificate else "",
@@ -165,20 +170,3 @@ def _shown(host: str, certificate: Certificate | None) -> str:
         others = (name for name in names if not is_loopback(name))
         return next(others, next(iter(names), socket.gethostname() if certificate else ""))
     return host
-
-
-def _check_address(host: str, port: int) -> None:
-    """Refuse an address of another machine, and a port that is in use."""
-    try:
-        family, kind, number, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, number) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except (OSError, UnicodeError) as error:
-        why = getattr(error, "strerror", None) or str(error)
-        if getattr(error, "errno", None) in {errno.EADDRINUSE, errno.EACCES}:
-            raise UsageError(f"--hmi-port {port}: {why}; choose another --hmi-port, or "
-                             "--no-hmi") from None
-        raise UsageError(f"--hmi-host {host}: expected an address of this machine, or 0.0.0.0 for "
-                         f"all ({why})") from None

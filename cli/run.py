@@ -373,7 +373,7 @@ def _in_child(run: Callable[[], Coroutine[Any, Any, int]]) -> int:
     """Watch a run in the root's child `run`, and return the exit code."""
     try:
         return asyncio.run(run())
-    except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
+    except (LaunchError, BagError, ValueError, OSError) as error:
         _say(str(error))
         return EXIT_USAGE
 
@@ -422,7 +422,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
         finally:
             interrupts.raise_again()
         return run.run() if run else _on_another_host(options, plan, reports)
-    except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
+    except (LaunchError, BagError, ValueError, OSError) as error:
         _say(str(error))
         return EXIT_USAGE
     except KeyboardInterrupt:

@@ -25,7 +25,6 @@ from typing import Any
 import msgspec
 
 from rampart import systems
-from rampart.actors.access.register import KeysError
 from rampart.actors.recording.bag_writer import check_target
 from rampart.actors.runtime.application import Application
 from rampart.actors.runtime.run_plan import DEFAULT_PORT, RunPlan, load_system
@@ -33,7 +32,7 @@ from rampart.actors.supervision.root import LAST_PORT
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import application_class, load_class
 from rampart.cli import application_options, page_options
-from rampart.cli.output import UsageError, between, positive, refusing, using, warn
+from rampart.cli.output import UsageError, between, positive, warn
 from rampart.cli.verbs import (
     PORT_VARIABLE,
     add_options,
@@ -280,9 +279,8 @@ def _checked_keys(options: argparse.Namespace, layout: Layout) -> str:
     from rampart.actors.access import key_folder  # noqa: PLC0415 of the extra
 
     folder = Path(options.keys).resolve()
-    with refusing(KeysError), using(folder):
-        until = key_folder.check(folder, [*layout.routers, *sorted(
-            layout.hosts.may_run(layout.plan.host, layout.members))])
+    until = key_folder.check(folder, [*layout.routers, *sorted(
+        layout.hosts.may_run(layout.plan.host, layout.members))])
     left = until - dt.datetime.now(dt.UTC)
     if left < SOON:
         warn(f"--keys {options.keys}: the first certificate expires at {until:%Y-%m-%d %H:%M} UTC; "

@@ -10,41 +10,8 @@ from typing import Any
 
 from rampart import systems
 from rampart.actors.runtime.run_plan import RunPlan, load_system
-from rampart.cli.output import UsageError, refusing, say_text
+from rampart.cli.output import UsageError, rendered, say_text
 from rampart.cli.verbs import add_verb, option, word
-
-_UNIT = """\
-# {file} as a service, made by `rampart service`. Install it with:
-#   rampart service ... | sudo tee /etc/systemd/system/{name}.service
-#   sudo systemctl daemon-reload && sudo systemctl enable --now {name}
-[Unit]
-Description=Rampart: {title}
-StartLimitIntervalSec=60
-StartLimitBurst=5
-
-[Service]
-Type=notify
-User={user}
-ExecStart={command}
-# Reports and checkpoints lie in the state directory, the run's sockets in the other one.
-StateDirectory={name}
-WorkingDirectory=%S/{name}
-RuntimeDirectory={name}
-RuntimeDirectoryMode=0700
-Environment=XDG_RUNTIME_DIR=%t/{name}
-# systemd ends and restarts the service if root, supervisor or manager stays away for so long.
-WatchdogSec={watchdog_s:g}
-TimeoutStartSec=30
-TimeoutStopSec=10
-# Only the root gets SIGTERM: it ends the nodes in order. A mission that failed is not repeated.
-KillMode=mixed
-Restart=on-abnormal
-RestartForceExitStatus=4
-RestartSec=1
-
-[Install]
-WantedBy=multi-user.target
-"""
 
 
 def add(verbs: Any) -> None:
@@ -76,15 +43,14 @@ def service(options: argparse.Namespace) -> int:
     spec = load_system(RunPlan(system_file=str(file)))
     from rampart.cli import run_options  # noqa: PLC0415 other verbs need no physics
 
-    with refusing(ValueError):
-        chosen = shlex.split(options.options)
+    chosen = shlex.split(options.options)
     run_options.parse(["--system", str(file), *chosen], "rampart run")
     words = [str(Path(sys.executable).with_name("rampart")), "run", "--system",
              str(file.resolve()), *chosen]
-    say_text(_UNIT.format(
-        file=file.name, name=f"rampart-{spec.name}", title=" ".join(spec.title.split()),
-        user=options.user, watchdog_s=options.watchdog_s,
-        command=" ".join(map(_quoted, words))))
+    say_text(rendered(
+        Path(__file__).with_name("rampart.service.jinja"), file=file.name,
+        name=f"rampart-{spec.name}", title=" ".join(spec.title.split()), user=options.user,
+        watchdog_s=options.watchdog_s, command=" ".join(map(_quoted, words))))
     return 0
 
 

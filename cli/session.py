@@ -73,14 +73,14 @@ class Session:
         """Return the real seconds to wait for an event that is due in simulated seconds."""
         return simulated_s / self.clock.rate + OVERHEAD_S
 
-    def listen(self, topic: Topic[Any], key: str, heard: Callable[[str, Header, Any], None],
+    def listen(self, topic: Topic[Any], heard: Callable[[str, Header, Any], None], key: str = "",
                garbage: Callable[[str, bytes, str], None] | None = None) -> None:
-        """Subscribe to a key.
+        """Subscribe to a topic.
 
         Args:
-            topic: the topic of the key.
-            key: full key expression.
+            topic: the topic.
             heard: called on the event loop with key (below the root), header and body.
+            key: full key expression; "" for all keys of the topic.
             garbage: called with key, payload and reason if a payload does not decode.
         """
 
@@ -94,7 +94,7 @@ class Session:
                 return
             heard(short, header, body)
 
-        self._bus.subscribe(key, deliver)
+        self._bus.subscribe(key or topic.pattern, deliver)
 
     def overhear(self, topic: Topic[Any], arrived: Callable[[str, bytes], None]) -> None:
         """Subscribe to a topic without decoding, which takes most of the time of a message.
@@ -110,7 +110,7 @@ class Session:
         """Return topic key → newest body, when all have arrived or after some real seconds."""
         heard = {topic.key: Latest[Any]() for topic in topics}
         for topic in topics:
-            self.listen(topic, topic.pattern, heard[topic.key].keep)
+            self.listen(topic, heard[topic.key].keep)
         await asyncio.gather(*(latest.first(timeout_s) for latest in heard.values()))
         return {key: latest.value for key, latest in heard.items() if latest.value is not None}
 

@@ -16,8 +16,8 @@ from rampart.actors.system.members import (
     load_application,
     load_member,
 )
-from rampart.actors.system.topics import declared_topics, own_topics, system_topics
-from rampart.cli.output import UsageError, refusing
+from rampart.actors.system.topics import system_topics
+from rampart.cli.output import UsageError
 from rampart.cli.robot_lines import RobotLines
 from rampart.cli.verbs import Option, either, option, port_of_environment
 from rampart.files import toml, working_folder
@@ -43,7 +43,6 @@ def choice(dest: str = "system", what: str = "", default: str = DEFAULT.stem) ->
         option("--system", dest=dest, metavar="SPEC", help="same as SPEC"))
 
 
-@refusing(ValueError)
 def load(file: str | None) -> SystemSpec:
     """Read a specification.
 
@@ -54,7 +53,7 @@ def load(file: str | None) -> SystemSpec:
         file: path, or name of a shipped system; None for the shipped default.
 
     Raises:
-        UsageError: the file cannot be read, or is not sound.
+        ValueError: the file cannot be read, or is not sound.
     """
     path = DEFAULT if file is None else systems.find(file)
     working_folder.admit(path.parent)
@@ -79,15 +78,14 @@ def at_hand(file: str | None, port: int | None = None) -> SystemSpec:
         port: base port of the run, if there are several.
 
     Raises:
-        UsageError: as of `load`.
+        ValueError: as of `load`.
     """
     if file is None:
-        with contextlib.suppress(NoRunError, UsageError):
+        with contextlib.suppress(NoRunError, ValueError):
             return load(find_run(port or port_of_environment()).system_file)
     return load(file)
 
 
-@refusing(ValueError, OSError)
 def check(file: str | None) -> Layout:
     """Check a system as a start does, with all classes imported, and return its layout.
 
@@ -95,7 +93,7 @@ def check(file: str | None) -> Layout:
         file: as in `load`.
 
     Raises:
-        UsageError: the system is not sound; one line.
+        ValueError: the system is not sound; one line.
     """
     spec = load(file)
     plan = RunPlan(system_file=str(DEFAULT if file is None else systems.find(file)))
@@ -107,22 +105,11 @@ def check(file: str | None) -> Layout:
         trial_class(spec)
         faults_of(spec)
         lines_of(spec)
-    except (ValueError, UsageError) as error:
+    except ValueError as error:
         raise UsageError(f"{plan.system_file}: {error}") from None
     return layout
 
 
-declared = refusing(ValueError)(declared_topics)
-"""Returns the topics of the engine and of a system's application."""
-
-topics_of = refusing(ValueError)(system_topics)
-"""Returns all topics of a system."""
-
-own_topics_of = refusing(ValueError)(own_topics)
-"""Returns the topics of a system that are not declared."""
-
-
-@refusing(ValueError)
 def lines_of(spec: SystemSpec) -> RobotLines:
     """Return the lines of a system's robot."""
     return import_class(application_class(spec).lines, RobotLines, "lines")()

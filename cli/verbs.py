@@ -182,14 +182,14 @@ def help_of(doc: str) -> dict[str, Any]:
             "epilog": f"examples:\n{examples}"}
 
 
-def extra(name: str, module: str) -> ModuleType:
-    """Import a module of an extra, which the base install lacks.
+def extra(name: str, *modules: str) -> ModuleType:
+    """Import modules of an extra, which the base install lacks, and return the last.
 
     Raises:
         UsageError: the extra is not installed.
     """
     try:
-        return importlib.import_module(module)
+        return [importlib.import_module(module) for module in modules][-1]
     except ImportError as error:
         raise UsageError(f"this needs the extra {name!r}, which is not installed ({error}); "
                          f"install it with: pip install 'rampart-robot[{name}]'") from None

@@ -52,7 +52,7 @@ class Platform(Actor):
         cls, topic: Topic[Any], name: str, parameters: Parameters
     ) -> tuple[str, ...]:
         """Name the axles."""
-        return parameters.axles
+        return parameters.axles if topic is AXLE else (name,)
 
     @every(0.1)
     def weigh(self) -> None:

@@ -45,7 +45,7 @@ from rampart.actors.operator.panels import (
 )
 from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.operator.requests import REQUESTS, RefusedError, Request, ResetRequest
-from rampart.actors.operator.server import Handlers, PageServer, PortError
+from rampart.actors.operator.server import Handlers, PageServer
 from rampart.actors.operator.state import STALE_S, HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
@@ -54,6 +54,7 @@ from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.web.access import Access, AccessError, is_loopback
 from rampart.actors.web.audit import AuditLog
 from rampart.actors.web.gate import Gate
+from rampart.actors.web.server import PortError
 from rampart.actors.web.tls import Tls, TlsError
 from rampart.actors.web.visitors import Register, Role, Visitor, digest
 from rampart.files.plain_text import one_line

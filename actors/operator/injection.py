@@ -17,13 +17,11 @@ import msgspec
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NamedFault
 from rampart.actors.operator.requests import RefusedError
 from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S, FaultWatch, Order
 from rampart.actors.runtime.injection import UNTOUCHED, flaw
 from rampart.actors.system.layout import published_keys
-from rampart.actors.system.topics import declared_topics, find_topic
 from rampart.manager.spec.schema import SystemSpec
 
 TAKE_HOLD_S = 3.0
@@ -233,19 +231,9 @@ class Injections:
 
 
 def places_of(system: SystemSpec) -> tuple[str, ...]:
-    """Return the keys of topics that can be disturbed: common ones, then the robot's.
+    """Return the keys of topics that can be disturbed: those that a node publishes.
 
-    Each member of a family has its key. The judge's topics (`world/`), those of injections,
-    greetings and error reports are left out.
+    The topics of the judge and of stand-ins, those of injections, and error reports are left out.
     """
-    known = declared_topics(system)
-    nodes, detections, recoveries = (
-        [row.name for row in rows] for rows in (system.nodes, system.detections, system.recoveries))
-    members = {
-        bus_topics.HEARTBEAT.key: [*nodes, *detections, *recoveries],
-        topics.DETECTION.key: detections,
-        topics.RECOVERY.key: recoveries, topics.RECOVERY_COMMAND.key: recoveries}
-    common = [topic.key.replace("{name}", name) for topic in known
-              if not topic.key.startswith(("world/", "stub/")) and topic.key not in UNTOUCHED
-              for name in (members.get(topic.key, ()) if topic.is_family else ("",))]
-    return (*common, *(key for key in published_keys(system) if find_topic(key, known) is None))
+    return tuple(key for key in published_keys(system) if key not in UNTOUCHED
+                 and not key.startswith(("world/", "stub/", "diagnostic/")))

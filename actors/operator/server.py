@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import html
-import socket
 from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,7 @@ from rampart.actors.web.access import SUBPROTOCOL, Access
 from rampart.actors.web.audit import AuditLog
 from rampart.actors.web.door import Door, address_of, login_routes, visitor_of
 from rampart.actors.web.gate import Gate
-from rampart.actors.web.server import WebServer
+from rampart.actors.web.server import WebServer, listen
 from rampart.actors.web.tls import Tls
 from rampart.actors.web.visitors import Role, Visitor
 from rampart.files.plain_text import one_line
@@ -68,10 +67,6 @@ _HEADERS = {
         "img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
         "require-trusted-types-for 'script'; trusted-types 'none'"),  # no text becomes HTML
     "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
-
-
-class PortError(OSError):
-    """The page's port cannot be bound."""
 
 
 class Handlers(msgspec.Struct, frozen=True):
@@ -150,7 +145,7 @@ class PageServer:
         self._reader = RequestReader(handlers.requests)
         self._count = 0
         self._open: dict[int, _Page] = {}
-        listening = _listen(access.host, access.port)
+        listening = listen(access.host, access.port)
         self.port: int = listening.getsockname()[1]
         access = msgspec.structs.replace(access, port=self.port)
         self._gate = gate(self.port)
@@ -315,23 +310,3 @@ async def _close(socket_: WebSocket, code: int, reason: str) -> None:
 async def _send(socket_: WebSocket, data: Any) -> None:
     text = msgspec.json.encode(data).decode()
     await asyncio.wait_for(socket_.send_text(text), SEND_TIMEOUT_S)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    listener: socket.socket | None = None
-    try:
-        family, kind, number, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind, number)
-        # The next incarnation takes the port although old connections linger.
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
-        listener.listen(16)
-        listener.setblocking(False)
-    except (OSError, OverflowError, UnicodeError) as error:
-        if listener is not None:
-            listener.close()
-        reason = getattr(error, "strerror", None) or str(error)
-        raise PortError(f"cannot serve the page on {host}:{port}: {reason}; "
-                        "choose another port") from None
-    return listener

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.system.members import application_class, load_application
+from rampart.actors.system.topics import system_topics
 from rampart.cli import application_options, systems
 from rampart.cli.analyse.campaign_tables import show_faults, show_runs
 from rampart.cli.output import (
@@ -24,7 +25,6 @@ from rampart.cli.output import (
     UsageError,
     print_json,
     print_table,
-    refusing,
     say,
     say_text,
     unknown,
@@ -66,22 +66,19 @@ def campaign(options: argparse.Namespace) -> int:
     """Do what the options ask for, and return the exit code."""
     spec = systems.load(options.system)
     if options.list:
-        return show_faults(all_groups(spec), as_json=options.json)
+        return show_faults(fault_groups(spec), as_json=options.json)
     if options.replay:
         return _replay(options)
     _check(options)
     if options.search is not None:
         return _hunt(options, spec)
     name, chosen = _choose(options, spec)
-    with refusing(ValueError):
-        jobs = with_content(chosen)
+    jobs = with_content(chosen)
     named: NamedCampaign | None = options.named[0] if options.named else None
     directory = Path(options.out) if options.out else Path("reports") / f"campaign-{name}"
-    with refusing(StoreError):
-        store = Store(directory)
+    store = Store(directory)
     try:
-        with refusing(BackendError):
-            made = _execute(options, jobs, store)
+        made = _execute(options, jobs, store)
         results = {run.job.key: run.result for run in store.runs({job.key for job in jobs})}
         store.close()
     except (StoreError, JobError) as error:
@@ -119,10 +116,9 @@ def _check(options: argparse.Namespace) -> None:
             raise UsageError(f"{name} {value}: must be {least} or more")
     if not options.patience > 0:
         raise UsageError(f"--patience {options.patience:g}: must be above 0")
-    with refusing(ValueError):
-        find_network(options.network)
-        for strategy in options.strategy:
-            find_strategy(strategy)
+    find_network(options.network)
+    for strategy in options.strategy:
+        find_strategy(strategy)
 
 
 def _base_jobs(options: argparse.Namespace, spec: SystemSpec) -> list[Job]:
@@ -134,8 +130,7 @@ def _base_jobs(options: argparse.Namespace, spec: SystemSpec) -> list[Job]:
     ftm = {"on": (True,), "off": (False,), "both": (False, True)}[options.ftm]
     chosen = application_options.alternatives(options, application_class(spec))
     for each in chosen:
-        with refusing(ValueError):
-            load_application(RunPlan(system_file=options.system, options=each), spec)
+        load_application(RunPlan(system_file=options.system, options=each), spec)
     return [Job(row="", system=options.system, strategy=strategy, options=each, ftm=with_ftm,
                 network=options.network, seed=options.seed, patience_s=options.patience,
                 duration_s=options.duration)
@@ -155,7 +150,7 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
             jobs, groups, options.runs, seed=options.seed, faults=faults_of(spec),
             together=options.together, moments=_moments(spec, jobs[0]),
             seeds=options.seeds or SEEDS)
-    planned = list(_planned(options.fault, spec, all_groups(spec)))
+    planned = list(_planned(options.fault, spec, fault_groups(spec)))
     together = options.together
     found = [(fault,) if fault else () for fault in planned] if together == 1 else [
         each for each in combinations([fault for fault in planned if fault], together)
@@ -167,7 +162,7 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
 def _on_different_topics(faults: Sequence[PlannedFault], spec: SystemSpec) -> bool:
     """Whether no two faults disturb the same topic or the same process."""
     hit: list[str] = []
-    of_robot, known = faults_of(spec), systems.topics_of(spec)
+    of_robot, known = faults_of(spec), system_topics(spec)
     for fault in faults:
         try:
             hit += {each.topic for each in of_robot.find(fault.fault, 0, known).disturbances}
@@ -180,14 +175,13 @@ def _moments(spec: SystemSpec, job: Job, *, searched: bool = False) -> tuple[flo
     """Return the interval from which moments of faults are drawn: within a run without faults."""
     if found := trial_class(spec).moments(spec, searched=searched):
         return found
-    with refusing(ValueError):
-        lasts_s = run_virtually(job).record.duration_s
+    lasts_s = run_virtually(job).record.duration_s
     return round(min(2.0, 0.1 * lasts_s), 2), round(0.9 * lasts_s, 2)
 
 
 def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[str, ...]]:
     """Return the faults to draw from: all, or those of --kinds."""
-    groups = all_groups(spec)
+    groups = fault_groups(spec)
     if not options.kinds:
         return groups
     wanted = options.kinds.split(",")
@@ -197,14 +191,10 @@ def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[st
     return {kind: groups[kind] for kind in wanted}
 
 
-all_groups = refusing(ValueError)(fault_groups)
-"""Returns the names of all faults of a system, by kind."""
-
-
 def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str, ...]]
              ) -> Iterable[PlannedFault | None]:
     every = [name for names in groups.values() for name in names]
-    nodes, known, faults = can_be_hit(spec), systems.topics_of(spec), faults_of(spec)
+    nodes, known, faults = can_be_hit(spec), system_topics(spec), faults_of(spec)
     for text in texts:
         if text == "none":
             yield None
@@ -250,10 +240,9 @@ def _replay(options: argparse.Namespace) -> int:
     directory = Path(options.out)
     if not directory.is_dir():
         raise UsageError(f"--out {options.out}: no such directory")
-    with refusing(StoreError):
-        store = Store(directory)
-        found = store.find(options.replay)
-        store.close()
+    store = Store(directory)
+    found = store.find(options.replay)
+    store.close()
     if found is None:
         raise UsageError(f"--replay {options.replay}: expected the key of one run in {directory}; "
                          "none or several match")
@@ -301,13 +290,11 @@ def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
     if not trial_class(spec).margins:
         raise UsageError(f"--search: {spec.name} has no judge that measures margins")
     extra("search", "optuna")
-    with refusing(ValueError):
-        bases = with_content(_base_jobs(options, spec))
+    bases = with_content(_base_jobs(options, spec))
     space = Space(tuple(bases), _groups(options, spec), faults_of(spec).intruder,
                   _moments(spec, bases[0], searched=True), options.together)
     directory = Path(options.out or "reports/campaign-search")
-    with refusing(StoreError):
-        store = Store(directory)
+    store = Store(directory)
     unit = trial_class(spec).margin_unit
     workers = options.jobs or os.cpu_count() or 1
     with tqdm(total=options.search, unit="run", file=sys.stderr,

@@ -14,7 +14,7 @@ from rampart.actors.supervision.process_title import POOL, RUN
 from rampart.actors.system.layout import Layout, Unit
 from rampart.cli import systems
 from rampart.cli.look import topic_catalogue as catalogue
-from rampart.cli.output import UsageError, print_json, print_table, say
+from rampart.cli.output import print_json, print_table, say
 from rampart.cli.verbs import JSON, add_verb, flag
 from rampart.manager.analysis.pairs import Pair, pairs
 from rampart.manager.spec.schema import Kind, SystemSpec
@@ -279,7 +279,7 @@ def check(options: argparse.Namespace) -> int:
     """
     try:
         layout = systems.check(options.system)
-    except UsageError as error:
+    except ValueError as error:
         if not options.json:
             raise
         print_json({"sound": False, "problem": str(error)})

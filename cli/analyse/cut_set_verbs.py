@@ -17,7 +17,6 @@ from rampart.cli.output import (
     print_json,
     print_table,
     progress,
-    refusing,
     say,
     say_text,
     using,
@@ -30,7 +29,6 @@ from rampart.manager.analysis.barriers import Guarded, guard, outlook
 from rampart.manager.analysis.cut_sets import CutSets, TooLargeError
 from rampart.manager.analysis.formula import Formula, FormulaError, formula_of
 from rampart.manager.analysis.open_psa import MAX_BYTES, OpenPsaError, read_open_psa, write_open_psa
-from rampart.manager.model.order import UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
 
 _LIMIT = 100
@@ -80,8 +78,7 @@ def run(options: argparse.Namespace) -> int:
         if spec is None:
             raise UsageError(f"{options.file}: --active and --export need a system spec")
         if options.export:
-            with using(f"--export {options.export}"):
-                Path(options.export).write_text(write_open_psa(spec), encoding="utf-8")
+            Path(options.export).write_text(write_open_psa(spec), encoding="utf-8")
             say(f"{spec.name}: {len(spec.events)} events written to {options.export}")
             return 0
         return _show_outlook(spec, options.active, as_json=options.json)
@@ -113,7 +110,7 @@ def _warn(doubt: OpenPsaError) -> None:
 
 def _load(options: argparse.Namespace) -> tuple[SystemSpec | None, Formula]:
     if options.file and options.file.lower().endswith(".xml"):
-        with using(options.file), refusing(OpenPsaError):
+        with using(options.file):
             text = read_bytes(Path(options.file), MAX_BYTES)
             return None, read_open_psa(text, options.file, options.top,
                                        _refuse if options.strict else _warn)
@@ -160,8 +157,7 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
 
 
 def _show_outlook(spec: SystemSpec, active: list[str], *, as_json: bool) -> int:
-    with refusing(UnknownElementError):
-        spec.build_mechanisms().sort(active)
+    spec.build_mechanisms().sort(active)
     view = outlook(spec, active)
     if as_json:
         print_json(view)

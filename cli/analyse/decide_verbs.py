@@ -8,12 +8,11 @@ from itertools import combinations
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import UsageError, print_json, print_table, refusing, say
+from rampart.cli.output import UsageError, print_json, print_rows, say
 from rampart.cli.verbs import JSON, add_verb, flag, option, several, word
-from rampart.manager.model.order import UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.decision import Decision
-from rampart.manager.strategies.registry import UnknownStrategyError, decide, decision_in_words
+from rampart.manager.strategies.registry import decide, decision_in_words
 
 
 def add(verbs: Any) -> None:
@@ -113,12 +112,9 @@ def show_table(options: argparse.Namespace) -> int:
                  "decisions": {strategy: {"block": d.rule, "rm": d.recoveries}
                                for strategy, d in zip(strategies, row, strict=True)}}
                 for row in shown]
-    if options.json:
-        print_json(data, indent=False)
-    else:
-        print_table(head, cells)
-        if len(strategies) > 1:
-            say(f"{len(differing)} of {len(rows)} sets differ")
+    print_rows(head, cells, data, as_json=options.json)
+    if len(strategies) > 1 and not options.json:
+        say(f"{len(differing)} of {len(rows)} sets differ")
     return 0
 
 
@@ -126,11 +122,7 @@ def _arbiter(spec: SystemSpec, strategy: str) -> Callable[[Iterable[str]], Decis
     """Return the decision as a function of the set of active mechanisms."""
     mechanisms, tree, order = spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order()
 
-    @refusing(UnknownElementError, UnknownStrategyError)
-    def decided(active: Iterable[str]) -> Decision:
-        return decide(active, mechanisms, tree, order, strategy)
-
-    return decided
+    return lambda active: decide(active, mechanisms, tree, order, strategy)
 
 
 def _row(decision: Decision) -> dict[str, Any]:

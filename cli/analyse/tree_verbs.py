@@ -13,13 +13,13 @@ import msgspec
 from rampart.cli import systems
 from rampart.cli.analyse.tree_svg import to_svg
 from rampart.cli.analyse.tree_text import to_text
-from rampart.cli.output import UsageError, refusing, say, unknown, using
+from rampart.cli.output import UsageError, say, unknown
 from rampart.cli.verbs import add_verb, option, word
 from rampart.files.plain_text import one_line
 from rampart.manager.drawing.diagram import WHATS, Diagram, Situation, draw
-from rampart.manager.model.order import CycleError, UnknownElementError
+from rampart.manager.model.order import CycleError
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.registry import UnknownStrategyError, decide
+from rampart.manager.strategies.registry import decide
 
 
 def to_json(diagrams: Sequence[Diagram]) -> str:
@@ -75,8 +75,7 @@ def show_tree(options: argparse.Namespace) -> int:
     if options.output is None:
         _print(text)
         return 0
-    with using(f"--output {options.output}"):
-        Path(options.output).write_text(text, encoding="utf-8")
+    Path(options.output).write_text(text, encoding="utf-8")
     for diagram in diagrams:
         say(f"{options.output}: {diagram.what}, {len(diagram.boxes)} boxes, "
             f"{len(diagram.edges)} lines")
@@ -96,9 +95,8 @@ def _draw(spec: SystemSpec, whats: Sequence[str], options: argparse.Namespace
         raise UsageError(f"--order {' '.join(criteria)}: together they form a {error}") from None
     situation = Situation()
     if options.active or options.strategy:
-        with refusing(UnknownElementError, UnknownStrategyError):
-            decision = decide(options.active, spec.build_mechanisms(), spec.build_ftm_tree(),
-                              order, strategy)
+        decision = decide(options.active, spec.build_mechanisms(), spec.build_ftm_tree(),
+                          order, strategy)
         situation = Situation(frozenset(decision.active), decision.recoveries, decision.rule,
                               strategy)
     return tuple(draw(spec, what, order, criteria, situation) for what in whats)

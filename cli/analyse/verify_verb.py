@@ -7,11 +7,10 @@ import time
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import positive, print_json, print_table, progress, refusing, say
+from rampart.cli.output import positive, print_json, print_table, progress, say
 from rampart.cli.verbs import JSON, add_verb, flag, several, whole
-from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, verify
+from rampart.manager.analysis.verification import MEANING, Report, verify
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.registry import UnknownStrategyError
 
 
 def add(verbs: Any) -> None:
@@ -45,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
     spec = systems.check(options.system).spec
     positive("--together", options.together)
     start = time.monotonic()
-    with progress() as show, refusing(TooLargeError, UnknownStrategyError):
+    with progress() as show:
         report = verify(spec, options.strategy, options.together, show)
     if options.json:
         print_json(report)

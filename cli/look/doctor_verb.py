@@ -17,7 +17,7 @@ from typing import Any, Literal
 import msgspec
 
 from rampart.actors.supervision.root import needed_of
-from rampart.cli.output import print_json, print_table
+from rampart.cli.output import print_rows
 from rampart.cli.verbs import JSON, add_verb
 
 PROCESSES = 40
@@ -78,12 +78,9 @@ def doctor(options: argparse.Namespace) -> int:
     exit code: 0 a run can start, 1 none can
     """
     findings = [finding for look in LOOKS for finding in look()]
-    if options.json:
-        print_json(findings)
-    else:
-        print_table(("", "what", "found", "without it"), [
-            (_SHOWN[finding.state], finding.what, finding.found, finding.cost)
-            for finding in findings])
+    print_rows(("", "what", "found", "without it"), [
+        (_SHOWN[finding.state], finding.what, finding.found, finding.cost)
+        for finding in findings], findings, as_json=options.json)
     return 1 if any(finding.state == "missing" for finding in findings) else 0
 
 

@@ -137,4 +137,4 @@ def _watch(session: Session, viewer: FoxgloveViewer) -> None:
         raise UsageError(f"the viewer cannot be started: {' '.join(str(error).split())}") from None
     show(views.start(now_ns()))
     for topic in views.translators:
-        session.listen(topic, topic.pattern, functools.partial(see, topic))
+        session.listen(topic, functools.partial(see, topic))

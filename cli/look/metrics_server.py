@@ -8,29 +8,26 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import socket
 from collections.abc import Iterator
 
+from prometheus_client import CollectorRegistry, make_asgi_app
 from prometheus_client.core import Metric
-from prometheus_client.exposition import choose_encoder
-from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
-from starlette.routing import Route
+from starlette.types import ASGIApp
 
 from rampart.actors.bus.run_info import ask
 from rampart.actors.ftm import topics
 from rampart.actors.machine.process_usage import read_count
-from rampart.actors.web.server import WebServer
+from rampart.actors.web.server import WebServer, listen
 from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
 from rampart.cli.look.metrics_families import Exposition, families
-from rampart.cli.output import UsageError, between, say
+from rampart.cli.output import between, say
 from rampart.cli.session import pause
 
 
 async def metrics(options: argparse.Namespace) -> int:
     """Serve until interrupted."""
     stop = asyncio.Event()
+    between("--port", options.port, 0, 65535)
     listening = listen(options.host, options.port)
     exporter = Exporter()
     server = WebServer(_app(exporter), listening)
@@ -43,22 +40,6 @@ async def metrics(options: argparse.Namespace) -> int:
         finally:
             server.stop()
     return 0
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """Return a socket that listens on an address.
-
-    Raises:
-        UsageError: the address is unknown, or in use.
-    """
-    between("--port", port, 0, 65535)
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        return socket.create_server((host, port), family=family)
-    except (OSError, UnicodeError) as error:  # the latter from invalid host names
-        why = getattr(error, "strerror", None) or error
-        raise UsageError(f"cannot serve on {host} port {port}: {why}; "
-                         "choose another --port or --host") from None
 
 
 class Exporter:
@@ -97,12 +78,7 @@ class Exporter:
         return families(self.look())
 
 
-def _app(exporter: Exporter) -> Starlette:
-    async def figures(request: Request) -> Response:
-        encode, kind = choose_encoder(request.headers.get("accept", ""))
-        return Response(encode(exporter), headers={"content-type": kind})
-
-    async def front(_request: Request) -> Response:
-        return PlainTextResponse("The metrics of Rampart are at /metrics\n")
-
-    return Starlette(routes=[Route("/metrics", figures), Route("/", front)])
+def _app(exporter: Exporter) -> ASGIApp:
+    registry = CollectorRegistry()
+    registry.register(exporter)
+    return make_asgi_app(registry)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import math
 import os
 import socket
 import ssl
 import time
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
@@ -40,8 +41,9 @@ from rampart.actors.ros2.wire import (
 )
 from rampart.actors.system.members import load_member
 from rampart.cli import systems
-from rampart.cli.look.topic_lines import in_line, print_rate, rate_of
-from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say, warn
+from rampart.cli.look.topic_lines import Echo, in_line, print_rate, rate_of
+from rampart.cli.output import NoEffectError, UsageError, print_json, print_rows, warn
+from rampart.cli.session import pause
 from rampart.manager.spec.schema import SystemSpec
 
 DOMAIN, DISTRIBUTION = "ROS_DOMAIN_ID", "ROS_DISTRO"
@@ -112,7 +114,7 @@ async def onlooker(connect: tuple[str, ...], domain: int, distribution: str = ""
         side = (RelaySide(_NODE, "/", domain, distribution, setup, lost=lost.append, whole=True,
                           first_s=_RELAY_S) if is_relayed
                 else ZenohSide(connect, asyncio.get_running_loop(), tls=tls))
-    except (ValueError, RelayError) as error:
+    except RelayError as error:
         raise UsageError(str(error)) from None
     try:
         found = Onlooker(side, domain)
@@ -194,12 +196,9 @@ async def list_topics(options: argparse.Namespace) -> int:
     """Print the topics of ROS 2, as `rampart topic list` does."""
     async with onlooker((options.ros,), domain_of_environment(), distribution()) as there:
         found = [_described(topic, ends) for topic, ends in there.graph.topics().items()]
-    if options.json:
-        print_json(found)
-    else:
-        print_table(("topic", "type", "publishers", "subscribers"), [
-            (row["topic"], ", ".join(row["types"]), ", ".join(row["publishers"]) or "-",
-             ", ".join(row["subscribers"]) or "-") for row in found])
+    print_rows(("topic", "type", "publishers", "subscribers"), [
+        (row["topic"], ", ".join(row["types"]), ", ".join(row["publishers"]) or "-",
+         ", ".join(row["subscribers"]) or "-") for row in found], found, as_json=options.json)
     return 0
 
 
@@ -211,23 +210,15 @@ def _described(topic: str, ends: list[Endpoint]) -> dict[str, Any]:
 
 async def echo(options: argparse.Namespace) -> int:
     """Print messages of ROS 2, as `rampart topic echo` does."""
-    done, seen = asyncio.Event(), 0
+    echo = Echo(options)
 
     def heard(message: Any, attachment: Attachment) -> None:
-        nonlocal seen
-        seen += 1
-        if options.count is not None and seen > options.count:
-            return
-        if options.json:
-            print_json({"topic": options.key, "sent_ns": attachment.stamp_ns,
-                        "sequence": attachment.sequence, "message": plain(message)}, indent=False)
-        else:
-            say(f"{attachment.stamp_ns / 1e9:.3f} {options.key} {in_line(plain(message))}")
-        if options.count is not None and seen >= options.count:
-            done.set()
+        echo.show({"topic": options.key, "sent_ns": attachment.stamp_ns,
+                   "sequence": attachment.sequence, "message": plain(message)},
+                  f"{attachment.stamp_ns / 1e9:.3f} {options.key} {in_line(plain(message))}")
 
-    await _receive(options, heard, done)
-    if not seen:
+    await _receive(options, heard, echo.done, options.duration)
+    if not echo.seen:
         raise NoEffectError(f"no message on {options.key}")
     return 0
 
@@ -235,9 +226,13 @@ async def echo(options: argparse.Namespace) -> int:
 async def measure(options: argparse.Namespace) -> int:
     """Measure rates of ROS 2 in real time, as `rampart topic hz` does."""
     times: list[float] = []
-    await _receive(options, lambda _message, _attachment: times.append(time.monotonic()),
-                asyncio.Event(), times=None if options.json else times,
-                duration_s=options.duration or (3.0 if options.json else None))
+
+    def show() -> None:
+        if times and not options.json:
+            print_rate(options.key, rate_of(times[-500:]))
+
+    await _receive(options, lambda *_: times.append(time.monotonic()), asyncio.Event(),
+                   options.duration or (3.0 if options.json else None), show)
     if options.json:
         print_json([{"topic": options.key, **rate_of(times[-500:])}])
     if not times:
@@ -245,24 +240,21 @@ async def measure(options: argparse.Namespace) -> int:
     return 0
 
 
-async def _receive(options: argparse.Namespace, heard: Any, done: asyncio.Event, *,
-                   times: list[float] | None = None, duration_s: float | None = None) -> None:
-    """Receive a topic until `done`, the end of the duration, or an interruption."""
+async def _receive(options: argparse.Namespace, heard: Callable[[Any, Attachment], None],
+                   done: asyncio.Event, duration_s: float | None,
+                   show: Callable[[], None] = lambda: None) -> None:
+    """Receive a topic until `done` or the end of the duration, and call `show` each second."""
     domain, types = domain_of_environment(), Types(distribution())
-    duration_s = duration_s or options.duration
     async with onlooker((options.ros,), domain, types.distribution) as there:
         ends = there.graph.on(options.key, EndpointKind.PUBLISHER)
         if not ends:
             known = ", ".join(there.graph.topics()) or "none"
             raise NoEffectError(f"no node publishes {options.key}; topics: {known}")
         name = ros_name(ends[0].type)
-        try:
-            decode = types.decoder(name)
-            if ends[0].hash not in {types.hash(name), UNKNOWN_HASH}:
-                warn(f"{ends[0].full_name} has another definition of {name} than "
-                     f"{types.distribution}; set {DISTRIBUTION} to its distribution")
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+        decode = types.decoder(name)
+        if ends[0].hash not in {types.hash(name), UNKNOWN_HASH}:
+            warn(f"{ends[0].full_name} has another definition of {name} than "
+                 f"{types.distribution}; set {DISTRIBUTION} to its distribution")
 
         def arrived(payload: bytes, attached: bytes | None) -> None:
             try:
@@ -273,11 +265,10 @@ async def _receive(options: argparse.Namespace, heard: Any, done: asyncio.Event,
         offered = ends[0].qos
         there.side.subscribe(
             ends[0].key, Qos(offered.reliable, offered.transient_local, depth=1), arrived)
-        until_s = time.monotonic() + (duration_s or float("inf"))
-        while not done.is_set() and time.monotonic() < until_s:
-            await asyncio.sleep(1.0 if times is not None else 0.02)
-            if times:
-                print_rate(options.key, rate_of(times[-500:]))
+        until_s = time.monotonic() + (duration_s or math.inf)
+        while not done.is_set() and (left_s := until_s - time.monotonic()) > 0:
+            await pause(done, min(1.0, left_s))
+            show()
 
 
 # -- check ----------------------------------------------------------------------------------------
@@ -299,18 +290,13 @@ async def check(options: argparse.Namespace) -> int:
     found: list[Finding] = []
     for node in spec.nodes:
         if node.actor == GATEWAY:
-            try:
-                gateway: Any = load_member(node, spec, spec.name).parameters
-                found += await _checked(node.name, gateway, spec)
-            except ValueError as error:
-                raise UsageError(str(error)) from None
-    if options.json:
-        print_json({"system": spec.name, "findings": found,
-                    "well": all(one.well for one in found)})
-    else:
-        print_table(("", "what", "how it is"), [
-            ("ok" if one.well else "!", one.what, one.why) for one in found])
-    return 0 if all(one.well for one in found) else 1
+            gateway: Any = load_member(node, spec, spec.name).parameters
+            found += await _checked(node.name, gateway, spec)
+    well = all(one.well for one in found)
+    print_rows(("", "what", "how it is"), [
+        ("ok" if one.well else "!", one.what, one.why) for one in found],
+        {"system": spec.name, "findings": found, "well": well}, as_json=options.json)
+    return 0 if well else 1
 
 
 async def _checked(name: str, gateway: Gateway.Parameters, spec: SystemSpec) -> list[Finding]:

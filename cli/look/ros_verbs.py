@@ -45,18 +45,16 @@ def check(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
 
     exit code: 0 no problem, 1 a problem, 2 bad usage
     """
-    return look(options).check(options)  # type: ignore[no-any-return]
+    return look().check(options)  # type: ignore[no-any-return]
 
 
-def look(options: argparse.Namespace) -> Any:
+def look() -> Any:
     """Return the module that looks at ROS 2.
 
     Raises:
         UsageError: the extra is not installed.
     """
-    del options
-    extra("ros2", "rosbags")
-    extra("ros2", "xxhash")
+    extra("ros2", "rosbags", "xxhash")
     from rampart.cli.look import ros_topics  # noqa: PLC0415 of the extra
 
     return ros_topics

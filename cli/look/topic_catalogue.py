@@ -17,9 +17,9 @@ from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import heard, published
-from rampart.actors.system.topics import find_topic
+from rampart.actors.system.topics import declared_topics, find_topic, system_topics
 from rampart.cli import systems
-from rampart.cli.output import UsageError, refusing, rendered, unknown
+from rampart.cli.output import UsageError, rendered, unknown
 from rampart.manager.spec.specification import SystemSpec
 
 MAILBOX = {
@@ -44,12 +44,11 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
     Raises:
         UsageError: an actor class does not exist, or declares an invalid topic.
     """
-    with refusing(ValueError):
-        members = Layout(RunPlan(system_file=spec.name), spec).members.values()
+    members = Layout(RunPlan(system_file=spec.name), spec).members.values()
     inputs = {member.name: heard(member) for member in members}
     outputs = {member.name: published(member) for member in members}
     return [TopicUse(topic, _who(topic, BASE_OUTPUTS, outputs) or ("tools",),
-                     _who(topic, BASE_INPUTS, inputs)) for topic in systems.topics_of(spec)]
+                     _who(topic, BASE_INPUTS, inputs)) for topic in system_topics(spec)]
 
 
 def resolve(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str]:
@@ -90,15 +89,15 @@ def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
     try:
         file = find_run(port).system_file
     except NoRunError as error:
-        shipped = systems.declared(systems.load(None))
+        shipped = declared_topics(systems.load(None))
         if _match(key, shipped) is None:
             raise UsageError(str(error)) from None
         return shipped
     try:
         spec = systems.load(file)
-        known = systems.declared(spec)
-        return known if _match(key, known) is not None else systems.topics_of(spec)
-    except UsageError as error:
+        known = declared_topics(spec)
+        return known if _match(key, known) is not None else system_topics(spec)
+    except ValueError as error:
         if _match(key, topics.ALL) is None:
             raise UnreadableError(str(error)) from None
         return topics.ALL

@@ -2,13 +2,41 @@
 
 from __future__ import annotations
 
+import argparse
+import asyncio
 import itertools
+import math
 import statistics
 from typing import Any
 
 import msgspec
 
-from rampart.cli.output import say
+from rampart.cli.output import print_json, say
+
+
+class Echo:
+    """Prints messages, until --count of them have come.
+
+    Attributes:
+        done: set when they have come.
+        seen: number of messages.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.done, self.seen = asyncio.Event(), 0
+        self._most, self._as_json = options.count or math.inf, options.json
+
+    def show(self, data: dict[str, Any], line: str) -> None:
+        """Print a message as data or in a line."""
+        self.seen += 1
+        if self.seen >= self._most:
+            self.done.set()
+        if self.seen > self._most:
+            return
+        if self._as_json:
+            print_json(data, indent=False)
+        else:
+            say(line)
 
 
 def rate_of(times_s: list[float]) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.ros2.translation.tables import ROUTER
+from rampart.actors.system.topics import system_topics
 from rampart.cli import completion, systems
 from rampart.cli.following import LOOK_S, is_over
 from rampart.cli.look import ros_verbs
@@ -35,8 +36,8 @@ from rampart.cli.look.topic_catalogue import (
     resolve,
     topics_for,
 )
-from rampart.cli.look.topic_lines import in_line, print_rate, rate_of
-from rampart.cli.output import NoEffectError, positive, print_json, print_table, say, say_text, warn
+from rampart.cli.look.topic_lines import Echo, in_line, print_rate, rate_of
+from rampart.cli.output import NoEffectError, positive, print_json, print_rows, say, say_text, warn
 from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
 from rampart.files import streams
@@ -79,18 +80,16 @@ def topic_list(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
       rampart topic list --ros
     """
     if options.ros:
-        return ros_verbs.look(options).list_topics(options)  # type: ignore[no-any-return]
+        return ros_verbs.look().list_topics(options)  # type: ignore[no-any-return]
     spec = systems.at_hand(options.system)
     if options.markdown:
         say_text(catalogue.markdown(spec).rstrip("\n"))
         return 0
     table = catalogue.uses(spec)
-    if options.json:
-        print_json([_describe(use) for use in table])
-    else:
-        print_table(("key", "message", "qos", "rate", "frame"),
-                    [(t.key, t.type.__name__, t.qos.value, catalogue.rate(t), t.frame)
-                     for t in (use.topic for use in table)])
+    print_rows(("key", "message", "qos", "rate", "frame"),
+               [(t.key, t.type.__name__, t.qos.value, catalogue.rate(t), t.frame)
+                for t in (use.topic for use in table)],
+               [_describe(use) for use in table], as_json=options.json)
     return 0
 
 
@@ -105,7 +104,7 @@ def topic_info(options: argparse.Namespace) -> int:
       rampart topic info detection/DM1
     """
     spec = systems.at_hand(options.system)
-    topic, _ = resolve(options.key, systems.topics_of(spec))
+    topic, _ = resolve(options.key, system_topics(spec))
     use = next(u for u in catalogue.uses(spec) if u.topic is topic)
     if options.json:
         print_json({**_describe(use),
@@ -138,46 +137,30 @@ async def topic_echo(options: argparse.Namespace) -> int:
     positive("--count", options.count)
     positive("--duration", options.duration)
     if options.ros:
-        return await ros_verbs.look(options).echo(options)  # type: ignore[no-any-return]
+        return await ros_verbs.look().echo(options)  # type: ignore[no-any-return]
     topic, key = _topic_of(options)
-    done = asyncio.Event()
-    seen = 0
-
-    def count() -> bool:
-        nonlocal seen
-        seen += 1
-        if options.count is not None and seen >= options.count:
-            done.set()
-        return options.count is None or seen <= options.count
+    echo = Echo(options)
 
     def heard(short: str, header: Header, body: Any) -> None:
-        if not count():
-            return
-        if options.json:
-            print_json({"key": short, "stamp": header.stamp, "source": header.source,
-                        "incarnation": header.incarnation, "sequence": header.sequence,
-                        "message": body}, indent=False)
-        else:
-            say(f"{header.stamp:.3f} {header.source}#{header.incarnation} {short} {in_line(body)}")
+        echo.show(
+            {"key": short, "stamp": header.stamp, "source": header.source,
+             "incarnation": header.incarnation, "sequence": header.sequence, "message": body},
+            f"{header.stamp:.3f} {header.source}#{header.incarnation} {short} {in_line(body)}")
 
     def garbage(short: str, payload: bytes, reason: str) -> None:
-        if not count():
-            return
-        if options.json:
-            print_json({"key": short, "garbage": payload[:256].hex(), "bytes": len(payload),
-                        "reason": reason}, indent=False)
-        else:
-            say(f"garbage {short} {len(payload)} bytes, not a {topic.type.__name__}: {reason}; "
-                f"{payload[:_SHOWN_BYTES]!r}")
+        echo.show(
+            {"key": short, "garbage": payload[:256].hex(), "bytes": len(payload), "reason": reason},
+            f"garbage {short} {len(payload)} bytes, not a {topic.type.__name__}: {reason}; "
+            f"{payload[:_SHOWN_BYTES]!r}")
 
     async with connect(options.port) as session:
         check_member(key.removeprefix(f"{ROOT}/"), session.run.nodes)
-        session.listen(topic, key, heard, garbage)
+        session.listen(topic, heard, key, garbage)
         async for left in _while_it_runs(session, options.duration):
-            if done.is_set():
+            if echo.done.is_set():
                 break
-            await pause(done, min(LOOK_S, left))
-    if not seen:
+            await pause(echo.done, min(LOOK_S, left))
+    if not echo.seen:
         raise _nothing_came(options.key, options.duration)
     return 0
 
@@ -195,7 +178,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
     """
     positive("--duration", options.duration)
     if options.ros:
-        return await ros_verbs.look(options).measure(options)  # type: ignore[no-any-return]
+        return await ros_verbs.look().measure(options)  # type: ignore[no-any-return]
     topic, key = _topic_of(options)
     arrivals: Remembered[str, deque[float]] = Remembered(MANY)
     duration_s = options.duration or (3.0 if options.json else None)
@@ -208,7 +191,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
                 times = arrivals[short] = deque(maxlen=_WINDOW)
             times.append(session.clock.now())
 
-        session.listen(topic, key, heard)
+        session.listen(topic, heard, key)
         async for left in _while_it_runs(session, duration_s):
             await asyncio.sleep(min(_HZ_REPORT_S, left))
             if not options.json:

@@ -31,12 +31,12 @@ import msgspec
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.cli.output import NoEffectError, UsageError, print_json, refusing, say, using
+from rampart.cli.output import NoEffectError, UsageError, print_json, say, using
 from rampart.cli.session import connect
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, option
 from rampart.files import toml
 from rampart.files.reading import read_text
-from rampart.manager.spec.adaptation import SETTINGS, Action, ChangeError, parse_value
+from rampart.manager.spec.adaptation import SETTINGS, Action, parse_value
 
 _WAIT_S = 2.0
 """Real seconds for the answer of the manager."""
@@ -91,14 +91,13 @@ async def change(options: argparse.Namespace) -> int:
             if answer.request == request.request:
                 answers.append(answer)
 
-        session.listen(topics.ADAPTATION, topics.ADAPTATION.at(), heard)
+        session.listen(topics.ADAPTATION, heard)
         await session.command(topics.ADAPT, request, lambda: bool(answers), _WAIT_S)
     if not answers:
         raise NoEffectError("the FTM Manager does not answer; try again when it is back")
     answer = answers[0]
     if options.json:
-        print_json({"accepted": answer.accepted, "reason": answer.reason,
-                    "version": answer.version})
+        print_json({name: getattr(answer, name) for name in ("accepted", "reason", "version")})
     elif answer.accepted:
         say(f"changed; this is change {answer.version} of the run")
     if not answer.accepted:
@@ -118,8 +117,7 @@ def _values(options: argparse.Namespace) -> dict[str, Any]:
             for key, sign, text in pairs:
                 if not sign or not key.strip() or not text.strip():
                     raise UsageError(f"{key}{sign}{text}: expected FIELD=VALUE")
-            with refusing(ChangeError):
-                return {key.strip(): parse_value(text.strip()) for key, _, text in pairs}
+            return {key.strip(): parse_value(text.strip()) for key, _, text in pairs}
         case Action.SET:
             names = [name for text in options.values for name in text.split(",") if name]
             return {"value": names if options.name == "order" and len(names) > 1

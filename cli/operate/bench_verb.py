@@ -28,16 +28,7 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import Member, load_application
 from rampart.cli import completion
-from rampart.cli.output import (
-    UsageError,
-    between,
-    print_json,
-    print_table,
-    progress,
-    refusing,
-    unknown,
-    warn,
-)
+from rampart.cli.output import UsageError, between, print_rows, progress, unknown, warn
 from rampart.cli.session import Session, connect
 from rampart.cli.verbs import JSON, PORT, add_verb, several, whole
 from rampart.manager.spec.nodes import Kind
@@ -108,9 +99,8 @@ async def bench(options: argparse.Namespace) -> int:
         run = session.run
         if run.replay_of:
             raise UsageError(f"port {run.base_port} is a replay of {run.replay_of}, without nodes")
-        with refusing(ValueError):
-            members = {name: member for name, member in members_of(run.system_file).items()
-                       if name in run.nodes}
+        members = {name: member for name, member in members_of(run.system_file).items()
+                   if name in run.nodes}
         names = options.node or usual(members)
         for name in names:
             if name not in members:
@@ -119,13 +109,11 @@ async def bench(options: argparse.Namespace) -> int:
             rows = await Restarts(session, {name: members[name] for name in names}).measure(
                 options.kills, show)
     failed = [row for row in rows if row.failure]
-    if options.json:
-        print_json([{**msgspec.to_builtins(row), "detected": spread(row.detected_ms),
-                     "output": spread(row.output_ms)} for row in rows])
-    else:
-        print_table(("node", "topic", "kills", "detected, ms", "output, ms (5 to 95 %)"), [
-            (row.node, row.topic, len(row.output_ms), in_words(row.detected_ms),
-             in_words(row.output_ms)) for row in rows])
+    print_rows(("node", "topic", "kills", "detected, ms", "output, ms (5 to 95 %)"), [
+        (row.node, row.topic, len(row.output_ms), in_words(row.detected_ms),
+         in_words(row.output_ms)) for row in rows],
+        [{**msgspec.to_builtins(row), "detected": spread(row.detected_ms),
+          "output": spread(row.output_ms)} for row in rows], as_json=options.json)
     for row in failed:
         warn(f"{row.node}: {row.failure}")
     return 1 if failed else 0
@@ -180,10 +168,9 @@ class Restarts:
             show: called with each line of progress.
         """
         for topic in {t.key: t for m in self._members.values() for t in regular_topics(m)}.values():
-            self._session.listen(topic, topic.pattern, self._output)
-        self._session.listen(ftm_topics.PROCESS_EVENT, ftm_topics.PROCESS_EVENT.pattern,
-                             self._event)
-        self._session.listen(ftm_topics.DETECTION, ftm_topics.DETECTION.pattern, self._detection)
+            self._session.listen(topic, self._output)
+        self._session.listen(ftm_topics.PROCESS_EVENT, self._event)
+        self._session.listen(ftm_topics.DETECTION, self._detection)
         show("listening")
         await asyncio.sleep(WARM_S)
         rows = [Row(name, self._topic_of(member)) for name, member in self._members.items()]

@@ -13,18 +13,19 @@ import msgspec
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
+from rampart.actors.runtime.corruption import field_type, is_array
 from rampart.actors.runtime.fault_watch import Order
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.actors.system.layout import published_keys
+from rampart.actors.system.topics import system_topics
 from rampart.cli import completion, systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
 from rampart.cli.operate.injecting import hit_process, refuse_details, run_fault
 from rampart.cli.operate.operator_verbs import trigger
-from rampart.cli.output import UsageError, positive, print_json, print_table, refusing, say
+from rampart.cli.output import UsageError, positive, print_json, print_table, say
 from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, several, word
 from rampart.manager.spec.specification import SystemSpec
-from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
+from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.topic_faults import NONSENSE, modes_of, systematic_faults
@@ -124,9 +125,8 @@ def orders_of(options: argparse.Namespace) -> tuple[str, tuple[Order, ...]]:
         UsageError: there is no such fault, or an option does not fit it.
     """
     unique = uuid.uuid4().hex[:6]
-    with refusing(ValueError):  # which the faults of a robot raise
-        own = faults_of(systems.at_hand(None, options.port)).own(
-            options.fault, f"{options.fault}-{unique}", options.duration)
+    own = faults_of(systems.at_hand(None, options.port)).own(
+        options.fault, f"{options.fault}-{unique}", options.duration)
     if own is not None:
         refuse_details(options)
         if not isinstance(own, tuple):
@@ -161,9 +161,8 @@ def choose(options: argparse.Namespace) -> Fault:
     if detailed:
         fault = _detailed(mode, key, known, options)
     else:
-        with refusing(UnknownFaultError):
-            fault = faults_of(systems.at_hand(None, options.port)).find(
-                options.fault, options.seed or 0, known)
+        fault = faults_of(systems.at_hand(None, options.port)).find(
+            options.fault, options.seed or 0, known)
     return fault.varied(share=options.share, on_s=options.on, off_s=options.off)
 
 
@@ -188,8 +187,7 @@ def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         raise UsageError(f"{option} {text}: expected FIELD=VALUE")
-    with refusing(InjectionError):
-        return name, value, field_type(topic.type, name).declared
+    return name, value, field_type(topic.type, name).declared
 
 
 def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
@@ -217,7 +215,7 @@ def _amount(option: str, text: str, topic: Topic[Any]) -> tuple[str, float]:
 
 
 def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
-    known = systems.topics_of(spec)
+    known = system_topics(spec)
     keys, faults = published_keys(spec), faults_of(spec)
     if as_json:
         everything = (*faults.named.values(), *systematic_faults(keys, known))

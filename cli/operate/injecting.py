@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import InjectionReport
-from rampart.actors.bus.run_info import NoRunError, find_run
+from rampart.actors.bus.run_info import find_run
 from rampart.actors.runtime.fault_watch import FaultWatch, Order
 from rampart.actors.supervision.kill_node import SignalError
 from rampart.cli.look.topic_catalogue import check_member
 from rampart.cli.operate.kill_node import signal_anywhere
-from rampart.cli.output import NoEffectError, UsageError, positive, print_json, refusing, say
+from rampart.cli.output import NoEffectError, UsageError, positive, print_json, say
 from rampart.cli.session import Session, connect, pause
 
 STOPPED_S = 5.0
@@ -64,7 +64,7 @@ async def run_fault(name: str, orders: Sequence[Order], options: argparse.Namesp
             if all(watch.is_settled for watch in watches):
                 settled.set()
 
-        session.listen(bus_topics.INJECTION_REPORT, bus_topics.INJECTION_REPORT.at(), hear)
+        session.listen(bus_topics.INJECTION_REPORT, hear)
         try:
             for watch in watches:
                 await _take_hold(session, watch)
@@ -122,10 +122,8 @@ async def hit_process(options: argparse.Namespace) -> int:
     if options.at_once and math.isfinite(lasts_s):
         raise UsageError("--at-once: this verb has to continue the stopped process; omit it, or "
                          "use --duration inf")
-    with refusing(NoRunError):
-        run = find_run(options.port)
-    with refusing(SignalError):
-        victim = await signal_anywhere(node, what.upper(), run.base_port)
+    run = find_run(options.port)
+    victim = await signal_anywhere(node, what.upper(), run.base_port)
     if not options.json:
         say(f"{options.fault}: pid {victim.pid}, incarnation {victim.incarnation}"
             + (f", for {lasts_s:g} s" if math.isfinite(lasts_s) else ""))

@@ -28,20 +28,12 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from rampart import systems as shipped
-from rampart.actors.access.register import IdentityName, KeysError, Kind, read_register
+from rampart.actors.access.register import IdentityName, Kind, read_register
 from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
 from rampart.cli import systems
-from rampart.cli.output import (
-    UsageError,
-    positive,
-    print_json,
-    print_table,
-    refusing,
-    say,
-    using,
-)
+from rampart.cli.output import UsageError, positive, print_rows, say, unknown
 from rampart.cli.verbs import (
     JSON,
     Option,
@@ -114,8 +106,7 @@ def init(options: argparse.Namespace) -> int:
     positive("--days", options.days, below=_MOST_DAYS)
     folder = Path(options.keys)
     keys = _keys()
-    with refusing(KeysError), using(folder):
-        keys.init(folder, options.days)
+    keys.init(folder, options.days)
     say(f"{folder}: created an authority; next: rampart keys issue --keys {folder} --system NAME")
     return 0
 
@@ -145,22 +136,21 @@ def issue(options: argparse.Namespace) -> int:
         _check_name(name)
     at = _addresses(options.system) if options.system else {}
     folder, keys = Path(options.keys), _keys()
-    with refusing(KeysError, ValueError), using(folder):
-        if options.address and not routers:
-            raise UsageError(f"--address {options.address[0]}: only routers have an address; "
-                             f"expected {' '.join(ROUTERS)} or --system, too")
-        for address in options.address:
-            keys.check_address(address)
-        register = read_register(folder)
-        for kind, holders in wanted:  # refuses each name before the first certificate is issued
-            register = register.issued(holders, kind)
-        for kind, holders in wanted:
-            for addresses in dict.fromkeys(at.get(name, ()) for name in holders):
-                there = [name for name in holders if at.get(name, ()) == addresses]
-                reached = (*options.address, *addresses) if kind == "router" else ()
-                keys.issue(folder, there, kind, reached, options.days)
-            if holders:
-                say(f"{kind}: {', '.join(holders)}")
+    if options.address and not routers:
+        raise UsageError(f"--address {options.address[0]}: only routers have an address; "
+                         f"expected {' '.join(ROUTERS)} or --system, too")
+    for address in options.address:
+        keys.check_address(address)
+    register = read_register(folder)
+    for kind, holders in wanted:  # refuses each name before the first certificate is issued
+        register = register.issued(holders, kind)
+    for kind, holders in wanted:
+        for addresses in dict.fromkeys(at.get(name, ()) for name in holders):
+            there = [name for name in holders if at.get(name, ()) == addresses]
+            reached = (*options.address, *addresses) if kind == "router" else ()
+            keys.issue(folder, there, kind, reached, options.days)
+        if holders:
+            say(f"{kind}: {', '.join(holders)}")
     return 0
 
 
@@ -178,8 +168,7 @@ def rotate(options: argparse.Namespace) -> int:
     """
     positive("--days", options.days, below=_MOST_DAYS)
     folder, keys = Path(options.keys), _keys()
-    with refusing(KeysError), using(folder):
-        done = keys.rotate(folder, options.names, options.days)
+    done = keys.rotate(folder, options.names, options.days)
     say(f"new: {', '.join(done) or 'none; the folder has no certificate'}")
     return 0
 
@@ -199,8 +188,7 @@ def revoke(options: argparse.Namespace) -> int:
     if not options.names:
         raise UsageError("revoke: expected NAME; `rampart keys show` lists the names")
     folder, keys = Path(options.keys), _keys()
-    with refusing(KeysError), using(folder):
-        keys.revoke(folder, options.names)
+    keys.revoke(folder, options.names)
     say(f"revoked: {', '.join(options.names)}; in force when the routers have been restarted: "
         f"{'; '.join(f'kill-node {name}' for name in ROUTERS)}")
     return 0
@@ -219,20 +207,17 @@ def show(options: argparse.Namespace) -> int:
     exit code: 0 all that are listed are valid, 1 one is not, 2 bad usage
     """
     folder, keys = Path(options.keys), _keys()
-    with refusing(KeysError), using(folder):
-        found = {entry.name: entry for entry in keys.entries(folder)}
+    found = {entry.name: entry for entry in keys.entries(folder)}
     for name in options.names:
         if name not in found:
-            raise UsageError(f"{name}: unknown in {folder}; `rampart keys show` lists the names")
+            raise unknown("name", name, found)
     shown = [found[name] for name in options.names or found]
     now = dt.datetime.now(dt.UTC)
     rows = [_row(entry, now) for entry in shown]
-    if options.json:
-        print_json({"keys": str(folder), "identities": rows})
-    else:
-        print_table(("name", "kind", "in its certificate", "until (UTC)", "fingerprint", "state"), [
-            (r["name"], r["kind"], r["common_name"], (r["not_after"] or "")[:16].replace("T", " "),
-             r["fingerprint"][:_SHOWN], r["state"]) for r in rows])
+    print_rows(("name", "kind", "in its certificate", "until (UTC)", "fingerprint", "state"), [
+        (r["name"], r["kind"], r["common_name"], (r["not_after"] or "")[:16].replace("T", " "),
+         r["fingerprint"][:_SHOWN], r["state"]) for r in rows],
+        {"keys": str(folder), "identities": rows}, as_json=options.json)
     return 0 if all(row["state"] in {"valid", "revoked", "not here"} for row in rows) else 1
 
 
@@ -273,14 +258,12 @@ def share(options: argparse.Namespace) -> int:
     layout = _layout(options.system)
     names = [host.name for host in layout.spec.hosts]
     if options.host not in names:
-        raise UsageError(f"{options.host}: unknown host of {options.system}; known: "
-                         f"{', '.join(names) or 'none, it runs on one machine'}")
+        raise unknown("host", options.host, names)
     host = "" if options.host == names[0] else options.host
     needed = [*layout.hosts.routers_of(host), *sorted(
         layout.hosts.may_run(host, layout.members)), *options.person]
     folder, to, keys = Path(options.keys), Path(options.to), _keys()
-    with refusing(KeysError), using(to):
-        keys.share(folder, to, needed)
+    keys.share(folder, to, needed)
     say(f"{to}: {len(needed)} keys for host {options.host}; start it there with --keys")
     return 0
 
@@ -302,8 +285,7 @@ def _addresses(system: str) -> dict[str, tuple[str, ...]]:
 def _layout(system: str) -> Layout:
     systems.load(system)
     plan = RunPlan(system_file=str(shipped.find(system)))
-    with refusing(ValueError):
-        return Layout(plan, load_system(plan))
+    return Layout(plan, load_system(plan))
 
 
 def _check_name(name: str) -> None:

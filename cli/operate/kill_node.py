@@ -1,18 +1,32 @@
 """`kill-node`: signals to nodes of this host and of other hosts.
 
-A process of this host is found in /proc. The supervisors of other hosts list and signal their
-processes, over the bus.
+Kill, stop or hang a node of a running robot.
+
+Examples:
+  kill-node osmosis_control                  # it is restarted
+  kill-node localization --signal STOP       # its heartbeat stops: it is replaced
+  kill-node --list                           # list the nodes
+In a system of several hosts it signals and lists the nodes of all hosts.
+`kill -9 PID` and `pkill -9 -f osmosis_control` also work.
+
+signals:
+  KILL   end the process at once (default)
+  STOP   freeze the process; CONT continues it
+  TERM   end the process in order; the supervisor treats this as a crash, too
+  SEGV   crash the process as a memory error does
+  WEDGE  hang the process: it exists, and its event loop is blocked (SIGUSR2)
 """
+# A process of this host is found in /proc. The supervisors of other hosts list and signal their
+# processes, over the bus.
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import json
-import os
 import sys
 import uuid
-from typing import Any, NamedTuple
+from typing import Any
 
 import argcomplete
 
@@ -26,27 +40,13 @@ from rampart.actors.supervision.kill_node import (
     UnknownNodeError,
     signal_node,
 )
-from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import RunProcess, find_processes
 from rampart.cli import completion
-from rampart.cli.session import UsageError, connect
+from rampart.cli.output import UsageError, say
+from rampart.cli.session import connect
+from rampart.cli.verbs import JSON, PORT, add_options, flag, help_of, option
 from rampart.files import streams
 from rampart.files.plain_text import one_line
-
-_EPILOG = """\
-signals:
-  KILL   end the process at once (default)
-  STOP   freeze the process; CONT continues it
-  TERM   end the process in order; the supervisor treats this as a crash, too
-  SEGV   crash the process as a memory error does
-  WEDGE  hang the process: it exists, and its event loop is blocked (SIGUSR2)
-
-examples:
-  kill-node osmosis_control                  # it is restarted
-  kill-node localization --signal STOP       # its heartbeat stops: it is replaced
-  kill-node --list                           # list the nodes
-In a system of several hosts it signals and lists the nodes of all hosts.
-`kill -9 PID` and `pkill -9 -f osmosis_control` also work.
-"""
 
 _TABLE_S = 2.0
 _ANSWER_S = 5.0
@@ -64,23 +64,15 @@ Row = dict[str, Any]
 """A process: `name`, `pid`, `incarnation`, `port`, and `host` in a system of several."""
 
 
-class Signalled(NamedTuple):
-    """The process that received a signal."""
-
-    pid: int
-    incarnation: int
-
-
-async def signal_anywhere(node: str, name: str, port: int | None) -> Signalled:
-    """Send a signal to a node of this host or of another one.
+async def signal_anywhere(node: str, name: str, port: int | None) -> RunProcess | fm.ProcessEvent:
+    """Send a signal to a node of this host or of another one; return pid and incarnation.
 
     Raises:
         SignalError: there is no such node, or it cannot be signalled.
         UsageError: there is no run.
     """
     try:
-        process = signal_node(node, name, port)
-        return Signalled(process.pid, process.incarnation)
+        return signal_node(node, name, port)
     except UnknownNodeError:
         if (found := await _signal(node, name, port)) is None:
             raise
@@ -90,14 +82,12 @@ async def signal_anywhere(node: str, name: str, port: int | None) -> Signalled:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
     streams.secure()
-    parser = build_parser()
-    argcomplete.autocomplete(parser)
-    options = parser.parse_args(arguments)
-    act = _list_nodes if options.list else _signal_node
     try:
-        for line in act(options):
-            print(line)
-    except (SignalError, UsageError) as refusal:
+        parser = build_parser()
+        argcomplete.autocomplete(parser)
+        options = parser.parse_args(arguments)
+        (_list_nodes if options.list else _signal_node)(options)
+    except (SignalError, ValueError) as refusal:
         print(f"kill-node: {refusal}", file=sys.stderr)
         return 2
     return 0
@@ -105,37 +95,32 @@ def main(arguments: list[str] | None = None) -> int:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog="kill-node", description="Kill, stop or hang a node of a running robot.",
-        epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
-    node: Any = parser.add_argument("node", nargs="?",
-                                    help="name of the node, for example osmosis_control")
-    node.completer = completion.nodes
-    parser.add_argument("--signal", default="KILL", type=str.upper, metavar="SIG",
-                        help="KILL (default), STOP, CONT, TERM, SEGV or WEDGE")
-    parser.add_argument("--port", type=int, default=os.environ.get("RAMPART_PORT") or None,
-                        help="base port of the run, if this machine has several (default: the "
-                             "variable RAMPART_PORT)")
-    parser.add_argument("--list", action="store_true", help="list the nodes of all runs")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser = argparse.ArgumentParser(prog="kill-node", **help_of(__doc__ or ""))
+    add_options(parser, (
+        option("node", nargs="?", completer=completion.nodes,
+               help="name of the node, for example osmosis_control"),
+        option("--signal", default="KILL", type=str.upper, metavar="SIG",
+               help="KILL (default), STOP, CONT, TERM, SEGV or WEDGE"),
+        PORT, flag("--list", "list the nodes of all runs"), JSON))
     return parser
 
 
-def _signal_node(options: argparse.Namespace) -> list[str]:
+def _signal_node(options: argparse.Namespace) -> None:
     if options.node is None:
         raise SignalError("expected the name of a node; --list shows the names")
     if options.signal not in SIGNALS:
         raise SignalError(f"--signal {options.signal}: unknown signal; known: {', '.join(SIGNALS)}")
     victim = asyncio.run(signal_anywhere(options.node, options.signal, options.port))
     if options.json:
-        return [json.dumps({"node": options.node, "pid": victim.pid, "signal": options.signal,
-                            "incarnation": victim.incarnation})]
-    return [f"{options.node} (pid {victim.pid}, incarnation {victim.incarnation}): "
-            f"{options.signal}"]
+        print(json.dumps({"node": options.node, "pid": victim.pid, "signal": options.signal,
+                          "incarnation": victim.incarnation}))
+    else:
+        say(f"{options.node} (pid {victim.pid}, incarnation {victim.incarnation}): "
+            f"{options.signal}")
 
 
-def _list_nodes(options: argparse.Namespace) -> list[str]:
-    """Return the processes of this machine, by its kernel, and those of other hosts."""
+def _list_nodes(options: argparse.Namespace) -> None:
+    """Print the processes of this machine, by its kernel, and those of other hosts."""
     runs = {run.base_port: run for run in find_runs()
             if run.hosts and options.port in {None, run.base_port}}
     rows: list[Row] = [
@@ -148,13 +133,15 @@ def _list_nodes(options: argparse.Namespace) -> list[str]:
         if missing:
             print(f"kill-node: {one_line(missing)}", file=sys.stderr)
     if options.json:
-        return [json.dumps(rows)]
+        print(json.dumps(rows))
+        return
     width = max((len(row.get("host", "")) for row in rows), default=0)
-    return ["{port:>6} {pid:>8} #{incarnation:<4} {where}{name}".format(
-        where=f"{row.get('host', ''):<{width}} " if width else "", **row) for row in rows]
+    for row in rows:
+        where = f"{row.get('host', ''):<{width}} " if width else ""
+        say("{port:>6} {pid:>8} #{incarnation:<4} {where}{name}".format(where=where, **row))
 
 
-async def _signal(node: str, name: str, port: int | None) -> Signalled | None:
+async def _signal(node: str, name: str, port: int | None) -> fm.ProcessEvent | None:
     async with connect(port) as session:
         found = await session.latest((topics.NODES,), _TABLE_S)
         table: fm.NodeTable | None = found.get(topics.NODES.key)
@@ -168,14 +155,14 @@ async def _signal(node: str, name: str, port: int | None) -> Signalled | None:
             if body.by == order.order:
                 answers.append(body)
 
-        session.listen(topics.PROCESS_EVENT, topics.PROCESS_EVENT.at(), event)
+        session.listen(topics.PROCESS_EVENT, event)
         if not await session.command(topics.SIGNAL, order, lambda: bool(answers), _ANSWER_S):
             raise SignalError(f"{node}: no answer from the supervisor of host "
                               f"{host or 'the first'} within {_ANSWER_S:g} s")
     [answer, *_] = answers
     if answer.event != "signalled":
         raise SignalError(f"{node}: {answer.detail}")
-    return Signalled(answer.pid, answer.incarnation)
+    return answer
 
 
 async def _other_hosts(run: RunInfo) -> tuple[list[Row], str]:
@@ -193,8 +180,7 @@ async def _other_hosts(run: RunInfo) -> tuple[list[Row], str]:
     try:
         async with asyncio.timeout(_PATIENCE_S + _LISTED_S / run.rate):
             async with connect(run.base_port) as session:
-                for supervisor in others:
-                    session.listen(topics.HOST_NODES, topics.HOST_NODES.at(supervisor), heard)
+                session.listen(topics.HOST_NODES, heard)
                 async with asyncio.timeout(session.real_s(_LISTED_S)):
                     await complete.wait()
     except UsageError as error:

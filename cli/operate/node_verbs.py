@@ -20,7 +20,7 @@ from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 
-from rampart.actors.bus.run_info import NoRunError, RunInfo, find_run
+from rampart.actors.bus.run_info import RunInfo, find_run
 from rampart.actors.bus.topic import Topic
 from rampart.actors.foreign.program import LOGS
 from rampart.actors.ftm import messages as fm
@@ -32,11 +32,9 @@ from rampart.cli.following import is_over
 from rampart.cli.operate.operator_verbs import Holdings
 from rampart.cli.output import (
     NoEffectError,
-    UsageError,
     between,
     print_json,
-    print_table,
-    refusing,
+    print_rows,
     say,
     say_text,
     unknown,
@@ -86,15 +84,11 @@ print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"
     if not found:
         raise NoEffectError("the supervisor does not answer; it may just be restarting, try again")
     table: fm.NodeTable = found[ftm_topics.NODES.key]
-    if options.json:
-        print_json(table.nodes)
-    else:
-        rare = {"host", "failing", "next_attempt_s"}
-        fields = [name for name in fm.NodeInfo.__struct_fields__
-                  if name not in rare or any(getattr(node, name) for node in table.nodes)]
-        print_table(fields, [[round(value, 2) if isinstance(value, float) else value
-                              for value in (getattr(node, name) for name in fields)]
-                             for node in table.nodes])
+    rare = {"host", "failing", "next_attempt_s"}
+    fields = [name for name in fm.NodeInfo.__struct_fields__
+              if name not in rare or any(getattr(node, name) for node in table.nodes)]
+    rows = [[getattr(node, name) for name in fields] for node in table.nodes]
+    print_rows(fields, rows, table.nodes, as_json=options.json)
     return 0
 
 
@@ -110,8 +104,7 @@ def node_log(options: argparse.Namespace) -> int:
       rampart node log estimator --lines 1000 | less
     """
     between("--lines", options.lines, 0, MOST_LINES)
-    with refusing(NoRunError):
-        run = find_run(options.port)
+    run = find_run(options.port)
     folder = Path(run.folder, LOGS)
     if options.name not in run.nodes:
         raise unknown("node", options.name, run.nodes)
@@ -247,7 +240,7 @@ def _lines(run: RunInfo) -> tuple[RobotLines, bool, dict[str, str]]:
         spec = systems.load(run.system_file)
         return (systems.lines_of(spec), any(node.actor == GATEWAY for node in spec.nodes),
                 clearing_in_words(spec))
-    except UsageError:  # for example a run from another folder: show the engine's lines
+    except ValueError:  # for example a run from another folder: show the engine's lines
         return RobotLines(), False, {}
 
 

@@ -61,7 +61,7 @@ async def reset(options: argparse.Namespace) -> int:
         if options.recovery not in known:
             return await _let_go(session, options.recovery, known)
         latched = Latest[fm.ManagerStatus]()
-        session.listen(ftm_topics.MANAGER_STATUS, ftm_topics.MANAGER_STATUS.at(), latched.keep)
+        session.listen(ftm_topics.MANAGER_STATUS, latched.keep)
         status = await latched.first(session.real_s(1.0))
         if status is None:
             raise NoEffectError("the FTM Manager does not answer; try again when it is back")
@@ -74,7 +74,7 @@ async def reset(options: argparse.Namespace) -> int:
             if body.context == fm.RESET_REFUSED and body.offender == options.recovery:
                 refusals.append(body.reason)
 
-        session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, keep)
+        session.listen(bus_topics.DIAGNOSTIC, keep)
 
         def is_released() -> bool:
             return latched.value is not None and options.recovery not in latched.value.latched
@@ -123,7 +123,8 @@ async def trigger(options: argparse.Namespace) -> int:
         if options.module not in stubs:
             raise unknown("stand-in detection module", options.module, stubs)
         report = Latest[fm.DetectionReport]()
-        session.listen(ftm_topics.DETECTION, ftm_topics.DETECTION.at(options.module), report.keep)
+        session.listen(ftm_topics.DETECTION, report.keep,
+                       ftm_topics.DETECTION.at(options.module))
 
         async def bring(state: fm.DetectionState) -> bool:
             return await session.command(
@@ -154,7 +155,7 @@ class Holdings:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._held: Remembered[str, fm.Holds] = Remembered(_NODES)
-        session.listen(ftm_topics.HOLDS, ftm_topics.HOLDS.pattern, self._keep)
+        session.listen(ftm_topics.HOLDS, self._keep)
 
     def _keep(self, _key: str, header: Header, body: fm.Holds) -> None:
         self._held[header.source] = body

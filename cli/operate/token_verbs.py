@@ -29,7 +29,7 @@ from rampart.actors.web.visitors import (
     read_visitors,
     revoke,
 )
-from rampart.cli.output import UsageError, print_json, print_table, say
+from rampart.cli.output import print_rows, say, using
 from rampart.cli.verbs import JSON, add_family, add_verb, option, word
 
 FILE = "page.tokens"
@@ -57,19 +57,11 @@ def issue_token(options: argparse.Namespace) -> int:
       rampart tokens issue anna --role drive
       rampart tokens issue control-room --role look --file /etc/rampart/page.tokens
     """
-    file = Path(options.file)
-    try:
+    with using("--role", VisitorError):
         role = check_role(options.role)
-    except VisitorError as error:
-        raise UsageError(f"--role: {error}") from None
-    try:
+    with using(options.file, VisitorError, SecretError):
         check_name(options.name)
-        token = issue(file, options.name, role)
-    except (VisitorError, SecretError) as error:
-        raise UsageError(f"{file}: {error}") from None
-    except OSError as error:
-        raise UsageError(f"{file}: cannot be written ({error.strerror})") from None
-    say(token)
+        say(issue(Path(options.file), options.name, role))
     return 0
 
 
@@ -82,11 +74,10 @@ def show_tokens(options: argparse.Namespace) -> int:
       rampart tokens show
       rampart tokens show --json
     """
-    visitors = _read(Path(options.file)).values()
-    if options.json:
-        print_json([{"name": v.name, "role": v.role} for v in visitors])
-    else:
-        print_table(["name", "role"], [[v.name, v.role] for v in visitors])
+    with using(options.file, VisitorError, SecretError):
+        visitors = read_visitors(Path(options.file)).values()
+    print_rows(("name", "role"), [(v.name, v.role) for v in visitors],
+               [{"name": v.name, "role": v.role} for v in visitors], as_json=options.json)
     return 0
 
 
@@ -99,19 +90,7 @@ def revoke_token(options: argparse.Namespace) -> int:
     Examples:
       rampart tokens revoke anna
     """
-    file = Path(options.file)
-    try:
-        revoke(file, options.name)
-    except (VisitorError, SecretError) as error:
-        raise UsageError(f"{file}: {error}") from None
-    except OSError as error:
-        raise UsageError(f"{file}: cannot be written ({error.strerror})") from None
+    with using(options.file, VisitorError, SecretError):
+        revoke(Path(options.file), options.name)
     say(f"revoked the token of {options.name}")
     return 0
-
-
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        return read_visitors(file)
-    except (VisitorError, SecretError) as error:
-        raise UsageError(f"{file}: {error}") from None

@@ -24,7 +24,7 @@ from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
 from rampart.cli.osmosis.lines import pilot_in_words
 from rampart.cli.osmosis.mission_verb import checked_reason
-from rampart.cli.output import NoEffectError, UsageError, between, refusing, say
+from rampart.cli.output import NoEffectError, UsageError, between, say
 from rampart.cli.session import Latest, Session, connect, pause
 from rampart.cli.terminal import END, keys
 from rampart.cli.verbs import PORT, add_verb, number, option
@@ -123,7 +123,7 @@ class _WayOut:
         self._request = m.WayOutRequest(f"rampart-{uuid.uuid4().hex[:10]}", session.name, reason)
         self._answer: m.WayOutAnswer | None = None
         self._stop = stop
-        session.listen(topics.WAY_OUT_ANSWER, topics.WAY_OUT_ANSWER.at(), self._reply)
+        session.listen(topics.WAY_OUT_ANSWER, self._reply)
 
     async def ask(self) -> None:
         """Ask for the way out.
@@ -162,9 +162,8 @@ class _WayOut:
 def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:
     spec = systems.load(session.run.system_file)
     parameters = next((n.parameters for n in spec.nodes if n.actor == TELEOPERATION), {})
-    with refusing(ValueError):
-        mapping = read_parameters(Teleoperation.Parameters, parameters, session.run.system_file,
-                                  "teleoperation")
+    mapping = read_parameters(Teleoperation.Parameters, parameters, session.run.system_file,
+                              "teleoperation")
     device = JoystickDevice(name, mapping, lambda: drive.moved(device.stick), drive.lost)
     missing = device.open()
     if missing:
@@ -200,10 +199,10 @@ class _Drive:
         self.tried = False
         self._pilot = Latest[m.PilotStatus]()
         self._base = Latest[m.BaseStatus]()
-        session.listen(topics.BASE_STATUS, topics.BASE_STATUS.at(), self._base.keep)
-        session.listen(topics.PILOT_STATUS, topics.PILOT_STATUS.at(), self._pilot.keep)
-        session.listen(topics.TELEOP_COMMAND, topics.TELEOP_COMMAND.at(), self._command)
-        session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, self._diagnostic)
+        session.listen(topics.BASE_STATUS, self._base.keep)
+        session.listen(topics.PILOT_STATUS, self._pilot.keep)
+        session.listen(topics.TELEOP_COMMAND, self._command)
+        session.listen(bus_topics.DIAGNOSTIC, self._diagnostic)
 
     def press(self, key: str) -> None:
         """Handle a key."""

@@ -118,8 +118,8 @@ class _Asked:
         self.answer: m.MissionOrderAnswer | None = None
         self.status: m.MissionStatus | None = None
         self.shown = asyncio.Event()
-        session.listen(topics.MISSION_ORDER_ANSWER, topics.MISSION_ORDER_ANSWER.at(), self._reply)
-        session.listen(topics.MISSION_STATUS, topics.MISSION_STATUS.at(), self._see)
+        session.listen(topics.MISSION_ORDER_ANSWER, self._reply)
+        session.listen(topics.MISSION_STATUS, self._see)
 
     def _reply(self, _key: str, header: Header, answer: m.MissionOrderAnswer) -> None:
         if answer.order == self._order.order and self.answer is None:

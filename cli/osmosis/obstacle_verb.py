@@ -21,15 +21,7 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.cli.output import (
-    NoEffectError,
-    UsageError,
-    positive,
-    print_json,
-    print_table,
-    say,
-    unknown,
-)
+from rampart.cli.output import NoEffectError, UsageError, positive, print_rows, say, unknown
 from rampart.cli.session import Latest, Session, connect
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, number, option
 
@@ -60,11 +52,9 @@ async def obstacle_list(options: argparse.Namespace) -> int:
     async with connect(options.port) as session:
         present = await _World(session).obstacles()
     head = ("name", "x_m", "y_m", "radius_m")
-    if options.json:
-        print_json([{name: getattr(o, name) for name in head} for o in present.values()])
-    else:
-        print_table(head, [(o.name, round(o.x_m, 2), round(o.y_m, 2), o.radius_m)
-                           for o in present.values()])
+    rows = [[getattr(o, name) for name in head] for o in present.values()]
+    print_rows(head, rows, [dict(zip(head, row, strict=True)) for row in rows],
+               as_json=options.json)
     return 0
 
 
@@ -121,8 +111,8 @@ class _World:
         self._session = session
         self._listed = Latest[m.ObstacleList]()
         self._complaint = ""
-        session.listen(topics.OBSTACLES, topics.OBSTACLES.at(), self._listed.keep)
-        session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, self._diagnostic)
+        session.listen(topics.OBSTACLES, self._listed.keep)
+        session.listen(bus_topics.DIAGNOSTIC, self._diagnostic)
 
     def _diagnostic(self, _key: str, _header: Header, report: bm.Diagnostic) -> None:
         if report.offender == self._session.name:

@@ -32,11 +32,11 @@ from rampart.actors.ftm.history import Fault, clear_history, read_history
 from rampart.actors.ftm.narrator import Narrator
 from rampart.actors.recording import incidents
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of, time_zero_s
-from rampart.actors.recording.bag_writer import BagError, complete, open_target
+from rampart.actors.recording.bag_writer import complete, open_target
 from rampart.actors.recording.incidents import Incident, incidents_in, state_folder
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.recording.run_documents import recorded_system
-from rampart.cli.output import UsageError, print_json, print_table, refusing, say
+from rampart.cli.output import UsageError, print_json, print_rows, print_table, say, unknown
 from rampart.cli.record.record_verbs import PLAYING, replay
 from rampart.cli.verbs import JSON, add_family, add_verb, flag, option, word
 from rampart.files.plain_text import one_line
@@ -92,15 +92,14 @@ def incident_list(options: argparse.Namespace) -> int:
       rampart incident list --system osmosis --json
     """
     found = _kept(options.system)
-    if options.json:
-        print_json({"incidents": [_data(kept) for kept in found]})
-    elif not found:
+    if not (found or options.json):
         say(f"no incidents in {state_folder('')}")
-    else:
-        print_table(("name", "system", "run", "from s", "to s", "cause", "incomplete"), [
-            (kept.incident.name, kept.incident.system, kept.incident.run,
-             round(kept.incident.from_s, 1), round(kept.incident.to_s, 1),
-             one_line(kept.incident.cause, 80), kept.state) for kept in found])
+        return 0
+    print_rows(("name", "system", "run", "from s", "to s", "cause", "incomplete"), [
+        (kept.incident.name, kept.incident.system, kept.incident.run,
+         round(kept.incident.from_s, 1), round(kept.incident.to_s, 1),
+         one_line(kept.incident.cause, 80), kept.state) for kept in found],
+        {"incidents": [_data(kept) for kept in found]}, as_json=options.json)
     return 0
 
 
@@ -166,7 +165,7 @@ def export(options: argparse.Namespace) -> int:
       rampart incident export
       rampart incident export 20261127-0912 crash.mcap
     """
-    with _recording(options.name) as kept, refusing(BagError):
+    with _recording(options.name) as kept:
         out = Path(options.out or f"incident-{kept.incident.name}.mcap")
         with open_target(out, overwrite=options.overwrite) as file, complete(out), (
                 kept.path.open("rb")) as source:
@@ -188,22 +187,20 @@ def history(options: argparse.Namespace) -> int:
     """
     rows: list[tuple[str, Fault]] = []
     for folder in _folders(options.system):
-        with refusing(ValueError):
-            if options.clear:
-                say(f"{folder.name}: {clear_history(folder)} faults cleared")
-            rows += ((folder.name, fault) for fault in read_history(folder))
+        if options.clear:
+            say(f"{folder.name}: {clear_history(folder)} faults cleared")
+        rows += ((folder.name, fault) for fault in read_history(folder))
     if options.clear:
         return 0
-    if options.json:
-        print_json({"faults": [{"system": system, **msgspec.structs.asdict(fault)}
-                               for system, fault in rows]})
-    elif not rows:
+    if not (rows or options.json):
         say(f"no faults in {state_folder('')}")
-    else:
-        print_table(("state", "system", "mechanism", "node", "times", "first", "last", "error"), [
-            (fault.state, system, one_line(fault.mechanism), one_line(fault.node), fault.times,
-             _day(fault.first_s), _day(fault.last_s), one_line(fault.error, 80))
-            for system, fault in rows])
+        return 0
+    print_rows(("state", "system", "mechanism", "node", "times", "first", "last", "error"), [
+        (fault.state, system, one_line(fault.mechanism), one_line(fault.node), fault.times,
+         _day(fault.first_s), _day(fault.last_s), one_line(fault.error, 80))
+        for system, fault in rows], {"faults": [
+            {"system": system, **msgspec.structs.asdict(fault)} for system, fault in rows]},
+        as_json=options.json)
     return 0
 
 
@@ -270,15 +267,12 @@ def _folders(system: str | None) -> list[Path]:
     Raises:
         UsageError: the system has none.
     """
-    root = state_folder("")
-    found = sorted(path for path in root.glob("*") if path.is_dir())
+    found = {path.name: path for path in sorted(state_folder("").glob("*")) if path.is_dir()}
     if system is None:
-        return found
-    if not (chosen := [path for path in found if path.name == system]):
-        known = ", ".join(path.name for path in found) or "none"
-        raise UsageError(f"--system {system}: no run of it has kept anything in {root}; "
-                         f"known: {known}")
-    return chosen
+        return list(found.values())
+    if system not in found:
+        raise unknown("system", system, found)
+    return [found[system]]
 
 
 def _kept(system: str | None) -> list[Kept]:
@@ -307,11 +301,9 @@ def _recording(name: str | None) -> Iterator[Kept]:
                          f"{found[0].incident.name} to {found[-1].incident.name}")
     kept = found[-1]
     if kept.path.exists():
-        with refusing(BagError):
-            yield kept
+        yield kept
         return
-    with tempfile.TemporaryDirectory(prefix="rampart-incident-") as folder, refusing(
-            BagError, OSError):
+    with tempfile.TemporaryDirectory(prefix="rampart-incident-") as folder:
         path = Path(folder, kept.path.name)
         yield Kept(incidents.write_recording(kept.path.parent, kept.incident, path), path)
 

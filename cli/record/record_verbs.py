@@ -25,7 +25,7 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.run_info import NoRunError, RunInfo, find_run
+from rampart.actors.bus.run_info import RunInfo, find_run
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, check_target
@@ -34,6 +34,7 @@ from rampart.actors.recording.process import result_of, stop_pipe
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
+from rampart.actors.system.topics import declared_topics, system_topics
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
 from rampart.cli.output import (
@@ -44,7 +45,6 @@ from rampart.cli.output import (
     print_json,
     print_table,
     progress,
-    refusing,
     say,
 )
 from rampart.cli.record.export import Export
@@ -134,14 +134,13 @@ def record(options: argparse.Namespace) -> int:
       rampart record poses.mcap --topics 'localization/*' 'detection/*'
     """
     positive("--duration", options.duration, below=1e9)
-    with refusing(NoRunError, BagError):
-        run = find_run(options.port)
-        wants = _wanted(options.topics, run)
-        path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
-        check_target(path, overwrite=options.overwrite)
-        recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants,
-                            others=_others(run), credentials=lambda run: tools_credentials(run)[0])
-        recorder.open()
+    run = find_run(options.port)
+    wants = _wanted(options.topics, run)
+    path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
+    check_target(path, overwrite=options.overwrite)
+    recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants,
+                        others=_others(run), credentials=lambda run: tools_credentials(run)[0])
+    recorder.open()
     stop = stop_pipe()
     say(f"recording {run.title} in {path}; ctrl-C ends it")
     try:
@@ -172,7 +171,7 @@ async def replay(options: argparse.Namespace) -> int:
     """
     _check(options)
     stop = asyncio.Event()
-    with refusing(BagError), stopped_by_signals(stop):
+    with stopped_by_signals(stop):
         path = Path(options.file)
         known = Summary(BagReader(path)).keys if options.topics else ()
         chosen: dict[str, Any] = {"start_s": options.start, "loop": options.loop,
@@ -241,11 +240,10 @@ def _others(run: RunInfo) -> OtherHosts | None:
     """
     if not run.hosts:
         return None
-    with refusing(ValueError, OSError):
-        plan = RunPlan(system_file=run.system_file, host=run.host)
-        tools_credentials(run)
-        working_folder.admit(Path(run.system_file).parent)
-        return others_of(Layout(plan, load_system(plan)))
+    plan = RunPlan(system_file=run.system_file, host=run.host)
+    tools_credentials(run)
+    working_folder.admit(Path(run.system_file).parent)
+    return others_of(Layout(plan, load_system(plan)))
 
 
 def _wanted(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
@@ -254,9 +252,9 @@ def _wanted(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
         return matcher(globs, ())
     spec = systems.load(run.system_file)
     try:
-        return matcher(globs, keys_of(run, systems.declared(spec)))
+        return matcher(globs, keys_of(run, declared_topics(spec)))
     except UsageError:
-        return matcher(globs, keys_of(run, systems.topics_of(spec)))
+        return matcher(globs, keys_of(run, system_topics(spec)))
 
 
 def keys_of(run: RunInfo, known: Iterable[Topic[Any]]) -> list[str]:
@@ -293,8 +291,7 @@ def bag_info(options: argparse.Namespace) -> int:
 
     exit code: 0 all was read, 1 a part cannot be read, 2 bad usage
     """
-    with refusing(BagError):
-        summary = Summary(BagReader(Path(options.file)))
+    summary = Summary(BagReader(Path(options.file)))
     if options.json:
         print_json(described(summary))
     else:
@@ -356,9 +353,8 @@ def bag_repair(options: argparse.Namespace) -> int:
 
     exit code: 0 all was copied, 1 a part was lost, 2 bad usage
     """
-    with refusing(BagError):
-        reader = BagReader(Path(options.file))
-        copied = repair(reader, Path(options.out), overwrite=options.overwrite)
+    reader = BagReader(Path(options.file))
+    copied = repair(reader, Path(options.out), overwrite=options.overwrite)
     lines = left_behind(reader)
     say(f"{options.out}: {copied} messages; left behind: "
         f"{one_line(', '.join(lines)) or 'nothing'}")
@@ -381,13 +377,12 @@ def bag_export(options: argparse.Namespace) -> int:
     """
     path = Path(options.file)
     folder = Path(options.out or path.with_suffix(""))
-    with refusing(BagError):
-        reader = BagReader(path)
-        wants = None
-        if options.topics:
-            wants = matcher(options.topics, [row["channel"] for row in Summary(reader).table()])
-        done = Export(reader, wants)
-        done.write(folder, options.to)
+    reader = BagReader(path)
+    wants = None
+    if options.topics:
+        wants = matcher(options.topics, [row["channel"] for row in Summary(reader).table()])
+    done = Export(reader, wants)
+    done.write(folder, options.to)
     return _copied(options, folder, done.counts, done.left_out, reader)
 
 
@@ -405,8 +400,7 @@ def bag_ros2(options: argparse.Namespace) -> int:
 
     exit code: 0 all was written, 1 a damaged part was left out, 2 bad usage
     """
-    extra("ros2", "rosbags")
-    extra("ros2", "xxhash")
+    extra("ros2", "rosbags", "xxhash")
     from rampart.cli.record.ros_bags import write  # noqa: PLC0415 of the extra
 
     folder = Path(options.out)

@@ -23,7 +23,7 @@ import msgspec
 import tomli_w
 
 from rampart.actors.bus import run_folder, run_info
-from rampart.actors.bus.bus import BusError, shared
+from rampart.actors.bus.bus import shared
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.recorder_connection import RecorderConnection
@@ -48,7 +48,7 @@ from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.members import load_class
 from rampart.actors.web.page_plan import PagePlan
-from rampart.cli.output import UsageError, refusing
+from rampart.cli.output import UsageError
 from rampart.cli.session import pause
 from rampart.manager.spec.schema import Kind
 
@@ -224,8 +224,7 @@ class Replay(RecordedRun):
             stack.enter_context(self._answering(clock, folder))
             bus = ZenohBus("", [], [endpoint(self._sockets, run_info.REPLAY)],
                            RecorderConnection(self._port))
-            with refusing(BusError):
-                await bus.open()
+            await bus.open()
             page = self._page(bus, clock, folder)
             showing = asyncio.create_task(page.run()) if page else None
             if showing:

@@ -7,14 +7,14 @@ from pathlib import Path
 import msgspec
 
 from rampart.actors.recording.bag_reader import BagReader, Summary
-from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.ros_bag import RosBag
 from rampart.actors.recording.run_documents import recorded_system
 from rampart.actors.ros2.gateway import Gateway
 from rampart.actors.ros2.translation.tables import GATEWAY
 from rampart.actors.ros2.translation.types import Types
+from rampart.actors.system.topics import system_topics
 from rampart.cli import systems
-from rampart.cli.output import UsageError, refusing
+from rampart.cli.output import UsageError
 from rampart.manager.spec.schema import SystemSpec
 
 
@@ -34,20 +34,19 @@ def write(file: Path, folder: Path, system: str | None, distribution: str | None
     Raises:
         UsageError: a file cannot be read or written, or an option is wrong.
     """
-    with refusing(BagError, ValueError):
-        reader = BagReader(file)
-        summary = Summary(reader)
-        if not reader.is_recording:
-            raise UsageError(f"{file}: an MCAP file of {reader.library or 'others'}; expected a "
-                             "recording of a run")
-        if system is None:
-            _, known = recorded_system(summary.files)
-            spec, topics = known.system, known.topics
-        else:
-            spec = systems.load(system)
-            topics = systems.topics_of(spec)
-        bag = RosBag(_types(spec, distribution), topics)
-        bag.write(reader, folder)
+    reader = BagReader(file)
+    summary = Summary(reader)
+    if not reader.is_recording:
+        raise UsageError(f"{file}: an MCAP file of {reader.library or 'others'}; expected a "
+                         "recording of a run")
+    if system is None:
+        _, known = recorded_system(summary.files)
+        spec, topics = known.system, known.topics
+    else:
+        spec = systems.load(system)
+        topics = system_topics(spec)
+    bag = RosBag(_types(spec, distribution), topics)
+    bag.write(reader, folder)
     return bag, reader
 
 

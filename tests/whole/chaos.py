@@ -333,8 +333,7 @@ class Chaos:
         missing = "no table from the supervisor"
         try:
             async with connect(self._run.port) as session:
-                session.listen(topics.NODES, topics.NODES.at(),
-                               lambda _key, _header, table: tables.append(table))
+                session.listen(topics.NODES, lambda _key, _header, table: tables.append(table))
                 deadline = time.monotonic() + session.real_s(_LISTEN_S)
                 while missing and time.monotonic() < deadline and not self.over():
                     await asyncio.sleep(0.02)

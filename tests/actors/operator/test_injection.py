@@ -189,7 +189,7 @@ def test_no_place_is_offered_that_must_not_be_disturbed():
     assert set(injections().choice()["modes"]) < set(MODES)
 
 
-def test_the_topics_of_the_robot_s_own_are_offered_after_the_common_ones(tmp_path):
+def test_the_robot_s_own_topics_are_offered(tmp_path):
     shipped = places_of(systems.load("osmosis"))
     own = places_of(systems.load(str(write_porter_system(tmp_path))))
     assert set(own) - set(shipped) == {

@@ -20,7 +20,6 @@ from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import REPORTS_ON, load_class, load_member
 from rampart.cli import systems as cli_systems
-from rampart.cli.output import UsageError
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.spec.tables import NonNegative, SpecificationError
@@ -112,7 +111,7 @@ def test_a_look_at_a_spec_refuses_parameters_of_the_modules_that_ship(tmp_path, 
     file = tmp_path / "own.toml"
     assert FULL.count(old) == 1
     file.write_text(FULL.replace(old, new))
-    with pytest.raises(UsageError, match=re.escape(f"{file}: {words}")):
+    with pytest.raises(ValueError, match=re.escape(f"{file}: {words}")):
         cli_systems.load(str(file))
 
 

@@ -141,7 +141,7 @@ def test_the_verbs_issue_show_and_revoke(tmp_path, capsys):
     (["issue", "anna", "--role", "look"], "page.tokens: anna has a token already; revoke it first"),
     (["revoke", "bob"], "page.tokens: no visitor 'bob'; known: anna"),
     (["show", "--file", "nowhere"], "nowhere: cannot be read (No such file or directory)"),
-    (["issue", "bob", "--role", "look", "--file", "no/where"], "no/where: cannot be written"),
+    (["issue", "bob", "--role", "look", "--file", "no/where"], "no/where: No such file"),
     (["show", "--file", "open"], "open: mode 0644: others can access it; chmod 600")])
 def test_what_a_verb_cannot_do_is_one_line_and_code_2(tmp_path, monkeypatch, capsys, arguments,
                                                       words):

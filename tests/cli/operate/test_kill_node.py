@@ -34,10 +34,9 @@ class Tables:
     def __init__(self, tables: dict[str, NodeTable]) -> None:
         self.tables = tables
 
-    def listen(self, _topic, key, heard) -> None:
+    def listen(self, _topic, heard) -> None:
         for supervisor, table in self.tables.items():
-            if f"/{supervisor}/" in key:
-                heard("", Header(supervisor, 1, 1, 0.0), table)
+            heard("", Header(supervisor, 1, 1, 0.0), table)
 
     def real_s(self, _simulated_s: float) -> float:
         return 0.05
