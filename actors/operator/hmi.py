@@ -54,7 +54,7 @@ from rampart.actors.runtime.run_context import NO_SYSTEM
 from rampart.actors.web.access import Access, AccessError, is_loopback
 from rampart.actors.web.audit import AuditLog
 from rampart.actors.web.gate import Gate
-from rampart.actors.web.server import PortError
+from rampart.actors.web.listening import PortError
 from rampart.actors.web.tls import Tls, TlsError
 from rampart.actors.web.visitors import Register, Role, Visitor, digest
 from rampart.files.plain_text import one_line

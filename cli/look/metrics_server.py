@@ -17,7 +17,8 @@ from starlette.types import ASGIApp
 from rampart.actors.bus.run_info import ask
 from rampart.actors.ftm import topics
 from rampart.actors.machine.process_usage import read_count
-from rampart.actors.web.server import WebServer, listen
+from rampart.actors.web.listening import listen
+from rampart.actors.web.server import WebServer
 from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
 from rampart.cli.look.metrics_families import Exposition, families
 from rampart.cli.output import between, say
