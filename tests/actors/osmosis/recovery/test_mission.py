@@ -14,7 +14,7 @@ from rampart.actors.osmosis.recovery.replan import Replan
 from rampart.actors.osmosis.recovery.return_home import ReturnHome
 from rampart.actors.runtime.actor import Actor, on
 from rampart.testing import run
-from tests.actors.osmosis.control.test_actors import AIRPORT
+from tests.actors.osmosis.control.house import AIRPORT
 from tests.actors.osmosis.recovery.world import Boss, hang
 from tests.osmosis_system import System
 

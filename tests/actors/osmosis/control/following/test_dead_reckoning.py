@@ -15,9 +15,9 @@ from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, Dea
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.testing import run
+from tests.actors.osmosis.control.house import AIRPORT
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
 from tests.actors.osmosis.control.localization_drive import Reading, Truth, disturbed
-from tests.actors.osmosis.control.test_actors import AIRPORT
 from tests.actors.osmosis.control.world import World
 from tests.osmosis_system import System, shipped_system
 

@@ -15,8 +15,8 @@ from rampart.actors.osmosis.control.following.light_row import RowLimits
 from rampart.actors.osmosis.control.following.route_control import PERIOD_S, RouteControl
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER
 from rampart.manager.spec.schema import Layers
+from tests.actors.osmosis.control.house import AIRPORT
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
-from tests.actors.osmosis.control.test_actors import AIRPORT
 from tests.osmosis_system import shipped_system
 
 SYSTEM = msgspec.structs.replace(shipped_system(), layers=Layers(checkpoints=True))

@@ -10,29 +10,21 @@ import pytest
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode, PilotMode
-from rampart.sim.virtual.virtual_loop import VirtualLoop
-from tests.actors.osmosis.control.mission_world import full_house
-from tests.actors.osmosis.control.test_actors import AIRPORT
-from tests.actors.osmosis.control.world import World
+from tests.actors.osmosis.control import house
+from tests.actors.osmosis.control.house import AIRPORT
 
-START = (AIRPORT.start.x_m, AIRPORT.start.y_m, AIRPORT.start.yaw_rad)
+START = AIRPORT.start
 DOWN = m.Goal(-29.5, -3.0, Mode.TAXI)
 ROW = m.Goal(-22.0, -18.5, Mode.TAXI)
 
 
-def play(scenario, world=None):
-    async def scene():
-        house = full_house(world or World(*START))
-        try:
-            await asyncio.sleep(1.0)
-            house.request(DOWN, ROW)
-            await asyncio.sleep(5.0)
-            await scenario(house, house.base)
-        finally:
-            await house.close()
+def play(scenario):
+    async def scene(house):
+        house.request(DOWN, ROW)
+        await asyncio.sleep(5.0)
+        await scenario(house, house.base)
 
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        runner.run(scene())
+    house.play(scene, parameters=house.FULL)
 
 
 def place(house):
@@ -55,7 +47,7 @@ def test_pause_and_resume():
         assert place(house) == pytest.approx(where, abs=0.01)
         operator.ask(MissionAction.PAUSE)
         operator.ask(MissionAction.RESUME)
-        assert await house.until(lambda: operator.status.phase is MissionPhase.SUCCEEDED, 90)
+        await house.until(MissionPhase.SUCCEEDED, 90)
         assert [a.accepted for a in operator.answers] == [True, False, True]
         assert operator.answers[1].reason == (
             "the mission is already paused, operator: aircraft passing")
@@ -67,10 +59,10 @@ def test_home():
     async def scenario(house, operator):
         await asyncio.sleep(6.0)
         operator.ask(MissionAction.HOME, "rain")
-        assert await house.until(lambda: operator.status.phase is MissionPhase.CANCELLED, 60)
+        await house.until(MissionPhase.CANCELLED, 60)
         assert operator.phases == ["idle", "running", "returning home", "cancelled"]
         assert operator.status.reason == "returned home, operator: rain"
-        assert math.dist(place(house), START[:2]) < 1.1
+        assert math.dist(place(house), (START.x_m, START.y_m)) < 1.1
         await asyncio.sleep(1.0)
         assert standing(house)
 
@@ -114,7 +106,7 @@ def test_a_transient_controlled_stop_pauses_the_mission_and_its_end_resumes_it()
         await asyncio.sleep(0.2)
         assert "continues when the robot is released" in operator.answers[-1].reason
         operator.release()
-        assert await house.until(lambda: operator.status.phase is MissionPhase.SUCCEEDED, 90)
+        await house.until(MissionPhase.SUCCEEDED, 90)
         assert operator.phases == ["idle", "running", "paused", "running", "succeeded"]
 
     play(scenario)
@@ -140,7 +132,7 @@ def test_the_operator_drives_elsewhere_and_hands_back_and_the_mission_goes_on_fr
         anew = operator.routes[routes:][-1]
         assert anew.active
         assert math.dist(anew.waypoints[0], place(house)) < 2.5, "planned from where it is now"
-        assert await house.until(lambda: operator.status.phase is MissionPhase.SUCCEEDED, 120)
+        await house.until(MissionPhase.SUCCEEDED, 120)
         assert operator.phases == ["idle", "running", "paused", "running", "succeeded"]
 
     play(scenario)
