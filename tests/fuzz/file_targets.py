@@ -183,7 +183,8 @@ def toml_document(data: bytes) -> None:
 
 
 @target("system", refuses=(SpecificationError,), form="toml", one_line=True,
-        words=_WORDS, samples=lambda: [_SMALL.encode()] * 9 + [_CELL.encode()])
+        words=_WORDS,
+        samples=lambda: [*[_SMALL.encode()] * 9, _CELL.encode(), _PAPER.encode()])
 def system(data: bytes) -> None:
     spec = parse_specification(data.decode(errors="replace"), "system.toml")
     formula_of(spec.build_fault_tree())

@@ -19,29 +19,6 @@ RM_ORDER = paper().build_order()
 FTM_TREE = paper().build_ftm_tree()
 
 
-@pytest.mark.parametrize(("names", "greatest"), [
-    ({"RM5", "RM3", "RM4"}, "RM5"),
-    ({"RM3", "RM4"}, None),
-    ({"RM2", "RM5"}, None),
-    ({"RM1", "RM2", "RM3", "RM4", "RM5"}, "RM1"),
-    ({"RM4"}, "RM4"),
-    (set(), None),
-])
-def test_dom_on_the_rm_order_as_in_the_paper(names, greatest):
-    assert greatest == RM_ORDER.greatest(names)
-
-
-@pytest.mark.parametrize(("names", "lowest"), [
-    ({"FTM4", "FTM5"}, "FTM2"),
-    ({"FTM4", "FTM7"}, "FTM1"),
-    ({"FTM2", "FTM5", "FTM6"}, "FTM1"),
-    ({"FTM7"}, "FTM7"),
-    ({"FTM2", "FTM4"}, "FTM2"),
-])
-def test_low_com_dom_as_in_the_paper(names, lowest):
-    assert lowest == FTM_TREE.lowest_common_dominant(names)
-
-
 def test_the_ftm_tree_is_the_one_of_figure_8():
     assert FTM_TREE.parents == {
         "FTM1": None, "FTM2": "FTM1", "FTM3": "FTM1", "FTM6": "FTM1", "FTM4": "FTM2",

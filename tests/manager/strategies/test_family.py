@@ -8,11 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
-from rampart.manager.model.order import CycleError, PartialOrder, Tree, refine
+from rampart.manager.model.order import (
+    CycleError,
+    PartialOrder,
+    Tree,
+    UnknownElementError,
+    refine,
+)
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.guarded_repair import GuardedRepair
 from rampart.manager.strategies.mission_first import MissionFirst
-from rampart.manager.strategies.registry import STRATEGIES
+from rampart.manager.strategies.registry import STRATEGIES, UnknownStrategyError, decide
 from rampart.manager.strategies.safety_first import SafetyFirst
 from rampart.manager.strategies.simultaneous import Simultaneous
 from tests.manager.bench import paper
@@ -135,6 +141,38 @@ def test_safety_first_follows_the_four_blocks(question):
     assert (decision.rule, decision.recoveries) == safety_first(system, active)
 
 
+SPEC = paper()
+PAPER = Arrangement(SPEC.build_mechanisms(), SPEC.build_ftm_tree(), SPEC.build_order())
+# Figure 8 of the paper and its list of mechanisms, by hand: the oracle reads no specification.
+BY_HAND = System(
+    PAPER,
+    {"FTM1": None, "FTM2": "FTM1", "FTM3": "FTM1", "FTM6": "FTM1", "FTM4": "FTM2", "FTM5": "FTM2",
+     "FTM7": "FTM6"},
+    closure({("RM1", "RM2"), ("RM1", "RM5"), ("RM2", "RM3"), ("RM2", "RM4"), ("RM5", "RM3"),
+             ("RM5", "RM4")}),
+    {"FTM1": ("RM1",), "FTM2": ("RM2",), "FTM3": ("RM2",), "FTM4": ("RM3",), "FTM5": ("RM4",),
+     "FTM6": ("RM5",), "FTM7": ("RM4",)}, {})
+
+
+@pytest.mark.parametrize("active", [
+    active for size in range(1, 8) for active in combinations(BY_HAND.parents, size)],
+    ids="+".join)
+def test_every_active_set_of_the_paper_s_system_is_decided_as_the_paper_says(active):
+    decision = decide(active, PAPER.mechanisms, PAPER.tree, PAPER.order)
+    assert (decision.rule, decision.recoveries) == safety_first(BY_HAND, active)
+    assert decision.active == tuple(sorted(active))
+
+
+def test_what_is_unknown_is_named_with_what_is_known_and_nothing_active_needs_nothing():
+    paper_s = PAPER.mechanisms, PAPER.tree, PAPER.order
+    with pytest.raises(UnknownElementError, match=r"unknown mechanism 'FTM9'; known: FTM1, FTM2"):
+        decide(["FTM1", "FTM9"], *paper_s)
+    with pytest.raises(UnknownStrategyError, match=r"unknown strategy 'bold'; known: .*safety-f"):
+        decide(["FTM1"], *paper_s, "bold")
+    nothing = decide([], *paper_s)
+    assert (nothing.rule, nothing.recoveries) == (0, ())
+
+
 # ---- simultaneous -----------------------------------------------------------------------------
 
 
@@ -252,8 +290,6 @@ def test_mission_first_takes_the_deepest_barriers_that_are_in_time(question, dat
                    for o in taken)
 
 
-PAPER = Arrangement(
-    paper().build_mechanisms(), paper().build_ftm_tree(), paper().build_order())
 @pytest.mark.parametrize(("active", "late", "rule", "executed"), [
     # deepest first: the respawn, although the stale command is there already
     ("FTM4", "", 1, "RM3"), ("FTM2 FTM4 FTM5", "", 1, "RM3 RM4"), ("FTM6 FTM7", "", 1, "RM4"),
