@@ -5,48 +5,30 @@ from __future__ import annotations
 import math
 
 import pytest
-import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.airport.model import Airport, StartPose
-from rampart.actors.runtime.actor import Context, Header
-from rampart.actors.runtime.clock import Clock
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, Motor
 from rampart.sim.osmosis.robot import WHEEL_NAMES
 from rampart.sim.osmosis.scene import WorldError
-from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.osmosis.world import World
-from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from tests.osmosis_system import run_context
+from tests.sim.osmosis.bench import Bench, run, world
 
 STUCK = m.ActuatorFaultKind.STUCK_WHEEL
 WEAK = m.ActuatorFaultKind.WEAK_WHEEL
 BRAKE = m.ActuatorFaultKind.BRAKE_FAILURE
 LEFT = ("front left", "rear left")
 
-FIELD = Airport(
-    "Field", {"a": (0.0, 0.0), "b": (1.0, 0.0)}, (("a", "b"),), shapely.box(-90, -90, 90, 90),
-    StartPose(0, 0, 0),
-)  # fmt: skip
-
 
 def fault(kind, wheel="front left", strength=0.0, duration_s=100.0, injection="f"):
     return m.ActuatorFault(injection, kind, wheel, strength, duration_s)
 
 
-def world(**changes) -> World:
-    return World(FIELD, **{"dead_man_timeout_s": None, "max_catch_up_s": 100.0, **changes})
-
-
 def driving(linear: float = 1.0, angular: float = 0.0) -> World:
     """A world whose robot has driven for three seconds."""
-    sim = world()
-    sim.command(linear, angular)
-    sim.step_to(3.0)
-    return sim
+    return run(world(), linear, angular, 3.0)
 
 
 def after(sim: World, seconds: float) -> World:
@@ -333,62 +315,44 @@ def test_every_fault_ends_in_time_and_with_the_last_one_all_is_healthy(faults):
 # ---- the actor ----------------------------------------------------------------------
 
 
-class Bench:
-    """A simulator whose clock is moved by hand; its reports and complaints are kept."""
+def reports(bench: Bench) -> list[tuple[str, int, bool, str]]:
+    return [(r.injection, r.affected, r.finished, r.reason)
+            for r in bench.all(bus_topics.INJECTION_REPORT)]
 
-    def __init__(self):
-        self.now_s = 10.0
-        clock = Clock(0.0, 1.0, lambda: self.now_s)
-        self.actor = Simulator(Context(
-            "simulator", 1, clock, VirtualBus(Hub(), "simulator"), run=run_context(airport=FIELD)))
-        self.reports, self.complaints = [], []
-        self.actor.publish = lambda topic, body, **_: (
-            self.reports.append((body.injection, body.affected, body.finished, body.reason))
-            if topic is bus_topics.INJECTION_REPORT else None)  # fmt: skip
-        self.actor.report_diagnostic = lambda *complaint: self.complaints.append(complaint)
-        self.actor.on_start()
 
-    def header(self) -> Header:
-        return Header("tester", 1, 1, self.now_s)
+def ordered(order: m.ActuatorFault) -> Bench:
+    """A simulator whose robot drives when a fault is ordered."""
+    bench = Bench()
+    bench.run(1.0, FORWARD)
+    bench.actor.actuator_fault(order, bench.header())
+    return bench
 
-    def run(self, seconds: float, linear: float = 1.0) -> None:
-        for _ in range(round(seconds / 0.02)):
-            self.now_s += 0.02
-            self.actor.command(m.BaseCommand(linear, 0.0), self.header())
-            self.actor.tick()
 
-    def order(self, order: m.ActuatorFault) -> None:
-        self.actor.actuator_fault(order, self.header())
+FORWARD = m.BaseCommand(1.0, 0.0)
 
 
 def test_the_simulator_reports_when_a_fault_is_taken_when_it_bites_and_when_it_is_over():
-    bench = Bench()
-    bench.run(1.0)
-    bench.order(fault(STUCK, duration_s=0.5))
-    assert bench.reports == [("f", 0, False, "")]
-    bench.run(0.1)
-    assert bench.reports[1:] == [("f", 1, False, "")]
-    bench.run(1.0)
-    assert bench.reports[2:] == [("f", 50, True, "")]
+    bench = ordered(fault(STUCK, duration_s=0.5))
+    assert reports(bench) == [("f", 0, False, "")]
+    bench.run(0.1, FORWARD)
+    assert reports(bench)[1:] == [("f", 1, False, "")]
+    bench.run(1.0, FORWARD)
+    assert reports(bench)[2:] == [("f", 50, True, "")]
     assert bench.complaints == []
 
 
 def test_a_fault_that_is_over_while_the_simulator_is_held_up_is_reported_all_the_same():
-    bench = Bench()
-    bench.run(1.0)
-    bench.order(fault(STUCK, duration_s=20.0))
-    bench.run(0.1)
+    bench = ordered(fault(STUCK, duration_s=20.0))
+    bench.run(0.1, FORWARD)
     bench.now_s += 60.0
     bench.actor.tick()
-    assert bench.reports[-1][0::2] == ("f", True)
+    assert reports(bench)[-1][0::2] == ("f", True)
 
 
-@pytest.mark.parametrize(("order", "reason"), BAD)
-def test_the_simulator_refuses_what_is_impossible_and_says_why(order, reason):
-    bench = Bench()
-    bench.run(0.1)
-    bench.order(order)
-    ((injection, count, finished, why),) = bench.reports
+def test_the_simulator_refuses_what_is_impossible_and_says_why():
+    order, reason = BAD[0]
+    bench = ordered(order)
+    ((injection, count, finished, why),) = reports(bench)
     assert (injection, count, finished) == ("f", 0, True)
     assert reason in why
     assert bench.complaints == [("actuator fault", why, "tester")]

@@ -5,26 +5,10 @@ from __future__ import annotations
 import math
 
 import pytest
-import shapely
 
-from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.sim.osmosis.robot import Drive, DriveLimits, twist_from_wheels
 from rampart.sim.osmosis.world import World
-
-FIELD = Airport(
-    "Field", {"a": (0.0, 0.0), "b": (1.0, 0.0)}, (("a", "b"),), shapely.box(-90, -90, 90, 90),
-    StartPose(0, 0, 0),
-)  # fmt: skip
-
-
-def world(**changes) -> World:
-    return World(FIELD, dead_man_timeout_s=None, max_catch_up_s=60, **changes)
-
-
-def run(sim: World, linear: float, angular: float, seconds: float) -> World:
-    sim.command(linear, angular)
-    sim.step_to(sim.time_s + seconds)
-    return sim
+from tests.sim.osmosis.bench import run, world
 
 
 def steady_rates(sim: World, seconds: float = 1.0) -> tuple[float, float]:

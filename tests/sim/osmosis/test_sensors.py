@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,22 +20,16 @@ from rampart.actors.osmosis.airport.model import (
 from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M, illuminance_per_candela
 from rampart.sim.osmosis.sensors import LaserSpec, LightSensor, wrap
 from rampart.sim.osmosis.world import World
+from tests.sim.osmosis.bench import FIELD, world
 
 
 def field(yaw_rad: float = 0.0, **changes) -> Airport:
-    return Airport(
-        "Field", {"a": (0.0, 0.0), "b": (1.0, 0.0)}, (("a", "b"),),
-        shapely.box(-90, -90, 90, 90), StartPose(0, 0, yaw_rad), **changes,
-    )  # fmt: skip
+    return replace(FIELD, start=StartPose(0, 0, yaw_rad), **changes)
 
 
 def towards(sim: World, ranges: np.ndarray, bearing_rad: float) -> float:
     index = (bearing_rad - sim.laser.angle_min_rad) / sim.laser.angle_increment_rad
     return float(ranges[round(index)])
-
-
-def world(airport: Airport, **changes) -> World:
-    return World(airport, dead_man_timeout_s=None, max_catch_up_s=60, **changes)
 
 
 # ---- laser --------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -13,46 +14,15 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.runtime.actor import Context, Header
-from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.actor import Header
 from rampart.sim.osmosis.simulator import Simulator
-from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from tests.osmosis_system import run_context
+from tests.sim.osmosis.bench import Bench
 
-AIRPORT = load_airport("vallombre")
-
-
-class Bench:
-    """A simulator whose clock is moved by hand and whose messages are kept."""
-
-    def __init__(self, **parameters):
-        self.now_s = 100.0
-        clock = Clock(0.0, 1.0, lambda: self.now_s)
-        context = Context("simulator", 1, clock, VirtualBus(Hub(), "simulator"), parameters,
-                          run_context(airport=AIRPORT))
-        self.actor = Simulator(context)
-        self.sent = []
-        self.actor.has_readers = lambda topic: True
-        self.actor.publish = lambda topic, body, stamp=None, name=None: self.sent.append(
-            (topic.key, body, self.now_s if stamp is None else stamp))  # fmt: skip
-        self.actor.on_start()
-
-    def run(self, seconds: float, command: m.BaseCommand | None = None) -> None:
-        for _ in range(round(seconds / 0.02)):
-            self.now_s += 0.02
-            if command is not None:
-                self.actor.command(command, self.header())
-            self.actor.tick()
-
-    def header(self, age_s: float = 0.0) -> Header:
-        return Header("safety_pilot", 1, 1, self.now_s - age_s)
-
-    def last(self, topic):
-        return [body for key, body, _ in self.sent if key == topic.key][-1]
+bench_at = partial(Bench, load_airport("vallombre"))
 
 
 def test_every_topic_of_the_summit_xl_layer_and_the_world_comes_at_its_rate():
-    bench = Bench(upper_laser=True)
+    bench = bench_at(upper_laser=True)
     bench.run(2.0)
     counts = Counter(key for key, _, _ in bench.sent)
     readings = [topic for topic in Simulator.outputs if topic is not ftm_topics.HOLDS]
@@ -62,7 +32,7 @@ def test_every_topic_of_the_summit_xl_layer_and_the_world_comes_at_its_rate():
 
 
 def test_a_robot_with_one_laser_has_one_and_with_two_both_see_the_same_with_noise_of_their_own():
-    one, two = Bench(), Bench(upper_laser=True)
+    one, two = bench_at(), bench_at(upper_laser=True)
     for bench in (one, two):
         bench.run(1.0)
     assert topics.UPPER_SCAN.key not in {key for key, _, _ in one.sent}
@@ -75,7 +45,7 @@ def test_a_robot_with_one_laser_has_one_and_with_two_both_see_the_same_with_nois
 
 
 def test_commands_move_the_robot_and_the_brake_holds_it():
-    bench = Bench()
+    bench = bench_at()
     start = bench.actor._world.pose
     bench.run(2.0, m.BaseCommand(0.5, 0.0))
     assert bench.last(topics.TRUTH).twist.linear_mps == pytest.approx(0.5, abs=0.02)
@@ -90,7 +60,7 @@ def test_commands_move_the_robot_and_the_brake_holds_it():
 
 
 def test_the_brake_is_released_when_the_last_who_holds_it_lets_go():
-    bench = Bench()
+    bench = bench_at()
     for source, engaged, brakes in (
             ("RM1", True, True), ("RM7", False, True), ("RM7", True, True), ("RM1", False, True),
             ("RM1", False, True), ("RM7", False, False)):
@@ -100,7 +70,7 @@ def test_the_brake_is_released_when_the_last_who_holds_it_lets_go():
 
 
 def test_an_old_command_does_not_keep_the_dead_man_quiet():
-    bench = Bench()
+    bench = bench_at()
     for _ in range(50):
         bench.run(0.02)
         bench.actor.command(m.BaseCommand(0.5, 0.0), bench.header(age_s=2.0))
@@ -108,7 +78,7 @@ def test_an_old_command_does_not_keep_the_dead_man_quiet():
 
 
 def test_obstacles_come_and_go_by_message_and_are_published_at_once():
-    bench = Bench(obstacles=2)
+    bench = bench_at(obstacles=2)
     bench.run(1.0)
     assert {o.name for o in bench.last(topics.OBSTACLES).obstacles} == {"crate", "drum"}
     order = m.ObstacleCommand("box", True, -27.0, 8.0, 0.3)
@@ -122,18 +92,16 @@ def test_obstacles_come_and_go_by_message_and_are_published_at_once():
 
 
 def test_an_impossible_order_is_reported_and_changes_nothing():
-    bench = Bench()
-    reports = []
-    bench.actor.report_diagnostic = lambda *report: reports.append(report)
+    bench = bench_at()
     bench.actor.obstacle(m.ObstacleCommand("x", True, -27.0, 11.0, 0.3), bench.header())
     bench.actor.command(m.BaseCommand(float("nan"), 0.0), bench.header())
-    assert [report[0] for report in reports] == ["obstacle", "velocity command"]
-    assert "on the robot" in reports[0][1]
+    assert [what for what, *_ in bench.complaints] == ["obstacle", "velocity command"]
+    assert "on the robot" in bench.complaints[0][1]
     assert bench.actor._world.obstacles == ()
 
 
 def test_held_up_it_publishes_fresh_readings_and_owns_up_to_the_loss():
-    bench = Bench()
+    bench = bench_at()
     bench.run(1.1)
     assert bench.last(topics.TRUTH).real_time_factor == 1.0
     bench.sent.clear()

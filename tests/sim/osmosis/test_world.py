@@ -18,6 +18,7 @@ from rampart.actors.osmosis.airport.model import (
 from rampart.actors.runtime.checkpoint import StateError
 from rampart.sim.osmosis.scene import SPARE_OBSTACLES, WorldError
 from rampart.sim.osmosis.world import WORLD_STATE, Clearance, World
+from tests.sim.osmosis import bench
 
 # A road 40 m long and 4 m wide, eastward; the robot starts in its west.
 ROAD = shapely.box(-2, -2, 38, 2)
@@ -29,8 +30,7 @@ def road(**changes) -> Airport:
 
 
 def world(airport: Airport | None = None, **changes) -> World:
-    settings = {"dead_man_timeout_s": None, "max_catch_up_s": 100.0, **changes}
-    return World(airport or road(), **settings)
+    return bench.world(airport or road(), **changes)
 
 
 # ---- time ---------------------------------------------------------------------------
