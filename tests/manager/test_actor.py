@@ -12,7 +12,6 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
-from shapely.geometry import box
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
@@ -24,7 +23,6 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea
 from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.messages import PilotMode
@@ -35,6 +33,7 @@ from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.actor import DECISIONS_PER_INCARNATION, FtmManager
 from rampart.sim.virtual.virtual_loop import VirtualLoop
+from tests.actors.osmosis.detection.lane import LANE
 from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor, hang
 from tests.osmosis_system import COMMAND, POSE, System, shipped_system
 from tests.virtual_time import within
@@ -123,9 +122,7 @@ class Whole(System):
     """All modules of the shipped system, and the world around them."""
 
     def __init__(self) -> None:
-        airport = Airport("field", {"a": (0.0, 0.0), "b": (1.0, 0.0)}, (("a", "b"),),
-                          box(-50.0, -2.5, 50.0, 2.5), StartPose(0.0, 0.0, 0.0))
-        super().__init__(system=shipped_system(), airport=airport)
+        super().__init__(system=shipped_system(), airport=LANE)
         timing = shipped_system().timing
         self.actors: dict[str, Actor] = {}
         self.modules: dict[str, tuple[type[Actor], dict[str, Any]]] = {

@@ -170,3 +170,20 @@ def mis_stamped(items: Items, topic: Topic[Any], wrong: str, from_s: float, *, o
             yield now_s, replace(item, stamp_s=WRONG_STAMPS[wrong](now_s))
         else:
             yield now_s, item
+
+
+def with_absurd(items: Items, topic: Topic[Any], from_s: float
+                ) -> Iterator[tuple[float, Reading | Truth]]:
+    """Yield what arrives, and before one reading two whose numbers are too large for a square."""
+    done = False
+    for now_s, item in items:
+        if now_s >= from_s and isinstance(item, Reading) and item.topic is topic and not done:
+            done = True
+            for number, behind_s in ((1e300, 0.002), (-1e300, 0.001)):
+                yield now_s, Reading(topic, now_s - behind_s, {
+                    topics.GPS: m.GpsFix(number, number, number, number, abs(number)),
+                    topics.IMU: m.Imu(number, number, number, number),
+                    topics.ODOMETRY: m.Odometry(
+                        m.Pose(number, number, number), m.Twist(number, number)),
+                    topics.ABSOLUTE_POSE: m.Pose(number, number, number)}[topic])
+        yield now_s, item

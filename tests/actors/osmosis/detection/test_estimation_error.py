@@ -13,7 +13,6 @@ from rampart.actors.osmosis.detection.area.estimation_error import (
     EstimationError,
     EstimationMonitor,
 )
-from rampart.actors.runtime.actor import Actor
 from rampart.testing import Ear
 from tests.actors.osmosis.control.localization_drive import (
     END_S,
@@ -161,22 +160,17 @@ def test_a_respawned_module_claims_nothing_before_it_has_compared_or_waited():
     assert (waiting.known, waiting.active) == (True, False)
 
 
-class Robot(Actor):
-    outputs = (topics.POSE, topics.GPS, topics.IMU, topics.ODOMETRY)
-
-
 @in_system(system=shipped_system())
 async def test_the_actor_names_the_life_that_lied(system):
     ear = system.start("ear", Ear)
-    robot = system.start("localization", Robot)
     system.start("DM8", EstimationError)
     await system.settle()
     for i in range(40):
         x_m = 0.1 * i
-        robot.publish(topics.IMU, m.Imu(0.0, 0.001 * i, 0.0, 0.0))
-        robot.publish(topics.ODOMETRY, m.Odometry(m.Pose(x_m, 0.0, 0.0), m.Twist(1.0, 0.0)))
-        robot.publish(topics.POSE, m.Pose(x_m, 0.0 if i < 20 else 2.0, 0.0))
-        robot.publish(topics.GPS, m.GpsFix(x_m, 0.0, 1.0, 0.0, 0.02))
+        system.say(topics.IMU, m.Imu(0.0, 0.001 * i, 0.0, 0.0))
+        system.say(topics.ODOMETRY, m.Odometry(m.Pose(x_m, 0.0, 0.0), m.Twist(1.0, 0.0)))
+        system.say(topics.POSE, m.Pose(x_m, 0.0 if i < 20 else 2.0, 0.0), "localization")
+        system.say(topics.GPS, m.GpsFix(x_m, 0.0, 1.0, 0.0, 0.02))
         await asyncio.sleep(0.1)
     assert ear.states == ["idle", "active"]
     report = ear.heard[-1][1]

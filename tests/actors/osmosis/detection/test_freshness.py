@@ -14,7 +14,6 @@ from rampart.actors.machine.absence import GRACE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.testing import Ear, play, table
-from tests.actors.osmosis.detection.sources import Source
 from tests.osmosis_system import COMMAND, POSE, in_system
 
 # f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead,
@@ -76,18 +75,17 @@ def test_it_becomes_active_exactly_when_the_age_reaches_the_timeout():
 @in_system()
 async def test_the_actor_reports_at_once_and_repeats_what_has_not_changed_each_second(system):
     ear = system.start("ear", Ear)
-    source = system.start("source", Source)
     dm2 = system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
     await asyncio.sleep(0.01)
     assert ear.states == ["idle"]
-    source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+    system.say(topics.COMMAND, m.Twist(0.5, 0.0))
     sent_s = system.clock.now()
     await asyncio.sleep(2.0)
     first = next(at for at, report in ear.heard if report.state == "active")
     assert first == pytest.approx(sent_s + 0.3, abs=1e-6)
     assert len(ear.heard) == pytest.approx(2.0 + 1, abs=1)
     for _ in range(10):
-        source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+        system.say(topics.COMMAND, m.Twist(0.5, 0.0))
         await asyncio.sleep(0.05)
     assert ear.states == ["idle", "active", "idle"]
     assert dm2.state is fm.DetectionState.IDLE
@@ -110,15 +108,15 @@ async def test_a_respawned_module_is_silent_until_it_knows_that_the_topic_is_sta
 
 @in_system()
 async def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_judges(system):
-    ear, source = system.start("ear", Ear), system.start("source", Source)
+    ear = system.start("ear", Ear)
     system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
-    source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+    system.say(topics.COMMAND, m.Twist(0.5, 0.0))
     await asyncio.sleep(0.1)
     loop = asyncio.get_running_loop()
     loop.jump(2.0)  # all are late, and so are the messages; the first of its mail may be old
-    source.publish(topics.COMMAND, m.Twist(0.5, 0.0), stamp=system.clock.now() - 1.0)
+    system.say(topics.COMMAND, m.Twist(0.5, 0.0), stamp_s=system.clock.now() - 1.0)
     await asyncio.sleep(EXCUSE_S / 2)
-    source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+    system.say(topics.COMMAND, m.Twist(0.5, 0.0))
     await asyncio.sleep(0.2)
     assert ear.states == ["idle"]
     loop.jump(2.0)  # the mail is read, but there was none
@@ -139,14 +137,11 @@ async def test_a_parameter_that_makes_no_sense_is_refused_by_name(
 @in_system()
 async def test_it_names_the_suspected_node_and_the_life_that_was_heard_last(system):
     ear = system.start("ear", Ear)
-    system.start("localization", Source)
-    await system.kill("localization")
-    source = system.start("localization", Source)
     system.start("DM6", Freshness, **POSE, timeout_s=0.3, suspects=["localization"])
     system.start("DM2", Freshness, **COMMAND, timeout_s=0.3, suspects=["osmosis_control"])
     await system.settle()
     for _ in range(5):
-        source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+        system.say(topics.POSE, m.Pose(0.0, 0.0, 0.0), "localization", incarnation=2)
         await asyncio.sleep(0.1)
     await asyncio.sleep(5.0)
     named = {report.reason: report.nodes for _, report in ear.heard if report.reason}

@@ -20,7 +20,6 @@ from rampart.actors.osmosis.detection.pilot_output import (
     PilotOutput,
     PilotOutputMonitor,
 )
-from rampart.actors.runtime.actor import Actor
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import Ear, run
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
@@ -177,29 +176,23 @@ def test_a_respawned_module_claims_nothing_of_a_pilot_whose_output_is_old_when_i
     assert (monitor.known, monitor.active) == (True, False)
 
 
-class Rest(Actor):
-    """The inputs of the pilot."""
-
-    outputs = (topics.COMMAND, topics.STANDBY_COMMAND, topics.SCAN, ftm_topics.MANAGER_STATUS)
-
-
 @pytest.mark.parametrize("silent_s", [0.5, 5.0])
 def test_a_sound_pilot_is_not_accused_when_both_computers_of_the_command_fall_silent(silent_s):
     """With the pilot itself, and the timeout of the shipped system."""
 
     async def scenario():
         async with System(system=OSMOSIS) as system:
-            ear, rest = system.start("ear", Ear), system.start("rest", Rest)
+            ear = system.start("ear", Ear)
             system.start("safety_pilot", SafetyPilot)
             system.start("DM12", PilotOutput)
             await system.settle()
             told = fm.ManagerStatus((), (), (), (), "safety-first", 0)
             for i in range(round((3.0 + silent_s) * 20)):
-                rest.publish(ftm_topics.MANAGER_STATUS, told)
-                rest.publish(topics.SCAN, full_sweep(number=i))
+                system.say(ftm_topics.MANAGER_STATUS, told)
+                system.say(topics.SCAN, full_sweep(number=i))
                 if i < 40 or i >= 40 + silent_s * 20:
-                    rest.publish(topics.COMMAND, m.Twist(0.8, 0.1))
-                    rest.publish(topics.STANDBY_COMMAND, m.Twist(0.8, 0.1))
+                    system.say(topics.COMMAND, m.Twist(0.8, 0.1), "osmosis_control")
+                    system.say(topics.STANDBY_COMMAND, m.Twist(0.8, 0.1), "standby_control")
                 await asyncio.sleep(PERIOD_S)
             return ear.states
 

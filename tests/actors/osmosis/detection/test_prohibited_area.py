@@ -8,12 +8,10 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from shapely.geometry import box
 
 from rampart.actors.detection.freshness import FreshnessMonitor
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.detection.area.prohibited_area import (
     FenceLimits,
     FenceMonitor,
@@ -23,9 +21,8 @@ from rampart.actors.osmosis.detection.area.prohibited_area import (
 )
 from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.messages import GpsFix
-from rampart.actors.runtime.actor import Actor
 from rampart.testing import Ear, play, run, table
-from tests.actors.osmosis.detection.sources import Source
+from tests.actors.osmosis.detection.lane import LANE
 from tests.osmosis_system import System, in_system, shipped_system
 
 LIMITS = FenceLimits(half_diagonal_m=0.473, reaction_s=0.3, braking_mps2=2.0)
@@ -142,33 +139,21 @@ def test_fence_timeline(events, expected):
     assert play(monitor, handle, events) == expected
 
 
-class Receiver(Actor):
-    """A GPS receiver that publishes the given fixes."""
-
-    outputs = (topics.GPS,)
-
-
-def lane_airport() -> Airport:
-    return Airport("lane", {"a": (0.0, 0.0), "b": (40.0, 0.0)}, (("a", "b"),),
-                   box(-5.0, -HALF_LANE_M, 45.0, HALF_LANE_M), StartPose(0.0, 0.0, 0.0))
-
-
 def test_the_actor_warns_in_time_by_the_margins_of_the_shipped_system():
     async def scenario() -> None:
         spec = shipped_system()
-        async with System(system=spec, airport=lane_airport()) as system:
+        async with System(system=spec, airport=LANE) as system:
             ear = system.start("ear", Ear)
-            gps = system.start("gps", Receiver)
             detection = next(d for d in spec.detections if d.name == "DM1")
             system.start("DM1", ProhibitedArea, **detection.parameters)
             y_m = 0.0
             for _ in range(20):  # along the lane, then straight at its edge with top speed
-                gps.publish(topics.GPS, m.GpsFix(0.0, 0.0, 1.0, 0.0, 0.05))
+                system.say(topics.GPS, m.GpsFix(0.0, 0.0, 1.0, 0.0, 0.05))
                 await asyncio.sleep(0.1)
             assert ear.states == ["idle"]
             while ear.states == ["idle"]:
                 y_m += 0.1
-                gps.publish(topics.GPS, m.GpsFix(20.0, y_m, 0.0, 1.0, 0.05))
+                system.say(topics.GPS, m.GpsFix(20.0, y_m, 0.0, 1.0, 0.05))
                 await asyncio.sleep(0.1)
             room_m = HALF_LANE_M - y_m - half_diagonal_m(spec.robot)
             timing = spec.timing
@@ -182,11 +167,10 @@ def test_the_actor_warns_in_time_by_the_margins_of_the_shipped_system():
 @in_system(system=shipped_system())
 async def test_nonsense_on_the_command_is_reported_with_the_first_message(system):
     ear = system.start("ear", Ear)
-    source = system.start("source", Source)
     system.start("DM3", Bounds)
-    source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+    system.say(topics.COMMAND, m.Twist(0.5, 0.0))
     await system.settle()
     assert ear.states == ["idle"]
-    source.publish(topics.COMMAND, m.Twist(5.0, 0.0))
+    system.say(topics.COMMAND, m.Twist(5.0, 0.0))
     await system.settle()
     assert ear.states == ["idle", "active"]

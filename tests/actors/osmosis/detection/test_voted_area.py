@@ -6,15 +6,12 @@ import asyncio
 import math
 
 import pytest
-from shapely.geometry import box
 
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.detection.area.position_vote import GPS, WHEELS, PositionVote
 from rampart.actors.osmosis.detection.area.voted_area import VotedArea, VotedPosition
-from rampart.actors.runtime.actor import Actor
-from rampart.testing import Ear
+from rampart.testing import Ear, table
 from tests.actors.osmosis.control.localization_drive import (
     END_S,
     SOURCES,
@@ -26,7 +23,9 @@ from tests.actors.osmosis.control.localization_drive import (
     fault,
     mis_stamped,
     sensor_faults,
+    with_absurd,
 )
+from tests.actors.osmosis.detection.lane import LANE
 from tests.osmosis_system import in_system, shipped_system
 
 FROM_S = 4.0
@@ -110,22 +109,8 @@ def test_one_wrong_stamp_is_over_when_another_source_fails_later(topic, wrong, l
 
 @pytest.mark.parametrize("topic", STAMPED, ids=lambda topic: topic.key)
 def test_one_absurd_number_is_over_too(topic):
-    """Finite, and too large for a square: it neither ends the module nor stays in its sums."""
-
-    def items():
-        at_s = FROM_S
-        for now_s, item in disturbed([(fault("absolute-pose-dropout"), FROM_S + 4.0, math.inf)]):
-            for sign in (1e300, -1e300) if now_s >= at_s and isinstance(item, Reading) \
-                    and item.topic is topic else ():
-                at_s = math.inf
-                yield now_s, Reading(topic, now_s - 0.001 - (sign > 0) * 0.001, {
-                    topics.GPS: m.GpsFix(sign, sign, sign, sign, abs(sign)),
-                    topics.IMU: m.Imu(sign, sign, sign, sign),
-                    topics.ODOMETRY: m.Odometry(m.Pose(sign, sign, sign), m.Twist(sign, sign)),
-                    topics.ABSOLUTE_POSE: m.Pose(sign, sign, sign)}[topic])
-            yield now_s, item
-
-    worst_m, unknown_s = follow_all(items())
+    items = disturbed([(fault("absolute-pose-dropout"), FROM_S + 4.0, math.inf)])
+    worst_m, unknown_s = follow_all(with_absurd(items, topic, FROM_S))
     assert worst_m < 0.4
     assert unknown_s < 0.45
 
@@ -201,48 +186,36 @@ def drift(t):
     return 0.3 * max(0.0, t - 1.0)
 
 
-@pytest.mark.parametrize(("a", "gps", "wheels_mps", "agreeing", "outlier"), [
-    pytest.param(none, none, 1.0, ("a", GPS), "", id="all agree"),
-    pytest.param(none, none, 0.5, ("a", GPS), "", id="the wheels are wrong"),
-    pytest.param(jump, none, 1.0, (GPS, WHEELS), "a", id="a is wrong at once"),
-    pytest.param(none, jump, 1.0, ("a", WHEELS), GPS, id="GPS is wrong at once"),
-    pytest.param(drift, none, 1.0, (GPS, WHEELS), "a", id="a drifts"),
-    pytest.param(none, drift, 1.0, ("a", WHEELS), GPS, id="GPS drifts"),
-    pytest.param(None, none, 1.0, (GPS, WHEELS), "", id="a is missing"),
-    pytest.param(none, None, 1.0, ("a", WHEELS), "", id="GPS is missing"),
-    pytest.param(None, drift, 0.5, (), "", id="a is missing, GPS and the wheels differ"),
-    pytest.param(None, None, 1.0, (), "", id="both are missing"),
-    pytest.param(jump, drift, 0.0, (), "", id="three witnesses, three stories"),
-    pytest.param(lambda t: 2.0 if 1.0 < t < 2.0 else 0.0, none, 1.0, ("a", GPS), "",
-                 id="a was wrong and agrees again"),
-])
-def test_two_out_of_three(a, gps, wheels_mps, agreeing, outlier):
-    it, now_s = vote(a, gps, wheels_mps)
+@pytest.mark.parametrize(("witnesses", "agreeing", "outlier"), **table({
+    "all agree": ((none, none, 1.0, None), ("a", GPS), ""),
+    "the wheels are wrong": ((none, none, 0.5, None), ("a", GPS), ""),
+    "a is wrong at once": ((jump, none, 1.0, None), (GPS, WHEELS), "a"),
+    "GPS is wrong at once": ((none, jump, 1.0, None), ("a", WHEELS), GPS),
+    "a drifts": ((drift, none, 1.0, None), (GPS, WHEELS), "a"),
+    "GPS drifts": ((none, drift, 1.0, None), ("a", WHEELS), GPS),
+    "a is missing": ((None, none, 1.0, None), (GPS, WHEELS), ""),
+    "GPS is missing": ((none, None, 1.0, None), ("a", WHEELS), ""),
+    "a is missing, GPS and the wheels differ": ((None, drift, 0.5, None), (), ""),
+    "both are missing": ((None, None, 1.0, None), (), ""),
+    "three witnesses, three stories": ((jump, drift, 0.0, None), (), ""),
+    "a was wrong and agrees again": ((lambda t: 2.0 if 1.0 < t < 2.0 else 0.0, none, 1.0, None),
+                                     ("a", GPS), ""),
+    "all agree, with encoders": ((none, none, 1.0, 1.0), ("a", GPS), ""),
+    "odometry is wrong": ((none, none, 0.5, 1.0), ("a", GPS), ""),
+    "the encoders are wrong": ((none, none, 1.0, 0.5), ("a", GPS), ""),
+    "two against two": ((none, none, 0.5, 0.5), (), ""),
+    "a is wrong, and it is not known how it moves": ((jump, none, 1.0, 0.5), (), ""),
+    "GPS alone, and it is not known how it moves": ((None, none, 1.0, 0.5), (), ""),
+}))
+def test_two_out_of_three_and_encoders_decide_whether_wheels_count(
+        witnesses, agreeing, outlier):
+    """The witnesses: a, GPS, odometry in m/s, and encoders in m/s or None."""
+    *three, encoders_mps = witnesses
+    it, now_s = vote(*three, encoders_mps=encoders_mps)
     assert (it.agreeing(now_s), it.outlier) == (agreeing, outlier)
 
 
-@pytest.mark.parametrize(("a", "gps", "wheels_mps", "encoders_mps", "agreeing"), [
-    pytest.param(none, none, 1.0, 1.0, ("a", GPS), id="all agree"),
-    pytest.param(none, none, 0.5, 1.0, ("a", GPS), id="odometry is wrong"),
-    pytest.param(none, none, 1.0, 0.5, ("a", GPS), id="the encoders are wrong"),
-    pytest.param(none, none, 0.5, 0.5, (), id="two against two"),
-    pytest.param(jump, none, 1.0, 0.5, (), id="a is wrong, and nobody knows how it moves"),
-    pytest.param(None, none, 1.0, 0.5, (), id="GPS alone, and nobody knows how it moves"),
-])
-def test_encoders_decide_whether_wheels_count(a, gps, wheels_mps, encoders_mps, agreeing):
-    it, now_s = vote(a, gps, wheels_mps, encoders_mps=encoders_mps)
-    assert it.agreeing(now_s) == agreeing
-
-
 # ---- the actor -----------------------------------------------------------------------------------
-
-
-class Robot(Actor):
-    outputs = (topics.ABSOLUTE_POSE, topics.GPS, topics.IMU, topics.ODOMETRY)
-
-
-LANE = Airport("lane", {"a": (0.0, 0.0), "b": (40.0, 0.0)}, (("a", "b"),),
-               box(-5.0, -2.5, 45.0, 2.5), StartPose(0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(("gps_y_m", "pose_y_m", "expected"), [
@@ -257,18 +230,18 @@ LANE = Airport("lane", {"a": (0.0, 0.0), "b": (40.0, 0.0)}, (("a", "b"),),
 @in_system(system=shipped_system(), airport=LANE)
 async def test_the_actor_needs_two(system, gps_y_m, pose_y_m, expected):
     """Along the lane with 1 m/s; after 2 s GPS or the absolute pose are wrong, or None: silent."""
-    ear, robot = system.start("ear", Ear), system.start("robot", Robot)
+    ear = system.start("ear", Ear)
     system.start("DM1", VotedArea, margin_m=0.6, blind_s=2.0, blind_m=2.0)
     await system.settle()
     for i in range(120):
         t = 0.05 * i
         gps, pose = (gps_y_m, pose_y_m) if t >= 2.0 else (0.0, 0.0)
-        robot.publish(topics.IMU, m.Imu(0.0, 0.001 * i, 0.0, 0.0))
-        robot.publish(topics.ODOMETRY, m.Odometry(m.Pose(t, 0.0, 0.0), m.Twist(1.0, 0.0)))
+        system.say(topics.IMU, m.Imu(0.0, 0.001 * i, 0.0, 0.0))
+        system.say(topics.ODOMETRY, m.Odometry(m.Pose(t, 0.0, 0.0), m.Twist(1.0, 0.0)))
         if pose is not None:
-            robot.publish(topics.ABSOLUTE_POSE, m.Pose(t, pose, 0.0))
+            system.say(topics.ABSOLUTE_POSE, m.Pose(t, pose, 0.0))
         if i % 2 == 0 and gps is not None:
-            robot.publish(topics.GPS, m.GpsFix(t, gps, 1.0, 0.0, 0.05))
+            system.say(topics.GPS, m.GpsFix(t, gps, 1.0, 0.0, 0.05))
         await asyncio.sleep(0.05)
     assert ear.states == expected
 
@@ -276,7 +249,7 @@ async def test_the_actor_needs_two(system, gps_y_m, pose_y_m, expected):
 @in_system(system=shipped_system(), airport=LANE)
 async def test_a_receiver_that_is_stuck_does_not_blind_it(system):
     """The robot leaves the lane while GPS repeats its last fix: the other two see it."""
-    ear, robot = system.start("ear", Ear), system.start("robot", Robot)
+    ear = system.start("ear", Ear)
     system.start("DM1", VotedArea, margin_m=0.6)
     await system.settle()
     x_m = y_m = 0.0
@@ -284,11 +257,11 @@ async def test_a_receiver_that_is_stuck_does_not_blind_it(system):
         away = i >= 40
         x_m, y_m = (x_m, y_m + 0.05) if away else (x_m + 0.05, y_m)
         heading = math.pi / 2 if away else 0.0
-        robot.publish(topics.IMU, m.Imu(heading, 0.001 * i, 0.0, 0.0))
-        robot.publish(topics.ODOMETRY, m.Odometry(m.Pose(x_m, y_m, heading), m.Twist(1.0, 0.0)))
-        robot.publish(topics.ABSOLUTE_POSE, m.Pose(x_m, y_m, heading))
+        system.say(topics.IMU, m.Imu(heading, 0.001 * i, 0.0, 0.0))
+        system.say(topics.ODOMETRY, m.Odometry(m.Pose(x_m, y_m, heading), m.Twist(1.0, 0.0)))
+        system.say(topics.ABSOLUTE_POSE, m.Pose(x_m, y_m, heading))
         if i % 2 == 0:
-            robot.publish(topics.GPS, m.GpsFix(x_m, 0.0, 0.0 if away else 1.0, 0.0, 0.05))
+            system.say(topics.GPS, m.GpsFix(x_m, 0.0, 0.0 if away else 1.0, 0.0, 0.05))
         await asyncio.sleep(0.05)
         if ear.states[-1:] == ["active"]:
             break

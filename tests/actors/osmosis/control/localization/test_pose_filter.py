@@ -25,6 +25,7 @@ from tests.actors.osmosis.control.localization_drive import (
     fault,
     mis_stamped,
     sensor_faults,
+    with_absurd,
 )
 
 FOR_EVER = math.inf
@@ -195,20 +196,7 @@ def test_a_source_is_silent_when_it_falls_silent_after_a_stamp_of_no_possible_ti
 
 @pytest.mark.parametrize("topic", STAMPED, ids=lambda topic: topic.key)
 def test_one_reading_beyond_all_measure_neither_ends_it_nor_stays_in_it(topic):
-    def items():
-        at_s = 4.0
-        for now_s, item in disturbed([]):
-            hit = now_s >= at_s and isinstance(item, Reading) and item.topic is topic
-            for bad in (1e300, -1e300) if hit else ():
-                at_s = math.inf
-                yield now_s, Reading(topic, now_s - (0.001 if bad < 0 else 0.002), {
-                    topics.GPS: m.GpsFix(bad, bad, bad, bad, abs(bad)),
-                    topics.IMU: m.Imu(bad, bad, bad, bad),
-                    topics.ODOMETRY: m.Odometry(m.Pose(bad, bad, bad), m.Twist(bad, bad)),
-                    topics.ABSOLUTE_POSE: m.Pose(bad, bad, bad)}[topic])
-            yield now_s, item
-
-    outcome = run_all(items())
+    outcome = run_all(with_absurd(disturbed([]), topic, 4.0))
     assert outcome.worst_m < 0.03
     assert outcome.excluded == set()
 
