@@ -13,7 +13,6 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, DeadReckoning
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
-from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.testing import run
 from tests.actors.osmosis.control.house import AIRPORT
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
@@ -24,17 +23,13 @@ from tests.osmosis_system import System, shipped_system
 PERIOD_S = 0.02
 
 
-def reckoning(bridge_m: float = 3.0) -> DeadReckoning:
-    return DeadReckoning(bridge_m)
-
-
 def straight(it: DeadReckoning, from_s: float, to_s: float, speed_mps: float = 1.0) -> None:
     for i in range(round(from_s / PERIOD_S), round(to_s / PERIOD_S) + 1):
         it.odometry(i * PERIOD_S, (speed_mps * i * PERIOD_S, 0.0, 0.0), i * PERIOD_S)
 
 
 def test_a_stale_pose_is_carried_on_from_its_stamp_not_from_its_arrival():
-    it = reckoning()
+    it = DeadReckoning(3.0)
     straight(it, 0.0, 2.0)
     assert it.estimate(2.0) is None
     it.pose(0.5, (5.0, 6.0, math.pi / 2), 2.0)  # it arrives 1.5 s late
@@ -42,7 +37,7 @@ def test_a_stale_pose_is_carried_on_from_its_stamp_not_from_its_arrival():
 
 
 def test_beyond_the_bound_there_is_no_pose_and_a_fresh_one_helps():
-    it = reckoning(bridge_m=2.0)
+    it = DeadReckoning(2.0)
     straight(it, 0.0, 1.0)
     it.pose(1.0, (0.0, 0.0, 0.0), 1.0)
     straight(it, 1.0, 2.9)
@@ -54,7 +49,7 @@ def test_beyond_the_bound_there_is_no_pose_and_a_fresh_one_helps():
 
 
 def test_without_fresh_odometry_a_stale_pose_is_not_bridged():
-    it = reckoning()
+    it = DeadReckoning(3.0)
     straight(it, 0.0, 1.0)
     it.pose(1.0, (0.0, 0.0, 0.0), 1.0)
     assert it.estimate(1.19) is not None
@@ -65,7 +60,7 @@ def test_without_fresh_odometry_a_stale_pose_is_not_bridged():
     (math.nan, 0.0, 0.0), (0.0, math.inf, 0.0),
     *((absurd, absurd, -absurd) for absurd in (1e160, 1.7e308, -1.7e308))])
 def test_what_is_no_number_or_beyond_all_measure_changes_nothing(pose):
-    it = reckoning()
+    it = DeadReckoning(3.0)
     straight(it, 0.0, 1.0)
     it.pose(0.9, (1.0, 2.0, 0.0), 1.0)
     it.pose(1.0, pose, 1.0)
@@ -79,7 +74,7 @@ WRONG_STAMPS = [1e9, 1.3, math.inf, math.nan]
 
 @pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
 def test_what_has_no_possible_time_is_not_believed_and_shuts_out_none(stamp_s):
-    it = reckoning()
+    it = DeadReckoning(3.0)
     it.odometry(stamp_s, (50.0, 0.0, 0.0), 0.0)
     straight(it, 0.0, 1.0)
     it.pose(1.0, (5.0, 6.0, 0.0), 1.0)
@@ -120,7 +115,7 @@ def test_it_moves_the_pose_as_the_wheels_moved_whatever_the_frame_of_odom(moves,
 
 @pytest.mark.parametrize("from_s", [2.0, 6.0, 12.0, 20.0])
 def test_on_the_simulated_robot_three_metres_cost_a_quarter_of_a_metre_at_most(from_s):
-    it, worst_m, bridged = reckoning(), 0.0, 0
+    it, worst_m, bridged = DeadReckoning(3.0), 0.0, 0
     for now_s, item in disturbed([]):
         if isinstance(item, Reading) and item.topic is topics.ODOMETRY:
             pose = item.body.pose
@@ -140,45 +135,32 @@ def test_on_the_simulated_robot_three_metres_cost_a_quarter_of_a_metre_at_most(f
 # ---- in Osmosis Control --------------------------------------------------------------------------
 
 
-class Robot(Actor):
-    """Publishes the given messages, and receives the command."""
-
-    outputs = (topics.POSE, topics.ODOMETRY, topics.SCAN, topics.ROUTE)
-
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        self.speeds: list[float] = []
-
-    @on(topics.COMMAND)
-    def command(self, message: m.Twist, _header: Header) -> None:
-        self.speeds.append(message.linear_mps)
-
-
 @pytest.mark.parametrize("mis_stamped", [None, topics.ODOMETRY, topics.POSE],
                          ids=["nothing", "odometry", "a pose"])
 def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
     """Also after a message from the future."""
 
     async def scenario(system: System) -> list[tuple[float, float]]:
-        robot = system.start("robot", Robot)
+        commands = system.hear(topics.COMMAND)
         system.start("control", OsmosisControl, bridge_m=2.0)
         await system.settle()
         world, seen = World(), []
-        robot.publish(topics.ROUTE, m.Route("m", 0, m.Mode.TAXI, True, ((0.0, 0.0), (30.0, 0.0)),
+        system.say(topics.ROUTE, m.Route("m", 0, m.Mode.TAXI, True, ((0.0, 0.0), (30.0, 0.0)),
                                             ""))
         for i in range(250):
             odom = m.Pose(world.x_m, world.y_m, world.yaw_rad)
-            robot.publish(topics.ODOMETRY, m.Odometry(odom, m.Twist(world.linear_mps, 0.0)))
-            robot.publish(topics.SCAN, full_sweep(number=i))
+            system.say(topics.ODOMETRY, m.Odometry(odom, m.Twist(world.linear_mps, 0.0)))
+            system.say(topics.SCAN, full_sweep(number=i))
             if world.x_m < 3.0:
-                robot.publish(topics.POSE, odom)
+                system.say(topics.POSE, odom)
                 lost_at_m = world.x_m
             if i == 60 and mis_stamped is not None:
-                robot.publish(mis_stamped, m.Odometry(odom, m.Twist(0.0, 0.0))
-                              if mis_stamped is topics.ODOMETRY else odom, stamp=1e9)
+                system.say(mis_stamped, m.Odometry(odom, m.Twist(0.0, 0.0))
+                              if mis_stamped is topics.ODOMETRY else odom, stamp_s=1e9)
             await asyncio.sleep(0.05)
-            world.move(robot.speeds[-1], 0.0)
-            seen.append((world.x_m - lost_at_m, robot.speeds[-1]))
+            speed_mps = commands[-1].message.linear_mps
+            world.move(speed_mps, 0.0)
+            seen.append((world.x_m - lost_at_m, speed_mps))
             assert i < 40 or seen[-1][0] > -1.0
         return seen
 
