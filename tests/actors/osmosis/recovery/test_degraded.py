@@ -30,7 +30,7 @@ class BoundedPilot(Pilot):
 
 
 async def braking(system: System) -> tuple[Boss, Base, Supervisor]:
-    boss, base = system.start("boss", Boss), system.start("base", Base)
+    boss, base = Boss(system), system.start("base", Base)
     supervisor = system.start("supervisor", Supervisor)
     system.start("safety_pilot", Node)
     system.start("RM1", EmergencyStop)
@@ -123,7 +123,7 @@ async def test_a_respawned_module_that_is_not_wanted_releases_what_its_earlier_l
 @pytest.mark.parametrize("obeys", [True, False])
 @in_system()
 async def test_the_pilot_is_bounded_until_released_and_one_that_keeps_no_bound_fails(system, obeys):
-    boss = system.start("boss", Boss)
+    boss = Boss(system)
     pilot = system.start("pilot", BoundedPilot if obeys else Pilot)
     system.start("RM8", ReducedSpeed, top_speed_mps=0.6)
     await asyncio.sleep(0.5)

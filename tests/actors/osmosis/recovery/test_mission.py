@@ -46,7 +46,7 @@ class Planner(Actor):
 def play(name, recovery, scenario, *, mission=True):
     async def scene():
         async with System(airport=AIRPORT) as system:
-            boss, planner = system.start("boss", Boss), system.start("planner", Planner)
+            boss, planner = Boss(system), system.start("planner", Planner)
             manager = system.start("mission_manager", MissionManager)
             system.start(name, recovery)
             await system.settle()
@@ -90,7 +90,7 @@ def test_a_replan_without_a_new_route_fails_with_the_reason(mission, way, dumb, 
         boss.order("RM6")
         await asyncio.sleep(2.2)
         assert boss.phases == ["idle", "acting", "failed"]
-        assert boss.reports[-1][1].reason == reason
+        assert boss.reports[-1].message.reason == reason
 
     play("RM6", Replan, scenario, mission=mission)
 
@@ -125,7 +125,7 @@ def test_with_nothing_to_bring_home_it_waits_for_a_mission_that_is_begun(begun):
     async def scenario(boss, planner, manager):
         boss.order("RM9")
         await asyncio.sleep(0.5)
-        assert boss.reports[-1][1].reason == "no mission is under way"
+        assert boss.reports[-1].message.reason == "no mission is under way"
         if begun:
             planner.begin("m2")
             await asyncio.sleep(0.5)
@@ -169,7 +169,7 @@ def test_where_home_is_not_known_it_waits_for_that_until_its_deadline(late_s):
         planner.dumb = False
         await asyncio.sleep(0.5)
         if late_s > 2.0:
-            assert boss.reports[-1][1].reason == (
+            assert boss.reports[-1].message.reason == (
                 "not done within 2 s: refused: the start of the mission is unknown")
             boss.order("RM9", decision=2)
             await asyncio.sleep(0.2)

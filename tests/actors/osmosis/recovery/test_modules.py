@@ -24,7 +24,7 @@ from tests.osmosis_system import System, in_system
 
 async def stopping(system: System, *, deaf: bool = False) -> tuple[Boss, Base]:
     """Start RM1, who commands it, and the base that it brakes."""
-    boss, base = system.start("boss", Boss), system.start("base", Base)
+    boss, base = Boss(system), system.start("base", Base)
     system.start("RM1", EmergencyStop)
     base.deaf = deaf
     await system.settle()
@@ -81,7 +81,7 @@ async def test_a_release_waits_for_the_brake_and_a_new_order_cancels_it(system, 
     await asyncio.sleep(1.0)
     assert base.engaged is ordered_again
     assert boss.phases[-1] == ("degraded" if ordered_again else "idle")
-    assert boss.reports[-1][1].decision == (8 if ordered_again else 7)
+    assert boss.reports[-1].message.decision == (8 if ordered_again else 7)
 
 
 @in_system()
@@ -134,7 +134,7 @@ async def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_reports
     (ControlledStop, PilotMode.STOP), (SwitchTeleoperation, PilotMode.TELEOPERATION)])
 @in_system()
 async def test_the_pilot_is_ordered_until_released(system, cls, mode):
-    boss, pilot = system.start("boss", Boss), system.start("pilot", Pilot)
+    boss, pilot = Boss(system), system.start("pilot", Pilot)
     system.start("RM", cls)
     await asyncio.sleep(1.0)
     assert pilot.heard == 0
@@ -147,7 +147,7 @@ async def test_the_pilot_is_ordered_until_released(system, cls, mode):
     boss.order("RM", decision=2)
     await system.settle()
     assert boss.phases == ["idle", "acting", "degraded"]
-    acknowledged = boss.reports[-1][1]
+    acknowledged = boss.reports[-1].message
     assert (acknowledged.state, acknowledged.decision) == (fm.RecoveryState.ACTIVATED, 2)
     await asyncio.sleep(1.0)
     assert pilot.heard == pytest.approx(7, abs=1)
@@ -161,7 +161,7 @@ async def test_the_pilot_is_ordered_until_released(system, cls, mode):
 
 @in_system()
 async def test_a_stop_fulfils_the_order_to_switch_to_teleoperation(system):
-    boss = system.start("boss", Boss)
+    boss = Boss(system)
     system.start("pilot", Pilot)
     rm2, rm5 = system.start("RM2", ControlledStop), system.start("RM5", SwitchTeleoperation)
     await system.settle()
@@ -173,7 +173,7 @@ async def test_a_stop_fulfils_the_order_to_switch_to_teleoperation(system):
 
 @in_system()
 async def test_a_pilot_that_does_not_obey_is_a_failure_and_one_that_comes_round_is_not(system):
-    boss, pilot = system.start("boss", Boss), system.start("pilot", Pilot)
+    boss, pilot = Boss(system), system.start("pilot", Pilot)
     system.start("RM2", ControlledStop)
     pilot.deaf = True
     await system.settle()
@@ -196,7 +196,7 @@ async def test_a_pilot_that_does_not_obey_is_a_failure_and_one_that_comes_round_
 
 @in_system()
 async def test_a_respawned_module_ends_the_order_its_earlier_life_left_only_when_told(system):
-    boss, pilot = system.start("boss", Boss), system.start("pilot", Pilot)
+    boss, pilot = Boss(system), system.start("pilot", Pilot)
     system.start("RM2", ControlledStop)
     await system.settle()
     boss.order("RM2")
@@ -214,7 +214,7 @@ async def test_a_respawned_module_ends_the_order_its_earlier_life_left_only_when
 
 
 async def respawning(system: System) -> tuple[Boss, Supervisor]:
-    boss, supervisor = system.start("boss", Boss), system.start("supervisor", Supervisor)
+    boss, supervisor = Boss(system), system.start("supervisor", Supervisor)
     for name in ("a", "b"):
         system.start(name, Node)
     system.start("RM3", Respawn, nodes=["a", "b"])
@@ -236,7 +236,7 @@ async def test_a_dead_node_is_asked_for_at_once_and_done_when_it_is_heard(system
     assert boss.phases == ["idle", "acting"]
     await asyncio.sleep(0.1)
     assert boss.phases == ["idle", "acting", "done"]
-    assert boss.reports[-1][1].reason == "a back"
+    assert boss.reports[-1].message.reason == "a back"
     assert system.incarnations["a"] == 2
 
 
@@ -268,7 +268,7 @@ async def test_a_second_node_that_fails_is_respawned_too_and_who_is_well_left_al
     boss.order("RM3", decision=2, nodes=("a", "b"))
     await asyncio.sleep(0.5)
     assert boss.phases == phases
-    assert boss.reports[-1][1].reason == "a, b back"
+    assert boss.reports[-1].message.reason == "a, b back"
     assert (system.incarnations["a"], system.incarnations["b"]) == (2, 2)
 
 
@@ -290,7 +290,7 @@ async def test_what_the_supervisor_will_not_do_is_a_failure(system, answer):
     boss.order("RM3", nodes=("a",))
     await system.settle()
     assert boss.phases == ["idle", "acting", "failed"]
-    assert boss.reports[-1][1].reason == f"a: {answer}"
+    assert boss.reports[-1].message.reason == f"a: {answer}"
 
 
 @in_system()
@@ -303,7 +303,7 @@ async def test_a_supervisor_that_is_away_is_asked_until_the_deadline(system):
     assert len({r.request for _, r in supervisor.requests}) == 1
     assert len(supervisor.requests) == pytest.approx(10, abs=1)
     await asyncio.sleep(0.2)
-    assert boss.reports[-1][1].reason == "not done within 2 s: a"
+    assert boss.reports[-1].message.reason == "not done within 2 s: a"
     supervisor.answer = "respawned"
     await asyncio.sleep(0.5)
     assert boss.phases == ["idle", "acting", "failed", "done"]

@@ -3,50 +3,37 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
-from typing import Any
+from itertools import groupby
 
-from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.testing import VirtualSystem
 
 
-class Boss(Actor):
+class Boss:
     """Sends the given commands to recovery modules, and keeps their reports."""
 
-    outputs = (ftm_topics.RECOVERY_COMMAND,)
-
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        self.reports: list[tuple[float, fm.RecoveryReport]] = []
-
-    @classmethod
-    def output_names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]
-    ) -> tuple[str, ...] | None:
-        return None if topic is ftm_topics.RECOVERY_COMMAND else (name,)
-
-    @on(ftm_topics.RECOVERY)
-    def recovery(self, message: fm.RecoveryReport, _header: Header) -> None:
-        self.reports.append((self.clock.now(), message))
+    def __init__(self, system: VirtualSystem) -> None:
+        self.system = system
+        self.reports = system.hear(ftm_topics.RECOVERY)
 
     @property
     def phases(self) -> list[str]:
         """Phases in sequence, repetitions left out."""
-        phases = [report.phase.value for _, report in self.reports]
-        return [p for i, p in enumerate(phases) if i == 0 or phases[i - 1] != p]
+        return [phase for phase, _ in groupby(r.message.phase.value for r in self.reports)]
 
     def order(self, recovery: str, decision: int = 1, nodes: tuple[str, ...] = (),
               reason: str = "a fault") -> None:
-        self.publish(ftm_topics.RECOVERY_COMMAND, fm.RecoveryCommand(True, decision, nodes, reason),
-                     name=recovery)
+        self._command(recovery, fm.RecoveryCommand(True, decision, nodes, reason))
 
     def release(self, recovery: str, decision: int = 2) -> None:
-        self.publish(ftm_topics.RECOVERY_COMMAND, fm.RecoveryCommand(False, decision, (), "gone"),
-                     name=recovery)
+        self._command(recovery, fm.RecoveryCommand(False, decision, (), "gone"))
+
+    def _command(self, recovery: str, command: fm.RecoveryCommand) -> None:
+        self.system.say(ftm_topics.RECOVERY_COMMAND, command, "boss", member=recovery)
 
 
 class Base(Actor):
