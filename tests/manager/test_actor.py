@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 
-from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import decode
 from rampart.actors.detection.freshness import Freshness
@@ -47,7 +46,7 @@ RESPAWN = {"RM3": CONTROL, "RM4": (*OTHERS, "localization")}
 class Robot(Actor):
     """Publishes command, pose and GPS at 20 Hz, until one of them is told to cease."""
 
-    outputs = (topics.COMMAND, topics.POSE, topics.GPS, ftm_topics.RESET)
+    outputs = (topics.COMMAND, topics.POSE, topics.GPS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -62,40 +61,6 @@ class Robot(Actor):
         if "pose" not in self.silent:
             self.publish(topics.POSE, m.Pose(0.0, self.y_m, 0.0))
         self.publish(topics.GPS, m.GpsFix(0.0, self.y_m, 0.0, 0.0, 0.05))
-
-
-class Recorder(Actor):
-    """Keeps decisions, the manager's statuses, and error reports."""
-
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        self.decisions: list[fm.DecisionRecord] = []
-        self.statuses: list[fm.ManagerStatus] = []
-        self.problems: list[str] = []
-        self.recoveries: list[tuple[str, str]] = []
-
-    @on(ftm_topics.DECISION)
-    def decision(self, message: fm.DecisionRecord, _header: Header) -> None:
-        self.decisions.append(message)
-
-    @on(ftm_topics.MANAGER_STATUS)
-    def status(self, message: fm.ManagerStatus, _header: Header) -> None:
-        self.statuses.append(message)
-
-    @on(bus_topics.DIAGNOSTIC)
-    def problem(self, message: bm.Diagnostic, _header: Header) -> None:
-        self.problems.append(f"{message.context}: {message.reason}")
-
-    @on(ftm_topics.RECOVERY)
-    def recovery(self, message: fm.RecoveryReport, header: Header) -> None:
-        entry = (header.source, message.phase.value)
-        if entry not in self.recoveries:
-            self.recoveries.append(entry)
-
-    @property
-    def taken(self) -> list[tuple[tuple[str, ...], int, tuple[str, ...]]]:
-        """Active mechanisms, rule and recoveries of each decision."""
-        return [(d.active, d.rule, d.recoveries) for d in self.decisions]
 
 
 class Counter(Actor):
@@ -141,7 +106,10 @@ class Whole(System):
 
     async def begin(self) -> None:
         """Start everything, and wait until all is known and well."""
-        self.recorder = self.start("recorder", Recorder)
+        self.decisions = self.hear(ftm_topics.DECISION)
+        self.recoveries = self.hear(ftm_topics.RECOVERY)
+        self._statuses = self.hear(ftm_topics.MANAGER_STATUS)
+        self._problems = self.hear(bus_topics.DIAGNOSTIC)
         self.base = self.start("base", Base)
         self.pilot = self.start("safety_pilot", Pilot)
         self.supervisor = self.start("supervisor", Supervisor)
@@ -150,7 +118,7 @@ class Whole(System):
         for name in self.modules:
             self.revive(name)
         await asyncio.sleep(1.0)
-        assert self.recorder.decisions == []
+        assert self.decisions == []
         assert self.status.activated == ()
 
     def revive(self, name: str) -> Actor:
@@ -162,7 +130,21 @@ class Whole(System):
     @property
     def status(self) -> fm.ManagerStatus:
         """What the manager said last."""
-        return self.recorder.statuses[-1]
+        return self._statuses[-1].message
+
+    @property
+    def problems(self) -> list[str]:
+        return [f"{p.message.context}: {p.message.reason}" for p in self._problems]
+
+    @property
+    def taken(self) -> list[tuple[tuple[str, ...], int, tuple[str, ...]]]:
+        """Active mechanisms, rule and recoveries of each decision."""
+        return [(d.message.active, d.message.rule, d.message.recoveries) for d in self.decisions]
+
+    @property
+    def silent(self) -> set[str]:
+        """All that ever counted as silent."""
+        return {name for status in self._statuses for name in status.message.silent}
 
 
 @asynccontextmanager
@@ -175,8 +157,8 @@ async def whole() -> AsyncIterator[Whole]:
 @within(whole)
 async def test_a_healthy_system_decides_nothing_in_a_minute(system):
     await asyncio.sleep(60.0)
-    assert system.recorder.decisions == []
-    assert system.recorder.problems == []
+    assert system.decisions == []
+    assert system.problems == []
     assert system.pilot.heard == 0
     assert system.base.orders == []
 
@@ -194,9 +176,10 @@ async def test_a_killed_node_is_asked_for_before_any_time_passes_and_released_wh
     assert (at, request.node, request.failed_incarnation, request.by) == (
         killed_s, node, 1, recovery)
     await asyncio.sleep(3.0)
-    assert system.recorder.taken == [((mechanism,), 1, (recovery,)), ((), 0, ())]
-    assert system.recorder.decisions[0].detected_s == killed_s
-    assert (recovery, "done") in system.recorder.recoveries
+    assert system.taken == [((mechanism,), 1, (recovery,)), ((), 0, ())]
+    assert system.decisions[0].message.detected_s == killed_s
+    assert any(r.header.source == recovery and r.message.phase.value == "done"
+               for r in system.recoveries)
     assert system.status.activated == ()
     assert system.incarnations[node] == 2
 
@@ -210,7 +193,7 @@ async def test_a_stale_command_stops_the_robot_until_it_is_fresh_again(system):
     system.robot.silent.clear()
     await asyncio.sleep(2.0)
     assert system.pilot.mode is PilotMode.AUTO
-    assert system.recorder.taken == [(("FTM2",), 1, ("RM2",)), ((), 0, ())]
+    assert system.taken == [(("FTM2",), 1, ("RM2",)), ((), 0, ())]
 
 
 @within(whole)
@@ -220,14 +203,14 @@ async def test_an_emergency_stop_comes_with_the_fix_and_stays_until_it_is_reset(
     await system.settle()
     assert system.base.engaged
     reset = fm.Reset("RM1", "operator")
-    system.robot.publish(ftm_topics.RESET, reset)
+    system.say(ftm_topics.RESET, reset)
     await system.settle()
-    assert system.recorder.problems == ["reset refused: the cause persists: FTM1 active"]
+    assert system.problems == ["reset refused: the cause persists: FTM1 active"]
     system.robot.y_m = 0.0
     await asyncio.sleep(5.0)
     assert system.base.engaged
     assert system.status.latched == ("RM1",)
-    system.robot.publish(ftm_topics.RESET, reset)
+    system.say(ftm_topics.RESET, reset)
     await system.settle()
     assert not system.base.engaged
     assert system.status.latched == ()
@@ -317,7 +300,7 @@ async def test_a_respawned_manager_adopts_a_latched_emergency_stop(system, dies_
         await asyncio.sleep(0.05)
         assert system.base.engaged
     assert system.status.latched == ("RM1",)
-    system.robot.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
+    system.say(ftm_topics.RESET, fm.Reset("RM1", "operator"))
     await asyncio.sleep(0.5)
     assert not system.base.engaged
 
@@ -334,7 +317,7 @@ async def test_a_respawned_manager_keeps_the_stop_in_force_while_it_finds_its_wa
     system.robot.silent.clear()
     await asyncio.sleep(2.0)
     assert system.pilot.mode is PilotMode.AUTO
-    numbers = [d.decision for d in system.recorder.decisions]
+    numbers = [d.message.decision for d in system.decisions]
     assert numbers == sorted(set(numbers))
     assert numbers[-1] > DECISIONS_PER_INCARNATION
 
@@ -347,8 +330,8 @@ async def test_a_manager_that_was_stopped_takes_nobodys_unread_mail_for_silence(
         loop.jump(pause_s)
         await asyncio.sleep(2.0)
     assert not system.base.engaged
-    assert all("DM" not in name for s in system.recorder.statuses for name in s.silent)
-    assert system.recorder.decisions == []
+    assert not any("DM" in name for name in system.silent)
+    assert system.decisions == []
 
 
 @within(whole)
@@ -361,7 +344,7 @@ async def test_a_manager_that_was_stopped_waits_for_modules_that_go_on_after_it(
     for actor in system.actors.values():
         actor.hold(False)
     await asyncio.sleep(2.0)
-    assert system.recorder.decisions == []
+    assert system.decisions == []
     assert set(system.incarnations.values()) == {1}
     system.actors["DM6"].hold(True)
     await asyncio.sleep(2.0)

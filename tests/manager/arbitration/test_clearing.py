@@ -14,7 +14,7 @@ from rampart.actors.detection.stub import StubDetection
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.recovery.stub import StubRecovery
-from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.checkpoint_file import FileCheckpoints
 from rampart.actors.supervision.node_process import OF_A_PART
 from rampart.manager.actor import FtmManager
@@ -212,18 +212,8 @@ def test_the_table_of_pairs_shows_what_has_not_cleared():
         ("RM3", "RM8"), ("RM8",), ("RM3", "RM8"), ("RM8",))
 
 
-class Observer(Actor):
-    """Triggers stand-ins, resets, and keeps the last status of the manager."""
-
-    outputs = (ftm_topics.STUB_TRIGGER, ftm_topics.RESET)
-    status: fm.ManagerStatus | None = None
-
-    @on(ftm_topics.MANAGER_STATUS)
-    def see(self, message: fm.ManagerStatus, _header: Header) -> None:
-        self.status = message
-
-    def detect(self, name: str, *, active: bool) -> None:
-        self.publish(ftm_topics.STUB_TRIGGER, fm.StubTrigger(name, active, "played"))
+def detect(system: VirtualSystem, name: str, *, active: bool) -> None:
+    system.say(ftm_topics.STUB_TRIGGER, fm.StubTrigger(name, active, "played"))
 
 
 @pytest.mark.parametrize("clears", [Clears.BY_OPERATOR, Clears.NEVER])
@@ -241,26 +231,26 @@ def test_a_manager_that_dies_with_all_recovery_modules_has_not_cleared(clears):
 
     async def scenario() -> None:
         async with VirtualSystem(run_context(system=spec), keeps_checkpoints=True) as system:
-            observer = system.start("observer", Observer)
+            statuses = system.hear(ftm_topics.MANAGER_STATUS)
             start(system)
             for detection in spec.detections:
                 system.start(detection.name, StubDetection)
             await asyncio.sleep(0.5)
             for detection in spec.detections:
-                observer.detect(detection.name, active=detection.name == "DM13")
+                detect(system, detection.name, active=detection.name == "DM13")
             await asyncio.sleep(1.0)
-            observer.detect("DM13", active=False)
+            detect(system, "DM13", active=False)
             await asyncio.sleep(1.0)
             for name in modules:
                 await system.kill(name)
             start(system)
             await asyncio.sleep(2.0)
-            status = observer.status
+            status = statuses[-1].message
             assert (status.active, status.activated, status.latched) == (
                 ("FTM13",), ("RM8",), ("RM8",))
-            observer.publish(ftm_topics.RESET, fm.Reset("RM8", "operator"))
+            system.say(ftm_topics.RESET, fm.Reset("RM8", "operator"))
             await asyncio.sleep(1.0)
-            assert observer.status.activated == (
+            assert statuses[-1].message.activated == (
                 () if clears is Clears.BY_OPERATOR else ("RM8",))
 
     run(scenario)
@@ -277,7 +267,7 @@ def test_a_resumed_run_has_not_cleared(tmp_path, clears):
                 tmp_path, "ftm_manager", "run", number * OF_A_PART + context.incarnation)))
 
         async with VirtualSystem(run_context(system=spec)) as system:
-            observer = system.start("observer", Observer)
+            statuses = system.hear(ftm_topics.MANAGER_STATUS)
             system.start("ftm_manager", manager)
             for detection in spec.detections:
                 system.start(detection.name, StubDetection)
@@ -285,9 +275,9 @@ def test_a_resumed_run_has_not_cleared(tmp_path, clears):
                 system.start(recovery.name, StubRecovery, takes_s=0.02, ends="done")
             await asyncio.sleep(0.5)
             for detection in spec.detections:
-                observer.detect(detection.name, active=detection.name in errors)
+                detect(system, detection.name, active=detection.name in errors)
             await asyncio.sleep(2.0)
-            return observer.status
+            return statuses[-1].message
 
     assert run(lambda: part(0, ())).latched == ()
     assert run(lambda: part(1, ("DM13",))).latched == ("RM8",)

@@ -15,7 +15,6 @@ import pytest
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.manager.spec.adaptation import (
     Action,
     Change,
@@ -115,95 +114,75 @@ def test_a_value_that_is_neither_is_refused(text):
 # -- the manager ---------------------------------------------------------------------------------
 
 
-class Engineer(Actor):
-    """Asks for changes and hears what comes of it."""
+class Adaptable(Whole):
+    """The whole system, which is asked for changes."""
 
-    outputs = (topics.ADAPT,)
-
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        self.answers: list[m.AdaptationAnswer] = []
-        self.systems: list[m.AdaptedSystem] = []
-        self.shadows: list[m.ShadowRecord] = []
-        self.commands: list[m.RecoveryCommand] = []
-
-    @on(topics.ADAPTATION)
-    def answer(self, message: m.AdaptationAnswer, _header: Header) -> None:
-        self.answers.append(message)
-
-    @on(topics.ADAPTED_SYSTEM)
-    def system(self, message: m.AdaptedSystem, _header: Header) -> None:
-        self.systems.append(message)
-
-    @on(topics.SHADOW)
-    def shadow(self, message: m.ShadowRecord, _header: Header) -> None:
-        self.shadows.append(message)
+    async def begin(self) -> None:
+        self.answers = self.hear(topics.ADAPTATION)
+        self.systems = self.hear(topics.ADAPTED_SYSTEM)
+        self.shadows = self.hear(topics.SHADOW)
+        await super().begin()
 
     async def ask(self, action: str, name: str, values: str = "{}") -> m.AdaptationAnswer:
         count = len(self.answers)
-        self.publish(topics.ADAPT, m.AdaptationRequest("r", action, name, values, "test"))
+        self.say(topics.ADAPT, m.AdaptationRequest("r", action, name, values, "test"))
         await turns()
         assert len(self.answers) == count + 1
-        return self.answers[-1]
+        return self.answers[-1].message
 
 
 @asynccontextmanager
-async def adaptable(keys: str = "") -> AsyncIterator[tuple[Whole, Engineer]]:
-    async with Whole() as system:
+async def adaptable(keys: str = "") -> AsyncIterator[Adaptable]:
+    async with Adaptable() as system:
         system.run = replace(system.run, document=copy.deepcopy(DOCUMENT),
                              plan=msgspec.structs.replace(system.run.plan, keys=keys))
         await system.begin()
-        engineer = system.start("engineer", Engineer)
-        await asyncio.sleep(0.1)
-        yield system, engineer
+        yield system
 
 
 @within(adaptable)
-async def test_a_change_is_applied_at_once_told_whole_and_repeated_and_nothing_else_happens(given):
-    system, engineer = given
-    answer = await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')
+async def test_a_change_is_applied_at_once_told_whole_and_repeated_and_nothing_else_happens(system):
+    answer = await system.ask("set", "strategy", '{"value": "guarded-repair"}')
     assert (answer.accepted, answer.reason, answer.version) == (True, "", 1)
-    told = engineer.systems[-1]
+    told = system.systems[-1].message
     assert (told.version, told.change) == (1, "set strategy to 'guarded-repair'")
     assert msgspec.json.decode(told.document)["strategy"] == "guarded-repair"
     assert system.status.strategy == "guarded-repair"
-    count = len(engineer.systems)
+    count = len(system.systems)
     await asyncio.sleep(5.0)
-    assert len(engineer.systems) >= count + 4
-    assert system.recorder.decisions == []  # belief in all modules was kept
+    assert len(system.systems) >= count + 4
+    assert system.decisions == []  # belief in all modules was kept
     assert system.pilot.heard == 0
 
 
 @within(adaptable)
-async def test_the_new_strategy_decides_from_then_on(given):
-    system, engineer = given
-    await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')
-    await engineer.ask("set", "shadow", '{"value": "safety-first"}')
+async def test_the_new_strategy_decides_from_then_on(system):
+    await system.ask("set", "strategy", '{"value": "guarded-repair"}')
+    await system.ask("set", "shadow", '{"value": "safety-first"}')
     system.robot.silent.add("command")
     await asyncio.sleep(1.2)
     await system.kill("osmosis_control")
     await asyncio.sleep(0.3)
-    assert (("FTM2", "FTM4"), 2, ("RM2", "RM3")) in system.recorder.taken
-    assert any(s.strategy == "safety-first" and s.recoveries == ("RM2",)
-               for s in engineer.shadows)
+    assert (("FTM2", "FTM4"), 2, ("RM2", "RM3")) in system.taken
+    assert any(s.message.strategy == "safety-first" and s.message.recoveries == ("RM2",)
+               for s in system.shadows)
     assert system.incarnations["osmosis_control"] == 2
 
 
 @within(adaptable)
-async def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not(given):
-    system, engineer = given
+async def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not(system):
     system.robot.silent.add("command")
     await asyncio.sleep(1.5)
-    answer = await engineer.ask("disable", "FTM7")
+    answer = await system.ask("disable", "FTM7")
     assert not answer.accepted
     assert answer.reason == ("not in the middle of a recovery: RM2; try again when it is over")
-    answer = await engineer.ask("retune", "DM99", '{"margin_m": 0.7}')
+    answer = await system.ask("retune", "DM99", '{"margin_m": 0.7}')
     assert answer.reason.startswith("unknown detection module, recovery module or mechanism")
-    answer = await engineer.ask("retune", "DM4", '{"timeout_s": 0.01}')
+    answer = await system.ask("retune", "DM4", '{"timeout_s": 0.01}')
     assert "would raise false alarms" in answer.reason
     system.robot.silent.clear()
     await asyncio.sleep(2.0)
-    assert (await engineer.ask("disable", "FTM7")).accepted
+    assert (await system.ask("disable", "FTM7")).accepted
 
 
 @pytest.mark.parametrize(("action", "name", "values", "words"), [
@@ -223,36 +202,33 @@ async def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_no
     ("retune", "DM3", '{"hold": 1}', "detection DM3: parameters.hold = 1: unknown field; known"),
 ])
 @within(adaptable)
-async def test_what_is_refused_changes_nothing(given, action, name, values, words):
-    system, engineer = given
-    answer = await engineer.ask(action, name, values)
+async def test_what_is_refused_changes_nothing(system, action, name, values, words):
+    answer = await system.ask(action, name, values)
     assert not answer.accepted
     assert words in answer.reason
     assert "\n" not in answer.reason
-    assert engineer.systems == []
+    assert system.systems == []
     system.robot.silent.add("command")
     await asyncio.sleep(1.5)
-    assert system.recorder.taken == [(("FTM2",), 1, ("RM2",))]
+    assert system.taken == [(("FTM2",), 1, ("RM2",))]
 
 
 @within(adaptable)
-async def test_a_mechanism_that_is_disabled_does_not_recover(given):
-    system, engineer = given
-    assert (await engineer.ask("disable", "FTM5")).accepted
+async def test_a_mechanism_that_is_disabled_does_not_recover(system):
+    assert (await system.ask("disable", "FTM5")).accepted
     await system.kill("hmi")
     await asyncio.sleep(2.0)
-    assert system.recorder.decisions == []
-    assert (await engineer.ask("enable", "FTM5")).accepted
+    assert system.decisions == []
+    assert (await system.ask("enable", "FTM5")).accepted
     await asyncio.sleep(1.0)
-    assert system.recorder.taken[0] == (("FTM5",), 1, ("RM4",))
+    assert system.taken[0] == (("FTM5",), 1, ("RM4",))
     assert system.incarnations["hmi"] == 2
 
 
 @within(partial(adaptable, keys="keys"))
-async def test_with_credentials_a_change_that_they_do_not_permit_is_refused(given):
-    _, engineer = given
-    answer = await engineer.ask(
+async def test_with_credentials_a_change_that_they_do_not_permit_is_refused(system):
+    answer = await system.ask(
         "retune", "DM5", '{"watch": ["hmi", "teleoperation", "localization"]}')
     assert not answer.accepted
     assert answer.reason.startswith("DM5: would need other topics")
-    assert (await engineer.ask("retune", "DM1", '{"margin_m": 0.7}')).accepted
+    assert (await system.ask("retune", "DM1", '{"margin_m": 0.7}')).accepted
