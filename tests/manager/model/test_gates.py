@@ -3,7 +3,7 @@
 from itertools import combinations, product
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rampart.manager.model.gates import (
@@ -95,6 +95,7 @@ def test_any_gate_holds_as_its_words_say(gate, active, mute):
 
 
 @given(GATES)
+@example(Gate(required=2, inputs=(detection_gate("A or B"), detection_gate("C"))))
 def test_what_is_written_is_read_again_unless_it_is_active_on_nothing_or_never(gate):
     sets = [active for size in range(5) for active in combinations(NAMES, size)]
     table = [gate.holds(active) for active in sets]
