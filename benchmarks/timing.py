@@ -16,13 +16,13 @@ import sys
 import time
 from typing import Any
 
+from benchmarks.own_root import OwnLauncher
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import ProcessEvent, RespawnRequest
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR, RunPlan
-from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.process_title import find_processes
 
 NODES = ("graph_planner", "osmosis_control", "localization", "teleoperation", "hmi",
@@ -73,7 +73,7 @@ class Ear(Actor):
 async def measure(port: int, kills: int) -> dict[str, list[float]]:
     """Run the system and return samples in seconds."""
     plan = RunPlan("bench", port, system_file="systems/paper.toml")
-    launcher = Launcher(plan, "timing")
+    launcher = OwnLauncher(plan, "timing")
     found: dict[str, list[float]] = {
         "message_ms": [], "death_ms": [], "exit_ms": [], "start_ms": [], "supervisor_back_ms": []}
     back: list[float] = []

@@ -145,7 +145,7 @@ class Run:
         if self._files is not None:
             self._files.save(msgspec.structs.replace(self._manifest, rate=self._plan.rate))
             keep = partial(self._files.keep_memory, self._plan.run_id)
-        return await self._on_processes(ProcessRun(self._trial, self._scenario, link, keep))
+        return await self._on_processes(ProcessRun(self._trial, link, self._scenario, keep))
 
     def _not_watched(self, root: Root) -> int:
         """Conclude a run whose process `run` has ended without a verdict."""

@@ -1,4 +1,4 @@
-"""TOML of bounded size and depth, read with `tomllib`."""
+"""TOML of bounded size, read with `tomllib`."""
 
 from __future__ import annotations
 
@@ -11,14 +11,10 @@ from rampart.files.reading import FileError, check_size
 MAX_SIZE = 1 << 19
 """Bytes of a file, characters of a text; shipped files have at most 16,000."""
 
-MAX_DEPTH = 32
-"""Deepest nesting of tables and arrays."""
-
 MAX_KEY_PARTS = 200
 """Most parts of a dotted key; `tomllib` takes memory by the square of their number."""
 
 _DOTTED = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){{{MAX_KEY_PARTS}}}""")
-_TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 
 
 def parse(text: str, most: int = MAX_SIZE) -> dict[str, Any]:
@@ -31,24 +27,10 @@ def parse(text: str, most: int = MAX_SIZE) -> dict[str, Any]:
     if _DOTTED.search(text):
         raise FileError(f"a key of more than {MAX_KEY_PARTS} dotted parts")
     try:
-        document = tomllib.loads(text.removeprefix("\ufeff"))
+        return tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"not valid TOML: {error}") from None
     except RecursionError:
-        raise FileError(_TOO_DEEP) from None
+        raise FileError("nested too deep") from None
     except ValueError:
         raise FileError("an integer with thousands of digits") from None
-    _check_nesting(document)
-    return document
-
-
-def _check_nesting(document: dict[str, Any]) -> None:
-    left: list[tuple[object, int]] = [(document, 0)]
-    while left:
-        value, depth = left.pop()
-        if depth > MAX_DEPTH:
-            raise FileError(_TOO_DEEP)
-        if isinstance(value, dict):
-            left += [(member, depth + 1) for member in value.values()]
-        elif isinstance(value, list):
-            left += [(member, depth + 1) for member in value]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 
+from benchmarks.own_root import OwnLauncher
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor
@@ -80,7 +81,7 @@ def stub_plan(system: Path, **changes: object) -> RunPlan:
 async def launched(plan: RunPlan) -> AsyncIterator[Launcher]:
     """Start a run without observer and end it."""
     os.environ["PYTHONPATH"] = str(ROOT)
-    launcher = Launcher(plan, "test")
+    launcher = OwnLauncher(plan, "test")
     try:
         await launcher.load()
         await launcher.start()

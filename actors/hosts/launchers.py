@@ -38,12 +38,12 @@ class FirstLauncher(Launcher):
     Args:
         run: The run.
         title: Of the run, for people.
-        link: Connection to the root; None to start a root.
+        link: Connection to the root.
         is_unwanted: Whether the user has interrupted the run.
         say: Takes a line with the hosts that it waits for.
     """
 
-    def __init__(self, run: RunContext, title: str, link: socket.socket | None,
+    def __init__(self, run: RunContext, title: str, link: socket.socket,
                  is_unwanted: Callable[[], bool], say: Callable[[str], None]) -> None:
         super().__init__(run.plan, title, link)
         self._is_unwanted, self._say = is_unwanted, say

@@ -1,7 +1,6 @@
 """The connection of the process `run` to the root, by which it loads, starts and ends the run.
 
-`run` is a child of the root and inherits the connection. Tests and benchmarks have none, and start
-a root.
+`run` is a child of the root and inherits the connection.
 """
 
 from __future__ import annotations
@@ -10,8 +9,6 @@ import asyncio
 import os
 import select
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -27,7 +24,6 @@ from rampart.actors.supervision import requests
 from rampart.actors.supervision.process_title import RUN, end_run, kill, set_title
 from rampart.actors.supervision.requests import LaunchError
 from rampart.actors.supervision.unseen import report_callbacks, watch
-from rampart.files import working_folder
 from rampart.files.streams import complain
 
 STARTUP_S = (0.8, 5.0)
@@ -35,7 +31,7 @@ STARTUP_S = (0.8, 5.0)
 silence is not a fault."""
 
 _LOADS = 1.4
-"""The same, in multiples of the time to load the root; all processes run after 0.9 to 1.25."""
+"""The same, in multiples of the time to load the root; all processes run after 0.6 to 0.95."""
 
 _MAX_LINE = 1 << 26
 _Answer = TypeVar("_Answer", bound=requests.FromRoot)
@@ -49,7 +45,7 @@ class Launcher:
     Args:
         plan: Of the run.
         title: Of the run, for people.
-        link: Connection to the root; None to start a root.
+        link: Connection to the root.
 
     Attributes:
         plan: Of the run; from `load` on with folder, ports and the root's pid.
@@ -61,7 +57,7 @@ class Launcher:
         report: Called with one line about each problem.
     """
 
-    def __init__(self, plan: RunPlan, title: str, link: socket.socket | None = None) -> None:
+    def __init__(self, plan: RunPlan, title: str, link: socket.socket) -> None:
         self.plan = plan
         self.names: tuple[str, ...] = ()
         self.failure = ""
@@ -71,7 +67,6 @@ class Launcher:
         self.report: Callable[[str], None] = complain
         self._title = title
         self._link = link
-        self._root: subprocess.Popen[bytes] | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
         self._answers: asyncio.Queue[requests.FromRoot | None] = asyncio.Queue()
@@ -83,8 +78,8 @@ class Launcher:
         if self._writer is not None:
             return
         report_callbacks(asyncio.get_running_loop(), lambda line: self.report(line))  # noqa: PLW0108 it may change
-        link = self._link or self._start_root()
-        reader, self._writer = await asyncio.open_unix_connection(sock=link, limit=_MAX_LINE)
+        reader, self._writer = await asyncio.open_unix_connection(
+            sock=self._link, limit=_MAX_LINE)
         self._reading = asyncio.create_task(self._read(reader))
         watch(self._reading, "the connection to the root", self.failed)
 
@@ -98,7 +93,7 @@ class Launcher:
         await self.connect()
         begun = await self._ask(requests.Begin(self.plan, self._title), requests.Begun)
         self.plan, self.names, self._load_s = begun.plan, begun.names, begun.load_s
-        if self._link is not None:
+        if self.plan.launcher_pid == os.getppid():
             set_title(self.plan.base_port, self.plan.launcher_pid, (RUN,), 1)
             _clean_up_after(self.plan.launcher_pid, self.plan.folder)
 
@@ -149,20 +144,8 @@ class Launcher:
             self._reading.cancel()
             await asyncio.gather(self._reading, return_exceptions=True)
             writer.close()
-            if self._root is not None:
-                await asyncio.to_thread(self._root.wait)
 
     # -- inside ---------------------------------------------------------------------------------
-
-    def _start_root(self) -> socket.socket:
-        ours, theirs = socket.socketpair()
-        with theirs:
-            self._root = subprocess.Popen(  # noqa: S603 our own interpreter and module
-                [sys.executable, "-P", "-m", "rampart.actors.supervision.root",
-                 str(theirs.fileno())],
-                stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()], process_group=0,
-                env=working_folder.environment())
-        return ours
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
         while line := await reader.readline():

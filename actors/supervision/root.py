@@ -63,7 +63,7 @@ from rampart.actors.supervision.requests import ForkRequest, LaunchError, Reply
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.watchdog import Watchdogs
 from rampart.actors.system.layout import Layout, adapted_system, load_run, published_keys
-from rampart.files import streams, working_folder
+from rampart.files import working_folder
 from rampart.files.plain_text import one_line
 from rampart.files.streams import complain
 
@@ -731,15 +731,3 @@ def reserve_ports(first: int) -> list[socket.socket]:
             return found
     raise LaunchError(f"--port {first}: too few free ports from {first} to {LAST_PORT} "
                       "for the routers")
-
-
-def main() -> int:
-    """Serve the process that started this one, on the descriptor in its argument."""
-    working_folder.admit()
-    streams.secure()
-    Root().serve(socket.socket(fileno=int(sys.argv[1])))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -33,6 +33,9 @@ Row = TypeVar("Row", bound=Table)
 LARGEST, SMALLEST = 1e9, 1e-9
 """Of numbers outside parameters; their squares and quotients are far from a float's limits."""
 
+MAX_DEPTH = 32
+"""Deepest nesting of tables and arrays."""
+
 LARGEST_INTEGER = 2 ** 63 - 1
 """Of MessagePack, by which parameters reach an actor."""
 
@@ -142,8 +145,8 @@ def _find_unwritable(document: dict[str, Any]) -> Iterator[Finding]:
     left: list[tuple[object, str, int, bool]] = [(document, "$", 0, False)]
     while left:
         value, path, depth, free = left.pop()
-        if depth > toml.MAX_DEPTH:
-            yield Finding("$", f"nested more than {toml.MAX_DEPTH} deep")
+        if depth > MAX_DEPTH:
+            yield Finding("$", f"nested more than {MAX_DEPTH} deep")
         elif isinstance(value, dict):
             left += [(member, f"{path}.{key}", depth + 1, free or key == "parameters")
                      for key, member in reversed(value.items())]

@@ -65,8 +65,8 @@ class ProcessRun:
 
     Args:
         trial: The trial to run.
+        link: Connection to the run's root.
         scenario: Faults and their times.
-        link: Connection to the run's root; None to start one.
         keep: Saves a copy of the record for a resumed run; called in a thread. None saves nothing.
 
     Attributes:
@@ -76,8 +76,7 @@ class ProcessRun:
         keep_alive: Called some 20 times a second.
     """
 
-    def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = (),
-                 link: socket.socket | None = None,
+    def __init__(self, trial: Trial, link: socket.socket, scenario: Sequence[PlannedFault] = (),
                  keep: Callable[[bytes], None] | None = None) -> None:
         if trial.run.system.hosts:
             from rampart.actors.hosts.launchers import FirstLauncher  # noqa: PLC0415 few have

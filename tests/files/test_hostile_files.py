@@ -56,7 +56,7 @@ def edited(old: str, new: str) -> str:
 
 NESTED = "x = " + "[" * 100_000 + "]" * 100_000
 AIRPORTS = {
-    "nested 100,000 deep": (TOML + NESTED, "more than 32 deep"),
+    "nested 100,000 deep": (TOML + NESTED, "nested too deep"),
     "longer than any airport": (TOML + "#" * (5 << 20), "longer than 4 MB"),
     "a coordinate of 400 digits": (edited("T = [30.0", f"T = [1{'0' * 400}"),
                                    "nodes.T[0]: 1000000000"),
@@ -80,7 +80,7 @@ def test_an_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, tex
 
 
 SPECS = {
-    "nested": ("x = " + "[" * 100_000, "more than 32 deep"),
+    "nested": ("x = " + "[" * 100_000, "nested too deep"),
     "long": (SPEC + "#" * (1 << 20), "longer than 512 kB"),
     "many events": (SPEC + "".join(f'[[event]]\nname = "X{i}"\n' for i in range(6000)),
                     "expected a list, at most 5000 long"),
@@ -112,7 +112,7 @@ def test_a_device_without_end_is_read_no_further_than_a_spec_is_long(tmp_path, c
 def test_a_table_to_be_replaced_is_read_within_the_same_bounds(tmp_path, capsys):
     path = tmp_path / "table.toml"
     path.write_text(NESTED)
-    assert "32 deep" in refusal(capsys, rampart, "adapt", "replace", "FTM7", str(path))
+    assert "nested too deep" in refusal(capsys, rampart, "adapt", "replace", "FTM7", str(path))
     with pytest.raises(ChangeError, match="expected a TOML value"):
         parse_value(NESTED)
 
@@ -338,5 +338,3 @@ def test_a_document_at_the_limits_is_read_and_strings_and_comments_hold_anything
     assert toml.parse(text)["w"] == f"{dots} '' {brackets}"
     with pytest.raises(FileError, match="200 dotted"):
         toml.parse(".".join("a" * 50_000) + " = 1")
-    with pytest.raises(FileError, match="32 deep"):
-        toml.parse("n = " + "[" * 33 + "]" * 33)

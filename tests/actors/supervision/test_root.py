@@ -16,12 +16,13 @@ import msgspec
 import pytest
 import pytest_asyncio
 
+from benchmarks.own_root import OwnLauncher
 from rampart.actors.bus import run_info
 from rampart.actors.bus.run_info import find_runs
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.runtime.run_plan import load_document
-from rampart.actors.supervision.launcher import Launcher, LaunchError
+from rampart.actors.supervision.launcher import LaunchError
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
 from rampart.cli import systems
@@ -220,7 +221,7 @@ async def test_what_starts_after_a_change_of_the_system_knows_it(tmp_path):
 @pytest.mark.processes
 async def test_the_number_of_another_run_is_refused_before_anything_starts(tmp_path):
     plan = stub_plan(write_stub_system(tmp_path))
-    launcher = Launcher(plan, "test")
+    launcher = OwnLauncher(plan, "test")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
         other.bind(run_info.address(plan.base_port))
         with pytest.raises(LaunchError, match=f"--port {plan.base_port}: in use by another run"):

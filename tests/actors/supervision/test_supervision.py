@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
+from benchmarks.own_root import OwnLauncher
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.run_folder import ROUTERS
@@ -352,7 +353,7 @@ async def test_an_end_while_the_supervisor_starts_starts_no_router_again(tmp_pat
 async def test_an_unsound_spec_is_one_line(tmp_path):
     system = write_stub_system(tmp_path)
     system.write_text(system.read_text().replace('detect = "DM3"', 'detect = "DM9"'))
-    launcher = Launcher(stub_plan(system), "test")
+    launcher = OwnLauncher(stub_plan(system), "test")
     with pytest.raises(LaunchError, match=r"stub\.toml.*DM9") as caught:
         await launcher.load()
     assert "\n" not in str(caught.value)

@@ -12,6 +12,7 @@ import sys
 
 import pytest
 
+from benchmarks.own_root import new_root
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import load_system
@@ -121,7 +122,9 @@ async def test_a_run_whose_observer_fails_ends_in_order_and_says_why(tmp_path, m
     monkeypatch.setattr(mission, "sinks", lambda clock: [*usual(clock), broken_sink])
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     async with asyncio.timeout(30):
-        record = await ProcessRun(mission).run()
+        root, link = new_root()
+        record = await ProcessRun(mission, link).run()
+        await asyncio.to_thread(root.wait)
     assert (record.mission, record.safety) == ("fail", "not known")
     assert f"ended: {WHY}" in record.reasons
     assert WHY in stream.getvalue()
