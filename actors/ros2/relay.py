@@ -16,6 +16,7 @@ to report the endpoints of all topics, 0 for those of topics with an endpoint of
 
 from __future__ import annotations
 
+import collections
 import functools
 import importlib
 import itertools
@@ -57,6 +58,9 @@ ACKNOWLEDGED_S = 0.1
 
 UNNAMED, UNNAMED_LOOKS = "_NODE_NAME_UNKNOWN_", 5
 """Name of an endpoint whose node is not known yet; after so many looks it is not of ROS 2."""
+
+SENT = 100
+"""Last own messages that are recognized, since over DDS a node receives its own ones too."""
 
 GID_BYTES = 16
 HASHED = "RIHS"
@@ -120,9 +124,10 @@ class Relay:
         self._node = rclpy.create_node(
             name, namespace=namespace, start_parameter_services=False, enable_rosout=False)
         self._endpoints: dict[tuple[str, str], Any] = {}
-        self._lock = threading.Lock()  # of the endpoints, while one is new in the graph
+        self._lock = threading.Lock()  # of `_own`, while an endpoint is new in it, and `_sent`
         self._kept: set[str] = set()  # topics whose messages are never too old
         self._own: set[str] = set()  # gids
+        self._sent: collections.deque[tuple[str, bytes]] = collections.deque(maxlen=SENT)
         self._calls: dict[int, tuple[Any, Any]] = {}
         self._answers: dict[int, queue.SimpleQueue[bytes | None]] = {}
         self._numbers = itertools.count(1)
@@ -210,6 +215,9 @@ class Relay:
         endpoint = self._endpoints.get((PUBLISHER, topic))
         if endpoint is not None and (
                 time.monotonic() - at_s <= LATE_S or topic in self._kept):
+            if (SUBSCRIPTION, topic) in self._endpoints:
+                with self._lock:
+                    self._sent.append((topic, payload))
             endpoint.publish(payload)
 
     def _on_ask(self, number: int, service: str, payload: bytes) -> None:
@@ -243,6 +251,9 @@ class Relay:
 
         def take(payload: bytes, info: dict[str, Any]) -> None:
             nonlocal last, jumped_s
+            with self._lock:
+                if (topic, payload) in self._sent:
+                    return
             sequence = info.get("publication_sequence_number") or 0
             if info.get("publisher_gid"):
                 gid = info["publisher_gid"]["data"][:GID_BYTES].hex()
@@ -250,7 +261,8 @@ class Relay:
                 now_s = time.monotonic()
                 if sequence <= last:
                     jumped_s = now_s
-                infos = self._infos(PUBLISHER, topic)
+                infos = {gid: info for gid, info in self._infos(PUBLISHER, topic).items()
+                         if gid not in self._own}
                 gid, *others = infos or [""]
                 last = sequence
                 if others:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,11 @@ class TypeFields:
         Raises:
             ValueError: there is no such field.
         """
+        what = self._what(path, said)
+        return _kind_of(what) if what else ""
+
+    def _what(self, path: str, said: str) -> Any:
+        """Return a field's type as `rosbags` describes it; None for a missing `header`."""
         what: Any = (Nodetype.NAME, self._name)
         for step in steps(path, said):
             kind, detail = what
@@ -60,14 +66,11 @@ class TypeFields:
             known = dict(self._types.fields(name))
             if step not in known:
                 if path == step == "header":
-                    return ""
+                    return None
                 raise ValueError(f"{said or path!r}: {name} has no field {step!r}"
                                  f"{near(step, known)}")
             what = known[step]
-        kind, detail = what
-        if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
-            return f"{detail[0][1] if detail[0][0] == Nodetype.NAME else detail[0][1][0]}[]"
-        return str(detail if kind == Nodetype.NAME else detail[0])
+        return what
 
     def writer(self, where: str) -> Callable[[Any], Any]:
         """Return a function that converts a value to the type of a field.
@@ -76,12 +79,8 @@ class TypeFields:
             ValueError: there is no such field, or it is a message.
         """
         kind = self.kind(where)
-        if kind == "geometry_msgs/msg/Quaternion":
-            return lambda value: self._types.like(kind, value)
-        if kind.endswith("[]"):
-            element = kind[:-2]
-            return list if "/" in element or element == "string" else (
-                lambda value: np.asarray(value, _NUMPY_OF.get(element, element)))
+        if kind == "geometry_msgs/msg/Quaternion" or kind.endswith("[]"):
+            return partial(self._types.field_like, self._what(where, where))
         if "/" in kind:
             raise ValueError(f"fields: {where} is a {kind}; expected one of its fields")
         if kind.startswith("float"):
@@ -89,7 +88,13 @@ class TypeFields:
         return _ENCODED.get(kind, int)
 
 
-_NUMPY_OF = {"byte": "uint8", "char": "uint8"}
+def _kind_of(what: Any) -> str:
+    kind, detail = what
+    if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+        return f"{_kind_of(detail[0])}[]"
+    return str(detail if kind == Nodetype.NAME else detail[0])
+
+
 _ENCODED: Mapping[str, Callable[[Any], Any]] = {"string": str, "bool": bool}
 
 

@@ -15,7 +15,7 @@ from rampart.actors.bus.bounds import MOST, Count, Floats32, Meta, Text, Whole
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ros2.translation.expressions import Expression, Plane
-from rampart.actors.ros2.translation.fields import BULK, LEN, TypeFields
+from rampart.actors.ros2.translation.fields import BULK, LEN, TypeFields, plain
 from rampart.actors.ros2.translation.forms import ON_PLANE, READY, kind_of, may_be_unknown
 from rampart.actors.ros2.translation.mapping import BESIDE, TF
 from rampart.actors.ros2.translation.tables import Ros2Link
@@ -96,7 +96,7 @@ def _base(kind: str) -> type | None:
 
 def _mirrored(name: str, types: Types, made: dict[str, type[msgspec.Struct]]
               ) -> type[msgspec.Struct]:
-    """Return a struct with the fields of a type of ROS 2.
+    """Return a struct with the fields of a type of ROS 2, and its defaults.
 
     Args:
         name: of the type.
@@ -105,13 +105,14 @@ def _mirrored(name: str, types: Types, made: dict[str, type[msgspec.Struct]]
     """
     if name in made:
         return made[name]
-    fields = []
+    fields, blank = [], types.blank(name)
     for field, what in types.fields(name):
         kind, detail = what
         if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE} and detail[0][1][0] in BULK:
-            fields.append((f"{field}{LEN}", Count))
+            fields.append((f"{field}{LEN}", Count, 0))
         else:
-            fields.append((field, _type_of(what, types, made)))
+            made_of = _type_of(what, types, made)
+            fields.append((field, made_of, msgspec.convert(plain(getattr(blank, field)), made_of)))
     made[name] = msgspec.defstruct(
         name.rpartition("/")[2], fields, bases=(Message,), frozen=True)
     return made[name]

@@ -142,9 +142,26 @@ class Types:
         return np.asarray(values, np.dtype(kind))
 
     def like(self, name: str, value: Any) -> Any:
-        """Return a message with the attributes of a value as its fields."""
-        return self._store.types[name](
-            **{field: getattr(value, field) for field, _ in self._definition(name)})
+        """Return a message with the attributes of a value as its fields, others by default."""
+        made = self.blank(name)
+        for field, what in self._definition(name):
+            if hasattr(value, field):
+                setattr(made, field, self.field_like(what, getattr(value, field)))
+        return made
+
+    def field_like(self, what: Any, value: Any) -> Any:
+        """Return a value in the form of a field, whose type is as in `fields`."""
+        import numpy as np  # noqa: PLC0415 with the first message
+
+        kind, detail = what
+        if kind == Nodetype.NAME:
+            return self.like(detail, value)
+        if kind == Nodetype.BASE:
+            return value
+        inner, of = detail[0]
+        if inner == Nodetype.BASE and of[0] != "string":
+            return np.asarray(value, np.dtype(_NUMPY[of[0]]))
+        return [self.field_like(detail[0], one) for one in value]
 
     def new(self, name: str, values: Mapping[str, Any]) -> Any:
         """Return a message with these fields."""

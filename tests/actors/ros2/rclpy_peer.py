@@ -1,11 +1,14 @@
 """Run by the Python that has the wheels of ROS 2: nodes of a robot in rclpy, over DDS.
 
-    python rclpy_peer.py base|rival|wrong
+    python rclpy_peer.py base|rival|wrong|reporter
 
 `base` publishes /odom 20 times a second (best effort) and its name once (transient local), offers
 /base/shut, the action /count and the lifecycle node /camera, and calls /rampart/stop for a line on
 standard input. `rival` publishes /odom and /cmd_vel too; `wrong` publishes texts on /odom. Each
 writes a line of JSON for each message, request and transition.
+
+`reporter` publishes the status of a lidar ten times a second, logs, and ends goals of /count. A
+word on standard input sets that: well, bad or quiet (no status); log (a line); succeed or abort.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import threading
 import time
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionServer
@@ -112,12 +116,44 @@ def wrong():
     return [node]
 
 
+def reporter():
+    node = rclpy.create_node("reporter")
+    publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+    state = {"level": b"\0", "end": "succeed"}
+
+    def step():
+        if state["level"] is not None:
+            message = DiagnosticArray(status=[DiagnosticStatus(
+                name="lidar", level=state["level"], message="no data")])
+            message.header.stamp = node.get_clock().now().to_msg()
+            publisher.publish(message)
+
+    def end(goal):
+        getattr(goal, state["end"])()
+        return Fibonacci.Result()
+
+    def listen():
+        for line in sys.stdin:
+            match line.strip():
+                case "well" | "bad" | "quiet" as word:
+                    state["level"] = {"well": b"\0", "bad": b"\2", "quiet": None}[word]
+                case "succeed" | "abort" as word:
+                    state["end"] = word
+                case "log":
+                    node.get_logger().error("no path")
+
+    node.create_timer(0.1, step)
+    node.held = ActionServer(node, Fibonacci, "/count", end)
+    threading.Thread(target=listen, daemon=True).start()
+    return [node]
+
+
 def main():
     is_over = threading.Event()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     signal.signal(signal.SIGTERM, lambda *_: is_over.set())
     executor = MultiThreadedExecutor(2)
-    nodes = {"base": base, "rival": rival, "wrong": wrong}[sys.argv[1]]()
+    nodes = {"base": base, "rival": rival, "wrong": wrong, "reporter": reporter}[sys.argv[1]]()
     for node in nodes:
         executor.add_node(node)
     say(up=sys.argv[1])

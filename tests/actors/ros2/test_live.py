@@ -21,10 +21,10 @@ PEER = ROOT / "tests/actors/ros2/sdk_peer.py"
 class Peer:
     """The other implementation, and what it says."""
 
-    def __init__(self, *command):
+    def __init__(self, *command, python=PYTHON):
         self.lines = []
         self.process = subprocess.Popen(
-            [PYTHON, *command], stdin=subprocess.PIPE, text=True,
+            [python, *command], stdin=subprocess.PIPE, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         self.reader = threading.Thread(target=self._read, daemon=True)
         self.reader.start()

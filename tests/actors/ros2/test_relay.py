@@ -42,6 +42,15 @@ def domain(monkeypatch):
     return number
 
 
+def interfaces(folder):
+    """Copy definitions that the gateway lacks."""
+    for name in ("test_msgs/action/Fibonacci.action", "rcl_interfaces/srv/GetParameters.srv",
+                 "rcl_interfaces/srv/SetParameters.srv"):
+        where = folder / "interfaces" / name
+        where.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROS / "share" / name, where)
+
+
 @pytest.fixture
 def system(tmp_path, domain):
     def write(more="", setup=SETUP):
@@ -58,10 +67,7 @@ distribution = "kilted", interfaces = ["interfaces"] }}
             "}}", "}")
         path = tmp_path / "guarded.toml"
         path.write_text(text + more)
-        for name in ("test_msgs/action/Fibonacci.action", "rcl_interfaces/srv/GetParameters.srv"):
-            where = tmp_path / "interfaces" / name
-            where.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROS / "share" / name, where)
+        interfaces(tmp_path)
         return path
 
     return write
@@ -114,6 +120,22 @@ type = "rcl_interfaces/srv/GetParameters"
 from = "camera/rate_wanted"
 to = "camera/rate"
 answer = { rate_hz = "values[0].double_value" }
+
+[[node]]
+name = "tuner"
+actor = "tests.actors.ros2.robot:Asker"
+kind = "non-control"
+
+[node.parameters]
+topic = "camera/rate_set"
+body = { parameters = [{ name = "rate_hz", value = { type = 3, double_value = 20.0 } }] }
+
+[[ros2]]
+call = "/camera/set_parameters"
+type = "rcl_interfaces/srv/SetParameters"
+from = "camera/rate_set"
+to = "camera/rate_is_set"
+answer = { well = "results[0].successful" }
 """
 
 
@@ -148,7 +170,8 @@ def test_topics_services_actions_states_and_parameters_over_dds(tmp_path, system
             run.wait_until(lambda: 3 in peer.said("goal"), 10, "no goal")
             assert "succeeded" in {one["phase"] for one in echoed(run, "count/state", 6)}
             run.wait_until(lambda: "inactive" in peer.said("state"), 10, "no transition")
-            assert echoed(run, "camera/rate")[0]["rate_hz"] == 12.5
+            assert echoed(run, "camera/rate_is_set")[0]["well"] is True
+            assert echoed(run, "camera/rate")[0]["rate_hz"] == 20.0  # 12.5 at its start
             told = json.loads(run.tool("status", "--json").stdout)["ros2"]
             assert set(told["nodes"]) == {"/rampart", "/base", "/camera"}
             assert run.tool("node", "log", "gateway").returncode == 0
@@ -206,6 +229,24 @@ def test_a_node_that_ends_is_missing_until_it_is_back(tmp_path, system):
             run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command any more")
             run.wait_until(lambda: echoed(run, "detection/D_NODES")[0]["state"] == "idle", 10,
                            "the node is missing still")
+
+
+def test_a_killed_node_is_detected_by_its_topic_before_it_leaves_the_graph(tmp_path, system):
+    path = system(NODES.replace('detect = "D_NODES"', 'detect = "D_NODES or D_SILENT"') + """
+[[detection]]
+name = "D_SILENT"
+title = "The odometry is silent"
+actor = "rampart.actors.detection.freshness:Freshness"
+parameters = { topic = "base/odometry", timeout_s = 0.5 }
+""")
+    with Peer(PEER, "base") as peer, RealRun(tmp_path, path) as run:
+        run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
+        run.wait_until(lambda: echoed(run, "detection/D_SILENT")[0]["state"] == "idle", 10,
+                       "no odometry")
+        peer.process.kill()
+        run.wait_for("(D_SILENT)", 10)
+        assert "/base" in echoed(run, "ros2/gateway/graph")[0]["nodes"]
+        assert echoed(run, "detection/D_NODES")[0]["state"] == "idle"
 
 
 def test_messages_of_another_node_than_the_named_one_never_pass(tmp_path, system):
@@ -267,7 +308,9 @@ async def test_a_command_that_waits_for_a_stopped_relay_is_not_repeated(domain):
         side.side.close()
 
 
-async def test_publishers_that_an_older_rclpy_does_not_tell_apart_have_no_gid(domain, tmp_path):
+@pytest.fixture
+def older(tmp_path):
+    """A setup whose rclpy is as before Kilted: a message does not name its publisher."""
     (tmp_path / "sitecustomize.py").write_text("""
 from rclpy.subscription import Subscription
 
@@ -281,7 +324,11 @@ Subscription.__init__ = older
 """)
     setup = tmp_path / "setup.bash"
     setup.write_text(f". {SETUP}\nexport PYTHONPATH={tmp_path}\n")
-    side, gids = Side(domain, setup), []
+    return setup
+
+
+async def test_publishers_that_an_older_rclpy_does_not_tell_apart_have_no_gid(domain, older):
+    side, gids = Side(domain, older), []
     side.node.subscribe("/odom", "nav_msgs/msg/Odometry", Qos(reliable=False, depth=10),
                         lambda _, attachment: gids.append(attachment.gid))
     with Peer(PEER, "base"):
@@ -294,6 +341,26 @@ Subscription.__init__ = older
         with Peer(PEER, "rival"):
             await side.until(lambda: gids[-40:] == [UNKNOWN_GID] * 40)
     side.side.close()
+
+
+@pytest.mark.parametrize("is_older", [False, True])
+async def test_a_node_does_not_receive_its_own_messages(domain, older, is_older):
+    """A detection on /diagnostics stayed active because of the gateway's report about it."""
+    side, got = Side(domain, older if is_older else SETUP), []
+    other = Side(domain, node="other")
+    publish, publish_too = (one.node.publisher("/cmd_vel", TWIST, Qos(depth=10))
+                            for one in (side, other))
+    side.node.subscribe("/cmd_vel", TWIST, Qos(depth=10), lambda payload, _: got.append(payload))
+
+    def received():
+        publish(side.twist(1.0))
+        publish_too(side.twist(2.0))
+        return len(got) > 10
+
+    await side.until(received)
+    assert set(got) == {side.twist(2.0)}
+    side.side.close()
+    other.side.close()
 
 
 async def test_an_environment_of_another_distribution_passes_nothing(domain):

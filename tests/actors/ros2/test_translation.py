@@ -385,3 +385,23 @@ def test_whatever_arrives_is_read_or_refused():
                 data[dice.randrange(4, len(data))] = dice.choice([0, 1, 127, 128, 255])
             with contextlib.suppress(ValueError):
                 decode(bytes(data[:dice.randint(4, len(data))]))
+
+
+def test_a_topic_of_any_type_has_the_defaults_of_ros_2_and_is_written_whole():
+    names = [name for name in JAZZY.known if "/msg/" in name and name not in READY]
+    for name in names:
+        made = message_of(Ros2Link(type=name, subscribe="/x", to="x"), JAZZY)
+        assert JAZZY.encode(name, JAZZY.like(name, made())) == JAZZY.encode(
+            name, JAZZY.blank(name)), name
+    assert len(names) > 100
+
+
+def test_a_list_of_messages_is_written_with_only_the_fields_that_are_set():
+    kind = "diagnostic_msgs/msg/DiagnosticArray"
+    source = message_of(Ros2Link(type=kind, subscribe="/x", to="x"), JAZZY)
+    message = msgspec.convert({"status": [
+        {"name": "lidar", "level": 2, "values": [{"key": "heat", "value": "91"}]}, {}]}, source)
+    written = JAZZY.decode(kind, said(kind, source)(message, 0))
+    assert [(one.name, one.level, one.message, [(v.key, v.value) for v in one.values])
+            for one in written.status] == [
+        ("lidar", 2, "", [("heat", "91")]), ("", 0, "", [])]
