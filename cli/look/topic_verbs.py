@@ -110,16 +110,16 @@ def topic_info(options: argparse.Namespace) -> int:
         print_json({**_describe(use),
                     "fields": [{"name": n, "type": t} for n, t in catalogue.fields(topic.type)]})
         return 0
-    say(f"key         {topic.key}")
-    say(f"message     {topic.type.__name__}: {catalogue.summary(topic.type)}")
-    for name, type_name in catalogue.fields(topic.type):
-        say(f"              {name}: {type_name}")
-    say(f"about       {topic.doc}")
-    say(f"qos         {topic.qos.value}, at the reader: {catalogue.MAILBOX[topic.qos]}")
-    say(f"rate        {catalogue.rate(topic)}")
-    say(f"frame       {topic.frame or 'none'}")
-    say(f"publishers  {', '.join(use.publishers) or 'none'}")
-    say(f"readers     {', '.join(use.readers) or 'none'}")
+    for name, text in (
+            ("key", topic.key),
+            ("message", f"{topic.type.__name__}: {catalogue.summary(topic.type)}"),
+            *(("", f"  {field}: {kind}") for field, kind in catalogue.fields(topic.type)),
+            ("about", topic.doc),
+            ("qos", f"{topic.qos.value}, at the reader: {catalogue.MAILBOX[topic.qos]}"),
+            ("rate", catalogue.rate(topic)), ("frame", topic.frame or "none"),
+            ("publishers", ", ".join(use.publishers) or "none"),
+            ("readers", ", ".join(use.readers) or "none")):
+        say(f"{name:<12}{text}")
     return 0
 
 

@@ -68,9 +68,7 @@ def add(verbs: Any) -> None:
                       "corrupt: add BIAS to a number, or to each number of an array"),
               several("--ramp", "FIELD=RATE", "corrupt: add RATE per simulated second"),
               several("--noise", "FIELD=SIGMA",
-                      "corrupt: add Gaussian noise of this standard deviation"),
-              option("--topic", help=argparse.SUPPRESS),  # old: --mode MODE --topic TOPIC
-              option("--mode", help=argparse.SUPPRESS)))
+                      "corrupt: add Gaussian noise of this standard deviation")))
 
 
 def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
@@ -103,8 +101,6 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     if options.system is not None:
         raise UsageError(f"--system {options.system}: only with --list; a fault is injected into "
                          "the run")
-    if options.topic and options.mode and options.fault is None:
-        options.fault = f"{options.mode}:{options.topic}"
     if not options.fault:
         raise UsageError("expected FAULT; `rampart inject --list` lists the faults")
     if options.fault.partition(":")[0] in PROCESS_FAULTS:

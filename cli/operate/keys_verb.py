@@ -105,8 +105,7 @@ def init(options: argparse.Namespace) -> int:
     """
     positive("--days", options.days, below=_MOST_DAYS)
     folder = Path(options.keys)
-    keys = _keys()
-    keys.init(folder, options.days)
+    _keys().init(folder, options.days)
     say(f"{folder}: created an authority; next: rampart keys issue --keys {folder} --system NAME")
     return 0
 
@@ -167,8 +166,7 @@ def rotate(options: argparse.Namespace) -> int:
       rampart keys rotate ada --days 1
     """
     positive("--days", options.days, below=_MOST_DAYS)
-    folder, keys = Path(options.keys), _keys()
-    done = keys.rotate(folder, options.names, options.days)
+    done = _keys().rotate(Path(options.keys), options.names, options.days)
     say(f"new: {', '.join(done) or 'none; the folder has no certificate'}")
     return 0
 
@@ -187,8 +185,7 @@ def revoke(options: argparse.Namespace) -> int:
     """
     if not options.names:
         raise UsageError("revoke: expected NAME; `rampart keys show` lists the names")
-    folder, keys = Path(options.keys), _keys()
-    keys.revoke(folder, options.names)
+    _keys().revoke(Path(options.keys), options.names)
     say(f"revoked: {', '.join(options.names)}; in force when the routers have been restarted: "
         f"{'; '.join(f'kill-node {name}' for name in ROUTERS)}")
     return 0
@@ -206,8 +203,8 @@ def show(options: argparse.Namespace) -> int:
 
     exit code: 0 all that are listed are valid, 1 one is not, 2 bad usage
     """
-    folder, keys = Path(options.keys), _keys()
-    found = {entry.name: entry for entry in keys.entries(folder)}
+    folder = Path(options.keys)
+    found = {entry.name: entry for entry in _keys().entries(folder)}
     for name in options.names:
         if name not in found:
             raise unknown("name", name, found)
@@ -262,9 +259,8 @@ def share(options: argparse.Namespace) -> int:
     host = "" if options.host == names[0] else options.host
     needed = [*layout.hosts.routers_of(host), *sorted(
         layout.hosts.may_run(host, layout.members)), *options.person]
-    folder, to, keys = Path(options.keys), Path(options.to), _keys()
-    keys.share(folder, to, needed)
-    say(f"{to}: {len(needed)} keys for host {options.host}; start it there with --keys")
+    _keys().share(Path(options.keys), Path(options.to), needed)
+    say(f"{options.to}: {len(needed)} keys for host {options.host}; start it there with --keys")
     return 0
 
 

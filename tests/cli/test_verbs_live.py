@@ -274,7 +274,7 @@ async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
         capsys, "topic", "hz", "porter/load", "--duration", "0.5", "--json")
     assert (code, json.loads(out)[0]["nominal_hz"]) == (0, 10)
     for fault in (["corrupt:porter/load"], ["drop:porter/axle/simulator"],
-                  ["--topic", "porter/load", "--mode", "corrupt", "--set", "mass_kg=0"]):
+                  ["corrupt:porter/load", "--set", "mass_kg=0"]):
         code, out, _ = await run.call(capsys, "inject", *fault, "--duration", "1", "--json")
         assert (code, json.loads(out)["effective"]) == (0, True)
 
