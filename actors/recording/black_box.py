@@ -1,15 +1,16 @@
 """The black box: the last minutes of a run, and an incident around each decision and failure.
 
-It is a recorder that keeps messages as they were sent, in a ring on disk (`ring`). A decision on a
-fault, or a failed process, begins an incident (`incidents`); another one before its end extends it.
-When an incident is over, its recording is written from the ring. All state is on disk: a black box
-that is restarted continues, and what a killed run leaves is read by `incidents.recover`.
+It is a recorder that keeps messages as they were handed over, in a ring on disk (`ring`). A
+decision on a fault, or a failed process, begins an incident (`incidents`); another one before its
+end extends it. The ring keeps the messages of incidents, from which tools write recordings. All
+state is on disk: a black box that is restarted continues, and tools read what a killed run leaves.
 
 The robot never waits for it. Without room it deletes its oldest incidents, then it ends.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import time
@@ -20,18 +21,19 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE, decode
+from rampart.actors.bus.recorder_connection import parse_frame, parse_head
 from rampart.actors.bus.run_info import RunInfo, find_runs
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.history import Debounce, History
 from rampart.actors.ftm.narrator import Narrator
-from rampart.actors.recording import incidents, ring
+from rampart.actors.recording import incidents
 from rampart.actors.recording.bag_writer import BagError, check_reserve
 from rampart.actors.recording.incidents import Incident
-from rampart.actors.recording.recorder import Recorder
 from rampart.actors.recording.ring import Ring
 from rampart.actors.recording.run_documents import Documents, collect
+from rampart.actors.recording.run_listener import RunListener
 from rampart.actors.system.topics import find_topic
 from rampart.files.plain_text import one_line
 from rampart.files.streams import complain
@@ -51,68 +53,72 @@ _LOCK_S = 5.0
 
 
 class BlackBoxWriter:
-    """Ring, incidents and history of one run; the form of a `BagWriter`, for a `Recorder`.
+    """Ring, incidents and history of one run.
 
     Args:
         folder: folder of the system.
         documents: description of the run.
         limits: `[black_box]` of the specification.
+        origin_s: start of simulated time, monotonic seconds.
         checkpoints: folder of the nodes' checkpoints; None without.
         again: whether it continues the ring of this part of the run.
         wall: returns Unix time.
 
     Attributes:
         messages: number of messages so far.
-        is_cut_off: whether the run has ended otherwise than in order.
 
     Raises:
         BagError: the folder of the run is in use.
         OSError: the folder cannot be written.
     """
 
-    written_bytes = 0  # no file grows
-
-    def __init__(self, folder: Path, documents: Documents, limits: Limits, *,
+    def __init__(self, folder: Path, documents: Documents, limits: Limits, *, origin_s: float = 0.0,
                  checkpoints: Path | None = None, again: bool = False,
                  wall: Callable[[], float] = time.time) -> None:
-        self.messages = 0
-        self.is_cut_off = False
         self._system, self._folder = folder, folder / documents.run_id
         self._limits, self._checkpoints, self._wall = limits, checkpoints, wall
+        self._origin_s, self._rate = origin_s, documents.rate
         self._run = documents.run_id
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        incidents.recover(folder, _living() | {self._run} if again else _living() - {self._run})
-        incidents.remove_empty(folder)
+        incidents.settle(folder, _living() | {self._run} if again else _living() - {self._run})
         self._folder.mkdir(exist_ok=True)
         self._lock = _locked(self._folder)
-        incidents.write_head(self._folder, documents)
+        incidents.begin(self._folder, documents)
         self._most_bytes = int(limits.limit_mb * 1e6)
-        self._make_room()
-        self._ring = Ring(self._folder, self._most_bytes // _SEGMENTS)
-        self._open = {incident.name: incident for incident, path
-                      in incidents.incidents_in(folder)
-                      if incident.run == self._run and not path.exists()}
-        self._written = dict(self._open)
+        self._ring = Ring(self._folder, self._most_bytes // _SEGMENTS, origin_s, documents.rate)
+        self._make_room(is_whole=True)
+        known = [one for one, _ in incidents.incidents_in(folder) if one.run == self._run]
+        self._last = known[-1] if known and again else None
+        self._described = self._last
         self._narrator = Narrator(documents.known.system.titles)
-        self._topics: dict[str, Topic[Any] | None] = {}
+        self._topics: dict[bytes, Topic[Any] | None] = {}
         self._debounce = Debounce()
         self._history = History(folder, self._run)
         self._reported = ""
         self._begun_s = -math.inf if again else math.inf
         self._now_s = self._tidied_s = -math.inf
+        self.messages = 0
 
-    def take(self, at_s: float, key: str, payload: bytes) -> None:
-        """Add a message, as `BagWriter.take`."""
+    def take(self, frame: bytes) -> None:
+        """Add a message as it was handed over.
+
+        Raises:
+            ValueError: it is not a frame.
+            OSError: the disk is full, or it cannot be written.
+        """
+        sent_s, key = parse_head(frame)
         self.messages += 1
+        at_s = (sent_s - self._origin_s) * self._rate
         self._begun_s, self._now_s = min(self._begun_s, at_s), max(self._now_s, at_s)
-        self._ring.add(at_s, key, payload)
+        self._ring.add(at_s, frame)
         if key not in self._topics:
-            self._topics[key] = find_topic(key.removeprefix(f"{ROOT}/"), _WATCHED)
+            self._topics[key] = find_topic(
+                key.decode(errors="replace").removeprefix(f"{ROOT}/"), _WATCHED)
         topic = self._topics[key]
         if topic is None:
             return
         try:
-            header, body = decode(topic, payload)
+            header, body = decode(topic, parse_frame(frame)[2])
         except UNREADABLE:
             return
         self._debounce.take(body, header, at_s)
@@ -121,32 +127,42 @@ class BlackBoxWriter:
                       isinstance(body, fm.ProcessEvent) and body.event in fm.FAILURES):
             self._trigger(lines[0].text, at_s)
 
-    def write_silences(self, record: dict[str, str]) -> None:
-        """Do nothing: the messages of other hosts are not kept."""
-
     def flush(self) -> None:
-        """Sync the ring, write descriptions and incidents that are over, and make room.
+        """Sync the ring, write the description of a new or extended incident, and make room.
 
         Raises:
             OSError: the disk is full, or it cannot be written.
         """
-        self._write(over_s=self._now_s)
+        self._ring.sync()
+        is_due = self._now_s - self._tidied_s >= _HOUSEKEEPING_S
+        if is_due:
+            self._tidied_s = self._now_s
+            incidents.keep_needed(self._ring, self._folder, self._now_s - self._limits.before_s)
+        self._make_room(is_whole=is_due)
+        self._describe_last()
+        self._history.put(self._debounce.changes(self._now_s), self._wall())
+        if self._history.problem != self._reported:
+            self._reported = self._history.problem
+            complain(self._reported)
 
-    def close(self, end: object = None) -> None:
-        """Write all incidents, also one of a run that was cut off, and remove the ring.
+    def close(self, *, is_cut_off: bool = False) -> None:
+        """Keep only the messages of incidents, or all if the run was cut off.
 
         Raises:
             OSError: the disk is full, or it cannot be written.
         """
-        del end
-        self._write(over_s=math.inf)
-        if not self.is_cut_off:
+        if self._last is not None and not is_cut_off:
+            self._last = msgspec.structs.replace(
+                self._last, to_s=min(self._last.to_s, self._now_s))
+        self.flush()
+        self._history.put(self._debounce.changes(math.inf), self._wall())
+        if not is_cut_off:
             self._history.heal_others(_living())
-            for path in ring.segments(self._folder):
-                path.unlink()
+            self._ring.close()
+            incidents.keep_needed(self._ring, self._folder)
+            incidents.end(self._folder)
         self.abandon()
-        incidents.recover(self._system, _living() - {self._run})
-        incidents.remove_empty(self._system)
+        incidents.settle(self._system, _living() - {self._run})
 
     def abandon(self) -> None:
         """Close all files as they are. Harmless when repeated."""
@@ -163,53 +179,34 @@ class BlackBoxWriter:
 
         An incident is twice as long as usual at most; the next one follows it without a gap.
         """
-        limits, last = self._limits, next(reversed(self._open.values()), None)
+        limits, last = self._limits, self._last
         if last is not None and at_s - limits.before_s <= last.to_s and (
                 at_s <= (end_s := last.at_s + 2 * limits.after_s + limits.before_s)):
-            self._open[last.name] = msgspec.structs.replace(last, to_s=max(
+            self._last = msgspec.structs.replace(last, to_s=max(
                 last.to_s, min(at_s + limits.after_s, end_s)))
             return
+        self._describe_last()
         wall_s = self._wall()
-        while (name := incidents.name_at(wall_s)) in self._open:
+        while (self._folder / f"{(name := incidents.name_at(wall_s))}.json").exists():
             wall_s += 0.001
-        self._open[name] = Incident(
+        self._last = Incident(
             name=name, system=self._system.name, run=self._run, at=incidents.iso(wall_s),
             cause=one_line(cause), at_s=at_s, to_s=at_s + limits.after_s,
             from_s=max(at_s - limits.before_s, self._begun_s, last.to_s if last else -math.inf),
             checkpoints=_read_all(self._checkpoints))
 
-    def _write(self, over_s: float) -> None:
-        """Write what is new, and the recordings of incidents that were over at a time."""
-        self._ring.sync()
-        self._keep_reserve()
-        for name, incident in list(self._open.items()):
-            if self._written.get(name) is not incident:
-                incidents.describe(self._folder, incident)
-                self._written[name] = incident
-            if incident.to_s < over_s - self._limits.before_s:  # nothing can extend it any more
-                is_cut = self.is_cut_off and incident.to_s > self._now_s
-                incidents.record(self._folder, msgspec.structs.replace(
-                    incident, to_s=min(incident.to_s, self._now_s),
-                    partial="the run was cut off" if is_cut else ""))
-                del self._open[name], self._written[name]
-                self._tidied_s = -math.inf
-        self._history.put(self._debounce.changes(over_s), self._wall())
-        if self._history.problem != self._reported:
-            self._reported = self._history.problem
-            complain(self._reported)
-        if self._now_s - self._tidied_s >= _HOUSEKEEPING_S:
-            self._tidied_s = self._now_s
-            self._ring.drop(min([self._now_s - self._limits.before_s,
-                                 *(i.from_s for i in self._open.values())]))
-            self._make_room()
+    def _describe_last(self) -> None:
+        if self._last is not None and self._last is not self._described:
+            incidents.describe(self._folder, self._last)
+            self._described = self._last
 
-    def _make_room(self) -> None:
-        while incidents.size(self._system) > self._most_bytes:
-            if not (incidents.drop_oldest(self._system, self._open) or self._ring.drop_oldest()):
-                return
+    # -- room -----------------------------------------------------------------------------------
 
-    def _keep_reserve(self) -> None:
+    def _make_room(self, *, is_whole: bool) -> None:
         """Delete the oldest incidents, then segments, while the disk has only its reserve.
+
+        Args:
+            is_whole: whether to keep to the limit of the system, too.
 
         Raises:
             OSError: nothing more can be deleted.
@@ -217,16 +214,22 @@ class BlackBoxWriter:
         while True:
             try:
                 check_reserve(self._folder)
-            except OSError:
-                if not (incidents.drop_oldest(self._system, self._open)
-                        or self._ring.drop_oldest()):
-                    raise
-            else:
+                if not is_whole or incidents.size(self._system) <= self._most_bytes:
+                    return
+                problem = None
+            except OSError as error:
+                problem = error
+            if incidents.drop_oldest(self._system, keep=self._last):
+                incidents.keep_needed(self._ring, self._folder,
+                                      self._now_s - self._limits.before_s)
+            elif not self._ring.drop_oldest():
+                if problem:
+                    raise problem
                 return
 
 
-class BlackBox(Recorder):
-    """The recorder of a black box.
+class BlackBox(RunListener):
+    """Hands the messages of a run to a `BlackBoxWriter`.
 
     Args:
         port: base port of the run.
@@ -242,23 +245,43 @@ class BlackBox(Recorder):
 
     def __init__(self, port: int, folder: Path, limits: Limits, *, launcher: int,
                  checkpoints: Path | None = None, again: bool = False) -> None:
-        super().__init__(port, folder, launcher=launcher)
+        super().__init__(port, folder, launcher)
         self._limits, self._checkpoints, self._again = limits, checkpoints, again
-        self._box: BlackBoxWriter | None = None
 
-    def _begin_file(self, info: RunInfo, begun_s: float) -> None:
-        del begun_s
+    def begin(self, info: RunInfo, frames: list[bytes]) -> None:
+        """See `RunListener`."""
+        del frames
         documents = collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
                             nodes=tuple(info.nodes), started=incidents.iso(time.time()))
-        self._box = BlackBoxWriter(self.path, documents, self._limits,
-                                   checkpoints=self._checkpoints, again=self._again)
-        # It has all that a recorder calls.
-        self.writer = self._box  # type: ignore[assignment]
+        self._box = BlackBoxWriter(
+            self.path, documents, self._limits, origin_s=info.origin_s,
+            checkpoints=self._checkpoints, again=self._again)
 
-    def _finish(self, why: str, *, run_is_over: bool) -> None:
-        if self._box is not None:
-            self._box.is_cut_off = run_is_over  # its launcher has died without a signal
-        super()._finish(why, run_is_over=run_is_over)
+    def write(self, frames: list[bytes], turn_s: float) -> None:
+        """See `RunListener`."""
+        del turn_s
+        for frame in frames:
+            with contextlib.suppress(ValueError):  # not from a node
+                self._box.take(frame)
+
+    def flush(self) -> None:
+        """See `RunListener`."""
+        self._box.flush()
+
+    def end(self, why: str, *, is_cut_off: bool) -> None:
+        """See `RunListener`."""
+        del why
+        self._box.close(is_cut_off=is_cut_off)
+
+    def abandon(self) -> None:
+        """See `RunListener`."""
+        if self._info is not None:
+            self._box.abandon()
+
+    @property
+    def messages(self) -> int:
+        """See `RunListener`."""
+        return self._box.messages if self._info is not None else 0
 
 
 def _living() -> set[str]:

@@ -3,12 +3,13 @@
 The folder of a system has one folder for each run:
 
     head.mcap       description of the run: specification, files, versions, options
-    NUMBER.ring     the last minutes (`ring`), while the run lives
+    ended           mark that it has ended in order, or that its end is described
+    NUMBER.ring     the last minutes, and the messages of incidents (`ring`)
     NAME.json       description of an incident (`Incident`)
-    NAME.mcap       its recording, once it is over
+    NAME.mcap       its recording, in folders of version 1.0
 
-The black box locks the folder of its run (flock(2)). A ring in an unlocked folder is from a run
-that was cut off: `recover` writes the recordings from it.
+The black box locks the folder of its run (flock(2)). An unlocked folder without the mark belongs to
+a run that was cut off: `settle` describes its last seconds as an incident.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.recording import ring
 from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.actors.recording.bag_writer import BagError, BagWriter
+from rampart.actors.recording.ring import Ring, Span
 from rampart.actors.recording.run_documents import (
     NOT_CHOSEN,
     Documents,
@@ -41,7 +43,7 @@ from rampart.actors.recording.views import Views
 from rampart.actors.system.topics import own_topics
 from rampart.manager.spec.tables import BlackBox
 
-HEAD = "head.mcap"
+HEAD, ENDED = "head.mcap", "ended"
 
 SLACK_S = 2.0
 """Simulated seconds that may be missing at either end of a complete incident."""
@@ -62,8 +64,7 @@ class Incident(msgspec.Struct, frozen=True, kw_only=True):
         from_s: begin of its recording.
         to_s: end of its recording.
         partial: why a part is missing; "" if none is.
-        checkpoints: state of each node at the begin, by file name; in the recording once it is
-            written.
+        checkpoints: state of each node at the begin, by file name.
     """
 
     name: str
@@ -130,8 +131,7 @@ def describe(folder: Path, incident: Incident) -> None:
 def incidents_in(folder: Path) -> list[tuple[Incident, Path]]:
     """Return the incidents of a system, oldest first, each with the path of its recording.
 
-    The recording of an incident that is not over does not exist yet. Damaged descriptions are left
-    out.
+    Only version 1.0 has left recordings there. Damaged descriptions are left out.
     """
     found = []
     for path in sorted(folder.glob("*/*.json"), key=lambda path: path.name):
@@ -142,8 +142,8 @@ def incidents_in(folder: Path) -> list[tuple[Incident, Path]]:
     return found
 
 
-def write_head(folder: Path, documents: Documents) -> None:
-    """Write the description of a run.
+def begin(folder: Path, documents: Documents) -> None:
+    """Write the description of a run, or of a further part of it.
 
     Raises:
         OSError: it cannot be written.
@@ -154,28 +154,67 @@ def write_head(folder: Path, documents: Documents) -> None:
     with path.open("rb") as file:
         os.fsync(file.fileno())
     path.replace(folder / HEAD)
+    (folder / ENDED).unlink(missing_ok=True)
 
 
-def record(folder: Path, incident: Incident) -> None:
-    """Write the recording and the final description of an incident.
+def end(folder: Path) -> None:
+    """Mark a run as ended in order.
+
+    Raises:
+        OSError: the mark cannot be written.
+    """
+    (folder / ENDED).touch()
+
+
+def settle(folder: Path, living: Collection[str] = ()) -> None:
+    """Describe the end of each run of a system that was cut off; remove runs without incidents.
+
+    A folder that cannot be written is left as it is.
 
     Args:
-        folder: folder of its run.
-        incident: its description.
+        folder: folder of the system.
+        living: ids of runs that live although their folder may be unlocked.
+    """
+    for run in (path.parent for path in sorted(folder.glob(f"*/{HEAD}"))):
+        with contextlib.suppress(OSError, BagError), _free(run, living) as is_free:
+            if not is_free:
+                continue
+            if not (run / ENDED).exists():
+                _describe_end(run)
+                end(run)
+            if next(run.glob("*.json"), None) is None:
+                shutil.rmtree(run, ignore_errors=True)
+
+
+def _describe_end(run: Path) -> None:
+    """Describe the last seconds of a run as an incident, unless they belong to one.
 
     Raises:
         BagError: the description of the run cannot be read.
-        OSError: the recording cannot be written.
+        OSError: the description cannot be written.
     """
-    path = folder / f"~{incident.name}.mcap"
-    try:
-        done = write_recording(folder, incident, path)
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-        path.replace(folder / f"{incident.name}.mcap")
-    finally:
-        path.unlink(missing_ok=True)
-    describe(folder, done)
+    span = ring.span_of(run)
+    if span.last_s < span.first_s:
+        return
+    known = _of_run(run)
+    for incident in known:
+        if incident.to_s > span.last_s + SLACK_S:
+            describe(run, msgspec.structs.replace(
+                incident, to_s=span.last_s, partial="the run was cut off"))
+    if any(incident.to_s >= span.last_s for incident in known):
+        return
+    system = recorded_system(Summary(BagReader(run / HEAD)).files)[1].system
+    from_s = max(span.first_s, span.last_s - (system.black_box or BlackBox()).before_s)
+    at = ring.segments(run)[-1].stat().st_mtime
+    describe(run, Incident(
+        name=name_at(at), system=run.parent.name, run=run.name, at=iso(at),
+        cause="the run was cut off", at_s=span.last_s, to_s=span.last_s,
+        from_s=max([from_s, *(i.to_s for i in known if i.from_s <= from_s)])))
+
+
+def is_over(folder: Path, incident: Incident) -> bool:
+    """Return whether the black box has all messages of an incident, in the folder of its run."""
+    return (folder / ENDED).exists() or ring.span_of(folder).last_s > incident.to_s
 
 
 def write_recording(folder: Path, incident: Incident, path: Path) -> Incident:
@@ -208,50 +247,6 @@ def write_recording(folder: Path, incident: Incident, path: Path) -> Incident:
     return done
 
 
-def recover(folder: Path, living: Collection[str] = ()) -> None:
-    """Write the incidents of the runs of a system that were cut off.
-
-    A folder that cannot be written is left as it is.
-
-    Args:
-        folder: folder of the system.
-        living: ids of runs that live although their folder may be unlocked.
-    """
-    for run in _runs(folder):
-        descriptor = None
-        with contextlib.suppress(OSError, BagError):
-            if run.name in living or (descriptor := lock(run)) is None:
-                continue
-            _recover_run(folder.name, run)
-        if descriptor is not None:
-            os.close(descriptor)
-
-
-def _recover_run(name: str, run: Path) -> None:
-    ends = ring.ends(run)
-    system = recorded_system(Summary(BagReader(run / HEAD)).files)[1].system
-    before_s = (system.black_box or BlackBox()).before_s
-    known = [incident for incident, _ in incidents_in(run.parent) if incident.run == run.name]
-    if ends is not None:
-        from_s, to_s = max(ends[0], ends[1] - before_s), ends[1]
-        if not any(incident.to_s >= to_s for incident in known):
-            from_s = max([from_s, *(i.to_s for i in known if i.from_s <= from_s)])
-            last = ring.segments(run)[-1].stat().st_mtime
-            incident = Incident(
-                name=name_at(last), system=name, run=run.name,
-                at=iso(last),
-                cause="the run was cut off", at_s=to_s, from_s=from_s, to_s=to_s)
-            describe(run, incident)
-            known.append(incident)
-    for incident in known:
-        if not (run / f"{incident.name}.mcap").exists() and ends is not None:
-            record(run, msgspec.structs.replace(
-                incident, partial=incident.partial or (
-                    "the run was cut off" if incident.to_s > ends[1] + SLACK_S else "")))
-    for path in (*ring.segments(run), *run.glob("~*"), *run.glob(".tmp*")):
-        path.unlink(missing_ok=True)
-
-
 def size(folder: Path) -> int:
     """Return the bytes of all runs of a system."""
     found = 0
@@ -261,32 +256,52 @@ def size(folder: Path) -> int:
     return found
 
 
-def drop_oldest(folder: Path, keep: Collection[str]) -> bool:
-    """Delete the oldest incident of a system, except some; return whether there was one.
+def drop_oldest(folder: Path, keep: Incident | None) -> bool:
+    """Delete the oldest incident of a system, except one; return whether there was one.
 
     Args:
         folder: folder of the system.
-        keep: names of incidents that stay.
+        keep: the incident that stays.
     """
     for incident, path in incidents_in(folder):
-        if incident.name not in keep:
-            path.unlink(missing_ok=True)
-            path.with_suffix(".json").unlink(missing_ok=True)
-            return True
+        if keep is not None and incident.name == keep.name:
+            continue
+        path.unlink(missing_ok=True)
+        path.with_suffix(".json").unlink(missing_ok=True)
+        with contextlib.suppress(OSError), _free(path.parent, ()) as is_free:
+            if is_free:
+                keep_needed(Ring(path.parent), path.parent)
+        return True
     return False
 
 
-def remove_empty(folder: Path) -> None:
-    """Remove the folders of ended runs that have no incident."""
-    for run in _runs(folder):
-        with contextlib.suppress(OSError):
-            if next(run.glob("*.json"), None) is None and (descriptor := lock(run)) is not None:
-                shutil.rmtree(run, ignore_errors=True)
-                os.close(descriptor)
+def keep_needed(kept: Ring, run: Path, from_s: float = math.inf) -> None:
+    """Delete the segments of a run that no incident needs.
+
+    Args:
+        kept: ring of the run.
+        run: its folder.
+        from_s: simulated time from which all segments stay.
+    """
+    needed = [Span(incident.from_s, incident.to_s) for incident in _of_run(run)]
+    needed.append(Span(from_s, math.inf))
+    kept.keep(lambda span: any(
+        span.first_s <= one.last_s and one.first_s <= span.last_s for one in needed))
 
 
-def _runs(folder: Path) -> Iterator[Path]:
-    return (path.parent for path in sorted(folder.glob(f"*/{HEAD}")))
+def _of_run(run: Path) -> list[Incident]:
+    return [incident for incident, _ in incidents_in(run.parent) if incident.run == run.name]
+
+
+@contextlib.contextmanager
+def _free(run: Path, living: Collection[str]) -> Iterator[bool]:
+    """Lock the folder of a run while no black box uses it; yield whether it is locked here."""
+    descriptor = None if run.name in living else lock(run)
+    try:
+        yield descriptor is not None
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
 
 
 def _documents(folder: Path, checkpoints: dict[str, bytes]) -> tuple[Documents, Views]:

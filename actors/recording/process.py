@@ -24,7 +24,8 @@ from rampart.actors.bus.zenoh_session import Credentials, credentials_in
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.black_box import BlackBox
 from rampart.actors.recording.other_hosts import OtherHosts
-from rampart.actors.recording.recorder import RUN_ENDED, Recorder
+from rampart.actors.recording.recorder import Recorder
+from rampart.actors.recording.run_listener import RUN_ENDED, RunListener
 from rampart.actors.runtime.run_plan import OBSERVER
 from rampart.files import streams, working_folder
 from rampart.manager.spec.tables import BlackBox as Limits
@@ -195,12 +196,12 @@ def record(order: Order) -> int:
             streams.complain(str(error))
         _answer(f"error: {error}")
         return 1
-    if recorder.writer is not None and order.black_box is None:
+    if isinstance(recorder, Recorder) and recorder.files:
         streams.complain(result_of(recorder))
     return 0
 
 
-def _recorder(order: Order, path: Path) -> Recorder:
+def _recorder(order: Order, path: Path) -> RunListener:
     if order.black_box is None:
         return Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher,
                         others=order.others, credentials=_launchers)

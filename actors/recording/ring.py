@@ -1,40 +1,46 @@
 """The last messages of a run, in files that a killed process and a loss of power leave readable.
 
 A ring is a folder of segments. A segment is a sequence of blocks, each with its length, checksum,
-and the times of its first and last message. `sync` writes one block and waits for the disk, so a
-loss of power costs the messages since the last `sync`. Messages are kept as they were sent, which
-is several times cheaper than to decode them for a recording.
+the times of its first and last message, and the clock that gives them. `sync` writes one block and
+waits for the disk, so a loss of power costs the messages since the last `sync`. Messages are kept
+in the frames in which nodes hand them over, which costs little processor time; `read` parses them.
 """
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import struct
 import zlib
-from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import lz4.frame
 
-from rampart.actors.bus.recorder_connection import frame, parse_frame
+from rampart.actors.bus.recorder_connection import parse_frame
 
 SEGMENT_S = 10.0
 """Simulated seconds of a segment."""
 
-_HEAD = struct.Struct("<IIdd")
+_HEAD = struct.Struct("<IIdddd")
 _LENGTH = struct.Struct("<I")
 _SUFFIX = ".ring"
 _LARGEST_BYTES = 64 << 20
 """Largest block that is read, compressed or not."""
 
 
-class Segment(NamedTuple):
-    """A file of a ring, and the time of its last message, simulated seconds."""
+class Span(NamedTuple):
+    """Times of the first and last message, simulated seconds; reversed if there is none."""
 
-    path: Path
-    last_s: float
+    first_s: float = math.inf
+    last_s: float = -math.inf
+
+    def with_all(self, others: Iterator[Span]) -> Span:
+        """Return the span that includes others."""
+        spans = (self, *others)
+        return Span(min(span.first_s for span in spans), max(span.last_s for span in spans))
 
 
 class Ring:
@@ -43,27 +49,28 @@ class Ring:
     Args:
         folder: existing folder.
         segment_bytes: size at which a segment ends before its time.
+        origin_s: start of simulated time, monotonic seconds.
+        rate: simulated seconds per real second.
 
     Raises:
         OSError: the folder cannot be read.
     """
 
-    def __init__(self, folder: Path, segment_bytes: int) -> None:
+    def __init__(self, folder: Path, segment_bytes: int = 0, origin_s: float = 0.0,
+                 rate: float = 1.0) -> None:
         self._folder = folder
         self._segment_bytes = segment_bytes
-        self._segments: deque[Segment] = deque(
-            Segment(path, max((last_s for _, last_s, _ in _blocks(path)), default=-1e9))
-            for path in segments(folder))
+        self._clock = origin_s, rate
+        self._spans = {path: _span(path) for path in segments(folder)}
         self._file: BinaryIO | None = None
-        self._first_s = 0.0
+        self._path = folder
         self._waiting = bytearray()
-        self._times: list[float] = []
+        self._now = Span()
 
-    def add(self, at_s: float, key: str, payload: bytes) -> None:
-        """Add a message that was sent at a simulated time."""
-        data = frame(at_s, key, payload)
-        self._waiting += _LENGTH.pack(len(data)) + data
-        self._times.append(at_s)
+    def add(self, at_s: float, frame: bytes) -> None:
+        """Add the frame of a message that was sent at a simulated time."""
+        self._waiting += _LENGTH.pack(len(frame)) + frame
+        self._now = Span(min(self._now.first_s, at_s), max(self._now.last_s, at_s))
         if len(self._waiting) > self._segment_bytes:
             self.sync()
 
@@ -73,36 +80,36 @@ class Ring:
         Raises:
             OSError: they cannot be written.
         """
-        if not self._times:
+        if not self._waiting:
             return
-        first_s, last_s = min(self._times), max(self._times)
-        packed = lz4.frame.compress(bytes(self._waiting))
+        packed = lz4.frame.compress(self._waiting)
         self._waiting.clear()
-        self._times.clear()
+        now, self._now = self._now, Span()
         if self._file is None:
-            number = int(self._segments[-1].path.stem) + 1 if self._segments else 1
-            path = self._folder / f"{number:010d}{_SUFFIX}"
-            self._file, self._first_s = path.open("xb"), first_s
-            self._segments.append(Segment(path, last_s))
+            number = int(max(self._spans).stem) + 1 if self._spans else 1
+            self._path = self._folder / f"{number:010d}{_SUFFIX}"
+            self._file = self._path.open("xb")
+            self._spans[self._path] = now
             _sync_folder(self._folder)
-        self._file.write(_HEAD.pack(len(packed), zlib.crc32(packed), first_s, last_s) + packed)
+        self._file.write(_HEAD.pack(len(packed), zlib.crc32(packed), *now, *self._clock) + packed)
         self._file.flush()
         os.fdatasync(self._file.fileno())
-        self._segments[-1] = self._segments[-1]._replace(last_s=last_s)
-        if last_s - self._first_s >= SEGMENT_S or self._file.tell() > self._segment_bytes:
+        span = self._spans[self._path] = now.with_all(iter([self._spans[self._path]]))
+        if span.last_s - span.first_s >= SEGMENT_S or self._file.tell() > self._segment_bytes:
             self.close()
 
-    def drop(self, before_s: float) -> None:
-        """Delete the segments whose messages are all before a time."""
-        while self._segments and self._segments[0].last_s < before_s and (
-                len(self._segments) > 1 or self._file is None):
-            self._segments.popleft().path.unlink(missing_ok=True)
+    def keep(self, wanted: Callable[[Span], bool]) -> None:
+        """Delete the segments that are not wanted, except the one that is being written."""
+        for path, span in list(self._spans.items()):
+            if not wanted(span) and (self._file is None or path != self._path):
+                self._delete(path)
 
     def drop_oldest(self) -> bool:
         """Delete the oldest segment that is not being written; return whether there was one."""
-        if len(self._segments) < (2 if self._file else 1):
+        path = min(self._spans, default=None)
+        if path is None or (self._file is not None and path == self._path):
             return False
-        self._segments.popleft().path.unlink(missing_ok=True)
+        self._delete(path)
         return True
 
     def close(self) -> None:
@@ -111,47 +118,63 @@ class Ring:
             self._file.close()
             self._file = None
 
+    def _delete(self, path: Path) -> None:
+        path.unlink(missing_ok=True)
+        del self._spans[path]
+
 
 def segments(folder: Path) -> list[Path]:
     """Return the segments of a ring, oldest first."""
     return sorted(path for path in folder.glob(f"*{_SUFFIX}") if path.stem.isdecimal())
 
 
-def ends(folder: Path) -> tuple[float, float] | None:
-    """Return the times of the first and last message, simulated seconds; None of an empty ring."""
-    times = [(first_s, last_s) for path in segments(folder) for first_s, last_s, _ in _blocks(path)]
-    return (min(first for first, _ in times), max(last for _, last in times)) if times else None
+def span_of(folder: Path) -> Span:
+    """Return the times of the first and last message of a ring."""
+    return Span().with_all(map(_span, segments(folder)))
 
 
 def read(folder: Path, from_s: float, to_s: float) -> Iterator[tuple[float, str, bytes]]:
-    """Yield time, key and payload of the messages within a time; damaged blocks are left out."""
+    """Yield time, key and payload of the messages within a time; damaged blocks are left out.
+
+    The messages of a block are in the order of their times.
+    """
     for path in segments(folder):
-        for first_s, last_s, packed in _blocks(path):
-            if last_s < from_s or first_s > to_s:
+        for span, (origin_s, rate), packed in _blocks(path):
+            if span.last_s < from_s or span.first_s > to_s:
                 continue
-            try:
-                data = memoryview(lz4.frame.decompress(packed))
-            except RuntimeError:
-                continue
-            at = 0
-            while at + _LENGTH.size <= len(data):
-                [length] = _LENGTH.unpack_from(data, at)
-                at += _LENGTH.size + length
-                found = parse_frame(data[at - length:at])
-                if from_s <= found[0] <= to_s:
-                    yield found
+            messages = [((sent_s - origin_s) * rate, key, payload)
+                        for sent_s, key, payload in _frames(packed)]
+            messages.sort(key=lambda message: message[0])
+            yield from (message for message in messages if from_s <= message[0] <= to_s)
 
 
-def _blocks(path: Path) -> Iterator[tuple[float, float, bytes]]:
-    """Yield the times and the content of each sound block, up to the first that is cut off."""
+def _frames(packed: bytes) -> Iterator[tuple[float, str, bytes]]:
+    try:
+        data = memoryview(lz4.frame.decompress(packed))
+    except RuntimeError:
+        return
+    at = 0
+    while at + _LENGTH.size <= len(data):
+        [length] = _LENGTH.unpack_from(data, at)
+        at += _LENGTH.size + length
+        with contextlib.suppress(ValueError):  # not from a node
+            yield parse_frame(data[at - length:at])
+
+
+def _span(path: Path) -> Span:
+    return Span().with_all(span for span, _, _ in _blocks(path))
+
+
+def _blocks(path: Path) -> Iterator[tuple[Span, tuple[float, float], bytes]]:
+    """Yield span, clock and content of each sound block, up to the first that is cut off."""
     with path.open("rb") as file:
         while len(head := file.read(_HEAD.size)) == _HEAD.size:
-            length, checksum, first_s, last_s = _HEAD.unpack(head)
+            length, checksum, first_s, last_s, origin_s, rate = _HEAD.unpack(head)
             packed = file.read(min(length, _LARGEST_BYTES))
             if len(packed) != length:
                 return
             if zlib.crc32(packed) == checksum:
-                yield first_s, last_s, packed
+                yield Span(first_s, last_s), (origin_s, rate), packed
 
 
 def _sync_folder(folder: Path) -> None:

@@ -54,15 +54,16 @@ _NAME = option("name", metavar="NAME", nargs="?", completer=names,
 
 
 class Kept(NamedTuple):
-    """An incident, and its recording; the file is missing while the incident is not over."""
+    """An incident, and the path of its recording, which may not exist."""
 
     incident: Incident
     path: Path
 
     @property
     def state(self) -> str:
-        """Whether its recording is whole."""
-        return self.incident.partial or ("" if self.path.exists() else "not over yet")
+        """Whether it is whole."""
+        return self.incident.partial or (
+            "" if incidents.is_over(self.path.parent, self.incident) else "not over yet")
 
 
 def add(verbs: Any) -> None:
@@ -276,18 +277,18 @@ def _folders(system: str | None) -> list[Path]:
 
 
 def _kept(system: str | None) -> list[Kept]:
-    """Return all incidents, oldest first, after those of runs that were cut off are written."""
+    """Return all incidents, oldest first, also of runs that were cut off."""
     living = {run.run_id for run in find_runs()}
     found = []
     for folder in _folders(system):
-        incidents.recover(folder, living)
+        incidents.settle(folder, living)
         found += [Kept(*one) for one in incidents_in(folder)]
     return sorted(found, key=lambda kept: kept.incident.name)
 
 
 @contextlib.contextmanager
 def _recording(name: str | None) -> Iterator[Kept]:
-    """Yield an incident with its recording; if it is not over, with a temporary one.
+    """Yield an incident with its recording in a temporary file.
 
     Raises:
         UsageError: it is not known, or cannot be read.
@@ -300,7 +301,7 @@ def _recording(name: str | None) -> Iterator[Kept]:
         raise UsageError(f"{name}: {len(found)} incidents begin so, from "
                          f"{found[0].incident.name} to {found[-1].incident.name}")
     kept = found[-1]
-    if kept.path.exists():
+    if kept.path.exists():  # of version 1.0
         yield kept
         return
     with tempfile.TemporaryDirectory(prefix="rampart-incident-") as folder:

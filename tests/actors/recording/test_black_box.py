@@ -11,10 +11,11 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from rampart.actors.bus.envelope import Header, encode
-from rampart.actors.bus.recorder_connection import RecorderConnection
+from rampart.actors.bus.recorder_connection import RecorderConnection, frame
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.recording import incidents, ring
@@ -23,6 +24,7 @@ from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.black_box import BlackBoxWriter
 from rampart.actors.recording.incidents import incidents_in
 from rampart.actors.recording.process import Order, RecorderProcess
+from rampart.actors.recording.run_documents import SYSTEM
 from rampart.manager.spec.tables import BlackBox as Limits
 from rampart.testing import free_base_port, wait_until
 from tests.actors.recording.samples import AnsweringLauncher, documents, pose
@@ -47,16 +49,24 @@ class Box:
         self.folder = folder / "paper"
         self.now = 1_800_000_000.0
         self.sent = 0
-        self.writer = BlackBoxWriter(self.folder, documents(run_id=run), limits, again=again,
+        described = documents(run_id=run)
+        table = f"\n[black_box]\nbefore_s = {limits.before_s}\n".encode()
+        described = msgspec.structs.replace(described, files=tuple(
+            (name, media, data + (table if name == SYSTEM else b""))
+            for name, media, data in described.files))
+        self.writer = BlackBoxWriter(self.folder, described, limits, again=again,
                                      checkpoints=checkpoints, wall=lambda: self.now)
+
+    def take(self, *message):
+        self.writer.take(frame(*message))
 
     def second(self, at_s, *messages, poses=20):
         self.now += 1
         for i in range(poses):
             self.sent += 1
-            self.writer.take(*pose(self.sent, at_s + i / poses))
+            self.take(*pose(self.sent, at_s + i / poses))
         for message in messages:
-            self.writer.take(*message)
+            self.take(*message)
         self.writer.flush()
 
     def seconds(self, from_s, to_s):
@@ -65,7 +75,14 @@ class Box:
 
     @property
     def kept(self):
-        return [(i, path) for i, path in incidents_in(self.folder) if path.exists()]
+        """The incidents that are over, as a tool lists them, each with a recording."""
+        incidents.settle(self.folder)
+        found = []
+        for incident, path in incidents_in(self.folder):
+            if incidents.is_over(path.parent, incident):
+                out = self.folder.parent / path.name
+                found.append((incidents.write_recording(path.parent, incident, out), out))
+        return found
 
 
 @pytest.fixture
@@ -127,9 +144,8 @@ def test_a_healthy_run_and_the_end_of_a_fault_leave_nothing(box):
 def test_a_failed_process_is_an_incident_without_any_decision(box):
     box.second(5.0, crash(5.5))
     box.writer.close()
-    [(incident, path)] = box.kept
+    [(incident, _path)] = box.kept
     assert incident.cause == "localization crashed, incarnation 1"
-    assert not ring.segments(path.parent)
 
 
 def test_overlapping_incidents_are_one_file(box):
@@ -146,26 +162,24 @@ def test_overlapping_incidents_are_one_file(box):
     assert [i.at_s for i, _ in box.kept] == [30.0, 100.0]
 
 
-def test_a_thousand_decisions_in_a_row_are_bounded_in_length_and_size(tmp_path):
-    limits = Limits(before_s=20, after_s=5, limit_mb=1)
-    box = Box(tmp_path, limits)
+def test_decisions_in_a_row_are_bounded_in_length_and_size(tmp_path):
+    box = Box(tmp_path, Limits(before_s=20, after_s=5, limit_mb=1))
     most = 0
-    for number in range(1000):
-        box.second(float(number), decision(number + 1, number + 0.5), poses=8)
-        if number % 50 == 0:
-            most = max(most, size(box.folder))
+    for at_s in range(0, 1000, 5):
+        box.second(float(at_s), decision(at_s + 1, at_s + 0.5), poses=200)
+        most = max(most, size(box.folder))
     box.writer.close()
-    assert len(box.kept) >= 3
-    assert all(i.to_s - i.from_s <= 31 for i, _ in box.kept)
-    ends = [(i.from_s, i.to_s) for i, _ in box.kept]
-    assert all(b[0] - a[1] < 1.0 for a, b in pairwise(ends))  # no gap
-    assert max(most, size(box.folder)) < 1.3e6  # the limit, and what one second adds
+    spans = [(i.from_s, i.to_s) for i, _ in incidents_in(box.folder)]
+    assert 3 <= len(spans) < 30
+    assert all(to_s - from_s <= 36 for from_s, to_s in spans)
+    assert all(b[0] - a[1] < 1.0 for a, b in pairwise(spans))  # no gap
+    assert max(most, size(box.folder)) < 1.3e6  # the limit, and what one turn adds
 
 
 def test_a_limit_below_the_size_of_an_incident_keeps_its_newest_part(tmp_path):
     box = Box(tmp_path, Limits(before_s=600, after_s=5, limit_mb=0.6))
-    for at_s in range(400):
-        box.second(float(at_s), poses=100)
+    for at_s in range(0, 400, 10):
+        box.second(float(at_s), poses=1000)
         assert size(box.folder) < 0.8e6
     box.second(400.0, decision(1, 400.0))
     box.seconds(401, 405)
@@ -181,22 +195,20 @@ def test_after_a_kill_of_everything_the_last_second_is_readable(tmp_path):
     box.seconds(0, 50)
     box.second(50.0, decision(1, 50.5))
     box.second(51.0)
-    box.writer.take(*pose(999, 52.0))  # was not synced
+    box.take(*pose(999, 52.0))  # was not synced
     box.writer.abandon()  # the kernel closes files and lock of a killed process
-    incidents.recover(box.folder)
+    incidents.settle(box.folder)
     [(incident, path)] = box.kept
     assert times(path)[-1] == pytest.approx(51.95, abs=0.01)
-    assert incident.partial == "the run was cut off, the ring ended earlier"
-    assert not ring.segments(path.parent)
-    incidents.recover(box.folder)  # twice is once
+    assert incident.partial == "the run was cut off"
+    incidents.settle(box.folder)  # twice is once
     assert len(box.kept) == 1
 
 
 def test_an_incident_that_the_death_of_the_launcher_cuts_off_is_marked(box):
     box.seconds(0, 30)
     box.second(30.0, decision(1, 30.5))
-    box.writer.is_cut_off = True
-    box.writer.close()
+    box.writer.close(is_cut_off=True)
     assert [(i.at_s, i.partial) for i, _ in box.kept] == [(30.5, "the run was cut off")]
 
 
@@ -204,7 +216,7 @@ def test_a_run_that_is_cut_off_without_a_fault_leaves_its_last_seconds(tmp_path)
     box = Box(tmp_path, Limits())
     box.seconds(0, 100)
     box.writer.abandon()
-    incidents.recover(box.folder)
+    incidents.settle(box.folder)
     [(incident, path)] = box.kept
     assert incident.cause == "the run was cut off"
     assert (times(path)[0], times(path)[-1]) == (
@@ -245,7 +257,7 @@ def test_two_runs_at_a_time_keep_their_incidents_apart(tmp_path):
     one, other = Box(tmp_path), Box(tmp_path, run="other")
     one.second(0.0, decision(1, 0.5))
     other.second(0.0, crash(0.5))
-    incidents.recover(one.folder)  # both live: their rings stay
+    incidents.settle(one.folder)  # both live: their rings stay
     assert ring.segments(one.folder / "sample")
     assert ring.segments(one.folder / "other")
     one.seconds(1, 30)
@@ -291,8 +303,8 @@ def test_a_wall_clock_that_jumps_back_disorders_nothing(box):
 
 def test_a_flood_of_garbage_on_watched_keys_begins_nothing(box):
     for number in range(100):
-        box.writer.take(0.5, ftm_topics.DECISION.at(), b"\xc1 garbage")
-        box.writer.take(0.5, ftm_topics.DETECTION.at(f"DM{number}"), b"")
+        box.take(0.5, ftm_topics.DECISION.at(), b"\xc1 garbage")
+        box.take(0.5, ftm_topics.DETECTION.at(f"DM{number}"), b"")
     box.second(1.0)
     box.writer.close()
     assert incidents_in(box.folder) == []
@@ -360,6 +372,12 @@ def kept(run):
     return [i for i, path in incidents_in(run.folder)]
 
 
+def recorded(run, incident):
+    path = run.folder / f"{incident.name}.mcap"
+    incidents.write_recording(run.folder / "sample", incident, path)
+    return Summary(BagReader(path))
+
+
 def test_a_killed_black_box_is_back_and_the_incident_goes_on(run, monkeypatch):
     monkeypatch.setattr("rampart.actors.recording.process._AGAIN_S", 0.0)
 
@@ -385,8 +403,7 @@ def test_a_killed_black_box_is_back_and_the_incident_goes_on(run, monkeypatch):
     run.box.end()
     [incident] = kept(run)
     assert incident.to_s > incident.at_s
-    assert not ring.segments(run.folder / "sample")
-    assert Summary(BagReader(run.folder / "sample" / f"{incident.name}.mcap")).messages > 5
+    assert recorded(run, incident).messages > 5
 
 
 def test_a_recording_and_a_black_box_run_side_by_side(run, tmp_path):
@@ -401,7 +418,7 @@ def test_a_recording_and_a_black_box_run_side_by_side(run, tmp_path):
     assert recorder.problem() == run.box.problem() == ""
     assert Summary(BagReader(tmp_path / "run.mcap")).keys[ftm_topics.DECISION.at()] == 1
     [incident] = kept(run)
-    found = Summary(BagReader(run.folder / "sample" / f"{incident.name}.mcap"))
+    found = recorded(run, incident)
     assert found.keys[ftm_topics.DECISION.at()] == 1
 
 
@@ -409,8 +426,7 @@ def test_the_death_of_the_launcher_keeps_the_last_seconds(run):
     wait_until(lambda: (run.send(), time.sleep(0.05), ring.segments(run.folder / "sample"))[-1],
                30, "the black box does not begin")
     run.process.kill()
-    wait_until(lambda: [i for i, path in incidents_in(run.folder) if path.exists()], 20,
-               "nothing is kept")
+    wait_until(lambda: kept(run), 20, "nothing is kept")
     assert [i.cause for i in kept(run)] == ["the run was cut off"]
 
 

@@ -27,7 +27,8 @@ from rampart.actors.recording.other_hosts import (
     distinct,
     others_of,
 )
-from rampart.actors.recording.recorder import RUN_ENDED, Recorder
+from rampart.actors.recording.recorder import Recorder
+from rampart.actors.recording.run_listener import RUN_ENDED
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
 from rampart.testing import free_base_port, wait_until

@@ -30,7 +30,8 @@ from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of
 from rampart.actors.recording.process import Order, RecorderProcess, result_of
-from rampart.actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
+from rampart.actors.recording.recorder import Recorder
+from rampart.actors.recording.run_listener import FLUSH_S, PERIOD_S
 from rampart.cli.main import main
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port, wait_until
 from tests import ROOT
@@ -318,7 +319,7 @@ def test_a_recorder_that_dies_is_noticed_and_one_that_ends_in_order_is_no_proble
 def test_a_recording_that_becomes_large_goes_on_in_another_file(
         port, launcher, tmp_path, monkeypatch):
     monkeypatch.setattr("rampart.actors.recording.recorder.FILE_BYTES", 30_000)
-    monkeypatch.setattr("rampart.actors.recording.recorder.FLUSH_S", 0.05)
+    monkeypatch.setattr("rampart.actors.recording.recorder.Recorder.flush_s", 0.05)
     recorder = Recorder(port, tmp_path / "run.mcap", launcher=launcher.pid)
     recorder.open()
     read_end, write_end = os.pipe()
