@@ -95,8 +95,11 @@ class Run:
             page=audited(plan.page, kept / f"audit-{plan.run_id}.jsonl"))
         if options.black_box and spec.hosts:
             raise UsageError("--black-box: not on several hosts; use --record")
-        if (options.black_box or spec.black_box) and not (options.virtual or spec.hosts):
-            plan = msgspec.structs.replace(plan, black_box=str(state_folder(spec.name)))
+        if options.black_box is not False and not (options.virtual or spec.hosts):
+            try:
+                plan = msgspec.structs.replace(plan, black_box=str(state_folder(spec.name)))
+            except BagError as error:
+                _say(f"black box: {error}")
         self._kind, self._context = kind, replace(run, plan=plan)
         self._trial = self._made(plan, sys.stderr)
         self._plan = plan

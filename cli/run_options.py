@@ -100,8 +100,9 @@ _OPTIONS = (
     number("--duration", "S", "simulated seconds after which a system without a mission ends "
            "(default: that of [end], else on interruption)"),
     word("--record", "FILE", "record all messages to an MCAP file"),
-    flag("--black-box", "keep the time around faults, see `rampart incident`; [black_box] of the "
-         "specification does the same"),
+    option("--black-box", action=argparse.BooleanOptionalAction, default=None,
+           help="keep the time around faults, see `rampart incident` (default: yes, except in "
+           "virtual time and on several hosts)"),
     flag("--overwrite", "let --record replace an existing file"),
     flag("--no-keys", "run on several hosts without --keys: every client on the network has "
          "full control"),

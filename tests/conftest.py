@@ -94,6 +94,14 @@ def pytest_configure(config):
     config.pluginmanager.register(LastLine())
 
 
+@pytest.fixture(autouse=True, scope="session")
+def own_state(tmp_path_factory):
+    """The black boxes of tests write to a temporary folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def own_path():
     """What a test has admitted to the path of imports, as its working folder, ends with it."""

@@ -80,9 +80,18 @@ class Incident(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def state_folder(system: str) -> Path:
-    """Return the folder of a system's incidents and history; it may not exist."""
+    """Return the folder of a system's incidents and history; it may not exist.
+
+    Raises:
+        BagError: the user has no home directory.
+    """
     home = os.environ.get("XDG_STATE_HOME", "")
-    return Path(home if home.startswith("/") else Path.home() / ".local/state", "rampart", system)
+    try:
+        state = Path(home) if home.startswith("/") else Path.home() / ".local/state"
+    except RuntimeError:
+        raise BagError("this user has no home directory; expected a folder in XDG_STATE_HOME"
+                       ) from None
+    return state / "rampart" / system
 
 
 def name_at(wall_s: float) -> str:

@@ -120,6 +120,8 @@ class RecorderProcess:
              msgspec.json.encode(self._order).decode()],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
             env=working_folder.environment())
+        if self._order.black_box is not None:
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)
         assert self._process.stdout is not None  # noqa: S101 for the type checker
         if self._order.black_box is not None:
             return
@@ -205,7 +207,6 @@ def _recorder(order: Order, path: Path) -> RunListener:
     if order.black_box is None:
         return Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher,
                         others=order.others, credentials=_launchers)
-    os.nice(_NICE)
     return BlackBox(order.port, path, order.black_box, launcher=order.launcher, again=order.again,
                     checkpoints=Path(order.checkpoints) if order.checkpoints else None)
 

@@ -266,7 +266,7 @@ def _folders(system: str | None) -> list[Path]:
     """Return the folders of the systems, or of one.
 
     Raises:
-        UsageError: the system has none.
+        UsageError: the system has none, or the user no home directory.
     """
     found = {path.name: path for path in sorted(state_folder("").glob("*")) if path.is_dir()}
     if system is None:

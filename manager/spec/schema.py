@@ -246,7 +246,7 @@ class SystemSpec(Table, frozen=True):
             none.
         order: Name of an order of the recoveries, or several; each decides what those before it
             leave open. The first defines which recovery is safer.
-        black_box: What a black box keeps around faults; None for no black box.
+        black_box: What the black box keeps around faults; None for the defaults.
         panels: Additional panels of the operator's page (`rampart.actors.operator`).
         ros2: Links to ROS 2 (`rampart.actors.ros2`).
     """

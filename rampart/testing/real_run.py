@@ -24,7 +24,8 @@ HEEDS_SIGNALS = ("env", "--default-signal=HUP,INT")
 class RealRun:
     """A run on real processes with a free base port; a context manager.
 
-    The exit ends the run and checks that no process of it is left.
+    The exit ends the run and checks that no process of it is left. There is no black box, unless
+    the arguments contain `--black-box`.
 
     Args:
         directory: Existing folder for output and report. It is the run's working directory, so
@@ -47,7 +48,8 @@ class RealRun:
         self._stdout = directory / "stdout.txt"
         self._command = [
             *self.command, "--system", str(system), "--json", "--port", str(self.port),
-            "--report", str(directory / "report"), *([] if hmi else ["--no-hmi"]), *arguments]
+            "--report", str(directory / "report"), "--no-black-box",
+            *([] if hmi else ["--no-hmi"]), *arguments]
 
     def __enter__(self) -> Self:
         with self._stdout.open("w") as out, self._stderr.open("w") as err:
