@@ -44,6 +44,7 @@ from rampart.actors.access.register import (
 )
 from rampart.actors.bus.zenoh_session import AUTHORITY, key_file
 from rampart.files.reading import FileError, read_bytes
+from rampart.files.writing import replace_file
 
 __all__ = ["check", "check_address", "days_left", "entries", "expired", "init", "issue",
            "lifetimes", "revoke", "rotate"]
@@ -88,8 +89,8 @@ def init(folder: Path, days: float = AUTHORITY_DAYS) -> None:
         if public.exists() and not own.exists():
             raise KeysError(f"{folder}: has keys that were issued elsewhere; expected a new folder")
         if not own.exists():
-            _write(own, new_authority(_now(), days))
-        _write(public, public_part(_read(own)), 0o644)
+            replace_file(own, new_authority(_now(), days))
+        replace_file(public, public_part(_read(own)), 0o644)
         if not register.exists():
             _keep(folder, Register())
 
@@ -115,7 +116,7 @@ def issue(folder: Path, names: Sequence[str], kind: Kind, addresses: Sequence[st
         common_names = register.of_kind(kind)
         _keep(folder, register)
         for name in names:
-            _write(_file(folder, name), new_certificate(
+            replace_file(_file(folder, name), new_certificate(
                 authority, common_names[name], kind, addresses=addresses, now=_now(),
                 days=DAYS[kind] if days is None else days))
 
@@ -174,7 +175,7 @@ def share(folder: Path, to: Path, names: Sequence[str]) -> None:
         raise KeysError(f"{to}: exists; expected a new folder")
     to.mkdir(mode=0o700)
     for file in (folder / AUTHORITY, folder / REGISTER, *(_file(folder, name) for name in names)):
-        _write(to / file.name, _read(file))
+        replace_file(to / file.name, _read(file))
 
 
 def entries(folder: Path) -> list[Entry]:
@@ -296,25 +297,7 @@ def _read(file: Path) -> bytes:
 
 def _keep(folder: Path, register: Register) -> None:
     text = msgspec.json.format(msgspec.json.encode(register, order="sorted"), indent=1)
-    _write(folder / REGISTER, text + b"\n", 0o644)
-
-
-def _write(file: Path, content: bytes, mode: int = 0o600) -> None:
-    """Write a file whole, or not at all."""
-    fresh = file.with_name(f".{file.name}~")
-    fresh.unlink(missing_ok=True)  # left by a process that was killed here
-    made = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
-    with os.fdopen(made, "wb") as out:
-        os.fchmod(out.fileno(), mode)
-        out.write(content)
-        out.flush()
-        os.fsync(out.fileno())
-    fresh.replace(file)
-    place = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(place)
-    finally:
-        os.close(place)
+    replace_file(folder / REGISTER, text + b"\n", 0o644)
 
 
 @contextlib.contextmanager

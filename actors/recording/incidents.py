@@ -41,6 +41,7 @@ from rampart.actors.recording.run_documents import (
 )
 from rampart.actors.recording.views import Views
 from rampart.actors.system.topics import own_topics
+from rampart.files.writing import replace_file, sync
 from rampart.manager.spec.tables import BlackBox
 
 HEAD, ENDED = "head.mcap", "ended"
@@ -125,16 +126,8 @@ def describe(folder: Path, incident: Incident) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    path = folder / f"{incident.name}.json"
-    with tempfile.NamedTemporaryFile(dir=folder, prefix=".", delete=False) as file:
-        try:
-            file.write(msgspec.json.format(msgspec.json.encode(incident)))
-            file.flush()
-            os.fsync(file.fileno())
-            Path(file.name).replace(path)
-        except BaseException:
-            Path(file.name).unlink(missing_ok=True)
-            raise
+    replace_file(folder / f"{incident.name}.json",
+                 msgspec.json.format(msgspec.json.encode(incident)))
 
 
 def incidents_in(folder: Path) -> list[tuple[Incident, Path]]:
@@ -160,8 +153,7 @@ def begin(folder: Path, documents: Documents) -> None:
     path = folder / f"~{HEAD}"
     with path.open("wb") as file:
         BagWriter(file, documents).close()
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
+    sync(path)
     path.replace(folder / HEAD)
     (folder / ENDED).unlink(missing_ok=True)
 

@@ -20,6 +20,7 @@ from typing import BinaryIO, NamedTuple
 import lz4.frame
 
 from rampart.actors.bus.recorder_connection import parse_frame
+from rampart.files.writing import sync
 
 SEGMENT_S = 10.0
 """Simulated seconds of a segment."""
@@ -90,7 +91,7 @@ class Ring:
             self._path = self._folder / f"{number:010d}{_SUFFIX}"
             self._file = self._path.open("xb")
             self._spans[self._path] = now
-            _sync_folder(self._folder)
+            sync(self._folder)
         self._file.write(_HEAD.pack(len(packed), zlib.crc32(packed), *now, *self._clock) + packed)
         self._file.flush()
         os.fdatasync(self._file.fileno())
@@ -175,11 +176,3 @@ def _blocks(path: Path) -> Iterator[tuple[Span, tuple[float, float], bytes]]:
                 return
             if zlib.crc32(packed) == checksum:
                 yield Span(first_s, last_s), (origin_s, rate), packed
-
-
-def _sync_folder(folder: Path) -> None:
-    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(opened)
-    finally:
-        os.close(opened)

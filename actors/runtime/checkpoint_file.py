@@ -34,6 +34,7 @@ from rampart.actors.runtime.checkpoint import (
     Record,
     SupersededError,
 )
+from rampart.files.writing import sync
 
 _CHECKSUM_BYTES = 16
 _LARGEST_FILE_BYTES = LARGEST_STATE_BYTES + 4096
@@ -140,11 +141,7 @@ def _place(folder: Path, node: str, age: tuple[int, int]) -> Path:
 def _confirm(folder: Path, node: str, run: str, age: tuple[int, int]) -> None:
     """Have the disk confirm a state, then remove the older ones that are no longer needed."""
     for path in (_place(folder, node, age), folder):
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        sync(path)
     kept = {record.age for record in read(folder, node, run).records}
     for other, file in files_of(folder, node).items():
         if other < age and other not in kept:

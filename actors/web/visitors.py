@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import os
 import re
-import tempfile
 from collections.abc import Callable, Iterable
 from enum import StrEnum
 from pathlib import Path
@@ -24,6 +22,7 @@ import msgspec
 
 from rampart.actors.web.access import new_token
 from rampart.actors.web.token_file import SecretError, file_state, read_private
+from rampart.files.writing import replace_file
 
 MOST = 200
 """Most visitors in a file."""
@@ -183,17 +182,7 @@ def _write(file: Path, visitors: dict[str, Visitor]) -> None:
     if len(visitors) > MOST:
         raise VisitorError(f"{len(visitors)} names; expected at most {MOST}")
     lines = "".join(f"{v.name} {v.role} {v.digest}\n" for v in visitors.values())
-    target = file.resolve()
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")  # mode 0600
-    try:
-        with os.fdopen(handle, "w", encoding="ascii") as made:
-            made.write(_HEAD + lines)
-            made.flush()
-            os.fsync(made.fileno())
-        Path(temporary).replace(target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    replace_file(file.resolve(), (_HEAD + lines).encode("ascii"))
 
 
 class Register:

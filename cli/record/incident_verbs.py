@@ -1,8 +1,8 @@
 """`rampart incident`: what the black box has kept of the time around faults.
 
 Inspect incidents: the time around each decision on a fault, each failed process,
-and the sudden end of a run. `rampart run --black-box`, or a run whose system has the
-table [black_box], keeps them in $XDG_STATE_HOME/rampart (~/.local/state/rampart).
+and the sudden end of a run. Each run on one machine keeps them, except in virtual time
+or with --no-black-box, in $XDG_STATE_HOME/rampart (~/.local/state/rampart).
 
 Examples:
   rampart incident list
@@ -158,7 +158,7 @@ async def replay_incident(options: argparse.Namespace) -> int:
 def export(options: argparse.Namespace) -> int:
     """Copy an incident.
 
-    Copy the recording of an incident: an MCAP file with all messages, and with
+    Write the recording of an incident: an MCAP file with all messages, and with
     specification, versions, options, files and checkpoints attached. It opens in
     viewers, and with `rampart bag` and `rampart replay` on any machine.
 

@@ -17,6 +17,7 @@ from typing import Any
 from markupsafe import Markup
 
 from rampart.actors.system.members import import_class
+from rampart.files.writing import replace_file
 from rampart.sim.campaign.charts import distributions
 from rampart.sim.campaign.job import trial_of_system
 from rampart.sim.campaign.named import Section
@@ -45,7 +46,6 @@ from rampart.sim.runs.report import (
     RunPictures,
     environment,
     margin_text,
-    write_atomically,
 )
 from rampart.sim.runs.trial import Trial
 from rampart.sim.runs.virtual_run import VirtualResult
@@ -93,7 +93,7 @@ def write_campaign_report(directory: Path, about: Campaign, runs: Sequence[Run],
     """
     directory.mkdir(parents=True, exist_ok=True)
     page = directory / FILE_NAME
-    write_atomically(page, render(directory, about, runs, worst).encode())
+    replace_file(page, render(directory, about, runs, worst).encode(), 0o644)
     return page
 
 

@@ -7,9 +7,7 @@ and mailed. All text from the bus is escaped.
 from __future__ import annotations
 
 import math
-import os
 import re
-import tempfile
 from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -18,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 from markupsafe import Markup
 
+from rampart.files.writing import replace_file
 from rampart.sim.runs.record import Interval, RunRecord
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ def try_report(run: RunRecord, render: Callable[[Any], str], directory: str | Pa
     def written(path: Path, content: Callable[[], bytes]) -> Path | None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(path, content())
+            replace_file(path, content(), 0o644)
         except Exception as error:  # of disk, template or chart alike: the verdict stands
             problems.setdefault(in_words(error), []).append(path.name)
             return None
@@ -98,23 +97,6 @@ def in_words(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file atomically.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            os.fchmod(file.fileno(), 0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def environment() -> jinja2.Environment:

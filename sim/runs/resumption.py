@@ -23,6 +23,7 @@ import msgspec
 
 from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.launcher import STARTUP_S
+from rampart.files.writing import replace_file
 
 MANIFEST = "run.json"
 FORMAT = 1
@@ -149,7 +150,7 @@ class RunFiles:
         """
         file = self.directory / MANIFEST
         try:
-            _write(file, msgspec.json.format(msgspec.json.encode(manifest)))
+            replace_file(file, msgspec.json.format(msgspec.json.encode(manifest)))
         except OSError as error:
             raise ResumptionError(f"{file}: cannot be written: {error.strerror}") from None
 
@@ -169,7 +170,7 @@ class RunFiles:
         if saved is None:
             (self.directory / MANIFEST).unlink(missing_ok=True)
         elif saved != self.saved():
-            _write(self.directory / MANIFEST, saved)
+            replace_file(self.directory / MANIFEST, saved)
 
     def end(self, manifest: Manifest) -> None:
         """Write the manifest of a run that has ended, and remove the copies of its record.
@@ -191,7 +192,7 @@ class RunFiles:
         newest, before = self._memories(run_id)
         with contextlib.suppress(FileNotFoundError):
             newest.replace(before)
-        _write(newest, hashlib.sha256(memory).digest() + memory)
+        replace_file(newest, hashlib.sha256(memory).digest() + memory)
 
     def recall(self, run_id: str, recall: Callable[[bytes], float]) -> tuple[float, list[str]]:
         """Load the newest undamaged copy of a run's record.
@@ -280,22 +281,3 @@ def _content(file: Path) -> bytes:
     if len(data) > _LARGEST_BYTES:
         raise OSError(0, f"more than {_LARGEST_BYTES} bytes")
     return data
-
-
-def _write(file: Path, content: bytes) -> None:
-    """Replace a file atomically and wait until it is on the disk."""
-    beside = file.with_name(f"{file.name}~")
-    try:
-        with beside.open("wb") as opened:
-            opened.write(content)
-            opened.flush()
-            os.fsync(opened.fileno())
-        beside.replace(file)
-    except OSError:
-        beside.unlink(missing_ok=True)
-        raise
-    folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
