@@ -92,14 +92,8 @@ class Run:
         kept = self._directory.resolve()
         plan = msgspec.structs.replace(
             plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"),
+            black_box=black_box_folder(options, spec),
             page=audited(plan.page, kept / f"audit-{plan.run_id}.jsonl"))
-        if options.black_box and spec.hosts:
-            raise UsageError("--black-box: not on several hosts; use --record")
-        if options.black_box is not False and not (options.virtual or spec.hosts):
-            try:
-                plan = msgspec.structs.replace(plan, black_box=str(state_folder(spec.name)))
-            except BagError as error:
-                _say(f"black box: {error}")
         self._kind, self._context = kind, replace(run, plan=plan)
         self._trial = self._made(plan, sys.stderr)
         self._plan = plan
@@ -321,6 +315,23 @@ def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
         yield recorder
     finally:
         recorder.end()
+
+
+def black_box_folder(options: argparse.Namespace, spec: SystemSpec) -> str:
+    """Return where the black box of a run writes; "" without one.
+
+    Raises:
+        UsageError: the option does not suit the run.
+    """
+    if options.black_box and spec.hosts:
+        raise UsageError("--black-box: not on several hosts; use --record")
+    if options.black_box is False or options.virtual or spec.hosts:
+        return ""
+    try:
+        return str(state_folder(spec.name))
+    except BagError as error:
+        _say(f"black box: {error}")
+        return ""
 
 
 @contextlib.contextmanager

@@ -15,8 +15,9 @@ from rampart.actors.runtime.run_plan import RunPlan
 from rampart.actors.supervision.process_title import find_processes
 from rampart.cli.main import main
 from rampart.cli.record.incident_verbs import names
-from rampart.cli.run import _black_box
+from rampart.cli.run import _black_box, black_box_folder
 from rampart.cli.run import main as run_main
+from rampart.cli.run_options import parse
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
 from tests.actors.recording.test_black_box import Box, box_pid, crash, decision
@@ -173,6 +174,26 @@ def test_virtual_time_and_several_hosts_have_none(capsys, tmp_path):
     assert run_main(["--system", str(spec), "--no-keys", "--black-box", "--report",
                      str(tmp_path)]) == 2
     assert "--black-box: not on several hosts" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("arguments", "has_one"), [
+    ([], True), (["--black-box"], True), (["--no-black-box"], False), (["--virtual"], False)])
+def test_a_real_run_on_one_machine_has_one(home, arguments, has_one):
+    options, _ = parse(["--system", str(CELL), *arguments], "launch.py")
+    folder = str(home / "paper") if has_one else ""
+    assert black_box_folder(options, shipped_system()) == folder
+
+
+def test_a_user_without_a_home_directory_has_a_run_and_one_line(monkeypatch, capsys):
+    monkeypatch.delenv("XDG_STATE_HOME")
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("os.getuid", lambda: 4_000_000)  # as in a container
+    options, _ = parse(["--system", str(CELL)], "launch.py")
+    assert black_box_folder(options, shipped_system()) == ""
+    assert capsys.readouterr().err == (
+        "launch.py: black box: this user has no home directory; expected a folder in "
+        "XDG_STATE_HOME\n")
+    assert main(["incident", "list"]) == 2
 
 
 def test_a_black_box_that_cannot_start_is_one_line(monkeypatch):
