@@ -39,7 +39,7 @@ _AGAIN_S = 10.0
 """Least real seconds between two starts of a black box."""
 
 _NICE = 5
-"""Niceness of a black box: it may be late by some hundred messages of a node."""
+"""Niceness of a black box above that of the run: it may be late by some hundred messages."""
 
 
 class Order(msgspec.Struct, frozen=True):
@@ -121,7 +121,7 @@ class RecorderProcess:
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
             env=working_folder.environment())
         if self._order.black_box is not None:
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, os.nice(0) + _NICE)
         assert self._process.stdout is not None  # noqa: S101 for the type checker
         if self._order.black_box is not None:
             return
