@@ -128,17 +128,17 @@ class BlackBoxWriter:
             self._trigger(lines[0].text, at_s)
 
     def flush(self) -> None:
-        """Sync the ring, write the description of a new or extended incident, and make room.
+        """Make room, sync the ring, and write the description of a new or extended incident.
 
         Raises:
             OSError: the disk is full, or it cannot be written.
         """
-        self._ring.sync()
         is_due = self._now_s - self._tidied_s >= _HOUSEKEEPING_S
         if is_due:
             self._tidied_s = self._now_s
             incidents.keep_needed(self._ring, self._folder, self._now_s - self._limits.before_s)
         self._make_room(is_whole=is_due)
+        self._ring.sync()
         self._describe_last()
         self._history.put(self._debounce.changes(self._now_s), self._wall())
         if self._history.problem != self._reported:

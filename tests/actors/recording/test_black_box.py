@@ -293,6 +293,25 @@ def test_the_reserve_of_the_disk_costs_the_oldest_first_then_ends_with_one_line(
     box.writer.abandon()
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounts a file system")
+def test_a_disk_that_others_fill_costs_the_oldest_incidents(tmp_path):
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3M", "tmpfs", tmp_path], check=True)
+    try:
+        box = Box(tmp_path)
+        for at_s in range(0, 1000, 100):
+            box.second(float(at_s), decision(at_s + 1, at_s + 0.5), poses=4000)
+        oldest = incidents_in(box.folder)[0]
+        with contextlib.suppress(OSError), (tmp_path / "filled").open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(4096))
+        box.second(1000.0)
+        assert oldest not in incidents_in(box.folder)
+        assert ring.span_of(box.folder / "sample").last_s > 1000
+        box.writer.abandon()
+    finally:
+        subprocess.run(["umount", "-l", tmp_path], check=True)
+
+
 def test_a_wall_clock_that_jumps_back_disorders_nothing(box):
     box.second(0.0, decision(1, 0.5))
     box.seconds(1, 40)
