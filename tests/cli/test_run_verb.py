@@ -11,7 +11,7 @@ import pytest
 
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
-from rampart.testing import free_port
+from rampart.testing.ports import free_base_port
 from tests import CELL, ROOT, TANK
 from tests.two_hosts import two_hosts
 from tests.whole.checkpoint_runs import write_short_mission
@@ -35,11 +35,13 @@ def test_messages_and_help_say_what_was_typed(capsys, start, name):
 
 
 def test_a_run_whose_page_would_have_another_program_s_port_is_refused(tmp_path, capsys):
-    port = free_port()
+    port = free_base_port()  # `free_port` is beyond the ports of a page
     with socket.create_server(("127.0.0.1", port)):
         arguments = ["--hmi-port", str(port), "--report", str(tmp_path / "report")]
         assert launch.main(arguments) == 2
-    assert capsys.readouterr().err.startswith(f"launch.py: --hmi-port {port}: ")
+    error = capsys.readouterr().err
+    assert error.startswith(f"launch.py: --hmi-port {port}: ")
+    assert "Address already in use" in error
     assert not (tmp_path / "report").exists()
 
 
