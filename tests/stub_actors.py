@@ -55,19 +55,28 @@ _IDLE = {"localization": "IdlePose", "ftm_manager": "IdleManager", "detection": 
          "recovery": "IdleRecovery"}
 
 
-def write_stub_system(directory: Path) -> Path:
-    """Write the shipped system with every actor replaced by an `Idler` of its kind."""
+def write_stub_system(directory: Path, *changes: tuple[str, str]) -> Path:
+    """Write the shipped system with every actor replaced by an `Idler` of its kind.
+
+    Args:
+        directory: Folder of the new file.
+        changes: Further replacements of text.
+    """
     text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
 
     def idle(row: re.Match[str]) -> str:
         kind = _IDLE.get(row["name"]) or _IDLE.get(row["table"], "Idler")
         return f'{row["head"]}actor = "tests.stub_actors:{kind}"'
 
-    file = directory / "stub.toml"
-    file.write_text(re.sub(
+    text = re.sub(
         r'(?m)^(?P<head>\[\[(?P<table>\w+)\]\]\n'
         r'(?:(?!\[)(?!actor)(?:name = "(?P<name>\w+)")?.*\n)*?)'
-        r'actor = "[^"]+"', idle, text), encoding="utf-8")
+        r'actor = "[^"]+"', idle, text)
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    file = directory / "stub.toml"
+    file.write_text(text, encoding="utf-8")
     return file
 
 

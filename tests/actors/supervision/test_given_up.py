@@ -70,33 +70,28 @@ def test_attempts_begin_when_the_window_has_room_and_come_further_and_further_ap
 @pytest.mark.parametrize("name", ["DM2", "osmosis_control"])
 @within(partial(played, SOON))
 async def test_a_process_that_fails_at_its_start_is_given_up_and_tried_again(world, name):
-    add, well = world.machine.add, []
-
-    def sick(names, incarnation, **how):
-        process = add(names, incarnation, **how)
-        if name in names and not well:
-            process.bound = False  # it is never heard, and ends
-            asyncio.get_running_loop().call_later(0.03, world.machine.kill, process)
-        return process
-
-    world.machine.add = sick
+    world.machine.sick.add(name)
     world.kill(name)
     await asyncio.sleep(0.02)
     world.respawn(name, 1)  # of RM3's node; once: the module may have been released since
     await eventually(lambda: world.row(name)[0] == "given up", 20)
     await asyncio.sleep(0.01)
-    forks = len(world.machine.forks)
+    given_up_s, forks = world.clock.now(), len(world.machine.forks)
     assert forks == 8
     asked = len(world.events)
     world.respawn(name, 2)  # whoever asks meanwhile is answered, and gets no process
     await asyncio.sleep(0.05)
     assert (name, "given up", world.row(name)[1]) in world.events[asked:]
+    next_s = next(row.next_attempt_s for row in world.supervisor.rows() if row.name == name)
+    await asyncio.sleep(next_s - world.clock.now() - 0.01)
     assert len(world.machine.forks) == forks
-    await asyncio.sleep(60)
+    await asyncio.sleep(0.03)
+    assert len(world.machine.forks) == forks + 1
+    await asyncio.sleep(given_up_s + 60 - world.clock.now())
     attempts = len(world.machine.forks) - forks
     assert 13 <= attempts <= 17  # 5 s, 2 s, and then one in four seconds
     assert world.row(name)[0] == "given up"
-    well.append(True)
+    world.machine.sick.clear()
     await eventually(lambda: world.row(name)[0] == "running", 10)
     assert len(world.machine.of(name)) == 1
     await asyncio.sleep(10)
@@ -175,28 +170,6 @@ async def test_an_unstable_node_is_reported_at_each_end_and_restarted_without_a_
     await asyncio.sleep(2.0)
     assert world.failing == set()
     assert [event for node, event, _ in world.events if node == "osmosis_control"][-1] == "stable"
-
-
-@within(partial(played, SOON))
-async def test_the_table_shows_when_a_process_is_tried_again(world):
-    def sick(names, incarnation, **how):
-        process = add(names, incarnation, **how)
-        if "DM2" in names:
-            process.bound = False
-            asyncio.get_running_loop().call_later(0.03, world.machine.kill, process)
-        return process
-
-    add, world.machine.add = world.machine.add, sick
-    world.kill("DM2")
-    await eventually(lambda: world.row("DM2")[0] == "given up", 20)
-    await asyncio.sleep(0.6)
-    (row,) = (row for row in world.supervisor.rows() if row.name == "DM2")
-    forks, now_s = len(world.machine.forks), world.clock.now()
-    assert row.next_attempt_s > now_s
-    await asyncio.sleep(row.next_attempt_s - now_s - 0.01)
-    assert len(world.machine.forks) == forks
-    await asyncio.sleep(0.03)
-    assert len(world.machine.forks) == forks + 1
 
 
 @pytest.mark.parametrize("ends", ["dies after 1.3 s", "is never heard", "well"])

@@ -35,7 +35,7 @@ class Node:
         """Report the end of its program."""
         self.world.silent.add(self.process.pid)
         self.world.say(topics.PROGRAM_END, ProgramEnd(self.process.pid, REASON),
-                       self.name, self.process.incarnation)
+                       self.name, incarnation=self.process.incarnation)
 
     def _see(self, _now_s: float, _source: str, key: str, payload: bytes) -> None:
         if key != topics.PROCESS_EVENT.at() or self.is_deaf:
@@ -137,10 +137,7 @@ async def test_a_node_that_does_not_start_its_program_is_replaced(world):
 @within(restarted)
 async def test_a_new_supervisor_takes_the_end_from_its_repetition(world):
     node = Node(world, OWN)
-    world.task.cancel()
-    await asyncio.gather(world.task, return_exceptions=True)
-    node.end_program()
-    world.start(known={OWN: 1})
+    await world.replace_supervisor(node.end_program, **{OWN: 1})
     await asyncio.sleep(0.1)
     node.end_program()
     await eventually(lambda: world.row(OWN) == ("running", 2, node.process.pid), 0.2)

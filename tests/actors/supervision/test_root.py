@@ -10,6 +10,8 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import msgspec
@@ -49,15 +51,15 @@ async def filled(port: int, other_than: set[int] = frozenset()) -> set[int]:
     return pool(port)
 
 
+def pilot_with_spare(word: str) -> tuple[str, str]:
+    """Return the change of the stub system by which safety_pilot has such a spare."""
+    return 'name = "safety_pilot"', f'name = "safety_pilot"\nspare = "{word}"'
+
+
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def run(tmp_path_factory):
     """One run, in which safety_pilot has no spare; the tests that follow hurt it in turn."""
-    folder = tmp_path_factory.mktemp("run")
-    file = write_stub_system(folder)
-    changed = folder / "none.toml"
-    changed.write_text(file.read_text(encoding="utf-8").replace(
-        'name = "safety_pilot"', 'name = "safety_pilot"\nspare = "none"'), encoding="utf-8")
-    async with running(folder, system_file=str(changed)) as both:
+    async with running(tmp_path_factory.mktemp("run"), pilot_with_spare("none")) as both:
         yield both
 
 
@@ -145,12 +147,8 @@ async def test_a_process_of_the_pool_that_cannot_become_a_node_costs_only_itself
 
 @pytest.mark.processes
 async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_end(tmp_path):
-    limits = "[supervision]\nintensity = 6\nperiod_s = 6.0\nbackoff_s = 0.05\n\n"
-    file = write_stub_system(tmp_path)
-    text = file.read_text(encoding="utf-8")
-    changed = tmp_path / "limited.toml"
-    changed.write_text(text.replace("[timing]", limits + "[timing]", 1), encoding="utf-8")
-    async with running(tmp_path, system_file=str(changed)) as (launcher, witness):
+    limits = "[supervision]\nintensity = 6\nperiod_s = 6.0\nbackoff_s = 0.05\n\n[timing]"
+    async with running(tmp_path, ("[timing]", limits)) as (launcher, witness):
         told, lives = [], set()
         launcher.report = told.append
         while not told:
@@ -167,9 +165,7 @@ async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_
 
 @pytest.mark.parametrize("word", ["warm", "own", "hot"])
 async def test_a_spare_of_version_0_7_means_the_pool_and_is_reported(tmp_path, word):
-    file = tmp_path / "old.toml"
-    file.write_text(write_stub_system(tmp_path).read_text(encoding="utf-8").replace(
-        'name = "safety_pilot"', f'name = "safety_pilot"\nspare = "{word}"'), encoding="utf-8")
+    file = write_stub_system(tmp_path, pilot_with_spare(word))
     notes: list[str] = []
     options, kind = parse(["--system", str(file), "--no-hmi"], "launch.py")
     plan, spec = plan_of(options, kind, notes.append)
@@ -188,11 +184,9 @@ class TellingDetection(IdleDetection):
 @pytest.mark.processes
 @pytest.mark.alone
 async def test_what_starts_after_a_change_of_the_system_knows_it(tmp_path):
-    file = tmp_path / "telling.toml"
-    file.write_text(write_stub_system(tmp_path).read_text(encoding="utf-8").replace(
-        "tests.stub_actors:IdleDetection",
-        "tests.actors.supervision.test_root:TellingDetection"), encoding="utf-8")
-    async with running(tmp_path, system_file=str(file)) as (launcher, witness):
+    async with running(tmp_path, (
+            "tests.stub_actors:IdleDetection",
+            "tests.actors.supervision.test_root:TellingDetection")) as (launcher, witness):
         port = launcher.plan.base_port
         there, start = await filled(port), len(witness.errors)
         document = load_document(launcher.plan)
@@ -230,40 +224,50 @@ async def test_the_number_of_another_run_is_refused_before_anything_starts(tmp_p
     assert find_processes(plan.base_port) == []
 
 
-def started(tmp_path: Path, **variables: str) -> tuple[subprocess.Popen[str], int]:
-    """Start a run of the stub system by its root; return that and the base port."""
+@asynccontextmanager
+async def started(tmp_path: Path, after_s: float | None = None
+                  ) -> AsyncIterator[tuple[subprocess.Popen[str], int]]:
+    """Start a run of the stub system by its root; yield that and the base port.
+
+    Args:
+        tmp_path: Folder of its files.
+        after_s: When to yield; by default when all its processes are there.
+    """
     plan = stub_plan(write_stub_system(tmp_path))
-    return subprocess.Popen(
-        [sys.executable, "-P", str(ROOT / "launch.py"), "--system", plan.system_file, "--no-hmi",
-         "--port", str(plan.base_port), "--report", str(tmp_path / "report"), "--json"],
-        env={**(variables or os.environ), "PYTHONPATH": str(ROOT)}, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True), plan.base_port
+    port = plan.base_port
+    with subprocess.Popen(
+            [sys.executable, "-P", str(ROOT / "launch.py"), "--system", plan.system_file,
+             "--no-hmi", "--port", str(port), "--report", str(tmp_path / "report"), "--json"],
+            env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, start_new_session=True) as root:
+        try:
+            if after_s is None:
+                await eventually(lambda: len(find_processes(port)) >= 26, 20)
+            else:
+                await asyncio.sleep(after_s)
+            yield root, port
+        finally:
+            root.kill()
 
 
 @pytest.mark.processes
 @pytest.mark.parametrize("stopped", [("supervisor", "DM1", "DM2", "RM1"), None])
 async def test_a_killed_root_leaves_nothing_within_two_seconds(tmp_path, stopped):
-    root, port = started(tmp_path)
-    with root:
-        try:
-            await eventually(lambda: len(find_processes(port)) >= 26, 20)
-            await asyncio.sleep(0.5)
-            folder = next(run.folder for run in find_runs() if run.base_port == port)
-            os.kill(process(port, "DM6"), signal.SIGUSR2)
-            for one in find_processes(port):
-                if stopped is None or set(one.names) & set(stopped):
-                    os.kill(one.pid, signal.SIGSTOP)
-        finally:
-            root.kill()
+    async with started(tmp_path) as (root, port):
+        await asyncio.sleep(0.5)
+        folder = next(run.folder for run in find_runs() if run.base_port == port)
+        os.kill(process(port, "DM6"), signal.SIGUSR2)
+        for one in find_processes(port):
+            if stopped is None or set(one.names) & set(stopped):
+                os.kill(one.pid, signal.SIGSTOP)
+        root.kill()
         await eventually(lambda: find_processes(port) == [] and not Path(folder).exists(), 2.0)
     assert not [run for run in find_runs() if run.base_port == port]
 
 
 @pytest.mark.processes
 async def test_with_the_watching_process_killed_the_run_ends_and_its_verdict_is_not_known(tmp_path):
-    root, port = started(tmp_path)
-    with root:
-        await eventually(lambda: len(find_processes(port)) >= 26, 20)
+    async with started(tmp_path) as (root, port):
         os.kill(process(port, "run"), signal.SIGKILL)
         out, err = await asyncio.to_thread(root.communicate, timeout=10)
     assert root.returncode == 4
@@ -276,9 +280,7 @@ async def test_with_the_watching_process_killed_the_run_ends_and_its_verdict_is_
 
 @pytest.mark.processes
 async def test_a_stopped_watching_process_is_continued_and_explain_knows_all_processes(tmp_path):
-    root, port = started(tmp_path)
-    with root:
-        await eventually(lambda: len(find_processes(port)) >= 26, 20)
+    async with started(tmp_path) as (root, port):
         described = {p.name for p in explain(systems.check(str(tmp_path / "stub.toml"))).processes}
         assert {"+".join(p.names) for p in find_processes(port)} <= described
         pid = process(port, "run")
@@ -292,9 +294,7 @@ async def test_a_stopped_watching_process_is_continued_and_explain_knows_all_pro
 @pytest.mark.processes
 @pytest.mark.parametrize("at_s", [0.05, 0.6, 1.2])
 async def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(tmp_path, at_s):
-    root, port = started(tmp_path)
-    with root:
-        await asyncio.sleep(at_s)
+    async with started(tmp_path, at_s) as (root, port):
         root.send_signal(signal.SIGINT)
         _, err = await asyncio.to_thread(root.communicate, timeout=20)
     assert root.returncode in {1, 4, -signal.SIGINT}  # the last before anything is loaded

@@ -13,24 +13,19 @@ import msgspec
 import pytest
 
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.bus.envelope import decode, pack
+from rampart.actors.bus.envelope import decode
 from rampart.actors.bus.messages import Heartbeat
-from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem, ManagerStatus, NodeState, RespawnRequest
 from rampart.actors.machine.patience import Usage
-from rampart.actors.runtime.actor import Context
-from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import SUPERVISOR, RunPlan, load_document, load_system
-from rampart.actors.supervision.processes import Answer, RunProcess
+from rampart.actors.supervision.processes import Answer, ProcessHandle, RunProcess
 from rampart.actors.supervision.supervised_process import MOST_EXCUSED_S
-from rampart.actors.supervision.supervisor import Supervisor
 from rampart.actors.system.layout import Layout
 from rampart.manager.spec.nodes import Kind, NodeSpec
 from rampart.manager.spec.tables import Supervision
-from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.testing import eventually, turns
+from rampart.testing import VirtualSystem, eventually, turns
 from tests import ROOT
 from tests.virtual_time import within
 
@@ -49,7 +44,7 @@ class Process:
         self.holders: list[Callable[[], None]] = []
 
 
-class Handle:
+class Handle(ProcessHandle):
     def __init__(self, machine: Machine, process: Process, ended: Callable[[], None]) -> None:
         self._machine, self._process, self._ended = machine, process, ended
         process.holders.append(ended)
@@ -61,9 +56,6 @@ class Handle:
         self._machine.questions += 1
         return self._process.gone
 
-    def stopped(self) -> bool:
-        return False
-
     def usage(self) -> Usage:
         return self._machine.usage(self._process)
 
@@ -71,8 +63,7 @@ class Handle:
         if self._ended in self._process.holders:
             self._process.holders.remove(self._ended)
 
-    def close(self) -> None:
-        self.ignore()
+    close = ignore
 
 
 class Machine:
@@ -88,6 +79,7 @@ class Machine:
         self.is_slow = False
         self.waiting: list[Callable[[], None]] = []
         self.hold_error: Exception | None = None
+        self.sick: set[str] = set()  # a new process of these is never heard, and ends
         self.starving: set[str] = set()
         self.starves_from_s = 0.0
         self.turning = False
@@ -100,8 +92,8 @@ class Machine:
 
     def add(self, names: tuple[str, ...], incarnation: int, *, bound: bool = False) -> Process:
         self.issued |= dict.fromkeys(names, incarnation)
-        bound = bound or not any(
-            p.names == names and not p.gone for p in self.processes.values())
+        bound = not self.sick.intersection(names) and (bound or not any(
+            p.names == names and not p.gone for p in self.processes.values()))
         pid = 1000 + len(self.processes)
         process = self.processes[pid] = Process(names, incarnation, pid, bound)
         if not bound:
@@ -153,39 +145,32 @@ class World:
     """A supervisor, its machine, and the bus between them."""
 
     def __init__(self, supervision: Supervision, commands: Sequence[str] = ()) -> None:
-        loop = asyncio.get_running_loop()
-        self.machine = Machine()
-        self.clock = Clock(loop.time(), source=loop.time)
-        self.hub = Hub()
-        self.bus = VirtualBus(self.hub, "tester", 1)
-        self.events: list[tuple[str, str, int]] = []
-        self.silent: set[int] = set()
-        self.failing: set[str] = set()
-        self.hub.taps.append(self.see)
         spec = load_system(PLAN)
         self.spec = msgspec.structs.replace(spec, supervision=supervision, nodes=(
             *spec.nodes, *(NodeSpec(f"of_{respawn}", Kind.NON_CONTROL, respawn=respawn,
                                     command=("true",)) for respawn in commands)))
-        self.lives = 0
-        self._sequence = 0
-        self.supervisor, self.task = self.start()
+        self.system = VirtualSystem(RunContext(PLAN, self.spec), Layout(PLAN, self.spec))
+        self.machine = Machine()
+        self.system.register = self.machine.issued.get
+        self.clock, self.hub, self.say = self.system.clock, self.system.hub, self.system.say
+        self.events: list[tuple[str, str, int]] = []
+        self.silent: set[int] = set()
+        self.failing: set[str] = set()
+        self.hub.taps.append(self.see)
+        self.start()
 
-    def start(self, known: dict[str, int] | None = None) -> tuple[Supervisor, asyncio.Task[None]]:
-        self.lives += 1
-        parameters = Layout(PLAN, self.spec).members[SUPERVISOR].parameters
-        self.supervisor = Supervisor(Context(
-            SUPERVISOR, self.lives, self.clock, VirtualBus(self.hub, SUPERVISOR, self.lives),
-            parameters, RunContext(PLAN, self.spec, known_incarnations=known or {}),
-            register=self.machine.issued.get), self.machine)
-        self.task = asyncio.create_task(self.supervisor.run())
-        return self.supervisor, self.task
+    def start(self, **known: int) -> None:
+        """Start the supervisor, or its replacement, which knows incarnations of nodes."""
+        self.system.run = RunContext(PLAN, self.spec, known_incarnations=known)
+        self.supervisor = self.system.start_node(SUPERVISOR, self.machine)
 
-    def say(self, topic: Topic, body: msgspec.Struct, source: str = "tester", life: int = 1,
-            *, key: str = "", stamp_s: float | None = None) -> None:
-        self._sequence += 1
-        self.bus.publish(topic, key or topic.at(), pack((
-            source, life, self._sequence, self.clock.now() if stamp_s is None else stamp_s,
-            body)))
+    async def replace_supervisor(self, meanwhile: Callable[[], object], **known: int) -> None:
+        """End the supervisor, and start another one after something has happened."""
+        task = self.system.tasks.pop(SUPERVISOR)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        meanwhile()
+        self.start(**known)
 
     def see(self, _now_s: float, _source: str, key: str, payload: bytes) -> None:
         if key == topics.PROCESS_EVENT.at():
@@ -198,7 +183,7 @@ class World:
     def beat(self, process: Process) -> None:
         for name in process.names:
             self.say(bus_topics.HEARTBEAT, Heartbeat(process.pid, 0, 0.1, 0, 0), name,
-                     process.incarnation, key=bus_topics.HEARTBEAT.at(name))
+                     incarnation=process.incarnation)
 
     async def beats(self) -> None:
         while True:
@@ -227,16 +212,12 @@ class World:
 async def running(supervision: Supervision = USUAL,
                   commands: Sequence[str] = ()) -> AsyncIterator[World]:
     world = World(supervision, commands)
-    await world.bus.open()
-    beats = asyncio.create_task(world.beats())
-    await eventually(world.all_run)
-    world.machine.forks.clear()
-    try:
+    async with world.system:
+        beats = asyncio.create_task(world.beats())
+        await eventually(world.all_run)
+        world.machine.forks.clear()
         yield world
-    finally:
-        for task in (beats, world.task):
-            task.cancel()
-        await asyncio.gather(beats, world.task, return_exceptions=True)
+        beats.cancel()
 
 
 @pytest.mark.parametrize("mute", [False, True])
@@ -250,7 +231,7 @@ async def test_a_supervisor_that_fails_ends_nobody_and_its_next_life_adopts_all(
             raise RuntimeError("no bus")
         world.supervisor.context.bus.publish = publish
     with contextlib.suppress(RuntimeError):
-        await world.task
+        await world.system.tasks[SUPERVISOR]
     assert set(world.machine.processes) - {killed.pid} == {
         p.pid for p in world.machine.processes.values() if not p.killed}
     world.machine.fork_error = None
@@ -328,13 +309,14 @@ async def test_what_is_not_heard_because_a_router_died_is_no_fault_of_any_proces
 async def test_a_process_that_waits_for_a_processor_has_longer_to_start(world):
     world.machine.starving = {"DM1"}
     world.machine.starves_from_s = asyncio.get_running_loop().time()
-    bound = world.machine.add
-    world.machine.add = lambda names, life: mute(bound(names, life))
+    add = world.machine.add
 
-    def mute(process: Process) -> Process:
+    def mute(*named: object) -> Process:
+        process = add(*named)
         world.silent.add(process.pid)
         return process
 
+    world.machine.add = mute
     for name in ("DM1", "DM2"):
         world.kill(name)
     await eventually(lambda: ("DM2", "wedged", 2) in world.events, 5.0)
@@ -345,7 +327,7 @@ async def test_a_process_that_waits_for_a_processor_has_longer_to_start(world):
 
 def status(world: World, life: int, stamp_s: float | None = None) -> None:
     world.say(topics.MANAGER_STATUS, ManagerStatus((), (), (), (), "safety-first", 0),
-              "ftm_manager", life, stamp_s=stamp_s)
+              "ftm_manager", incarnation=life, stamp_s=stamp_s)
 
 
 NO_DESCRIPTOR = OSError(errno.EMFILE, os.strerror(errno.EMFILE))
@@ -470,8 +452,8 @@ async def test_a_heartbeat_that_names_a_process_of_somebody_elses_has_nobody_ado
     stranger = world.machine.add(("editor",), 1)
     world.machine.kill(own)
     for _ in range(20):
-        world.say(bus_topics.HEARTBEAT, Heartbeat(stranger.pid, 0, 0.1, 0, 0), "DM1", life,
-                  key=bus_topics.HEARTBEAT.at("DM1"))
+        world.say(bus_topics.HEARTBEAT, Heartbeat(stranger.pid, 0, 0.1, 0, 0), "DM1",
+                  incarnation=life)
         await asyncio.sleep(0.05)
     assert not stranger.killed
     assert world.row("DM1")[0] == "running"
@@ -483,10 +465,9 @@ async def test_a_heartbeat_that_names_a_process_of_somebody_elses_has_nobody_ado
 async def test_of_two_lives_of_one_node_a_new_supervisor_adopts_the_higher_and_ends_the_other(
         world, numbers):
     names = world.kill("DM2").names
-    world.task.cancel()
-    await asyncio.gather(world.task, return_exceptions=True)
-    two = [world.machine.add(names, number, bound=True) for number in numbers]
-    world.start(known={"DM2": 7})
+    two: list[Process] = []
+    await world.replace_supervisor(lambda: two.extend(
+        world.machine.add(names, number, bound=True) for number in numbers), DM2=7)
     await turns()
     higher = max(two, key=lambda p: p.incarnation)
     assert world.row("DM2") == ("running", 7, higher.pid)

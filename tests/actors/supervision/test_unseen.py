@@ -21,7 +21,7 @@ from rampart.actors.supervision.root import needed_of
 from rampart.actors.supervision.unseen import report_callbacks, watch
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.process_run import ProcessRun
-from rampart.testing import free_base_port
+from rampart.testing import free_base_port, turns
 from tests import ROOT
 from tests.stub_actors import Idler, launched, stub_plan, write_stub_system
 
@@ -41,11 +41,6 @@ class Stumbler(Idler):
 
 def fail(why: str) -> None:
     raise RuntimeError(why)
-
-
-async def turns() -> None:
-    for _ in range(5):
-        await asyncio.sleep(0)
 
 
 async def test_the_end_of_a_task_is_told_unless_it_was_cancelled():
@@ -86,11 +81,8 @@ async def test_what_a_callback_raises_is_told_once_and_a_flood_of_it_is_bounded(
 @pytest.mark.processes
 async def test_what_a_nodes_callbacks_and_forgotten_tasks_raise_is_told_and_it_goes_on(
         tmp_path, capfd):
-    system = write_stub_system(tmp_path)
-    text = system.read_text()
-    at = text.index('name = "localization"')
-    system.write_text(text[:at] + text[at:].replace(
-        "tests.stub_actors:IdlePose", "tests.actors.supervision.test_unseen:Stumbler", 1))
+    system = write_stub_system(tmp_path, (
+        "tests.stub_actors:IdlePose", "tests.actors.supervision.test_unseen:Stumbler"))
     async with launched(stub_plan(system)) as launcher:
         said = ""
         async with asyncio.timeout(20):
@@ -143,28 +135,27 @@ async def test_a_run_may_open_as_many_files_as_the_hard_limit_allows(tmp_path):
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
+LACKING_CAPABILITIES = ["--inh-caps=-all,+dac_override", "--ambient-caps=-all,+dac_override"]
+NO_PROCESSES = [pytest.param(
+    ["setpriv", "--reuid=47112", "--regid=47112", "--clear-groups", *LACKING_CAPABILITIES,
+     "prlimit", f"--nproc={processes}"], "", id=f"{processes} processes",
+    marks=pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"),
+                             reason="only root can be a user who may start no process"))
+    for processes in (1, 3, 4, 12, 60)]
+NO_FILES = pytest.param(
+    ["sh", "-c", 'ulimit -n 64; exec "$@"', "sh"],
+    f"the hard limit is 64, and 23 processes need {needed_of(resource.RLIMIT_NOFILE, 23)}",
+    id="64 files")
+
+
 @pytest.mark.processes
-@pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"),
-                    reason="only root can be a user who may start no process")
-@pytest.mark.parametrize("processes", [1, 3, 4, 12, 60])
-def test_a_run_that_may_start_too_few_processes_is_refused_in_one_line(tmp_path, processes):
-    reads_all = ["--inh-caps=-all,+dac_override", "--ambient-caps=-all,+dac_override"]
+@pytest.mark.parametrize(("limited", "words"), [*NO_PROCESSES, NO_FILES])
+def test_a_run_that_may_have_too_few_processes_or_files_is_refused_in_one_line(
+        tmp_path, limited, words):
     result = subprocess.run(
-        ["setpriv", "--reuid=47112", "--regid=47112", "--clear-groups", *reads_all,
-         "prlimit", f"--nproc={processes}", sys.executable, str(ROOT / "launch.py"),
-         "--no-hmi", "--port", str(free_base_port()), "--report", str(tmp_path / "report")],
+        [*limited, sys.executable, str(ROOT / "launch.py"), "--system", "paper", "--no-hmi",
+         "--port", str(free_base_port()), "--report", str(tmp_path / "report")],
         check=False, capture_output=True, text=True, timeout=60)
     assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
+    assert words in result.stderr
     assert not (tmp_path / "report").exists()
-
-
-@pytest.mark.processes
-def test_a_run_that_may_open_too_few_files_is_refused_in_one_line(tmp_path):
-    result = subprocess.run(
-        ["sh", "-c", 'ulimit -n 64; exec "$@"', "sh", sys.executable, str(ROOT / "launch.py"),
-         "--system", "paper", "--no-hmi", "--port", str(free_base_port()),
-         "--report", str(tmp_path / "report")],
-        check=False, capture_output=True, text=True, timeout=60)
-    assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
-    needed = needed_of(resource.RLIMIT_NOFILE, 23)
-    assert f"the hard limit is 64, and 23 processes need {needed}" in result.stderr

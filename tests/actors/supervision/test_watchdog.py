@@ -78,13 +78,15 @@ def run_of(tmp_path, device, *arguments):
     return RealRun(folder, "paper", "--watchdog", str(device.path), *arguments)
 
 
-def test_a_run_that_is_well_feeds_both_and_disarms_the_device_at_its_end(
+def test_a_run_feeds_both_while_its_manager_is_replaced_and_disarms_the_device_at_its_end(
         tmp_path, device, notified):
     with run_of(tmp_path, device) as run:
         assert notified.recv(100) == b"READY=1\nWATCHDOG=1"
         run.wait_for("running")
         device.is_fed()
         assert notified.recv(100) == b"WATCHDOG=1"
+        run.kill("ftm_manager")
+        device.is_fed()
         run.process.send_signal(signal.SIGTERM)
         run.process.wait(20)
     device.read()
@@ -106,15 +108,8 @@ def test_a_manager_that_hangs_at_each_start_starves_them(tmp_path, device):
         assert run.process.poll() is None
 
 
-def test_a_manager_that_is_killed_does_not(tmp_path, device):
-    with run_of(tmp_path, device) as run:
-        run.wait_for("running")
-        device.is_fed()
-        run.kill("ftm_manager")
-        device.is_fed()
-
-
-def test_root_and_supervisor_that_are_stopped_starve_them(tmp_path, device):
+def test_a_stopped_root_and_supervisor_starve_it_and_a_killed_root_leaves_it_armed(
+        tmp_path, device):
     with run_of(tmp_path, device) as run:
         run.wait_for("running")
         device.is_fed()
@@ -122,12 +117,6 @@ def test_root_and_supervisor_that_are_stopped_starve_them(tmp_path, device):
         run.process.send_signal(signal.SIGSTOP)
         assert device.starves(20)
         run.process.send_signal(signal.SIGCONT)
-        device.is_fed()
-
-
-def test_a_killed_root_leaves_the_device_armed_and_nobody_holds_it(tmp_path, device):
-    with run_of(tmp_path, device) as run:
-        run.wait_for("running")
         device.is_fed()
         run.process.kill()
         run.process.wait()
