@@ -36,7 +36,7 @@ from rampart.sim.campaign.store import _NO_RUN, _run
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
-from tests import CELL, ROOT
+from tests import CELL, ROOT, TANK
 from tests.actors.osmosis.airport.test_formats import GRAPH, TOML
 from tests.actors.recording.samples import documents, pose
 from tests.fuzz.message_extremes import sample
@@ -45,54 +45,6 @@ from tests.fuzz.target import target
 SYSTEMS = ROOT / "systems"
 _CELL = CELL.read_text("utf-8")
 _PAPER = (SYSTEMS / "paper.toml").read_text("utf-8")
-_SMALL = """
-name = "small"
-title = "A lamp and a guard"
-[timing]
-heartbeat_timeout_s = 0.5
-command_timeout_s = 0.5
-localization_timeout_s = 0.5
-scan_timeout_s = 0.5
-dead_man_timeout_s = 0.5
-manager_timeout_s = 0.5
-detection_silence_timeout_s = 1
-[[node]]
-name = "manager"
-actor = "rampart.manager.actor:FtmManager"
-kind = "manager"
-[[node]]
-name = "lamp"
-actor = "rampart.actors.runtime.stub_node:StubNode"
-kind = "control"
-respawn = "RM1"
-[[detection]]
-name = "DM1"
-title = "No light"
-actor = "rampart.actors.detection.watchdog:Watchdog"
-parameters = { watch = ["lamp"], timeout_s = 0.5 }
-[[recovery]]
-name = "RM1"
-title = "New lamp"
-actor = "rampart.actors.recovery.respawn:Respawn"
-kind = "masking"
-claims = ["lamp"]
-[[mechanism]]
-name = "FTM1"
-detect = "DM1"
-recover = "RM1"
-event = "dark"
-against = { within_s = 3.0, hazard = "night" }
-[[event]]
-name = "dark"
-gate = { at_least = 1 }
-of = ["bulb", "wire"]
-[[event]]
-name = "bulb"
-[[event]]
-name = "wire"
-[orders.safer]
-"""
-
 
 @cache
 def _kept() -> tempfile.TemporaryDirectory[str]:
@@ -184,7 +136,7 @@ def toml_document(data: bytes) -> None:
 
 @target("system", refuses=(SpecificationError,), form="toml", one_line=True,
         words=_WORDS,
-        samples=lambda: [*[_SMALL.encode()] * 9, _CELL.encode(), _PAPER.encode()])
+        samples=lambda: [*[TANK.encode()] * 9, _CELL.encode(), _PAPER.encode()])
 def system(data: bytes) -> None:
     spec = parse_specification(data.decode(errors="replace"), "system.toml")
     formula_of(spec.build_fault_tree())
@@ -212,7 +164,7 @@ def adaptation(data: bytes) -> None:
 
 @target("system-json", refuses=(SpecificationError, ValueError, RecursionError), form="json",
         samples=lambda: [msgspec.json.encode(read_document(text, "small.toml"))
-                                        for text in [_SMALL] * 9 + [_CELL]])
+                                        for text in [TANK] * 9 + [_CELL]])
 def system_json(data: bytes) -> None:
     """A changed system, as `manager/system` carries it."""
     check_document(msgspec.json.decode(data, type=dict[str, Any]), "cell.toml")

@@ -203,14 +203,6 @@ def test_what_was_published_before_the_loss_is_not_the_last_state(robot, ground)
     assert not ground.copies.is_caught_up({"camera": EPOCH + 1})
 
 
-def test_a_host_with_an_empty_disk_gets_what_the_other_holds(robot):
-    robot.keep("camera", state(3, 40))
-    fresh = Host("ground")
-    exchange(robot, fresh)
-    assert fresh.disk == {"camera": state(3, 40)}
-    assert fresh.copies.is_caught_up({"camera": 0})
-
-
 EVENTS = st.lists(st.one_of(
     st.tuples(st.just("keep"), st.sampled_from(["camera", "hmi"])),
     st.tuples(st.sampled_from(["robot publishes", "ground publishes"]), st.integers(0, 3)),

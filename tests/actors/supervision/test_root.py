@@ -147,8 +147,8 @@ async def test_a_process_of_the_pool_that_cannot_become_a_node_costs_only_itself
 
 @pytest.mark.processes
 async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_end(tmp_path):
-    limits = "[supervision]\nintensity = 6\nperiod_s = 6.0\nbackoff_s = 0.05\n\n[timing]"
-    async with running(tmp_path, ("[timing]", limits)) as (launcher, witness):
+    limits = "\n[supervision]\nintensity = 6\nperiod_s = 6.0\nbackoff_s = 0.05\n\n[timing]\n"
+    async with running(tmp_path, ("\n[timing]\n", limits)) as (launcher, witness):
         told, lives = [], set()
         launcher.report = told.append
         while not told:
