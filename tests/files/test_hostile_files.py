@@ -24,7 +24,6 @@ from PIL import Image
 from rampart.actors.osmosis.airport import mask
 from rampart.actors.osmosis.airport.errors import AirportError
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair
-from rampart.actors.supervision.process_title import parse_title
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
 from rampart.files import toml
@@ -315,14 +314,6 @@ def test_a_store_with_a_damaged_row_says_so_when_it_is_read(tmp_path):
     with pytest.raises(StoreError, match="cannot be used"):
         list(store.runs())
     store.close()
-
-
-def test_the_title_of_a_process_may_hold_numbers_without_end():
-    assert parse_title(1, f"rampart[{'9' * 5000}/1] a #1") is None
-    assert parse_title(1, f"rampart[1/1] a #{'9' * 5000}") is None
-    found = parse_title(1, "rampart[7400/123] a+b #18446744073709551615")
-    assert found is not None
-    assert found.names == ("a", "b")
 
 
 def test_a_document_at_the_limits_is_read_and_strings_and_comments_hold_anything():

@@ -116,14 +116,6 @@ async def test_a_stopped_router_is_not_waited_for(routers, sockets, stopped):
         await send_until(other, lambda: heard)
 
 
-async def test_a_client_that_starts_before_the_routers_waits_for_one(routers, sockets):
-    async with asyncio.TaskGroup() as group:
-        group.create_task(routers.start("router_b"))
-        async with client(sockets) as one, client(sockets) as other:
-            heard = hear(one)
-            await send_until(other, lambda: heard)
-
-
 async def test_without_routers_the_error_is_one_line(sockets, monkeypatch):
     monkeypatch.setattr(zenoh_bus, "PATIENCE_S", 0.05)
     with pytest.raises(BusError, match=rf"^no router at \S+{sockets}/router_a or \S+/router_b "

@@ -38,11 +38,6 @@ def answering(answer: bytes) -> Iterator[int]:
 INFO = run_info.RunInfo(1, 7450, 1.0, 0.0, "x.toml", "", (), "r", 0, "a run")
 
 
-def test_a_launcher_answers_with_its_run():
-    with answering(msgspec.json.encode(INFO)) as port:
-        assert run_info.ask(port) == INFO
-
-
 def test_a_socket_of_another_user_is_not_a_launcher(monkeypatch):
     monkeypatch.setattr(run_info, "is_same_user", lambda _connection: False)
     with answering(msgspec.json.encode(INFO)) as port:

@@ -103,15 +103,23 @@ async def running(cls: type[Actor], name: str, make_bus: MakeBus, incarnation: i
         await asyncio.wait_for(asyncio.gather(task, return_exceptions=True), 5)
 
 
+@asynccontextmanager
+async def talking(make_bus: MakeBus, reader: type[Actor] = Listener, incarnation: int = 1
+                  ) -> AsyncIterator[tuple[Actor, Actor]]:
+    """Run a reader, and a talker that it has heard of."""
+    async with (running(reader, "listener", make_bus) as listener,
+                running(Talker, "talker", make_bus, incarnation) as talker):
+        await eventually(lambda: listener.peers == [("talker", incarnation)])
+        yield listener, talker
+
+
 async def test_a_message_arrives_with_its_header(make_bus):
-    async with running(Listener, "listener", make_bus) as listener:
-        async with running(Talker, "talker", make_bus, incarnation=3) as talker:
-            await eventually(lambda: listener.peers == [("talker", 3)])
-            talker.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5), stamp=0.25)
-            await eventually(lambda: bool(listener.heard))
-            message, header = listener.heard[0]
-            assert message == m.Pose(1.0, 2.0, 0.5)
-            assert (header.source, header.incarnation, header.stamp) == ("talker", 3, 0.25)
+    async with talking(make_bus, incarnation=3) as (listener, talker):
+        talker.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5), stamp=0.25)
+        await eventually(lambda: bool(listener.heard))
+        message, header = listener.heard[0]
+        assert message == m.Pose(1.0, 2.0, 0.5)
+        assert (header.source, header.incarnation, header.stamp) == ("talker", 3, 0.25)
 
 
 class Twice(Listener):
@@ -127,45 +135,39 @@ class Twice(Listener):
 
 
 async def test_each_handler_of_a_topic_hears_each_message_in_the_order_of_the_classes(make_bus):
-    async with running(Twice, "listener", make_bus) as listener:
-        async with running(Talker, "talker", make_bus) as talker:
-            await eventually(lambda: bool(listener.peers))
-            for x_m in (1.0, 2.0):
-                talker.publish(topics.POSE, m.Pose(x_m, 0.0, 0.0))
-                await eventually(lambda x_m=x_m: listener.heard[-1:] != []
-                                 and listener.heard[-1][0].x_m == x_m)
-            talker.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
-            await eventually(lambda: len(listener.heard) == 6)
-            assert [body.x_m for body, _ in listener.heard[:4]] == [1.0, 1.0, 2.0, 2.0]
-            assert [body.recovery for body, _ in listener.heard[4:]] == ["RM1", "RM1"]
+    async with talking(make_bus, Twice) as (listener, talker):
+        for x_m in (1.0, 2.0):
+            talker.publish(topics.POSE, m.Pose(x_m, 0.0, 0.0))
+            await eventually(lambda x_m=x_m: listener.heard[-1:] != []
+                             and listener.heard[-1][0].x_m == x_m)
+        talker.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
+        await eventually(lambda: len(listener.heard) == 6)
+        assert [body.x_m for body, _ in listener.heard[:4]] == [1.0, 1.0, 2.0, 2.0]
+        assert [body.recovery for body, _ in listener.heard[4:]] == ["RM1", "RM1"]
 
 
 async def test_garbage_is_counted_and_reported_and_the_actor_goes_on(make_bus):
-    async with running(Listener, "listener", make_bus) as listener:
-        async with running(Talker, "talker", make_bus) as talker:
-            await eventually(lambda: bool(listener.peers))
-            pose = encode(Header("talker", 1, 900, 0.0), m.Pose(0.0, 0.0, 0.0))
-            no_text = encode(Header("talker", 1, 901, 0.0), fm.Reset("RM1", "x")).replace(
-                b"talker", b"talk\xff\xff")
-            # On a key that Zenoh does not thin out when a burst finds its queue full.
-            for garbage in (b"", b"\xff\x00 garbage", b"\x91" * 100_000, pose, no_text):
-                talker._bus.publish(ftm_topics.RESET, ftm_topics.RESET.at(), garbage)
-            talker.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
-            await eventually(lambda: listener._rejected == 5)
-            await eventually(lambda: len(listener.heard) == 1)
+    async with talking(make_bus) as (listener, talker):
+        pose = encode(Header("talker", 1, 900, 0.0), m.Pose(0.0, 0.0, 0.0))
+        no_text = encode(Header("talker", 1, 901, 0.0), fm.Reset("RM1", "x")).replace(
+            b"talker", b"talk\xff\xff")
+        # On a key that Zenoh does not thin out when a burst finds its queue full.
+        for garbage in (b"", b"\xff\x00 garbage", b"\x91" * 100_000, pose, no_text):
+            talker._bus.publish(ftm_topics.RESET, ftm_topics.RESET.at(), garbage)
+        talker.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
+        await eventually(lambda: listener._rejected == 5)
+        await eventually(lambda: len(listener.heard) == 1)
 
 
 async def test_a_message_from_the_future_is_refused_and_shuts_out_none_that_is_of_now(make_bus):
-    async with running(Listener, "listener", make_bus) as listener:
-        async with running(Talker, "talker", make_bus) as talker:
-            await eventually(lambda: bool(listener.peers))
-            now_s = talker.clock.now()
-            for count, stamp_s in enumerate((now_s + 3600.0, math.inf, math.nan), start=1):
-                talker.publish(topics.POSE, m.Pose(9.0, 0.0, 0.0), stamp=stamp_s)
-                await eventually(lambda count=count: listener._rejected == count)
-            talker.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0))
-            await eventually(lambda: len(listener.heard) == 1)
-            assert listener.heard[0][0].x_m == 1.0
+    async with talking(make_bus) as (listener, talker):
+        now_s = talker.clock.now()
+        for count, stamp_s in enumerate((now_s + 3600.0, math.inf, math.nan), start=1):
+            talker.publish(topics.POSE, m.Pose(9.0, 0.0, 0.0), stamp=stamp_s)
+            await eventually(lambda count=count: listener._rejected == count)
+        talker.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0))
+        await eventually(lambda: len(listener.heard) == 1)
+        assert listener.heard[0][0].x_m == 1.0
 
 
 @pytest.mark.parametrize("forged", [1, 3, 77, 2 ** 53])
@@ -218,15 +220,13 @@ def test_a_command_that_was_under_way_for_too_long_is_not_obeyed_and_a_state_is(
 
 
 async def test_a_command_that_comes_twice_is_handled_once(make_bus):
-    async with running(Listener, "listener", make_bus) as listener:
-        async with running(Talker, "talker", make_bus) as talker:
-            await eventually(lambda: bool(listener.peers))
-            twice = encode(Header("talker", 1, 5, 0.0), fm.Reset("RM1", "operator"))
-            talker._bus.publish(ftm_topics.RESET, ftm_topics.RESET.at(), twice)
-            talker._bus.publish(ftm_topics.RESET, ftm_topics.RESET.at(), twice)
-            talker.publish(ftm_topics.RESET, fm.Reset("RM2", "operator"))
-            await eventually(lambda: any(b.recovery == "RM2" for b, _ in listener.heard))
-            assert [b.recovery for b, _ in listener.heard] == ["RM1", "RM2"]
+    async with talking(make_bus) as (listener, talker):
+        twice = encode(Header("talker", 1, 5, 0.0), fm.Reset("RM1", "operator"))
+        talker._bus.publish(ftm_topics.RESET, ftm_topics.RESET.at(), twice)
+        talker._bus.publish(ftm_topics.RESET, ftm_topics.RESET.at(), twice)
+        talker.publish(ftm_topics.RESET, fm.Reset("RM2", "operator"))
+        await eventually(lambda: any(b.recovery == "RM2" for b, _ in listener.heard))
+        assert [b.recovery for b, _ in listener.heard] == ["RM1", "RM2"]
 
 
 async def test_a_handler_that_raises_ends_its_actor_only(make_bus):
@@ -240,15 +240,6 @@ async def test_a_handler_that_raises_ends_its_actor_only(make_bus):
         talker.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
         with pytest.raises(ValueError, match="outputs do not declare"):
             talker.publish(topics.SCAN, m.LaserScan(0.0, 0.1, 8.0, b""))
-
-
-async def test_timers_run_at_the_rate_of_simulated_time(make_bus):
-    async with running(Listener, "listener", make_bus, rate=4.0) as fast:
-        start, ticks = fast.clock.now(), fast.ticks
-        await asyncio.sleep(0.25)
-        elapsed, ticked = fast.clock.now() - start, fast.ticks - ticks
-        assert elapsed > 0.9
-        assert ticked == pytest.approx(elapsed / 0.02, rel=0.5)
 
 
 class Former(Talker):
@@ -267,13 +258,14 @@ class Newcomer(Listener):
 async def test_what_a_newcomer_hears_of_before_is_each_topics_last_if_that_is_no_silence(
         make_bus, age_s, number):
     order = m.GoalOrder("m1", 0, m.Goal(1.0, 2.0, m.Mode.TAXI), True)
-    async with running(Former, "talker", make_bus) as former:
+    slow = 0.05  # on a busy machine the newcomer takes a while
+    async with running(Former, "talker", make_bus, rate=slow) as former:
         now_s = former.clock.now()
         former.publish(topics.GOAL, order, stamp=now_s - 100.0)
         former.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0), stamp=now_s - age_s - 0.01)
         former.publish(topics.POSE, m.Pose(2.0, 0.0, 0.0), stamp=now_s - age_s)
         former.publish(ftm_topics.RESET, fm.Reset("RM1", "you"))
-        async with running(Newcomer, "listener", make_bus) as newcomer:
+        async with running(Newcomer, "listener", make_bus, rate=slow) as newcomer:
             await eventually(lambda: len(newcomer.heard) >= number)
             former.publish(ftm_topics.RESET, fm.Reset("RM2", "you"))
             await eventually(lambda: len(newcomer.heard) > number)
@@ -287,9 +279,7 @@ async def test_what_a_newcomer_hears_of_before_is_each_topics_last_if_that_is_no
 async def test_a_newcomer_hears_nothing_twice_and_nothing_of_the_dead(make_bus):
     async with running(Talker, "talker", make_bus) as dead:
         dead.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0))
-    async with (running(Talker, "talker", make_bus) as talker,
-                running(Listener, "listener", make_bus) as listener):
-        await eventually(lambda: bool(listener.peers))
+    async with talking(make_bus) as (listener, talker):
         for x in (2.0, 3.0, 4.0):
             talker.publish(topics.POSE, m.Pose(x, 0.0, 0.0))
             await asyncio.sleep(0.02)
@@ -302,13 +292,11 @@ async def test_what_a_node_has_no_use_for_in_this_life_does_not_reach_it(make_bu
         def listens(self, topic) -> bool:
             return topic is not topics.POSE
 
-    async with running(Deaf, "listener", make_bus) as deaf:
-        async with running(Talker, "talker", make_bus) as talker:
-            await eventually(lambda: bool(deaf.peers))
-            talker.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
-            talker.publish(ftm_topics.RESET, fm.Reset("RM1", "you"))
-            await eventually(lambda: bool(deaf.heard))
-            assert [message for message, _ in deaf.heard] == [fm.Reset("RM1", "you")]
+    async with talking(make_bus, Deaf) as (deaf, talker):
+        talker.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
+        talker.publish(ftm_topics.RESET, fm.Reset("RM1", "you"))
+        await eventually(lambda: bool(deaf.heard))
+        assert [message for message, _ in deaf.heard] == [fm.Reset("RM1", "you")]
 
 
 def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
@@ -376,23 +364,22 @@ def test_a_handler_with_a_name_that_the_base_class_has_is_refused(base, name):
         type("Own", (base,), {name: every(1.0)(lambda self: None)})
 
 
-async def test_an_attribute_that_hides_a_method_is_refused_before_the_node_works():
-    class Own(Actor):
-        def __init__(self, context: Context) -> None:
-            super().__init__(context)
-            self.stop = False
-
-    node = Own(Context("own", 1, Clock(0.0), VirtualBus(Hub(), "own")))
-    with pytest.raises(TypeError, match=r"Own\.stop: Actor has a method of this name"):
-        await node.run()
+class Stopless(Actor):
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.stop = False
 
 
-async def test_a_value_of_the_class_that_hides_a_method_is_refused():
-    class Own(DetectionModule):
-        activate = 3
+class Activateless(DetectionModule):
+    activate = 3
 
-    node = Own(Context("own", 1, Clock(0.0), VirtualBus(Hub(), "own")))
-    with pytest.raises(TypeError, match=r"Own\.activate: DetectionModule has a method"):
+
+@pytest.mark.parametrize(("cls", "words"), [
+    (Stopless, r"Stopless\.stop: Actor has a method of this name"),
+    (Activateless, r"Activateless\.activate: DetectionModule has a method")])
+async def test_an_attribute_that_hides_a_method_is_refused_before_the_node_works(cls, words):
+    node = cls(Context("own", 1, Clock(0.0), VirtualBus(Hub(), "own")))
+    with pytest.raises(TypeError, match=words):
         await node.run()
 
 

@@ -275,17 +275,6 @@ def test_a_message_that_leaves_as_it_came_is_not_affected(mode, fields, affected
     assert faults.expire("i") == affected
 
 
-def test_the_first_effect_is_told_once():
-    faults = gate("drop", on_s=1.0, off_s=1.0)
-    sent(faults, [11.0])
-    assert faults.take_news() == []
-    sent(faults, [12.0, 12.1])
-    ((order, affected, reason),) = faults.take_news()
-    assert (order.injection, order.topic, affected, reason) == (
-        "i", "localization/pose", 1, "")
-    assert faults.take_news() == []
-
-
 def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
     faults = gate("drop")
     sent(faults, [11.0, 12.0])
