@@ -10,6 +10,7 @@ import pytest
 
 from rampart.files import working_folder
 from tests import ROOT
+from tests.documents.page import Page
 
 LOOK = ("from rampart.actors.system import members\n"
         "from rampart.files import working_folder\n"
@@ -58,9 +59,7 @@ def test_a_folder_that_is_gone_is_not_searched(tmp_path, monkeypatch):
     assert working_folder.why_not() == "the working folder is gone (No such file or directory)"
 
 
-TANK = (ROOT / "docs/how-to/ready-modules.md").read_text(encoding="utf-8")
-TANK_ACTORS = TANK.split("```python\n")[1].split("```")[0]
-TANK_TOML = "name = " + TANK.split("```toml\nname = ")[1].split("```")[0]
+TANK = Page("how-to/ready-modules")
 
 
 @pytest.mark.parametrize(("mode", "code"), [(0o755, 0), (0o757, 2)])
@@ -69,8 +68,8 @@ def test_modules_beside_a_specification_are_imported_if_only_the_user_can_write_
     there, here = tmp_path / "there", tmp_path / "here"
     there.mkdir()
     here.mkdir()
-    (there / "tank.py").write_text(TANK_ACTORS)
-    (there / "tank.toml").write_text(TANK_TOML)
+    (there / "tank.py").write_text(TANK.block("python"))
+    (there / "tank.toml").write_text(TANK.block("toml", "name = "))
     there.chmod(mode)
     done = subprocess.run(
         [sys.executable, "-P", "-m", "rampart.cli.main", "run", "--system", "../there/tank.toml",

@@ -43,18 +43,18 @@ def disagreements(layout: Layout, config: Mapping[str, Any]) -> tuple[list[str],
     Returns what is let through and not declared, or the other way round; and who may publish on
     each key.
     """
-    declared = Declared(layout)
-    keys = {key: zenoh.KeyExpr(f"{ROOT}/{key}") for key in dict.fromkeys(declared.keys())}
+    every, declared = declared_rights(layout)
+    keys = {key: zenoh.KeyExpr(f"{ROOT}/{key}") for key in every}
     wrong: list[str] = []
     speakers: dict[str, set[str]] = {}
-    for name in declared.identities:
+    for name, right in declared.items():
         for flow, message, what in _CLAIMS:
             lets = _let_through(config, name, flow, message)
             for key, expression in keys.items():
                 may = lets(expression)
                 if may and (flow, message) == ("ingress", "put"):
                     speakers.setdefault(key, set()).add(name)
-                if may != declared.may(name, what, key):
+                if may != (key in right.get(what, ())):
                     wrong.append(f"{name}: {message} of {key!r} ({flow}) is " + (
                         "let through, and not declared" if may else "declared, and refused"))
     return wrong, speakers
@@ -82,103 +82,66 @@ def on_each_host(layout: Layout) -> Iterator[Layout]:
 def _let_through(config: Mapping[str, Any], common_name: str, flow: str,
                  message: str) -> Callable[[zenoh.KeyExpr], bool]:
     """Return whether a router lets a message through on a key, by the name in a certificate."""
-    if not config["enabled"]:
-        return lambda _key: True
+    assert (config["enabled"], config["default_permission"]) == (True, "deny")
+    assert {rule["permission"] for rule in config["rules"]} == {"allow"}
     subjects = {subject["id"] for subject in config["subjects"]
-                if common_name in subject.get("cert_common_names", [common_name])}
+                if common_name in subject["cert_common_names"]}
     chosen = {rule for policy in config["policies"] if subjects & set(policy["subjects"])
               for rule in policy["rules"]}
-    found: dict[str, list[str]] = {"allow": [], "deny": []}
-    for rule in config["rules"]:
-        if rule["id"] in chosen and flow in rule["flows"] and message in rule["messages"]:
-            found[rule["permission"]] += rule["key_exprs"]
-    by_default = config["default_permission"] == "allow"
-    denies, allows = _includer(found["deny"]), _includer(found["allow"])
-    return lambda key: not denies(key) and (by_default or allows(key))
-
-
-def _includer(expressions: list[str]) -> Callable[[zenoh.KeyExpr], bool]:
-    literal = {one for one in expressions if "*" not in one}
-    wide = [zenoh.KeyExpr(one) for one in expressions if "*" in one]
+    keys = [key for rule in config["rules"] for key in rule["key_exprs"]
+            if rule["id"] in chosen and flow in rule["flows"] and message in rule["messages"]]
+    literal = {one for one in keys if "*" not in one}
+    wide = [zenoh.KeyExpr(one) for one in keys if "*" in one]
     return lambda key: str(key) in literal or any(one.includes(key) for one in wide)
 
 
-class Declared:
-    """What the classes of a system declare, asked key by key."""
+Right = dict[str, set[str]]
+"""The keys that an identity may say, hear, answer and ask."""
 
-    def __init__(self, layout: Layout) -> None:
-        hosts = layout.hosts
-        self._own = layout.plan.host
-        routers = {name: host for host in hosts.supervisors for name in hosts.routers_of(host)}
-        self._members = {**layout.members, **{name: router(name) for name in routers}}
-        self._may_run = {host: {*hosts.may_run(host, layout.members), *hosts.routers_of(host)}
-                         for host in hosts.supervisors}
-        self._far = {name: host for name, host in routers.items() if host != self._own}
-        self.identities = (*layout.members, *self._far, *PEOPLE)
-        self._pages = [m for m in layout.members.values() if m.actor.is_page]
-        self._names = [*routers, *layout.members]
-        every = (*declared_topics(layout.spec), *BASE_OUTPUTS, *BASE_INPUTS,
-                 *layout.topics.values(),
-                 *(t for m in (*layout.members.values(), *map(router, routers))
-                   for t in (*m.actor.outputs, *m.actor.inputs())))
-        self._topics = {topic.key: topic for topic in every}
 
-    def keys(self) -> Iterator[str]:
-        """Yield all keys that there are, below the root."""
-        for topic in self._topics.values():
-            for name in self._names if topic.is_family else ("",):
-                yield topic.key.replace("{name}", name)
-        for member in self._members.values():
-            yield from member.actor.own_keys(member.parameters)
-        yield from _FOREIGN
+def declared_rights(layout: Layout) -> tuple[list[str], dict[str, Right]]:
+    """Return all keys below the root, and by identity what the classes of a system declare.
 
-    def may(self, identity: str, what: str, key: str) -> bool:
-        """Return whether an identity declares that it says, hears, ... on a key.
+    A router of another host has the rights of everything that may run there, and of people. A node
+    that runs elsewhere has no link to a router of this host.
+    """
+    hosts = layout.hosts
+    routers = {name: host for host in hosts.supervisors for name in hosts.routers_of(host)}
+    members = {**layout.members, **{name: router(name) for name in routers}}
+    topics = {topic.key: topic for topic in (
+        *declared_topics(layout.spec), *BASE_OUTPUTS, *BASE_INPUTS, *layout.topics.values(),
+        *(t for m in members.values() for t in (*m.actor.outputs, *m.actor.inputs())))}.values()
+    own = {name: set(m.actor.own_keys(m.parameters)) for name, m in members.items()}
+    keys = list(dict.fromkeys((
+        *(topic.key.replace("{name}", name) for topic in topics
+          for name in (members if topic.is_family else ("",))), *set().union(*own.values()),
+        *_FOREIGN)))
+    kept = {key for key in keys if any(
+        topic.member(key) is not None and topic.qos is not Qos.COMMAND for topic in topics)}
+    found: dict[str, Right] = {}
+    for name, member in members.items():
+        says, hears = ({key for key in keys if may(member, key)} for may in (_says, _hears))
+        found[name] = {"says": says | own[name], "hears": hears | own[name],
+                       "answers": says & kept, "asks": (hears | own[name]) & kept}
+    pages = [name for name, member in layout.members.items() if member.actor.is_page]
+    outside = {topic.key for topic in topics if topic.outside and topic.qos is Qos.COMMAND}
+    operated = {INJECT.key, *outside, *(key for page in pages for key in found[page]["says"] if not
+                any(topic.member(key) is not None for topic in BASE_OUTPUTS))}
+    found[OBSERVER]["says"] |= operated
+    if len(hosts.supervisors) > 1:  # its recorder does
+        found[OBSERVER]["hears"] = set(keys)
+    found["viewer"] = {"hears": set(keys), "asks": set(keys)}
+    found["operator"] = {**found["viewer"], "says": operated}
 
-        The routers of another host do for all that may run there, and for people; who runs
-        elsewhere has no link to a router of this host.
-        """
-        if identity in self._far:
-            return any(self._may(one, what, key)
-                       for one in (*self._may_run[self._far[identity]], *PEOPLE))
-        return (identity in self._may_run[self._own] or identity in PEOPLE) and (
-            self._may(identity, what, key))
+    def on(host: str) -> set[str]:
+        return {*hosts.may_run(host, layout.members), *hosts.routers_of(host)}
 
-    def _may(self, identity: str, what: str, key: str) -> bool:
-        if what == "never":
-            return False
-        of_person, kept = identity in PEOPLE, self._is_kept(key)
-        if what == "answers":
-            return not of_person and kept and _says(self._members[identity], key)
-        if what == "asks":
-            return (of_person or kept) and self._hears(identity, key)
-        if what == "hears" and identity == OBSERVER and len(self._may_run) > 1:
-            return True  # its recorder does
-        return (self._says if what == "says" else self._hears)(identity, key)
-
-    def _says(self, identity: str, key: str) -> bool:
-        if identity in PEOPLE:
-            return identity == "operator" and self._is_operated(key)
-        member = self._members[identity]
-        return (key in member.actor.own_keys(member.parameters) or _says(member, key)
-                or (identity == OBSERVER and self._is_operated(key)))
-
-    def _hears(self, identity: str, key: str) -> bool:
-        if identity in PEOPLE:
-            return True
-        member = self._members[identity]
-        return key in member.actor.own_keys(member.parameters) or _hears(member, key)
-
-    def _is_operated(self, key: str) -> bool:
-        if any(topic.member(key) is not None for topic in BASE_OUTPUTS):
-            return False
-        return key == INJECT.key or any(_says(page, key) for page in self._pages) or any(
-            topic.outside and topic.qos is Qos.COMMAND and topic.key == key
-            for topic in self._topics.values())
-
-    def _is_kept(self, key: str) -> bool:
-        return any(topic.member(key) is not None and topic.qos is not Qos.COMMAND
-                   for topic in self._topics.values())
+    far = {name: {what: set().union(*(found[one].get(what, ()) for one in (*on(host), *PEOPLE)))
+                  for what in ("says", "hears", "answers", "asks")}
+           for name, host in routers.items() if host != layout.plan.host}
+    here = {name: right if name in PEOPLE or name in on(layout.plan.host) else {}
+            for name, right in found.items() if name in layout.members or name in PEOPLE}
+    return keys, here | far
 
 
 def _says(member: Member, key: str) -> bool:

@@ -121,21 +121,14 @@ class Keyed:
         return Credentials(found.authority, found.own, {self.socket: self.at})
 
     def __enter__(self):
-        self.start()
+        self.router = zenoh.open(session_config(
+            [self.socket], [], self.shown("router_a"), access_of(self.layout, str(self.keys))))
         return self
 
     def __exit__(self, *_):
         self.router.close()
         for one in self._kept:
             one.close()
-
-    def start(self):
-        self.router = zenoh.open(session_config(
-            [self.socket], [], self.shown("router_a"), access_of(self.layout, str(self.keys))))
-
-    def restart(self):
-        self.router.close()
-        self.start()
 
     def joined(self, name: str, credentials: Credentials | None = None):
         return opened(session_config((), [self.socket], credentials or self.shown(name)))

@@ -13,20 +13,20 @@ import zenoh
 
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.topics import INJECT
-from tests.actors.access.declared import Declared
+from tests.actors.access.declared import declared_rights
 from tests.actors.access.keyed import Keyed, every_key, layout_of, make_keys, wait_for
 
 pytestmark = pytest.mark.processes
 
 LAYOUT = layout_of("osmosis")
-DECLARED = Declared(LAYOUT)
+_, DECLARED = declared_rights(LAYOUT)
 KEYS = every_key(LAYOUT)
 NODES = ("safety_pilot", "ftm_manager", "supervisor", "DM4", "hmi", "observer")
 PEOPLE = {"ada": "operator", "bob": "viewer"}
 
 
 def may(name, what):
-    return {key for key in KEYS if DECLARED.may(PEOPLE.get(name, name), what, key)}
+    return DECLARED[PEOPLE.get(name, name)].get(what, set()).intersection(KEYS)
 
 
 @pytest.fixture(scope="module")

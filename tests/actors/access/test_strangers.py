@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from rampart.actors.access import key_folder
 from rampart.actors.access.certificates import new_authority, new_certificate, public_part
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.bus import BusError
@@ -149,26 +148,6 @@ def test_only_a_certificate_of_the_authority_that_is_valid_is_let_in(keyed, what
             "of another authority": lambda: issued(new_authority(NOW, 9)),
             "signed by a node": lambda: issued(node, chain=public_part(node))}[what]()
     assert is_let_in(keyed, written(keyed, made)) == taken
-
-
-def test_a_rotated_one_is_taken_by_the_same_router(keyed):
-    before = (keyed.keys / "safety_pilot.pem").read_bytes()
-    key_folder.rotate(keyed.keys, ["safety_pilot"])
-    assert (keyed.keys / "safety_pilot.pem").read_bytes() != before
-    assert is_let_in(keyed, keyed.shown("safety_pilot"))
-    assert is_let_in(keyed, written(keyed, before))  # until it expires
-
-
-def test_a_revoked_one_is_out_when_the_router_has_restarted(keyed):
-    stolen = written(keyed, (keyed.keys / "safety_pilot.pem").read_bytes(), "stolen")
-    key_folder.revoke(keyed.keys, ["safety_pilot"])
-    assert is_let_in(keyed, stolen)  # no router has read it yet
-    keyed.restart()
-    assert not is_let_in(keyed, stolen)
-    key_folder.issue(keyed.keys, ["safety_pilot"], "node")
-    keyed.restart()
-    assert is_let_in(keyed, keyed.shown("safety_pilot"))
-    assert not is_let_in(keyed, stolen)  # the same name, another identity
 
 
 def test_a_link_is_closed_when_its_certificate_expires(keyed):

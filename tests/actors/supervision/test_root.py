@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -18,13 +17,10 @@ import msgspec
 import pytest
 import pytest_asyncio
 
-from benchmarks.own_root import OwnLauncher
-from rampart.actors.bus import run_info
 from rampart.actors.bus.run_info import find_runs
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.runtime.run_plan import load_document
-from rampart.actors.supervision.launcher import LaunchError
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
 from rampart.cli import systems
@@ -88,14 +84,6 @@ async def test_the_next_supervisor_is_there_within_thirty_milliseconds_of_the_la
                 await asyncio.sleep(0.001)
             took.append(time.monotonic() - begun_s)
     assert sorted(took)[len(took) // 2] < 0.03
-
-
-@pytest.mark.processes
-@pytest.mark.alone
-async def test_a_stopped_root_is_continued(run, witness):
-    async with witness.comes_back("DM1"):
-        os.kill(run[0].plan.launcher_pid, signal.SIGSTOP)
-        os.kill(witness.pid("DM1"), signal.SIGKILL)
 
 
 @pytest.mark.processes
@@ -210,18 +198,6 @@ async def test_what_starts_after_a_change_of_the_system_knows_it(tmp_path):
 
 
 # -- start and end ---------------------------------------------------------------------------------
-
-
-@pytest.mark.processes
-async def test_the_number_of_another_run_is_refused_before_anything_starts(tmp_path):
-    plan = stub_plan(write_stub_system(tmp_path))
-    launcher = OwnLauncher(plan, "test")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
-        other.bind(run_info.address(plan.base_port))
-        with pytest.raises(LaunchError, match=f"--port {plan.base_port}: in use by another run"):
-            await launcher.load()
-        await launcher.end()
-    assert find_processes(plan.base_port) == []
 
 
 @asynccontextmanager

@@ -23,7 +23,7 @@ from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.run_folder import ROUTERS
 from rampart.actors.bus.run_info import find_runs
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import NodeTable, ProcessEvent, RespawnRequest
+from rampart.actors.ftm.messages import NodeTable, ProcessEvent
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_plan import load_system
@@ -161,23 +161,6 @@ async def test_a_node_is_back_while_who_hears_it_is_stopped(witness, port):
         os.kill(process(port, "ftm_manager"), signal.SIGKILL)
         await eventually(lambda: process(port, "ftm_manager") is None)
         os.kill(supervisor, signal.SIGCONT)
-
-
-async def test_a_node_of_a_recovery_module_waits_for_its_request(witness):
-    _, life = witness.state("osmosis_control")
-    os.kill(witness.pid("osmosis_control"), signal.SIGKILL)
-    await eventually(lambda: witness.state("osmosis_control") == ("crashed", life))
-    await asyncio.sleep(0.3)
-    assert witness.state("osmosis_control") == ("crashed", life)
-    request = RespawnRequest(1, "osmosis_control", life, "RM3")
-    for _ in range(3):  # the same request again changes nothing
-        witness.publish(topics.RESPAWN, request)
-    await eventually(lambda: witness.state("osmosis_control") == ("running", life + 1))
-    witness.publish(topics.RESPAWN, request)
-    witness.publish(topics.RESPAWN, RespawnRequest(2, "nobody", 1, "RM3"))
-    await eventually(lambda: witness.saw("nobody", "refused"))
-    await asyncio.sleep(0.2)
-    assert witness.state("osmosis_control") == ("running", life + 1)
 
 
 async def test_an_observer_hears_the_error_reports_of_all_nodes(witness):

@@ -409,6 +409,21 @@ async def test_a_living_process_is_replaced_once_however_long_nobody_can_fork(wo
 
 
 @within(running)
+async def test_a_node_of_a_recovery_module_waits_for_its_request_which_counts_once(world):
+    world.kill("osmosis_control")
+    await asyncio.sleep(1.0)
+    assert world.row("osmosis_control")[:2] == ("crashed", 1)
+    world.respawn("nobody", 1)
+    for _ in range(2):
+        for _ in range(3):
+            world.respawn("osmosis_control", 1)
+        await asyncio.sleep(1.0)
+    assert world.row("osmosis_control")[:2] == ("running", 2)
+    assert world.machine.forks == [("osmosis_control", 2)]
+    assert [event[:2] for event in world.events if event[0] == "nobody"] == [("nobody", "refused")]
+
+
+@within(running)
 async def test_nothing_is_asked_for_again_before_it_is_answered(world):
     world.machine.is_slow = True
     world.kill("DM1")
