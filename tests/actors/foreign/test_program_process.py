@@ -24,6 +24,7 @@ from rampart.actors.foreign.program_process import ProgramProcess
 from rampart.actors.foreign.pulse import NotifySocket
 from rampart.actors.machine.unix_peer import process_state
 from rampart.manager.spec.nodes import ChildLimits
+from rampart.testing import eventually
 from tests import ROOT
 
 FORKS = """
@@ -138,10 +139,14 @@ async def test_it_may_end_in_order_when_it_is_asked_to_also_if_it_is_stopped(tmp
 
 @isolated
 async def test_daemons_that_end_before_it_leave_no_zombies(tmp_path):
-    started = Started(tmp_path, "for i in 1 2 3; do (setsid true & ); done; sleep 0.3; exit 4")
-    await asyncio.sleep(0.2)
-    stats = [file.read_text().rpartition(")")[2].split()[:2] for file in proc("stat")]
-    assert ["Z", str(os.getpid())] not in stats
+    os.mkfifo(tmp_path / "go")
+    started = Started(tmp_path, "for i in 1 2 3; do (setsid sh -c 'echo >> ends' & ); done; "
+                                "read _ < go; exit 4")
+    ends = tmp_path / "ends"
+    await eventually(lambda: ends.exists() and len(ends.read_text()) == 3)
+    await eventually(lambda: ["Z", str(os.getpid())] not in [
+        file.read_text().rpartition(")")[2].split()[:2] for file in proc("stat")])
+    (tmp_path / "go").write_text("\n")
     assert await started.end() == "ended: exit code 4"
 
 
