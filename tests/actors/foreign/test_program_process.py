@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from rampart.actors.foreign.descendants import descendants
+from rampart.actors.foreign.descendants import descendants, is_below, kill_all
 from rampart.actors.foreign.output_log import OutputLog
 from rampart.actors.foreign.program_process import ProgramProcess
 from rampart.actors.foreign.pulse import NotifySocket
@@ -192,6 +192,42 @@ async def test_limits_and_signals_are_those_of_the_program_and_not_of_this_proce
     assert not [one for one in signal.valid_signals() if int(ignored, 16) >> (one - 1) & 1]
     with pytest.raises(ValueError, match=r"limits\.open_files = .* is above the hard limit"):
         Started(tmp_path, "", open_files=mine[1] + 1)
+
+
+PARENT = """
+import asyncio, os, sys
+from pathlib import Path
+from rampart.actors.foreign.output_log import OutputLog
+from rampart.actors.foreign.program_process import ProgramProcess
+from rampart.manager.spec.nodes import ChildLimits
+
+async def main():
+    ProgramProcess("/bin/sh", ["-c", sys.argv[2]], folder=Path(sys.argv[1]),
+                   environment=dict(os.environ), limits=ChildLimits(),
+                   log=OutputLog(Path(sys.argv[1], "it.log")), inherited=[], ended=print)
+    await asyncio.sleep(600)
+
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
+def test_the_program_ends_with_the_process_of_its_node(tmp_path, number):
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, str(tmp_path), "sleep 600; true"],
+                              cwd=ROOT)
+    try:
+        until_s = time.monotonic() + 20
+        while len(pids := descendants(parent.pid)) < 2 and time.monotonic() < until_s:
+            time.sleep(0.01)
+        program = next(pid for pid in pids if is_below(pid, parent.pid)
+                       and Path(f"/proc/{pid}/stat").read_text().split()[3] == str(parent.pid))
+        os.kill(parent.pid, number)
+        parent.wait()
+        while process_state(program) not in "XZ" and time.monotonic() < until_s:
+            time.sleep(0.001)
+        assert process_state(program) in "XZ"
+    finally:
+        kill_all(lambda: [pid for pid in pids if process_state(pid) not in "XZ"])
 
 
 SEND = """
