@@ -22,7 +22,7 @@ from rampart.actors.ros2.translation.types import Types
 _REQUEST, _RESPONSE = "_Request", "_Response"
 _GOAL, _SEND, _GET = "_Goal", "_SendGoal", "_GetResult"
 
-_ENDS = {4: "succeeded", 5: "cancelled", 6: "aborted"}
+ENDS = {4: "succeeded", 5: "cancelled", 6: "aborted"}
 """Status of a goal that has ended (action_msgs/msg/GoalStatus)."""
 
 _RESULT_WITHIN_S = 86_400.0
@@ -261,7 +261,7 @@ class ActionCall:
             if answer is None:
                 raise ValueError(why)
             status = self._types.decode(f"{self._link.type}{_GET}{_RESPONSE}", answer).status
-            self._publish(number, _ENDS.get(int(status), "aborted"))
+            self._publish(number, ENDS.get(int(status), "aborted"))
         except ValueError as error:
             self._publish(number, "unanswered", str(error))
 

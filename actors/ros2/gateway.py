@@ -207,10 +207,10 @@ class Gateway(Actor):
         if given.middleware == "rclpy" and not run.plan.virtual:
             self._side = self._relay = self._start_relay()
         else:
-            self._side = side_of(self, self._bus, given.connect, given.mode, self._recorder.take,
-                                 tls=given.tls)
+            self._side = side_of(self, self._bus, given.connect, given.mode, tls=given.tls)
         self.node = RosNode(self._side, self._types, given.node, wall_ns=partial(wall_ns, self),
-                            refuse=self.refuse, namespace=given.namespace, domain=given.domain)
+                            refuse=self.refuse, namespace=given.namespace, domain=given.domain,
+                            record=None if run.plan.virtual else self._recorder.take)
         if given.clock == "ros":
             decode = self._types.decoder(_CLOCK_TYPE)
             self.node.subscribe(_CLOCK, _CLOCK_TYPE, Qos(reliable=False, depth=1),
@@ -243,8 +243,8 @@ class Gateway(Actor):
         log = OutputLog(log_folder(run.plan) / f"{self.name}.log")
         log.note(f"{self.name} #{self.context.incarnation} starts its relay")
         return RelaySide(given.node, given.namespace, given.domain, given.distribution,
-                         given.setup, lost=self._relay_lost, record=self._recorder.take,
-                         output=log.write, first_s=run.system.timing.startup_grace_s)
+                         given.setup, lost=self._relay_lost, output=log.write,
+                         first_s=run.system.timing.startup_grace_s)
 
     def _relay_lost(self, error: RelayError) -> None:
         def fail() -> None:

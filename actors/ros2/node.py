@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import count
 
-from rampart.actors.ros2.side import Side
+from rampart.actors.ros2.side import Side, packed, recorded_key
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import Attachment, Endpoint, EndpointKind, Qos, dds_name
 
@@ -33,13 +33,15 @@ class RosNode:
         domain: of ROS.
         wall_ns: returns the time of ROS 2, nanoseconds since 1970.
         refuse: called with topic and reason for each message that is not one of ROS 2.
+        record: takes key and payload of each message for the recording, if given; the virtual bus
+            is recorded anyway.
     """
 
     def __init__(self, side: Side, types: Types, name: str, *, wall_ns: Callable[[], int],
-                 refuse: Callable[[str, str], None], namespace: str = "/", domain: int = 0
-                 ) -> None:
+                 refuse: Callable[[str, str], None], namespace: str = "/", domain: int = 0,
+                 record: Callable[[str, bytes], None] | None = None) -> None:
         self._side, self.types, self._wall_ns, self._refuse = side, types, wall_ns, refuse
-        self.domain = domain
+        self.domain, self._record = domain, record
         self._node = Endpoint(domain, side.id, _NODE_ID, _NODE_ID, EndpointKind.NODE, name,
                               namespace)
         self._ids = count(1)
@@ -58,6 +60,13 @@ class RosNode:
                         node.node, node.namespace, topic, dds_name(ros_type),
                         self.types.hash(ros_type), qos)
 
+    def _keeper(self, key: str) -> Callable[[bytes, bytes | None], None]:
+        """Return a function that records a message on a key."""
+        record, where = self._record, recorded_key(key)
+        if record is None:
+            return lambda _payload, _attachment: None
+        return lambda payload, attachment: record(where, packed(payload, attachment))
+
     def publisher(self, topic: str, ros_type: str, qos: Qos) -> Callable[[bytes], None]:
         """Return a function that publishes a message on a topic.
 
@@ -66,11 +75,14 @@ class RosNode:
         """
         mine = self._endpoint(EndpointKind.PUBLISHER, topic, ros_type, qos)
         put, gid, numbers = self._side.publisher(mine.key, qos), mine.gid, count(1)
+        keep = self._keeper(mine.key)
         self._published.add(gid)
         self._side.token(mine.token)
 
         def publish(payload: bytes) -> None:
-            put(payload, Attachment(next(numbers), self._wall_ns(), gid).pack())
+            attachment = Attachment(next(numbers), self._wall_ns(), gid).pack()
+            put(payload, attachment)
+            keep(payload, attachment)
 
         return publish
 
@@ -85,8 +97,10 @@ class RosNode:
             ValueError: the type is not known.
         """
         mine = self._endpoint(EndpointKind.SUBSCRIPTION, topic, ros_type, qos)
+        keep = self._keeper(mine.key)
 
         def deliver(payload: bytes, attached: bytes | None) -> None:
+            keep(payload, attached)
             try:
                 attachment = Attachment.unpack(attached)
             except ValueError as error:

@@ -27,15 +27,7 @@ import msgspec
 
 from rampart.actors.foreign.program import inherited_environment
 from rampart.actors.foreign.pulse import Pulse
-from rampart.actors.ros2.side import (
-    NO_ANSWER,
-    Answered,
-    Deliver,
-    Record,
-    Reply,
-    packed,
-    recorded_key,
-)
+from rampart.actors.ros2.side import NO_ANSWER, Answered, Deliver, Reply
 from rampart.actors.ros2.wire import (
     UNKNOWN_GID,
     UNKNOWN_HASH,
@@ -73,7 +65,6 @@ class RelaySide:
         setup: file that bash sources first, e.g. a workspace's `install/setup.bash`; "" for the
             environment as it is or, if that has no ROS 2, `/opt/ros/DISTRIBUTION/setup.bash`.
         lost: called once with a `RelayError` when the relay has ended.
-        record: takes each message that is published or received, if given.
         output: takes what the relay prints, if given.
         whole: whether the graph has the endpoints of all topics, or those of our topics only.
         first_s: how long the relay may take to start.
@@ -87,17 +78,17 @@ class RelaySide:
     """
 
     def __init__(self, name: str, namespace: str, domain: int, distribution: str, setup: str, *,
-                 lost: Callable[[RelayError], None], record: Record | None = None,
+                 lost: Callable[[RelayError], None],
                  output: Callable[[bytes], None] | None = None, whole: bool = False,
                  first_s: float = 10.0) -> None:
         self.id = f"{_SESSION}-{os.getpid()}"
         self.problems: list[str] = []
         self._domain, self._distribution = domain, distribution
-        self._lost, self._record, self._output = lost, record, output
+        self._lost, self._output = lost, output
         self._loop = asyncio.get_running_loop()
         self._pulse = Pulse(HANG_S, max(first_s, HANG_S), HANG_S)
         self._numbers = count(1)
-        self._readers: dict[str, tuple[str, Deliver]] = {}
+        self._readers: dict[str, Deliver] = {}
         self._servers: dict[str, Callable[[bytes, bytes | None, Reply], None]] = {}
         self._asked: dict[int, tuple[bytes, Answered, asyncio.TimerHandle]] = {}
         self._watchers: list[Callable[[str, bool], None]] = []
@@ -143,19 +134,12 @@ class RelaySide:
     def publisher(self, key: str, qos: Qos) -> Callable[[bytes, bytes], None]:
         """See `Side.publisher`."""
         topic = self._declare(EndpointKind.PUBLISHER, key, qos)
-        where = recorded_key(key)
-
-        def publish(payload: bytes, attachment: bytes) -> None:
-            self._send("put", topic, time.monotonic(), payload=payload)
-            if self._record is not None:
-                self._record(where, packed(payload, attachment))
-
-        return publish
+        return lambda payload, _attachment: self._send(
+            "put", topic, time.monotonic(), payload=payload)
 
     def subscribe(self, key: str, qos: Qos, deliver: Deliver) -> None:
         """See `Side.subscribe`."""
-        self._readers[self._declare(EndpointKind.SUBSCRIPTION, key, qos)] = (
-            recorded_key(key), deliver)
+        self._readers[self._declare(EndpointKind.SUBSCRIPTION, key, qos)] = deliver
 
     def serve(self, key: str, asked: Callable[[bytes, bytes | None, Reply], None]) -> None:
         """See `Side.serve`; a request that is not answered at once gets no answer."""
@@ -306,12 +290,8 @@ class RelaySide:
 
     def _on_message(self, topic: str, gid: str, sequence: int, stamp_ns: int, payload: bytes
                     ) -> None:
-        where, deliver = self._readers[topic]
-        attachment = Attachment(
-            sequence, stamp_ns, bytes.fromhex(gid) if gid else UNKNOWN_GID).pack()
-        deliver(payload, attachment)
-        if self._record is not None:
-            self._record(where, packed(payload, attachment))
+        self._readers[topic](payload, Attachment(
+            sequence, stamp_ns, bytes.fromhex(gid) if gid else UNKNOWN_GID).pack())
 
     def _on_request(self, number: int, service: str, payload: bytes) -> None:
         is_answered = False

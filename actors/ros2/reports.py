@@ -19,6 +19,7 @@ from rampart.actors.bus.fields import NUMBER, TEXT, Field
 from rampart.actors.bus.topic import Topic
 from rampart.actors.detection.finding import Recurrent, Sustained
 from rampart.actors.detection.module import DetectionModule
+from rampart.actors.ros2.calls import ENDS
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import Suspects, TopicHeard
 from rampart.files.plain_text import one_line
@@ -29,8 +30,7 @@ Pattern = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
 
 _LEVELS = ("ok", "warn", "error", "stale")
 _SEVERITIES = {"debug": 10, "info": 20, "warn": 30, "error": 40, "fatal": 50}
-_RESULTS = {4: "succeeded", 5: "cancelled", 6: "aborted"}
-"""Constants of DiagnosticStatus, Log and GoalStatus."""
+"""Constants of DiagnosticStatus and Log."""
 
 _MOST = 1000
 """Most statuses or goals whose state is remembered."""
@@ -244,7 +244,7 @@ class ActionResult(_Counting):
                     ] if message.phase in results else []
         # The gateway passes no ids of goals, so a goal is the time of its acceptance.
         goals = [((one.goal_info.stamp.sec, one.goal_info.stamp.nanosec),
-                  _RESULTS.get(one.status, "")) for one in message.status_list]
+                  ENDS.get(one.status, "")) for one in message.status_list]
         bad = Counter(goal for goal, result in goals if result in results)
         before = self._counted
         if before is None:

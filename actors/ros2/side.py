@@ -90,10 +90,6 @@ Reply = Callable[[bytes, bytes], None]
 Answered = Callable[[bytes | None, bytes | None, str], None]
 """Called with payload and attachment of an answer, or with None, None and the reason."""
 
-Record = Callable[[str, bytes], None]
-"""Takes key and payload of a message for the recording."""
-
-
 class Side(Protocol):
     """The network as a node of ROS 2 uses it.
 
@@ -135,7 +131,6 @@ class ZenohSide:
     Args:
         dial: endpoints of the routers of ROS 2, e.g. "tcp/localhost:7447".
         loop: runs all callbacks.
-        record: takes each message that is published or received, if given.
         mode: "client", with everything through the router, or "peer", with direct links.
         tls: files for endpoints "tls/…".
 
@@ -143,16 +138,14 @@ class ZenohSide:
         ValueError: an endpoint is not valid, or a file cannot be read; one line.
     """
 
-    def __init__(self, dial: Sequence[str], loop: asyncio.AbstractEventLoop,
-                 record: Record | None = None, *, mode: Mode = "client", tls: Tls | None = None
-                 ) -> None:
+    def __init__(self, dial: Sequence[str], loop: asyncio.AbstractEventLoop, *,
+                 mode: Mode = "client", tls: Tls | None = None) -> None:
         self.id = f"{1 << 127 | secrets.randbits(127):032x}"
         try:
             config = _configured(dial, mode, self.id, tls)
         except zenoh.ZError as error:
             raise ValueError(f"connect = {list(dial)}: {' '.join(str(error).split())}") from None
         self._loop = loop
-        self._record = record
         self._session: zenoh.Session | None = None
         self._is_closed = False
         self._waiting: list[Callable[[zenoh.Session], Any]] = []
@@ -228,15 +221,11 @@ class ZenohSide:
         kept: deque[tuple[bytes, bytes]] = deque(maxlen=qos.depth)
         self._declare(declare)
 
-        where = recorded_key(key)
-
         def publish(payload: bytes, attachment: bytes) -> None:
             if made is not None:
                 made.put(payload, attachment=attachment)
             elif qos.transient_local:
                 kept.append((payload, attachment))
-            if self._record is not None:
-                self._record(where, packed(payload, attachment))
 
         return publish
 
@@ -245,14 +234,7 @@ class ZenohSide:
 
         def arrived(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
             payload, attached = sample.payload.to_bytes(), sample.attachment
-            self._tell(received, payload, None if attached is None else attached.to_bytes())
-
-        where = recorded_key(key)
-
-        def received(payload: bytes, attachment: bytes | None) -> None:
-            deliver(payload, attachment)
-            if self._record is not None:
-                self._record(where, packed(payload, attachment))
+            self._tell(deliver, payload, None if attached is None else attached.to_bytes())
 
         if qos.transient_local:
             recovery = ext.RecoveryConfig(

@@ -19,15 +19,15 @@ from rampart.actors.bus.bus import Bus
 from rampart.actors.ros2.bus_side import BusSide, WatchedBus
 from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.ros_clock import EPOCH_NS, NS
-from rampart.actors.ros2.side import Mode, Record, Side, Tls, ZenohSide
+from rampart.actors.ros2.side import Mode, Side, Tls, ZenohSide
 from rampart.actors.ros2.translation.tables import ROUTER
 from rampart.actors.ros2.translation.types import Distribution, Types
 from rampart.actors.ros2.wire import Attachment, Qos
 from rampart.actors.runtime.actor import Actor, Context
 
 
-def side_of(actor: Actor, bus: Bus, connect: Sequence[str], mode: Mode,
-            record: Record | None = None, *, tls: Tls | None = None) -> Side:
+def side_of(actor: Actor, bus: Bus, connect: Sequence[str], mode: Mode, *,
+            tls: Tls | None = None) -> Side:
     """Return the network of ROS 2 for an actor: over Zenoh, or in virtual time over its bus.
 
     Args:
@@ -35,13 +35,12 @@ def side_of(actor: Actor, bus: Bus, connect: Sequence[str], mode: Mode,
         bus: of the actor.
         connect: endpoints of the routers of ROS 2.
         mode: of the session of Zenoh.
-        record: takes each message over Zenoh; the virtual bus is recorded anyway.
         tls: files for endpoints "tls/…".
     """
     context = actor.context
     if context.run.plan.virtual:
         return BusSide(cast("WatchedBus", bus), actor.name, context.incarnation)
-    return ZenohSide(connect, asyncio.get_running_loop(), record, mode=mode, tls=tls)
+    return ZenohSide(connect, asyncio.get_running_loop(), mode=mode, tls=tls)
 
 
 def wall_ns(actor: Actor) -> int:
