@@ -18,6 +18,8 @@ SYSTEM = Path(__file__).resolve().parents[1] / "warehouse.toml"
     (None, None, None), ("localization-jump@12", "M_JUMP", "R_STOP"),
     ("costmap-stale@10", "M_COSTMAP", "R_RESTART"),
     ("drop:nav/command@10+5", "M_SILENT", "R_RESTART"),
+    ("control-late@10", "M_REPORTED", "R_RESTART"), ("no-way@10", "M_REPORTED", "R_RESTART"),
+    ("goal-aborted@10", "M_REPORTED", "R_RESTART"),
     ("stuck:guard/velocity@10+inf", "M_GUARD_STUCK", "R_RESTART"),
     ("drop:guard/velocity@10+inf", "M_GUARD_SILENT", "R_RESTART"),
     ("corrupt:guard/velocity@10+inf", "M_TURN", "R_RESTART"),

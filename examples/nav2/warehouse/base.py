@@ -9,7 +9,7 @@ from rampart import every
 from rampart.actors.ros2.stand_in import StandIn
 from warehouse import topics
 from warehouse.hall import WAY_M, clearance_m, sweep_m
-from warehouse.topics import Skew, Truth
+from warehouse.topics import Skew, Trouble, Truth
 
 STEP_S = 0.02
 RAYS, RANGE_M = 36, 6.0
@@ -31,7 +31,7 @@ class Base(StandIn):
 
     parameters: Parameters
     node_name = "base_driver"
-    outputs = (topics.TRUTH, topics.SKEW)
+    outputs = (topics.TRUTH, topics.SKEW, topics.TROUBLE)
     node_kind = "world"
 
     def declare(self) -> None:
@@ -93,6 +93,7 @@ class Base(StandIn):
         self.publish(topics.TRUTH, Truth(
             self._x_m, self._y_m, clearance_m(self._x_m, self._y_m), self._corners / len(WAY_M)))
         self.publish(topics.SKEW, Skew(0.0))
+        self.publish(topics.TROUBLE, Trouble(False, False, False))
 
     @every(1.0)
     def battery(self) -> None:

@@ -14,13 +14,19 @@ from rampart.actors.ros2.wire import Qos
 from rampart.actors.runtime.actor import every
 from warehouse import topics
 from warehouse.hall import DEPTH_M, WAY_M, WIDTH_M
-from warehouse.topics import Skew
+from warehouse.topics import Skew, Trouble
 
 UNCONFIGURED, INACTIVE, ACTIVE = 1, 2, 3
 """States of lifecycle_msgs/msg/State."""
 TRANSITIONS = {(UNCONFIGURED, 1): INACTIVE, (INACTIVE, 3): ACTIVE, (ACTIVE, 4): INACTIVE,
                (INACTIVE, 2): UNCONFIGURED}
 """State and transition (configure, activate, deactivate, clean up) to the next state."""
+
+EXECUTING, ABORTED = 2, 6
+"""Of action_msgs/msg/GoalStatus."""
+
+ERROR = 40
+"""Of rcl_interfaces/msg/Log."""
 
 SPEED_MPS = 0.7
 
@@ -35,6 +41,13 @@ class Lifecycle(StandIn):
 
     A process that is started later is unconfigured, and publishes nothing until it is active.
     """
+
+    trouble = Trouble(False, False, False)
+
+    @on(topics.TROUBLE)
+    def take_trouble(self, message: Trouble, _header: Header) -> None:
+        """Take the errors to report."""
+        self.trouble = message
 
     def declare(self) -> None:
         """Declare the services of the life cycle."""
@@ -103,6 +116,9 @@ class PlannerServer(Lifecycle):
         self._publish_plan = self.publisher("/plan", "nav_msgs/msg/Path")
         self._publish_map = self.publisher("/global_costmap/costmap", "nav_msgs/msg/OccupancyGrid",
                                        Qos(transient_local=True, depth=1))
+        self._publish_log = self.publisher("/rosout", "rcl_interfaces/msg/Log")
+        self._publish_goals = self.publisher(
+            "/navigate_to_pose/_action/status", "action_msgs/msg/GoalStatusArray")
         self.serve("/navigate_to_pose/_action/cancel_goal", "action_msgs/srv/CancelGoal",
                    self._cancel)
 
@@ -114,6 +130,16 @@ class PlannerServer(Lifecycle):
     def plan(self) -> None:
         """Publish plan and costmap."""
         if not self.is_active:
+            return
+        goals, goal = (self.types.blank(f"action_msgs/msg/{name}")
+                       for name in ("GoalStatusArray", "GoalStatus"))
+        goal.status = ABORTED if self.trouble.aborted else EXECUTING
+        goals.status_list = [goal]
+        self._publish_goals(goals)
+        if self.trouble.no_way:
+            line = self.types.blank("rcl_interfaces/msg/Log")
+            line.name, line.level, line.msg = "planner_server", ERROR, "Failed to find a valid path"
+            self._publish_log(line)
             return
         path = self.types.blank("nav_msgs/msg/Path")
         path.header.frame_id = "map"
@@ -142,9 +168,22 @@ class ControllerServer(Lifecycle):
         self._pose: tuple[float, float, float] | None = None
         self._next: int | None = None
         self._publish = self.publisher("/cmd_vel_nav", "geometry_msgs/msg/Twist")
+        self._publish_status = self.publisher(
+            "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
         self.subscribe("/plan", "nav_msgs/msg/Path", self._planned)
         self.subscribe("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped", self._located,
                        Qos(transient_local=True, depth=1))
+
+    @every(0.5)
+    def report(self) -> None:
+        """Publish whether the control loop keeps its rate."""
+        array, status = (self.types.blank(f"diagnostic_msgs/msg/{name}")
+                         for name in ("DiagnosticArray", "DiagnosticStatus"))
+        status.name = "controller_server: rate"
+        status.level, status.message = (
+            (2, "control loop missed its rate") if self.trouble.late_control else (0, "20 Hz"))
+        array.status = [status]
+        self._publish_status(array)
 
     def _planned(self, message: Any) -> None:
         self._plan = [(p.pose.position.x, p.pose.position.y) for p in message.poses]

@@ -62,6 +62,14 @@ class Skew(Message, frozen=True):
     x_m: float
 
 
+class Trouble(Message, frozen=True):
+    """Which errors the nodes of the navigation report; none without a fault."""
+
+    late_control: bool
+    no_way: bool
+    aborted: bool
+
+
 CHECKED = Topic("guard/velocity", Velocity, Qos.SENSOR, 20, "base_link",
                 "The navigation's command within the guard's limits.")
 ORDER = Topic("guard/order", Order, Qos.STATE, 5, "", "Orders of a recovery to the guard.")
@@ -69,3 +77,4 @@ LIMIT = Topic("guard/limit", Limit, Qos.STATE, 5, "", "Orders of a recovery to d
 STATE = Topic("guard/state", GuardState, Qos.STATE, 5, "", "State of the guard.")
 TRUTH = Topic("world/truth", Truth, Qos.STATE, 10, "map", "Ground truth, for the judge only.")
 SKEW = Topic("hall/skew", Skew, Qos.STATE, 10, "map", "For faults of the localization.")
+TROUBLE = Topic("hall/trouble", Trouble, Qos.STATE, 10, "", "For faults that nodes report.")
