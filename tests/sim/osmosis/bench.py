@@ -54,8 +54,8 @@ class Bench:
                 self.actor.command(command, self.header())
             self.actor.tick()
 
-    def header(self, age_s: float = 0.0, source: str = "tester") -> Header:
-        return Header(source, 1, 1, self.now_s - age_s)
+    def header(self, age_s: float = 0.0) -> Header:
+        return Header("tester", 1, 1, self.now_s - age_s)
 
     def all(self, topic: Any) -> list[Any]:
         return [body for key, body, _ in self.sent if key == topic.key]

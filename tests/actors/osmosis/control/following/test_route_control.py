@@ -82,3 +82,17 @@ def test_only_who_bridges_a_stale_pose_stops_when_it_has_nothing_to_bridge_with(
     bench.core.route(WAY)
     bench.drive(1.0)
     assert (bench.drive(1.0, localized=False)[-1] == m.Twist(0.0, 0.0)) == (bridge is not None)
+
+
+def test_what_is_kept_says_where_a_successor_takes_up_the_route():
+    bench, after = Bench(), Bench()
+    assert bench.core.kept is None
+    bench.core.route(WAY)
+    bench.drive(0.2)
+    kept = bench.core.kept
+    assert kept is not None
+    assert (kept.route, kept.row_start) == (WAY, WAY.waypoints[0])
+    assert kept.progress_m == pytest.approx(0.0, abs=1e-6)
+    after.core.restore(kept)
+    assert after.core.route(WAY)
+    assert after.core.kept.row_start == WAY.waypoints[0]
