@@ -80,6 +80,7 @@ REFUSED = {
     "$: not valid TOML": [("[robot]", "[robot")],
     "$.robot.length_m = 'long': expected a number > 0": [("length_m = 0.72", 'length_m = "long"')],
     "$.robot.widht_m = 0.614: unknown field; known:": [("width_m =", "widht_m =")],
+    "$.node[4]: required field 'name' is missing": [('name = "hmi"\n', "")],
     "$.robot: required field 'width_m' is missing": [("width_m = 0.614\n", "")],
     "$.timing.heartbeat_period_s = -0.14: expected a number": [
         ("heartbeat_period_s = 0.14", "heartbeat_period_s = -0.14")],
