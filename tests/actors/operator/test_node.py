@@ -16,9 +16,18 @@ from rampart.actors.operator import server as hmi_server
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
-from rampart.testing import eventually, free_port
-from tests.actors.operator.browser import browser
-from tests.actors.operator.world import AIRPORT, RATE, hear, repeated, served
+from rampart.testing import eventually
+from tests.actors.operator.page import show
+from tests.actors.operator.world import (
+    AIRPORT,
+    RATE,
+    ask,
+    hear,
+    open_page,
+    repeated,
+    served,
+    visited,
+)
 
 
 async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world):
@@ -35,43 +44,27 @@ async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world)
         assert len(world.others.requests) == count
 
 
-async def test_an_hmi_respawned_in_mid_run_starts_nothing(world):
-    await asyncio.sleep(9.0 / RATE)
-    async with world.hmi(incarnation=2, mission=AIRPORT.mission("AB")):
-        await asyncio.sleep(2.0 / RATE)
-    assert world.others.requests == []
+async def test_the_emergency_stop_is_reset_from_the_page(world, hmi, page):
+    told = await ask(page, type="reset", recovery="RM1")
+    assert "'RM1' does not wait for a reset" in told["text"]
+    world.say_latched("RM1")
+    await eventually(lambda: hmi._state.latched == ("RM1",))
+    assert (await ask(page, type="reset", recovery="RM1"))["type"] == "done"
+    await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
 
 
-async def test_the_emergency_stop_is_reset_from_the_page(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        async with websockets.connect(f"ws://{at}/ws") as page:
-            await page.send('{"type": "reset", "recovery": "RM1"}')
-            assert "'RM1' does not wait for a reset" in (await hear(page, "error"))["text"]
-            world.say_latched("RM1")
-            await eventually(lambda: hmi._state.latched == ("RM1",))
-            await page.send('{"type": "reset", "recovery": "RM1"}')
-            await hear(page, "done")
-            await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
-
-
-@pytest.mark.parametrize("error", [KeyError("a\nb"), RuntimeError("dry"), RecursionError()])
-async def test_a_handler_that_fails_is_told_in_one_line_and_the_page_goes_on(
-        world, monkeypatch, error):
+async def test_a_handler_that_fails_is_told_in_one_line_and_the_page_goes_on(world, monkeypatch):
     def fail(*_):
-        raise error
+        raise KeyError("a\nb")
 
     monkeypatch.setattr(OsmosisHmi, "_fulfil", fail)
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        async with websockets.connect(f"ws://{at}/ws") as page:
-            await page.send('{"type": "reset", "recovery": "RM1"}')
-            assert "reset failed" in (await hear(page, "error"))["text"]
-            await eventually(lambda: bool(world.others.diagnostics))
-            reason = world.others.diagnostics[0].reason
-            assert reason.startswith(f"reset: {type(error).__name__}")
-            assert "\n" not in reason
-            await hear(page, "state")
+    async with visited(world) as (_, page):
+        assert "reset failed" in (await ask(page, type="reset", recovery="RM1"))["text"]
+        await eventually(lambda: bool(world.others.diagnostics))
+        reason = world.others.diagnostics[0].reason
+        assert reason.startswith("reset: KeyError")
+        assert "\n" not in reason
+        await hear(page, "state")
 
 
 async def test_a_page_that_cannot_be_shown_is_closed_with_a_reason_and_told(world, monkeypatch):
@@ -79,78 +72,62 @@ async def test_a_page_that_cannot_be_shown_is_closed_with_a_reason_and_told(worl
         raise RuntimeError("no introduction")
 
     monkeypatch.setattr(hmi_feed.Feed, "push", fail)
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        async with websockets.connect(f"ws://{at}/ws") as page:
-            await page.wait_closed()
-            assert page.close_code == 1011
-            assert "failed" in page.close_reason
+    async with visited(world) as (hmi, page):
+        await page.wait_closed()
+        assert page.close_code == 1011
+        assert "failed" in page.close_reason
         await eventually(lambda: bool(world.others.diagnostics))
         assert "RuntimeError: no introduction" in world.others.diagnostics[0].reason
         assert hmi._server.pages == 0
 
 
-async def test_a_mission_is_started_from_the_page_unless_one_runs(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        async with websockets.connect(f"ws://{at}/ws") as page:
-            await page.send('{"type": "mission", "name": "Z"}')
-            assert (await hear(page, "error"))["text"] == "unknown mission 'Z'; known: A, B, AB"
-            await page.send('{"type": "mission", "name": "B"}')
-            await hear(page, "done")
-            await eventually(lambda: bool(world.others.requests))
-            assert world.others.requests[0].name == "B"
-            world.say_running(world.others.requests[0])
-            await eventually(lambda: hmi._submission.pending is None)
-            await page.send('{"type": "mission", "name": "A"}')
-            assert (await hear(page, "error"))["text"] == "mission B is running"
+async def test_a_mission_is_started_from_the_page_unless_one_runs(world, hmi, page):
+    told = await ask(page, type="mission", name="Z")
+    assert told["text"] == "unknown mission 'Z'; known: A, B, AB"
+    assert (await ask(page, type="mission", name="B"))["type"] == "done"
+    await eventually(lambda: bool(world.others.requests))
+    assert world.others.requests[0].name == "B"
+    world.say_running(world.others.requests[0])
+    await eventually(lambda: hmi._submission.pending is None)
+    assert (await ask(page, type="mission", name="A"))["text"] == "mission B is running"
 
 
-@pytest.mark.parametrize("text", [
-    "", "not json", "[]", "null", "{}", '{"type": "reset"}', '{"type": "reset", "recovery": 1}',
-    '{"type": "format", "disk": "c"}', '{"type": "reset", "recovery": "RM1", "extra": 1}',
-    "[" * 4000, b"\xff\xfe\x00",
-    '{"type": "order"}', '{"type": "order", "action": "explode"}',
-    '{"type": "order", "action": "PAUSE"}', '{"type": "order", "action": null}',
-    '{"type": "order", "action": ["pause"]}', '{"type": "order", "action": "pause", "by": "RM6"}',
-    '{"type": "order", "action": "pause", "reason": 7}',
-    '{"type": "order", "action": "pause", "reason": "' + 201 * "x" + '"}',
-])
-async def test_a_malformed_message_is_answered_with_an_error_and_ignored(world, text):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        async with websockets.connect(f"ws://{at}/ws") as page:
-            await page.send(text)
-            assert "not understood" in (await hear(page, "error"))["text"]
-            world.others.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
-            assert (await hear(page, "state"))["pose"]
+async def test_a_malformed_message_is_answered_with_an_error_and_ignored(world, page):
+    for text in (
+            "", "not json", "[]", "null", "{}", '{"type": "reset"}',
+            '{"type": "reset", "recovery": 1}', '{"type": "format", "disk": "c"}',
+            '{"type": "reset", "recovery": "RM1", "extra": 1}', "[" * 4000, b"\xff\xfe\x00",
+            *(f'{{"type": "order"{more}}}' for more in (
+                "", ', "action": "explode"', ', "action": "PAUSE"', ', "action": ["pause"]',
+                ', "action": "pause", "by": "RM6"', ', "action": "pause", "reason": 7',
+                ', "action": "pause", "reason": "' + 201 * "x" + '"'))):
+        await page.send(text)
+        assert "not understood" in (await hear(page, "error"))["text"], text
+    world.others.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
+    assert (await hear(page, "state"))["pose"]
     assert (world.others.resets, world.others.orders) == ([], [])
 
 
-async def test_an_order_is_given_from_the_page_if_it_makes_sense_and_its_answer_is_shown(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        async with websockets.connect(f"ws://{at}/ws") as page:
-            await page.send('{"type": "order", "action": "pause"}')
-            assert (await hear(page, "error"))["text"] == (
-                "no status of the Mission Manager was received yet")
-            world.say(m.MissionPhase.RUNNING, m.MissionAction.PAUSE)
-            await eventually(lambda: hmi._state.picture.value("mission") is not None)
-            await page.send('{"type": "order", "action": "resume"}')
-            assert (await hear(page, "error"))["text"] == (
-                "resume is not possible while the mission is running; possible: pause")
-            await page.send('{"type": "order", "action": "pause", "reason": "runway in use"}')
-            assert (await hear(page, "done"))["text"] == "pause requested"
-            await eventually(lambda: bool(world.others.orders))
-            order = world.others.orders[0]
-            assert (order.action, order.reason, order.by) == ("pause", "runway in use", "operator")
-            world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(
-                order.order, False, "a reason"))
-            await eventually(lambda: hmi._orders.pending is None)
-            while (state := await hear(page, "state"))["order"]["number"] == 0:
-                pass
-            assert state["order"]["text"] == "pause refused: a reason"
-            assert state["events"][-1]["text"] == "order to the mission: pause refused: a reason"
+async def test_an_order_is_given_from_the_page_if_it_makes_sense_and_its_answer_is_shown(
+        world, hmi, page):
+    told = await ask(page, type="order", action="pause")
+    assert told["text"] == "no status of the Mission Manager was received yet"
+    world.say(m.MissionPhase.RUNNING, m.MissionAction.PAUSE)
+    await eventually(lambda: hmi._state.picture.value("mission") is not None)
+    told = await ask(page, type="order", action="resume")
+    assert told["text"] == "resume is not possible while the mission is running; possible: pause"
+    told = await ask(page, type="order", action="pause", reason="runway in use")
+    assert told["text"] == "pause requested"
+    await eventually(lambda: bool(world.others.orders))
+    order = world.others.orders[0]
+    assert (order.action, order.reason, order.by) == ("pause", "runway in use", "operator")
+    world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(
+        order.order, False, "a reason"))
+    await eventually(lambda: hmi._orders.pending is None)
+    while (state := await hear(page, "state"))["order"]["number"] == 0:
+        pass
+    assert state["order"]["text"] == "pause refused: a reason"
+    assert state["events"][-1]["text"] == "order to the mission: pause refused: a reason"
     assert {o.order for o in world.others.orders} == {order.order}
 
 
@@ -159,7 +136,7 @@ async def test_a_page_that_takes_nothing_gives_its_place_back(world, monkeypatch
     monkeypatch.setattr(hmi_server, "CLOSE_TIMEOUT_S", 0.1)
     monkeypatch.setattr(OsmosisHmi, "_hello", lambda _hmi: {
         "type": "hello", "much": "x" * (1 << 25)})
-    async with world.hmi(hmi_port=free_port()) as hmi:
+    async with world.hmi() as hmi:
         host, port = (await served(hmi)).split(":")
         with socket.create_connection((host, int(port))) as mute:
             mute.sendall(f"GET /ws HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\n"
@@ -169,16 +146,14 @@ async def test_a_page_that_takes_nothing_gives_its_place_back(world, monkeypatch
             await eventually(lambda: hmi._server.pages == 0)
 
 
-async def test_a_foreign_origin_and_a_foreign_host_are_refused(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        with pytest.raises(websockets.InvalidStatus, match="403"):
-            await websockets.connect(f"ws://{at}/ws", origin="http://evil.example")
-        async with httpx.AsyncClient() as client:
-            assert (await client.get(f"http://{at}/")).status_code == 200
-            rebound = await client.get(f"http://{at}/", headers={"host": "evil.example"})
-            assert rebound.status_code == 400
-            assert (await client.get(f"http://{at}/../hmi.py")).status_code == 404
+async def test_a_foreign_origin_and_a_foreign_host_are_refused(hmi):
+    at = await served(hmi)
+    with pytest.raises(websockets.InvalidStatus, match="403"):
+        await open_page(at, origin="http://evil.example")
+    async with httpx.AsyncClient(base_url=f"http://{at}") as client:
+        assert (await client.get("/")).status_code == 200
+        assert (await client.get("/", headers={"host": "evil.example"})).status_code == 400
+        assert (await client.get("/../hmi.py")).status_code == 404
 
 
 async def test_without_a_free_port_the_hmi_works_without_a_page_and_says_why(world):
@@ -193,19 +168,6 @@ async def test_without_a_free_port_the_hmi_works_without_a_page_and_says_why(wor
     assert "choose another port" in report.reason
 
 
-async def test_a_successor_takes_the_page_over_at_once(world):
-    port = free_port()
-    async with world.hmi(hmi_port=port) as first:
-        at = await served(first)
-        page = await websockets.connect(f"ws://{at}/ws")
-        await hear(page, "state")
-    async with world.hmi(incarnation=2, hmi_port=port) as second:
-        at = await served(second)
-        async with websockets.connect(f"ws://{at}/ws") as again:
-            await hear(again, "state")
-    await page.close()
-
-
 BUTTONS = "[...document.querySelectorAll('#orders button:enabled')].map((b) => b.dataset.order)"
 
 
@@ -216,35 +178,33 @@ async def press(tab, key: str) -> None:
 
 
 @pytest.mark.page
-async def test_in_chromium_the_orders_that_make_sense_are_buttons_for_mouse_and_keyboard(world):
+async def test_in_chromium_the_orders_that_make_sense_are_buttons_for_mouse_and_keyboard(
+        world, hmi, tab):
     p, a = m.MissionPhase, m.MissionAction
-    async with world.hmi(hmi_port=free_port()) as hmi, browser() as tab:
-        await tab.show(f"http://{await served(hmi)}/")
-        await tab.until("document.getElementById('link').textContent === 'live'")
-        assert await tab.value("document.getElementById('orders').hidden") is True
-        for phase, possible in ((p.RUNNING, (a.PAUSE, a.SKIP, a.CANCEL, a.HOME)),
-                                (p.PAUSED, (a.RESUME, a.SKIP, a.CANCEL, a.HOME)),
-                                (p.RETURNING, (a.PAUSE, a.CANCEL))):
-            async with repeated(lambda phase=phase, possible=possible: world.say(phase, *possible)):
-                shown = [x.value for x in (a.PAUSE, a.RESUME, a.SKIP, a.HOME, a.CANCEL)
-                         if x in possible]
-                await tab.until(f"JSON.stringify({BUTTONS}) === '{json.dumps(shown)}'"
-                                .replace(", ", ","))
-        async with repeated(lambda: world.say(p.RUNNING, *a)):
-            await tab.until(f"{BUTTONS}.length === 5")
-            await tab.value("document.querySelector('[data-order=pause]').focus()")
-            await press(tab, "Enter")
-            # The HMI repeats an order until it is answered.
-            await eventually(lambda: {o.action for o in world.others.orders} == {a.PAUSE})
-            world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(
-                world.others.orders[0].order, True, ""))
-            await tab.until("document.getElementById('toast').textContent === 'pause obeyed'")
-            cancel = "document.querySelector('[data-order=cancel]')"
-            await tab.value(f"{cancel}.click()")
-            assert await tab.value(f"{cancel}.textContent") == "Sure?"
-            assert len({o.order for o in world.others.orders}) == 1
-            await tab.value(f"{cancel}.click()")
-            await eventually(lambda: world.others.orders[-1].action == a.CANCEL)
-        world.say(p.CANCELLED)
-        await tab.until("document.getElementById('orders').hidden")
-        assert tab.errors == []
+    await show(tab, hmi)
+    await tab.until("document.getElementById('orders')?.hidden")
+    for phase, possible in ((p.RUNNING, (a.PAUSE, a.SKIP, a.CANCEL, a.HOME)),
+                            (p.PAUSED, (a.RESUME, a.SKIP, a.CANCEL, a.HOME)),
+                            (p.RETURNING, (a.PAUSE, a.CANCEL))):
+        async with repeated(lambda phase=phase, possible=possible: world.say(phase, *possible)):
+            shown = [x.value for x in (a.PAUSE, a.RESUME, a.SKIP, a.HOME, a.CANCEL)
+                     if x in possible]
+            await tab.until(f"JSON.stringify({BUTTONS}) === '{json.dumps(shown)}'"
+                            .replace(", ", ","))
+    async with repeated(lambda: world.say(p.RUNNING, *a)):
+        await tab.until(f"{BUTTONS}.length === 5")
+        await tab.value("document.querySelector('[data-order=pause]').focus()")
+        await press(tab, "Enter")
+        # The HMI repeats an order until it is answered.
+        await eventually(lambda: {o.action for o in world.others.orders} == {a.PAUSE})
+        world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(
+            world.others.orders[0].order, True, ""))
+        await tab.until("document.getElementById('toast').textContent === 'pause obeyed'")
+        cancel = "document.querySelector('[data-order=cancel]')"
+        await tab.value(f"{cancel}.click()")
+        assert await tab.value(f"{cancel}.textContent") == "Sure?"
+        assert len({o.order for o in world.others.orders}) == 1
+        await tab.value(f"{cancel}.click()")
+        await eventually(lambda: world.others.orders[-1].action == a.CANCEL)
+    world.say(p.CANCELLED)
+    await tab.until("document.getElementById('orders').hidden")

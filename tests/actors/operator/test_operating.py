@@ -1,31 +1,23 @@
-"""The operator's hands on the page's WebSocket: driving, strategy, signals, faults."""
+"""The operator's hands on the page's WebSocket: driving, signals, faults."""
 
 from __future__ import annotations
 
 import asyncio
-import json
 
 import pytest
-import websockets
 
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.operator import stick_arbitration
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.supervision.kill_node import SignalError, UnknownNodeError
 from rampart.actors.supervision.process_title import RunProcess
-from rampart.testing import eventually, free_port
-from tests.actors.operator.world import hear, repeated, served
+from rampart.testing import eventually
+from tests.actors.operator.world import ask, hear, open_page, repeated, served, visited
 from tests.osmosis_system import shipped_system
 
-TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
-
-
-async def ask(page, **wish) -> dict:
-    """Send a wish and return what the page is told."""
-    await page.send(json.dumps(wish))
-    return await hear(page, "done", "error", "stick")
 
 
 async def operating(page, shown) -> dict:
@@ -61,40 +53,24 @@ class Hand:
         return await ask(self.page, type="stick", panel=self.panel, held=False)
 
 
-def open_page(at: str, **options):
-    return websockets.connect(f"ws://{at}/ws", **options)
-
-
 # ---- driving ------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("patient")
-async def test_a_held_stick_is_repeated_as_often_as_the_robot_needs_it(world):
-    """At twenty times real time, the Safety Pilot's 0.3 s are 15 ms: no page is that fast."""
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            await Hand(page).take()
-            count = len(world.others.stick)
-            await eventually(lambda: len(world.others.stick) >= count + 5)
-            assert world.others.stick[-1].dead_man
+async def test_a_page_that_falls_silent_has_let_go(world, page):
+    hand = Hand(page)
+    await hand.take()
+    await eventually(lambda: world.others.stick[-1] == RELEASED)
+    shown = await operating(page, lambda o: o["holder"] is None)
+    assert "page 1 was silent for 0.3 s" in shown["note"]
+    assert not (await hand.hold())["drives"]
+    assert "let go first" in (await hand.hold())["text"]
+    assert world.others.stick[-1] == RELEASED
 
 
-async def test_a_page_that_falls_silent_has_let_go(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            hand = Hand(page)
-            await hand.take()
-            await eventually(lambda: world.others.stick[-1] == RELEASED)
-            shown = await operating(page, lambda o: o["holder"] is None)
-            assert "page 1 was silent for 0.3 s" in shown["note"]
-            assert not (await hand.hold())["drives"]
-            assert "let go first" in (await hand.hold())["text"]
-            assert world.others.stick[-1] == RELEASED
-
-
-@pytest.mark.usefixtures("patient")
-async def test_a_page_that_closes_or_vanishes_has_let_go(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
+async def test_a_page_that_closes_or_vanishes_and_an_hmi_that_is_stopped_have_let_go(
+        world, monkeypatch):
+    monkeypatch.setattr(stick_arbitration, "TIMEOUT_S", 60.0)  # it is not its silence
+    async with world.hmi() as hmi:
         at = await served(hmi)
         for end in (lambda page: page.close(), None):
             world.others.stick.clear()
@@ -106,67 +82,42 @@ async def test_a_page_that_closes_or_vanishes_has_let_go(world):
                 await end(page)
             await eventually(lambda: RELEASED in world.others.stick)
             await eventually(lambda: hmi._server.pages == 0)
-
-
-@pytest.mark.usefixtures("patient")
-async def test_an_hmi_that_is_stopped_lets_go(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        page = await open_page(await served(hmi))
+        page = await open_page(at)
         await Hand(page).take()
+        assert world.others.stick[-1] != RELEASED
     await eventually(lambda: world.others.stick[-1] == RELEASED)
     await page.close()
 
 
-async def test_a_stick_out_of_bounds_is_refused(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            told = await ask(page, type="stick", panel="Drive", held=True, forward=7.0)
-            assert "not understood" in told["text"]
-
-
 @pytest.mark.usefixtures("patient")
-async def test_what_a_stalled_connection_delivers_does_not_move_the_robot(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            hand = Hand(page)
-            await hand.let_go()
-            told = await hand.hold()
-            for _ in range(3):  # with a ticket, but pressed long ago
-                told = await ask(page, type="stick", panel="Drive", held=True, pressed_s=5,
-                                 ticket=told["ticket"], forward=0.5)
-                assert "let go first" in told["text"]
-            await hand.let_go()
-            for _ in range(3):  # pressed just now, by a ticket of long ago
-                told = await ask(page, type="stick", panel="Drive", held=True, ticket=1.0)
-                assert not told["drives"]
+async def test_what_a_stalled_connection_delivers_does_not_move_the_robot(world, page):
+    hand = Hand(page)
+    await hand.let_go()
+    told = await hand.hold()
+    for _ in range(3):  # with a ticket, but pressed long ago
+        told = await ask(page, type="stick", panel="Drive", held=True, pressed_s=5,
+                         ticket=told["ticket"], forward=0.5)
+        assert "let go first" in told["text"]
+    await hand.let_go()
+    for _ in range(3):  # pressed just now, by a ticket of long ago
+        told = await ask(page, type="stick", panel="Drive", held=True, ticket=1.0)
+        assert not told["drives"]
     assert set(world.others.stick) == {RELEASED}
 
 
-def pilot(mode: m.PilotMode, forbids: str = "") -> m.PilotStatus:
-    return m.PilotStatus(mode, bool(forbids), forbids, 0, forbids=forbids)
+async def test_the_page_says_whether_the_stick_has_an_effect_now(world, page):
+    shown = await operating(page, lambda _: True)
+    assert shown["text"] == "no effect: the Safety Pilot is silent"
+    async with repeated(lambda: world.others.publish(
+            topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.AUTO, False, "", 0))):
+        shown = await operating(page, lambda o: "overrides the mission" in o["text"])
+        assert shown["works"] is True
+        world.others.publish(topics.BASE_STATUS, m.BaseStatus(
+            True, False, 0.0, (0.0, 0.0, 0.0, 0.0)))
+        await operating(page, lambda o: "the brake is engaged" in o["text"])
 
 
-async def test_the_page_says_whether_the_stick_has_an_effect_now(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            shown = await operating(page, lambda _: True)
-            assert shown["text"] == "no effect: the Safety Pilot is silent"
-            for said, works, text in (
-                    (pilot(m.PilotMode.AUTO), True, "overrides the mission"),
-                    (pilot(m.PilotMode.TELEOPERATION), True, "obeys only the joystick"),
-                    (pilot(m.PilotMode.STOP, "RM2: stale"), False, "no effect: RM2: stale")):
-                async with repeated(
-                        lambda said=said: world.others.publish(topics.PILOT_STATUS, said)):
-                    shown = await operating(page, lambda o, t=text: t in o["text"])
-                    assert shown["works"] is works
-            async with repeated(lambda: world.others.publish(
-                    topics.PILOT_STATUS, pilot(m.PilotMode.AUTO))):
-                world.others.publish(topics.BASE_STATUS, m.BaseStatus(
-                    True, False, 0.0, (0.0, 0.0, 0.0, 0.0)))
-                await operating(page, lambda o: "the brake is engaged" in o["text"])
-
-
-# ---- strategy, signals, faults ------------------------------------------------------------------
+# ---- signals, faults ----------------------------------------------------------------------------
 
 
 async def test_a_signal_to_a_node_of_another_host_is_ordered_of_its_supervisor(world, monkeypatch):
@@ -174,23 +125,22 @@ async def test_a_signal_to_a_node_of_another_host_is_ordered_of_its_supervisor(w
         raise UnknownNodeError(f"unknown node {node!r}")
 
     monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
-    async with world.hmi(hmi_port=free_port(), launcher_pid=1) as hmi:
-        async with open_page(await served(hmi)) as page:
-            world.others.publish(ftm_topics.NODES, fm.NodeTable((
-                fm.NodeInfo("teleoperation", "control", 7, fm.NodeState.RUNNING, 1, 0, host="g"),
-                fm.NodeInfo("localization", "control", 8, fm.NodeState.RUNNING, 1, 0))))
-            async with asyncio.timeout(5):
-                while "teleoperation" not in str(await hear(page, "state")):
-                    pass
-            told = await ask(page, type="signal", node="localization", signal="KILL")
-            assert (told["type"], world.others.signals) == ("error", [])
-            for name in ("KILL", "STOP"):
-                told = await ask(page, type="signal", node="teleoperation", signal=name)
-                assert told["type"] == "done"
-            await eventually(lambda: [(one.node, one.signal) for one in world.others.signals] == [
-                ("teleoperation", "KILL"), ("teleoperation", "STOP")])
-            first, second = world.others.signals
-            assert first.order != second.order  # the same one twice would be one
+    async with visited(world, launcher_pid=1) as (_, page):
+        world.others.publish(ftm_topics.NODES, fm.NodeTable((
+            fm.NodeInfo("teleoperation", "control", 7, fm.NodeState.RUNNING, 1, 0, host="g"),
+            fm.NodeInfo("localization", "control", 8, fm.NodeState.RUNNING, 1, 0))))
+        async with asyncio.timeout(5):
+            while "teleoperation" not in str(await hear(page, "state")):
+                pass
+        told = await ask(page, type="signal", node="localization", signal="KILL")
+        assert (told["type"], world.others.signals) == ("error", [])
+        for name in ("KILL", "STOP"):
+            told = await ask(page, type="signal", node="teleoperation", signal=name)
+            assert told["type"] == "done"
+        await eventually(lambda: [(one.node, one.signal) for one in world.others.signals] == [
+            ("teleoperation", "KILL"), ("teleoperation", "STOP")])
+        first, second = world.others.signals
+        assert first.order != second.order  # the same one twice would be one
 
 
 async def test_a_signal_is_sent_to_a_node_and_to_the_hmi_itself_after_its_answer(
@@ -204,36 +154,30 @@ async def test_a_signal_is_sent_to_a_node_and_to_the_hmi_itself_after_its_answer
         return RunProcess(77, 7450, 1, (node,), 1)
 
     monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
-
-    async with world.hmi(hmi_port=free_port(), launcher_pid=1) as hmi:
-        async with open_page(await served(hmi)) as page:
-            told = await ask(page, type="signal", node="localization", signal="KILL")
-            assert told == {"type": "done", "text": "localization (pid 77): KILL"}
-            for node, name, why in (("localization", "HUP", "unknown signal 'HUP'"),
-                                    ("launchd", "KILL", "unknown node 'launchd'")):
-                told = await ask(page, type="signal", node=node, signal=name)
-                assert told["type"] == "error"
-                assert why in told["text"]
-            assert "will reconnect" in (await ask(page, type="signal", node="hmi", signal="KILL"
-                                                ))["text"]
-            assert sent == [("localization", "KILL")]
-            await eventually(lambda: sent[1:] == [("hmi", "KILL")])
+    async with visited(world, launcher_pid=1) as (_, page):
+        told = await ask(page, type="signal", node="localization", signal="KILL")
+        assert told == {"type": "done", "text": "localization (pid 77): KILL"}
+        for node, name, why in (("localization", "HUP", "unknown signal 'HUP'"),
+                                ("launchd", "KILL", "unknown node 'launchd'")):
+            told = await ask(page, type="signal", node=node, signal=name)
+            assert told["type"] == "error"
+            assert why in told["text"]
+        told = await ask(page, type="signal", node="hmi", signal="KILL")
+        assert "will reconnect" in told["text"]
+        assert sent == [("localization", "KILL")]
+        await eventually(lambda: sent[1:] == [("hmi", "KILL")])
 
 
-async def test_without_processes_nothing_can_be_signalled(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            told = await ask(page, type="signal", node="localization", signal="KILL")
-            assert "have no processes" in told["text"]
+async def test_without_processes_nothing_can_be_signalled(page):
+    told = await ask(page, type="signal", node="localization", signal="KILL")
+    assert "have no processes" in told["text"]
 
 
 async def test_a_fault_that_nobody_takes_is_shown_to_have_no_effect(world):
-    async with world.hmi(hmi_port=free_port(), system=shipped_system()) as hmi:
-        async with open_page(await served(hmi)) as page:
-            told = await ask(page, type="inject", fault="drop:world/truth")
-            assert told["type"] == "error"
-            await ask(page, type="inject", fault="drop:plan/route")
-            shown = await operating(page, lambda o: o["faults"] and o["faults"][0]["ended"])
-            assert shown["faults"][0]["state"] == (
-                "no effect: no publisher of plan/route answers")
-            assert len({o.injection for o in world.others.injections}) == 1
+    async with visited(world, system=shipped_system()) as (_, page):
+        told = await ask(page, type="inject", fault="drop:world/truth")
+        assert told["type"] == "error"
+        await ask(page, type="inject", fault="drop:detection/DM1")
+        shown = await operating(page, lambda o: o["faults"] and o["faults"][0]["ended"])
+        assert shown["faults"][0]["state"] == "no effect: no publisher of detection/DM1 answers"
+        assert len({o.injection for o in world.others.injections}) == 1

@@ -8,41 +8,23 @@ from urllib.parse import urlsplit
 import pytest
 
 from rampart.actors.operator.hmi import Hmi
-from rampart.testing import free_port
-from tests.actors.operator.browser import browser
-from tests.actors.operator.page import SPEC, events, page, speaking_world
-from tests.actors.operator.world import repeated, served
+from tests.actors.operator.page import events, page, show
+from tests.actors.operator.world import SPEC, repeated
 
 pytestmark = pytest.mark.page
 
 
-@pytest.fixture
-async def world():
-    async with speaking_world() as made:
-        yield made
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-async def test_on_a_phone_nothing_is_wider_than_the_screen(world, scheme):
-    async with page(world, width=360, height=740, scheme=scheme) as tab, \
-            repeated(world.others.busy):
-        await tab.until(f"{events('active')} === 'FTM4'")
-        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
-        assert await tab.value("document.documentElement.scrollWidth") == 360
-        wide = """[...document.querySelectorAll('main *')].filter((e) =>
-            e.getBoundingClientRect().right > 361 && !e.closest('.across, .scroll'))
-            .map((e) => e.tagName + '#' + e.id + '.' + e.className).join()"""
-        assert await tab.value(wide) == ""
-
-
-async def test_the_page_asks_nobody_but_the_hmi_for_anything(world):
-    async with page(world) as tab, repeated(world.others.busy):
+async def test_the_page_asks_nobody_but_the_hmi_for_anything(world, tab):
+    async with page(world, tab), repeated(world.others.busy):
         await tab.until(f"{events('active')} === 'FTM4'")
         hosts = {urlsplit(url).hostname for url in tab.requests if not url.startswith("data:")}
         assert hosts == {"127.0.0.1"}
         assert any(url.startswith("ws://") for url in tab.requests)
 
 
+WIDE = """[...document.querySelectorAll('main *')].filter((e) =>
+    e.getBoundingClientRect().right > 361 && !e.closest('.across, .scroll'))
+    .map((e) => e.tagName + '#' + e.id + '.' + e.className).join()"""
 NAMELESS = """(() => {
   const wrong = [];
   const seen = (e) => e.checkVisibility && e.checkVisibility();
@@ -117,16 +99,20 @@ PALE = """(() => {
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-async def test_everything_has_a_name_and_can_be_read_and_reached(world, scheme):
-    async with page(world, scheme=scheme) as tab, repeated(world.others.busy):
-        await tab.until(f"{events('active')} === 'FTM4'")
-        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
+async def test_everything_has_a_name_can_be_read_and_reached_and_fits_a_phone(world, tab, scheme):
+    busy = f"{events('active')} === 'FTM4' && document.querySelectorAll('#nodes tr').length > 0"
+    async with page(world, tab, scheme=scheme) as hmi, repeated(world.others.busy):
+        await tab.until(busy)
         assert await tab.value(NAMELESS) == ""
         assert await tab.value(PALE) == ""
+        await show(tab, hmi, scheme=scheme, width=360, height=740)
+        await tab.until(busy)
+        assert await tab.value("document.documentElement.scrollWidth") == 360
+        assert await tab.value(WIDE) == ""
 
 
-async def test_by_keyboard_the_focus_is_seen_and_the_first_stop_skips_to_the_map(world):
-    async with page(world) as tab:
+async def test_by_keyboard_the_focus_is_seen_and_the_first_stop_skips_to_the_map(world, tab):
+    async with page(world, tab):
         for kind in ("rawKeyDown", "keyUp"):
             await tab.call("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab",
                            windowsVirtualKeyCode=9)
@@ -139,20 +125,19 @@ async def test_by_keyboard_the_focus_is_seen_and_the_first_stop_skips_to_the_map
         assert await tab.value("window.still") is True  # and the connection was kept
 
 
-async def test_a_robot_that_offers_nothing_has_a_page_without_map_stick_and_mission(world):
-    plain = Hmi(world.context("hmi", 1, hmi_port=free_port(), system=SPEC))
-    async with world.running(plain), browser() as tab, repeated(world.others.busy):
-        await tab.show(f"http://{await served(plain)}/")
+async def test_a_robot_that_offers_nothing_has_a_page_without_map_stick_and_mission(world, tab):
+    plain = Hmi(world.context("hmi", 1, system=SPEC))
+    async with world.running(plain), repeated(world.others.busy):
+        await show(tab, plain)
         await tab.until(f"{events('active')} === 'FTM4'")
         await tab.until("document.querySelectorAll('#nodes tr').length > 0")
         shown = await tab.value("[...document.querySelectorAll('.panel h2')]"
                                 ".filter((e) => e.checkVisibility()).map((e) => e.id).join()")
         assert shown.split(",") == ["safety-title", "tree-title", "decisions-title", "events-title",
                                     "order-title", "nodes-title", "fault-heading"]
-        assert tab.errors == []
 
 
-async def test_who_wants_no_motion_sees_none(world):
+async def test_who_wants_no_motion_sees_none(world, tab):
     moving = "getComputedStyle(document.querySelector('.event .box')).transitionDuration"
-    async with page(world, motion="reduce") as tab:
+    async with page(world, tab, motion="reduce"):
         assert json.loads(f"[{(await tab.value(moving)).replace('s', '')}]") == [0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 
 import pytest
 
@@ -12,7 +11,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.page.map import MAX_PATHS_BYTES, page_map
 from tests.actors.operator.browser import mouse
-from tests.actors.operator.page import page, speaking_world
+from tests.actors.operator.page import page
 from tests.actors.operator.world import repeated
 from tests.actors.osmosis.airport.large import WIDE_M, write_large_airport
 
@@ -30,39 +29,33 @@ def large(tmp_path_factory):
     return load_airport(write_large_airport(tmp_path_factory.mktemp("airport") / "large.toml"))
 
 
-async def test_an_airport_of_8_km_is_drawn_and_its_marks_are_seen_at_every_zoom(large):
-    async with speaking_world() as world:
-        mission = m.MissionStatus("r1/first", "A", m.MissionPhase.RUNNING, 1, tuple(
-            m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in large.mission("A").goals),
-            (12.0,), (), "")
+async def test_an_airport_of_8_km_is_drawn_and_its_marks_are_seen_at_every_zoom(world, tab, large):
+    mission = m.MissionStatus("r1/first", "A", m.MissionPhase.RUNNING, 1, tuple(
+        m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in large.mission("A").goals),
+        (12.0,), (), "")
 
-        def drive() -> None:
-            world.others.publish(topics.POSE, m.Pose(500.0, -520.0, 0.5))
-            world.others.publish(topics.MISSION_STATUS, mission)
+    def drive() -> None:
+        world.others.publish(topics.POSE, m.Pose(500.0, -520.0, 0.5))
+        world.others.publish(topics.MISSION_STATUS, mission)
 
-        async with page(world, airport=large) as tab, repeated(drive):
-            await tab.until("document.querySelectorAll('#map .goal').length > 3")
-            await tab.until(
-                "document.querySelector('.robot').getAttribute('visibility') === 'visible'")
-            if folder := os.environ.get("RAMPART_PICTURES"):
-                await tab.screenshot(f"{folder}/map-large.png")
-            assert await tab.value(f"{BOX}.width > {WIDE_M}") is True
-            assert await tab.value("document.querySelectorAll('#map .pavement').length") > 1000
-            ring, goal = size_px("#map .robot-ring"), size_px("#map .goal")
-            sizes = [await tab.value(ring), await tab.value(goal)]
-            assert 12 < min(sizes) <= max(sizes) < 80, sizes
-            await tab.value("document.getElementById('follow').click()")
-            await tab.until(f"{BOX}.width < 30")
-            assert await tab.value(ring) == pytest.approx(sizes[0], rel=0.05)
-            if folder:
-                await tab.screenshot(f"{folder}/map-close.png")
-            await tab.value("document.querySelector('[title=\"Show the whole map\"]').click()")
-            await tab.until(f"{BOX}.width > {WIDE_M}")
-            assert await tab.value("document.getElementById('follow').ariaPressed") == "false"
+    async with page(world, tab, airport=large), repeated(drive):
+        await tab.until("document.querySelectorAll('#map .goal').length > 3")
+        await tab.until("document.querySelector('.robot').getAttribute('visibility') === 'visible'")
+        assert await tab.value(f"{BOX}.width > {WIDE_M}") is True
+        assert await tab.value("document.querySelectorAll('#map .pavement').length") > 1000
+        ring, goal = size_px("#map .robot-ring"), size_px("#map .goal")
+        sizes = [await tab.value(ring), await tab.value(goal)]
+        assert 12 < min(sizes) <= max(sizes) < 80, sizes
+        await tab.value("document.getElementById('follow').click()")
+        await tab.until(f"{BOX}.width < 30")
+        assert await tab.value(ring) == pytest.approx(sizes[0], rel=0.05)
+        await tab.value("document.querySelector('[title=\"Show the whole map\"]').click()")
+        await tab.until(f"{BOX}.width > {WIDE_M}")
+        assert await tab.value("document.getElementById('follow').ariaPressed") == "false"
 
 
-async def test_wheel_drag_and_keys_zoom_and_move_the_map(large):
-    async with speaking_world() as world, page(world, airport=large) as tab:
+async def test_wheel_drag_and_keys_zoom_and_move_the_map(world, tab, large):
+    async with page(world, tab, airport=large):
         await tab.until("document.querySelectorAll('#map .pavement').length > 1000")
         await asyncio.sleep(0.5)  # panels find their places
         at = await tab.value("(() => { const r = document.getElementById('map')"

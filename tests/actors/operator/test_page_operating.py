@@ -6,7 +6,6 @@ import asyncio
 import json
 
 import pytest
-import websockets
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
@@ -19,14 +18,13 @@ from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser, mouse
-from tests.actors.operator.world import World, hear, repeated, served
+from tests.actors.operator.page import LIVE, show
+from tests.actors.operator.test_operating import RELEASED, Hand
+from tests.actors.operator.world import World, hear, open_page, repeated, served
 from tests.osmosis_system import shipped_system
 
 pytestmark = pytest.mark.page
 
-TOKEN = "abcdefghijklmnop"
-RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
-LIVE = "document.getElementById('link').textContent === 'live'"
 FREE = "document.querySelector('.stick-state').textContent === 'free'"
 WORDS = "document.querySelector('.stick-text').textContent"
 PAD = "document.querySelector('.stick')"
@@ -41,7 +39,13 @@ def alive(world: World):
     return repeated(say)
 
 
-CONTROL_HELD = 2
+@pytest.fixture
+async def tab(world, hmi, tab):
+    """The page of an HMI in a run in which all is well."""
+    async with alive(world):
+        await show(tab, hmi)
+        await tab.until(FREE)
+        yield tab
 
 
 async def key(tab, name: str, *, down: bool, repeat: bool = False, modifiers: int = 0) -> None:
@@ -73,10 +77,8 @@ async def drives(tab, world, **position: float) -> None:
     await tab.until("document.querySelector('.stick-state').textContent === 'you drive'")
 
 
-async def drive_ahead(tab, world, hmi) -> None:
-    """Open the page and hold the key W on its stick."""
-    await tab.show(f"http://{await served(hmi)}/")
-    await tab.until(FREE)
+async def drive_ahead(tab, world) -> None:
+    """Hold the key W on the stick of the page."""
     await tab.value(f"{PAD}.focus()")
     await key(tab, "w", down=True)
     await drives(tab, world, forward=0.5)
@@ -90,94 +92,81 @@ async def stops(world) -> None:
 
 
 @pytest.mark.usefixtures("patient")
-async def test_the_keyboard_drives_while_a_key_is_held_and_everything_else_stops(world):
-    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        await tab.show(f"http://{await served(hmi)}/")
-        await tab.until(FREE)
-        await key(tab, "ArrowUp", down=True)
-        await asyncio.sleep(0.15)
-        assert not moved(world)  # only with the focus on the stick
-        await key(tab, "ArrowUp", down=False)
+async def test_the_keyboard_drives_while_a_key_is_held_and_everything_else_stops(world, tab):
+    await key(tab, "ArrowUp", down=True)
+    await asyncio.sleep(0.15)
+    assert not moved(world)  # only with the focus on the stick
+    await key(tab, "ArrowUp", down=False)
 
+    await tab.value(f"{PAD}.focus()")
+    await key(tab, "ArrowUp", down=True)
+    await drives(tab, world, forward=0.5)
+    await key(tab, "a", down=True)
+    await drives(tab, world, forward=0.5, left=0.5)
+    await key(tab, "ArrowUp", down=False)
+    await drives(tab, world, left=0.5)
+    await key(tab, "a", down=False)
+    await stops(world)
+
+    for lost in (f"{PAD}.blur()", "dispatchEvent(new Event('blur'))",
+                 "Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
+                 "document.dispatchEvent(new Event('visibilitychange'));"
+                 "delete document.hidden"):
         await tab.value(f"{PAD}.focus()")
-        await key(tab, "ArrowUp", down=True)
-        await drives(tab, world, forward=0.5)
-        await key(tab, "a", down=True)
-        await drives(tab, world, forward=0.5, left=0.5)
-        await key(tab, "ArrowUp", down=False)
-        await drives(tab, world, left=0.5)
-        await key(tab, "a", down=False)
+        await key(tab, "ArrowDown", down=True)
+        await drives(tab, world, forward=-0.5)
+        await tab.value(lost)
         await stops(world)
-
-        for lost in (f"{PAD}.blur()", "dispatchEvent(new Event('blur'))",
-                     "Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
-                     "document.dispatchEvent(new Event('visibilitychange'));"
-                     "delete document.hidden"):
-            await tab.value(f"{PAD}.focus()")
-            await key(tab, "ArrowDown", down=True)
-            await drives(tab, world, forward=-0.5)
-            await tab.value(lost)
-            await stops(world)
-            await tab.value(f"{PAD}.focus()")
-            await key(tab, "ArrowDown", down=True, repeat=True)  # held since before
-            await stops(world)
-            await key(tab, "ArrowDown", down=False)
-        assert tab.errors == []
+        await tab.value(f"{PAD}.focus()")
+        await key(tab, "ArrowDown", down=True, repeat=True)  # held since before
+        await stops(world)
+        await key(tab, "ArrowDown", down=False)
 
 
 @pytest.mark.usefixtures("patient")
-@pytest.mark.parametrize("name", ["Control", "Alt", "Meta"])
-async def test_a_key_that_is_let_go_under_another_one_is_let_go(world, name):
-    held = {"Alt": 1, "Control": CONTROL_HELD, "Meta": 4}[name]
-    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        await drive_ahead(tab, world, hmi)
+async def test_a_key_that_is_let_go_under_another_one_is_let_go(world, tab):
+    for name, held in (("Alt", 1), ("Control", 2), ("Meta", 4)):
+        await drive_ahead(tab, world)
         await key(tab, f"{name}Left", down=True, modifiers=held)
         await stops(world)
         await key(tab, "w", down=False, modifiers=held)
         await key(tab, f"{name}Left", down=False)
         await stops(world)
-        await tab.value(f"{PAD}.focus()")
-        await key(tab, "w", down=True)
-        await drives(tab, world, forward=0.5)
-        await key(tab, "w", down=False)
-        await stops(world)
+    await drive_ahead(tab, world)
+    await key(tab, "w", down=False)
+    await stops(world)
 
 
-async def test_a_connection_that_is_too_slow_to_drive_is_told_so(world, monkeypatch):
+async def test_a_connection_that_is_too_slow_to_drive_is_told_so(world, tab, monkeypatch):
     monkeypatch.setattr(stick_arbitration, "TIMEOUT_S", -1.0)  # every ticket comes too late
-    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        await tab.show(f"http://{await served(hmi)}/")
-        await tab.until(FREE)
-        await tab.value(f"{PAD}.focus()")
-        await key(tab, "w", down=True)
-        await tab.until(f"{WORDS}.includes('the connection is slow')")
-        assert not moved(world)
+    await tab.value(f"{PAD}.focus()")
+    await key(tab, "w", down=True)
+    await tab.until(f"{WORDS}.includes('the connection is slow')")
+    assert not moved(world)
 
 
 @pytest.mark.usefixtures("patient")
-async def test_the_page_says_why_teleoperation_does_not_follow_it(world):
-    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        await drive_ahead(tab, world, hmi)
-        world.others.publish(bus_topics.DIAGNOSTIC, bm.Diagnostic(
-            "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
-        await tab.until("document.querySelector('.stick-state').textContent === 'not followed'")
-        assert "/dev/input/js0 has the stick" in await tab.value(WORDS)
-        await key(tab, "w", down=False)
-        await stops(world)
+async def test_the_page_says_why_teleoperation_does_not_follow_it(world, tab):
+    await drive_ahead(tab, world)
+    world.others.publish(bus_topics.DIAGNOSTIC, bm.Diagnostic(
+        "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
+    await tab.until("document.querySelector('.stick-state').textContent === 'not followed'")
+    assert "/dev/input/js0 has the stick" in await tab.value(WORDS)
+    await key(tab, "w", down=False)
+    await stops(world)
 
 
-async def test_a_page_that_hangs_has_let_go_and_is_to_press_again(world):
-    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        await drive_ahead(tab, world, hmi)
-        await tab.value("{ const end = Date.now() + 700; while (Date.now() < end); }")
-        await tab.until(f"{WORDS}.includes('let go first, then press again')")
-        await stops(world)
-        await key(tab, "w", down=False)
-        await tab.until(FREE)
-        await key(tab, "w", down=True)
-        await drives(tab, world, forward=0.5)
-        await tab.call("Page.navigate", url="about:blank")
-        await stops(world)
+async def test_a_page_that_hangs_has_let_go_and_is_to_press_again(world, tab):
+    await drive_ahead(tab, world)
+    await tab.value("{ const end = Date.now() + 700; while (Date.now() < end); }")
+    await tab.until(f"{WORDS}.includes('let go first, then press again')")
+    await stops(world)
+    await key(tab, "w", down=False)
+    await tab.until(FREE)
+    await key(tab, "w", down=True)
+    await drives(tab, world, forward=0.5)
+    await tab.call("Page.navigate", url="about:blank")
+    await stops(world)
 
 
 @pytest.mark.usefixtures("patient")
@@ -185,7 +174,7 @@ async def test_an_hmi_that_comes_back_is_not_driven_by_a_key_that_is_still_held(
     port = free_port()
     async with browser() as tab, alive(world):
         async with world.hmi(hmi_port=port) as hmi:
-            await tab.show(f"http://{await served(hmi)}/")
+            await show(tab, hmi)
             await tab.until(FREE)
             await tab.value(f"{PAD}.focus()")
             await key(tab, "ArrowUp", down=True)
@@ -210,85 +199,74 @@ async def test_an_hmi_that_comes_back_is_not_driven_by_a_key_that_is_still_held(
 
 
 @pytest.mark.usefixtures("patient")
-async def test_the_stick_on_the_screen_and_a_gamepad_drive(world):
-    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        await tab.show(f"http://{await served(hmi)}/")
-        await tab.until(FREE)
-        await tab.value(f"{PAD}.scrollIntoView({{block: 'center'}})")
-        await tab.value("document.querySelector('.stick-words input').value = 100")
-        x, y, radius = await hand_on_the_pad(tab)
-        await mouse(tab, "mousePressed", x, y)
-        await mouse(tab, "mouseMoved", x, y - 3 * radius)  # outside: full ahead, no more
-        await drives(tab, world, forward=1.0)
-        await mouse(tab, "mouseReleased", x, y - 3 * radius)
-        await stops(world)
+async def test_the_stick_on_the_screen_and_a_gamepad_drive(world, tab):
+    await tab.value(f"{PAD}.scrollIntoView({{block: 'center'}})")
+    await tab.value("document.querySelector('.stick-words input').value = 100")
+    x, y, radius = await hand_on_the_pad(tab)
+    await mouse(tab, "mousePressed", x, y)
+    await mouse(tab, "mouseMoved", x, y - 3 * radius)  # outside: full ahead, no more
+    await drives(tab, world, forward=1.0)
+    await mouse(tab, "mouseReleased", x, y - 3 * radius)
+    await stops(world)
 
-        await tab.value(
-            "window.pad = {connected: true, axes: [0.5, 0.05], buttons: Array.from({length: 8},"
-            " () => ({pressed: false}))}; navigator.getGamepads = () => [window.pad];"
-            " dispatchEvent(new Event('gamepadconnected'))")
-        await stops(world)  # moved, but the dead man is not held
-        await tab.value("window.pad.buttons[4].pressed = true")
-        await drives(tab, world, left=-0.5)
-        await tab.value("window.pad.buttons[4].pressed = false")
-        await stops(world)
+    await tab.value(
+        "window.pad = {connected: true, axes: [0.5, 0.05], buttons: Array.from({length: 8},"
+        " () => ({pressed: false}))}; navigator.getGamepads = () => [window.pad];"
+        " dispatchEvent(new Event('gamepadconnected'))")
+    await stops(world)  # moved, but the dead man is not held
+    await tab.value("window.pad.buttons[4].pressed = true")
+    await drives(tab, world, left=-0.5)
+    await tab.value("window.pad.buttons[4].pressed = false")
+    await stops(world)
 
-        await tab.value("window.pad.buttons[4].pressed = true")
-        await drives(tab, world, left=-0.5)
-        await tab.value("window.pad.connected = false;"
-                        "dispatchEvent(new Event('gamepaddisconnected'))")
-        await stops(world)
-        await tab.value("window.pad.connected = true;"
-                        "dispatchEvent(new Event('gamepadconnected'))")
-        await stops(world)  # plugging in moves nothing
-        await tab.value("window.pad.buttons[4].pressed = false")
-        await asyncio.sleep(0.15)
-        await tab.value("window.focusless = true; document.hasFocus = () => !window.focusless;"
-                        "window.pad.buttons[4].pressed = true")
-        await stops(world)  # meant for another window
-        await tab.value("window.focusless = false")
-        await stops(world)
-        assert tab.errors == []
+    await tab.value("window.pad.buttons[4].pressed = true")
+    await drives(tab, world, left=-0.5)
+    await tab.value("window.pad.connected = false;"
+                    "dispatchEvent(new Event('gamepaddisconnected'))")
+    await stops(world)
+    await tab.value("window.pad.connected = true;"
+                    "dispatchEvent(new Event('gamepadconnected'))")
+    await stops(world)  # plugging in moves nothing
+    await tab.value("window.pad.buttons[4].pressed = false")
+    await asyncio.sleep(0.15)
+    await tab.value("window.focusless = true; document.hasFocus = () => !window.focusless;"
+                    "window.pad.buttons[4].pressed = true")
+    await stops(world)  # meant for another window
+    await tab.value("window.focusless = false")
+    await stops(world)
 
 
 @pytest.mark.usefixtures("patient")
-async def test_the_second_operator_sees_who_drives(world):
-    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        at = await served(hmi)
-        await tab.show(f"http://{at}/")
-        await tab.until(FREE)
-        async with websockets.connect(f"ws://{at}/ws") as other:
-            number = (await hear(other, "operating"))["page"]
-            ticket = 0
-            await other.send(json.dumps({"type": "stick", "panel": "Drive", "held": False}))
+async def test_the_second_operator_sees_who_drives(world, hmi, tab):
+    async with open_page(await served(hmi)) as other:
+        number = (await hear(other, "operating"))["page"]
+        hand = Hand(other)
+        await hand.take()
 
-            async def drive() -> None:
-                nonlocal ticket
-                while True:
-                    await other.send(json.dumps({"type": "stick", "panel": "Drive", "held": True,
-                                                 "ticket": ticket, "forward": 0.25}))
-                    told = await hear(other, "stick")
-                    ticket = told["ticket"]
-                    await asyncio.sleep(0.03)
+        async def drive() -> None:
+            while True:
+                await hand.hold(0.25)
+                await asyncio.sleep(0.03)
 
-            driving = asyncio.create_task(drive())
-            await tab.until("document.querySelector('.stick-state').textContent"
-                            f" === 'page {number} drives'")
-            await tab.value(f"{PAD}.focus()")
-            await key(tab, "ArrowDown", down=True)
-            await tab.until(f"{WORDS}.includes('page {number} has the stick')")
-            driving.cancel()
-            await asyncio.gather(driving, return_exceptions=True)
-        await tab.until(f"{WORDS}.includes('let go first, then press again')")
-        await stops(world)
-        await key(tab, "ArrowDown", down=False)
+        driving = asyncio.create_task(drive())
+        await tab.until("document.querySelector('.stick-state').textContent"
+                        f" === 'page {number} drives'")
+        await tab.value(f"{PAD}.focus()")
         await key(tab, "ArrowDown", down=True)
-        await drives(tab, world, forward=-0.5)
-        await key(tab, "ArrowDown", down=False)
-    assert {s.forward for s in world.others.stick} == {0.25, 0.0, -0.5}
+        await tab.until(f"{WORDS}.includes('page {number} has the stick')")
+        driving.cancel()
+        await asyncio.gather(driving, return_exceptions=True)
+    await tab.until(f"{WORDS}.includes('let go first, then press again')")
+    await stops(world)
+    await key(tab, "ArrowDown", down=False)
+    await key(tab, "ArrowDown", down=True)
+    await drives(tab, world, forward=-0.5)
+    await key(tab, "ArrowDown", down=False)
+    assert {s.forward for s in world.others.stick} == {0.5, 0.25, 0.0, -0.5}
 
 
-async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monkeypatch):
+@pytest.mark.parametrize("hmi", [{"launcher_pid": 1}], indirect=True)
+async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, tab, monkeypatch):
     sent = []
 
     def signal_node(node: str, name: str, _port: int) -> RunProcess:
@@ -303,58 +281,49 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monk
             for name in ("safety_pilot", "osmosis_control"))))
 
     row = "document.querySelector('tr[data-node=osmosis_control]')"
-    async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), launcher_pid=1) as hmi):
-        await tab.show(f"http://{await served(hmi)}/")
-        await tab.until(LIVE)
-        async with repeated(lambda: table(fm.NodeState.RUNNING, 0)):
-            await tab.until(f"{row} !== null")
-            await tab.value(f"{row}.querySelector('button').click()")
-            assert await tab.value("document.getElementById('signal-dialog').open") is True
-            assert await tab.value("document.getElementById('signal-confirm').hidden") is True
-            choose = "[...document.querySelectorAll('#signals button')].find((b) => b.textContent"
-            await tab.value(f"{choose} === 'KILL').click()")
-            assert await tab.value("document.getElementById('signal-confirm').textContent") == (
-                "Send KILL to osmosis_control")
-            assert sent == []
-            await tab.value("document.getElementById('signal-confirm').click()")
-            await eventually(lambda: sent == [("osmosis_control", "KILL")])
-            await tab.until("document.getElementById('toast').textContent"
-                            " === 'osmosis_control (pid 77): KILL'")
-            assert await tab.value("document.getElementById('signal-dialog').open") is False
-        assert tab.errors == []
-
-
-async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
-    async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), faults=OsmosisFaults().offered(),
-                          system=shipped_system()) as hmi):
-        await tab.show(f"http://{await served(hmi)}/")
-        await tab.until("!document.getElementById('strategy-set').disabled")
-        assert await tab.value("document.getElementById('strategy-name').value") == "safety-first"
-        await tab.value("document.getElementById('strategy-name').value = 'mission-first';"
-                        "document.getElementById('strategy-set').click()")
-        await eventually(lambda: bool(world.others.adaptations))
-        world.others.publish(ftm_topics.ADAPTATION, fm.AdaptationAnswer(
-            world.others.adaptations[0].request, True, "", 1))
+    async with repeated(lambda: table(fm.NodeState.RUNNING, 0)):
+        await tab.until(f"{row} !== null")
+        await tab.value(f"{row}.querySelector('button').click()")
+        assert await tab.value("document.getElementById('signal-dialog').open") is True
+        assert await tab.value("document.getElementById('signal-confirm').hidden") is True
+        choose = "[...document.querySelectorAll('#signals button')].find((b) => b.textContent"
+        await tab.value(f"{choose} === 'KILL').click()")
+        assert await tab.value("document.getElementById('signal-confirm').textContent") == (
+            "Send KILL to osmosis_control")
+        assert sent == []
+        await tab.value("document.getElementById('signal-confirm').click()")
+        await eventually(lambda: sent == [("osmosis_control", "KILL")])
         await tab.until("document.getElementById('toast').textContent"
-                        " === 'strategy mission-first is in force, change 1 of the run'")
+                        " === 'osmosis_control (pid 77): KILL'")
+        assert await tab.value("document.getElementById('signal-dialog').open") is False
 
-        submit = "document.getElementById('inject').requestSubmit()"
-        for chosen, topic in (("gps-bias", "summit_xl/gps"), ("freeze:", "plan/route")):
-            await tab.value(
-                f"document.getElementById('fault').value = '{chosen}';"
-                "document.getElementById('fault').dispatchEvent(new Event('change'));"
-                "document.getElementById('fault-topic').value = 'plan/route';"
-                f"document.getElementById('fault-duration').value = '4'; {submit}")
-            await eventually(lambda topic=topic: any(
-                o.topic == topic for o in world.others.injections))
-            order = next(o for o in world.others.injections if o.topic == topic)
-            assert order.duration_s == 4.0
-            world.others.publish(bus_topics.INJECTION_REPORT, bm.InjectionReport(
-                order.injection, "simulator", 12, True, ""))
-            await tab.until("document.querySelector('#faults li').textContent"
-                            f".startsWith('{chosen}')")
-            await tab.until("document.querySelector('#faults li').textContent"
-                            ".includes('over, 12 messages changed')")
-        assert tab.errors == []
+
+@pytest.mark.parametrize("hmi", [{"faults": OsmosisFaults().offered(),
+                                  "system": shipped_system()}], indirect=True)
+async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world, tab):
+    await tab.until("!document.getElementById('strategy-set').disabled")
+    assert await tab.value("document.getElementById('strategy-name').value") == "safety-first"
+    await tab.value("document.getElementById('strategy-name').value = 'mission-first';"
+                    "document.getElementById('strategy-set').click()")
+    await eventually(lambda: bool(world.others.adaptations))
+    world.others.publish(ftm_topics.ADAPTATION, fm.AdaptationAnswer(
+        world.others.adaptations[0].request, True, "", 1))
+    await tab.until("document.getElementById('toast').textContent"
+                    " === 'strategy mission-first is in force, change 1 of the run'")
+
+    submit = "document.getElementById('inject').requestSubmit()"
+    for chosen, topic in (("gps-bias", "summit_xl/gps"), ("freeze:", "plan/route")):
+        await tab.value(
+            f"document.getElementById('fault').value = '{chosen}';"
+            "document.getElementById('fault').dispatchEvent(new Event('change'));"
+            "document.getElementById('fault-topic').value = 'plan/route';"
+            f"document.getElementById('fault-duration').value = '4'; {submit}")
+        await eventually(lambda topic=topic: any(o.topic == topic for o in world.others.injections))
+        order = next(o for o in world.others.injections if o.topic == topic)
+        assert order.duration_s == 4.0
+        world.others.publish(bus_topics.INJECTION_REPORT, bm.InjectionReport(
+            order.injection, "simulator", 12, True, ""))
+        await tab.until("document.querySelector('#faults li').textContent"
+                        f".startsWith('{chosen}')")
+        await tab.until("document.querySelector('#faults li').textContent"
+                        ".includes('over, 12 messages changed')")

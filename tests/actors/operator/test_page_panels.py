@@ -8,11 +8,11 @@ from contextlib import asynccontextmanager
 import pytest
 
 from rampart.actors.operator.panels import Panel
-from tests.actors.operator.browser import browser, mouse
+from tests.actors.operator.browser import mouse
 from tests.actors.operator.extremes import MARKUP
-from tests.actors.operator.page import LIVE, events, page, speaking_world
+from tests.actors.operator.page import LIVE, events, page, show
 from tests.actors.operator.test_panels import PANELS, Speaks, hmi
-from tests.actors.operator.world import repeated, served
+from tests.actors.operator.world import repeated
 from tests.tank import LEVEL, PUMP, VALVE, Level, Phase, Pump, Valve
 
 pytestmark = pytest.mark.page
@@ -53,29 +53,21 @@ OVERLAPS = """(() => {
 })()"""
 
 
-@pytest.fixture
-async def world():
-    async with speaking_world() as made:
-        yield made
-
-
 @asynccontextmanager
-async def tank(world, panels=SHOWN, **look):
-    """A page with panels of a tank, and one who says what they show."""
+async def tank(world, tab, panels=SHOWN, **look):
+    """Show a page with panels of a tank; yields one who says what they show."""
     said = Speaks(world.context("speaks", 1))
-    async with world.running(said), world.running(hmi(world, panels)) as made, browser() as tab:
-        await tab.show(f"http://{await served(made)}/", **look)
-        await tab.until(LIVE)
-        yield tab, said
-        assert tab.errors == []
+    async with world.running(said), world.running(hmi(world, panels)) as made:
+        await show(tab, made, **look)
+        yield said
 
 
 def text(name: str) -> str:
     return f"{BODY.format(name)}.textContent"
 
 
-async def test_each_kind_of_panel_shows_its_fields_and_whether_they_are_heard(world):
-    async with tank(world) as (tab, said):
+async def test_each_kind_of_panel_shows_its_fields_and_whether_they_are_heard(world, tab):
+    async with tank(world, tab) as said:
         assert "no data" in await tab.value(text("Level"))
         height = 0.25
 
@@ -105,34 +97,36 @@ async def test_each_kind_of_panel_shows_its_fields_and_whether_they_are_heard(wo
         await tab.until(f"{now} === 'draining'")
 
 
-async def test_a_page_that_opens_later_shows_the_past(world):
-    async with tank(world) as (tab, said):
+async def test_a_page_that_opens_later_shows_the_past(world, tab):
+    plot = Panel(title="Over time", plot=("tank/level:height_m",), seconds=60)
+    async with tank(world, tab, (plot,)) as said:
         async with repeated(lambda: said.publish(LEVEL, Level(0.5))):
             await tab.until(f"{DRAWN} > 100")
         await tab.call("Page.reload")
         await tab.until(f"{LIVE} && {DRAWN} > 50")
 
 
-@pytest.mark.parametrize(("width", "height"), [(1920, 1080), (1366, 768), (1100, 700)])
-async def test_no_panel_lies_on_another_or_is_too_narrow(world, width, height):
-    async with tank(world, width=width, height=height) as (tab, said), repeated(world.others.busy):
+async def test_no_panel_lies_on_another_or_is_too_narrow(world, tab):
+    async with tank(world, tab) as said, repeated(world.others.busy):
         said.publish(LEVEL, Level(0.5))
-        await tab.until(f"{events('active')} === ''")
-        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
-        await tab.until(f"{OVERLAPS} === ''", 5)
-        await tab.value("document.querySelector('.panel summary').click()")
-        await tab.until(f"{OVERLAPS} === ''", 5)
+        for width, height in ((1920, 1080), (1366, 768), (1100, 700)):
+            await tab.show(await tab.value("location.href"), width=width, height=height)
+            await tab.until(f"{LIVE} && document.querySelectorAll('#nodes tr').length > 0")
+            await tab.until(f"{OVERLAPS} === ''", 5)
+            await tab.value("document.querySelector('.panel summary').click()")
+            await tab.until(f"{OVERLAPS} === ''", 5)
+            await tab.value("document.getElementById('arrange-reset').click()")
 
 
-@pytest.mark.parametrize(("width", "height"), [(1920, 1080), (1366, 768)])
-async def test_so_do_those_of_a_robot_with_panels_of_its_own(world, width, height):
-    async with page(world, width=width, height=height) as tab, repeated(world.others.busy):
-        await tab.until(f"{events('active')} === 'FTM4'")
-        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
-        await tab.until(f"{OVERLAPS} === ''", 5)
-        if width == 1920:
-            end = "document.getElementById('tree').getBoundingClientRect().bottom"
-            assert await tab.value(end) < height  # above the fold
+async def test_nor_one_of_a_robot_with_panels_of_its_own(world, tab):
+    async with page(world, tab, width=1366, height=768) as hmi, repeated(world.others.busy):
+        for height in (768, 1080):
+            await show(tab, hmi, width=height * 16 // 9, height=height)
+            await tab.until(f"{events('active')} === 'FTM4'")
+            await tab.until("document.querySelectorAll('#nodes tr').length > 0")
+            await tab.until(f"{OVERLAPS} === ''", 5)
+        end = "document.getElementById('tree').getBoundingClientRect().bottom"
+        assert await tab.value(end) < height  # above the fold
 
 
 async def press(tab, name: str) -> None:
@@ -140,8 +134,8 @@ async def press(tab, name: str) -> None:
         await tab.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
 
 
-async def test_by_keyboard_a_panel_is_moved_and_folded_and_the_page_remembers(world):
-    async with tank(world) as (tab, _):
+async def test_by_keyboard_a_panel_is_moved_and_folded_and_the_page_remembers(world, tab):
+    async with tank(world, tab):
         before = await tab.value(NAMES)
         assert before[:3] == ["Level", "Over time", "Pump"]
         await tab.value("document.querySelector('[data-name=\"Pump\"] .tool').focus()")
@@ -163,8 +157,8 @@ async def test_by_keyboard_a_panel_is_moved_and_folded_and_the_page_remembers(wo
         assert await tab.value(folded) is True
 
 
-async def test_what_grows_by_itself_moves_nothing_under_a_hand_that_is_about_to_press(world):
-    async with tank(world, width=1100, height=700) as (tab, _):
+async def test_what_grows_by_itself_moves_nothing_under_a_hand_that_is_about_to_press(world, tab):
+    async with tank(world, tab, width=1100, height=700):
         await tab.until(f"{OVERLAPS} === ''", 5)
         below = await tab.value(
             "(() => { const top = (p) => p.getBoundingClientRect();"
@@ -189,8 +183,8 @@ async def test_what_grows_by_itself_moves_nothing_under_a_hand_that_is_about_to_
         await tab.until(f"{where} !== {json.dumps(before)} && {OVERLAPS} === ''", 5)
 
 
-async def test_by_mouse_a_panel_is_dragged_to_where_another_one_is(world):
-    async with tank(world, width=1920, height=1080) as (tab, _):
+async def test_by_mouse_a_panel_is_dragged_to_where_another_one_is(world, tab):
+    async with tank(world, tab, width=1920, height=1080):
         await tab.until(f"{OVERLAPS} === ''", 5)
         at = ("JSON.stringify((() => {{ const b = document.querySelector('[data-name=\"{}\"] {}')"
               ".getBoundingClientRect(); return [b.left + b.width / 2, b.top + 8]; }})())")
@@ -201,24 +195,26 @@ async def test_by_mouse_a_panel_is_dragged_to_where_another_one_is(world):
         await tab.until(f"{NAMES}[2] === 'Level'")
 
 
-@pytest.mark.parametrize("kept", [
-    "{", "null", "7", '{"order": 3, "folded": {}}', '{"order": [null, "Pump", "Pump", "x"]}',
-    '{"order": ["__proto__", "Pump"], "folded": ["<b>", "Pump"]}'])
-async def test_nonsense_in_the_browser_s_memory_does_no_harm(world, kept):
-    async with tank(world) as (tab, _):
+async def test_nonsense_in_the_browser_s_memory_does_no_harm(world, tab):
+    async with tank(world, tab):
         before = await tab.value(NAMES)
         key = await tab.value("Object.keys(localStorage)[0]")
-        await tab.value(f"localStorage.setItem({json.dumps(key)}, {json.dumps(kept)})")
-        await tab.call("Page.reload")
-        await tab.until(f"{LIVE} && {NAMES}.length === {len(before)}")
-        assert sorted(await tab.value(NAMES)) == sorted(before)
+        for kept in ("{", "null", "7", '{"order": 3, "folded": {}}',
+                     '{"order": [null, "Pump", "Pump", "x"]}',
+                     '{"order": ["__proto__", "Pump"], "folded": ["<b>", "Pump"]}'):
+            await tab.value(f"localStorage.setItem({json.dumps(key)}, {json.dumps(kept)});"
+                            "window.before = true")
+            await tab.call("Page.reload")
+            await tab.until(f"window.before === undefined && {LIVE}"
+                            f" && {NAMES}.length === {len(before)}")
+            assert sorted(await tab.value(NAMES)) == sorted(before)
 
 
-async def test_markup_in_a_field_a_title_or_a_state_is_inert(world):
+async def test_markup_in_a_field_a_title_or_a_state_is_inert(world, tab):
     panels = (Panel(title=MARKUP[:60], text="manager/status:strategy", unit="<b>"),
               Panel(title="List", table=("manager/status:strategy",)),
               Panel(title="States", states="manager/status:strategy", of=(MARKUP[:60], "a")))
-    async with tank(world, panels) as (tab, _):
+    async with tank(world, tab, panels):
         from rampart.actors.ftm import messages as fm
         from rampart.actors.ftm import topics
 
@@ -234,8 +230,8 @@ async def test_markup_in_a_field_a_title_or_a_state_is_inert(world):
         assert [url for url in tab.requests if url.endswith("/x")] == []
 
 
-async def test_a_panel_that_fails_takes_nothing_else_along(world):
-    async with tank(world) as (tab, said):
+async def test_a_panel_that_fails_takes_nothing_else_along(world, tab):
+    async with tank(world, tab) as said:
         await tab.value(f"Object.defineProperty({BODY.format('Level')}.querySelector('.figure'),"
                         " 'textContent', { get() { throw Error('broken on purpose'); } })")
         async with repeated(lambda: said.publish(LEVEL, Level(0.5, (4.5,)))):

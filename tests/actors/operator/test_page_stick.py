@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import asynccontextmanager
-
 import pytest
 
 from rampart.actors.operator.panels import Panel
 from rampart.testing import eventually
-from tests.actors.operator.browser import browser
-from tests.actors.operator.page import LIVE
+from tests.actors.operator.page import show
 from tests.actors.operator.test_page_operating import key
 from tests.actors.operator.test_stick_panel import AT_REST, DRIVE, driven, rests
 from tests.tank import Hand
@@ -27,21 +24,14 @@ def state(panel: str = "Drive") -> str:
     return f"{of(panel, '.stick-state')}.textContent"
 
 
-@asynccontextmanager
-async def opened(at: str, **look):
-    async with browser() as tab:
-        await tab.show(f"http://{at}/", **look)
-        await tab.until(f"{LIVE} && {state()} === 'free'")
-        yield tab
-        assert tab.errors == []
-
-
 async def is_told(robot, hand: Hand) -> None:
     await eventually(lambda: robot.hands[-1] == hand)
 
 
-async def test_of_two_sticks_each_has_its_keys_and_the_gamepad_is_the_first_one_s(world):
-    async with driven(world, DRIVE, LIFT) as (robot, _, at), opened(at) as tab:
+async def test_of_two_sticks_each_has_its_keys_and_the_gamepad_is_the_first_one_s(world, tab):
+    async with driven(world, DRIVE, LIFT) as (robot, hmi, _):
+        await show(tab, hmi)
+        await tab.until(f"{state()} === 'free'")
         how = await tab.value(f"{of('Lift', '.stick-words')}.textContent")
         assert "click it and hold the up or down key, W or S. Letting go stops" in how
         await tab.value(f"{of('Lift', '.stick')}.focus()")
@@ -60,8 +50,3 @@ async def test_of_two_sticks_each_has_its_keys_and_the_gamepad_is_the_first_one_
         assert await tab.value(state("Lift")) == "free"
         await tab.value("window.held = false")
         await rests(robot)
-
-
-async def test_on_a_phone_a_stick_has_room(world):
-    async with driven(world, DRIVE, LIFT) as (_, _, at), opened(at, width=360, height=740) as tab:
-        assert await tab.value("document.documentElement.scrollWidth") == 360

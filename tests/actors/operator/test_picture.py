@@ -188,16 +188,6 @@ async def test_a_page_that_answers_has_few_frames_on_the_way_and_then_the_newest
         assert len(p.line.frames) - 1 == on_the_way + 1
 
 
-async def test_a_page_that_takes_nothing_is_given_up(monkeypatch):
-    monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.05)
-    async with Pushing() as p:
-        await p.line.until(lambda frames: len(frames) >= 2)
-        p.line.taken.clear()
-        p.state.log(1.0, "note", "news")
-        with pytest.raises(TimeoutError):
-            await asyncio.wait_for(asyncio.shield(p.task), 5)
-
-
 async def test_a_page_that_draws_nothing_is_given_up(monkeypatch):
     monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.3)
     async with Pushing() as p:

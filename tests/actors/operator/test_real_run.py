@@ -6,7 +6,6 @@ import asyncio
 import json
 import ssl
 import subprocess
-import sys
 from pathlib import Path
 
 import httpx
@@ -17,8 +16,8 @@ from websockets.sync.client import connect
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.web.visitors import Role, issue
 from rampart.testing import RealRun, free_base_port
-from tests import ROOT
 from tests.actors.operator.browser import browser
+from tests.actors.operator.test_page_operating import key
 from tests.actors.web.pems import pair
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
@@ -39,10 +38,8 @@ STATE = f"(({ROW}) || document.createElement('p')).textContent"
 async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed_to_its_report(
         tmp_path):
     port = free_base_port()
-    short = tmp_path / "SHORT.miss"
-    short.write_text("x=-27,y=-8,taxi=1\n")
-    with RealRun(tmp_path, "paper", "--mission", str(short), "--rate", "1", "--hmi-port", str(port),
-                 "--wait", hmi=True) as run:
+    with RealRun(tmp_path, "paper", "--mission", short(tmp_path), "--rate", "1", "--hmi-port",
+                 str(port), "--wait", hmi=True) as run:
         await asyncio.to_thread(run.sleep_until, 1.0)
         async with browser() as tab:
             await tab.show(f"http://127.0.0.1:{port}/")
@@ -89,6 +86,13 @@ async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed
     assert Path(result["report"]).is_file()
 
 
+def short(tmp_path) -> str:
+    """Write a mission of one goal, and return its file."""
+    file = tmp_path / "SHORT.miss"
+    file.write_text("x=-27,y=-8,taxi=1\n")
+    return str(file)
+
+
 async def kill(tab, node: str) -> None:
     await tab.value(f"document.querySelector('tr[data-node={node}] button').click();"
                     "[...document.querySelectorAll('#signals button')]"
@@ -96,51 +100,7 @@ async def kill(tab, node: str) -> None:
                     "document.getElementById('signal-confirm').click()")
 
 
-async def key(tab, name: str, *, down: bool) -> None:
-    await tab.call("Input.dispatchKeyEvent", type="rawKeyDown" if down else "keyUp", key=name,
-                   code=name)
-
-
 ELSEWHERE = ["--hmi-host", "0.0.0.0"]
-
-
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["--hmi-host", "192.0.2.1", "--hmi-unencrypted"],
-     "--hmi-host 192.0.2.1: expected an address of this machine"),
-    (["--hmi-host", "no such host", "--hmi-unencrypted"],
-     "--hmi-host no such host: expected an address of this machine"),
-    (ELSEWHERE, "--hmi-host 0.0.0.0: page on 0.0.0.0: has to be encrypted, because other machines "
-                "can reach it: --hmi-cert FILE --hmi-key FILE; or --hmi-unencrypted"),
-    ([*ELSEWHERE, "--hmi-cert", "robot.crt"],
-     "--hmi-cert robot.crt: contains no key; expected --hmi-key FILE, too"),
-    ([*ELSEWHERE, "--hmi-cert", "nothing"], "--hmi-cert, --hmi-key: key nothing: cannot be read"),
-    ([*ELSEWHERE, "--hmi-key", "robot.key"], "--hmi-key robot.key: expected --hmi-cert FILE, too"),
-    ([*ELSEWHERE, "--hmi-cert", "robot.crt", "--hmi-key", "other.key"],
-     "--hmi-cert, --hmi-key: key other.key: does not fit certificate robot.crt"),
-    ([*ELSEWHERE, "--hmi-cert", "old.crt", "--hmi-key", "old.key"],
-     "--hmi-cert, --hmi-key: certificate old.crt: certificate has expired"),
-    ([*ELSEWHERE, "--hmi-cert", "no", "--hmi-key", "other.key"],
-     "--hmi-cert, --hmi-key: certificate no: cannot be read (No such file or directory)"),
-    ([*ELSEWHERE, "--hmi-cert", "robot.crt", "--hmi-key", "robot.key", "--hmi-unencrypted"],
-     "--hmi-unencrypted: contradicts --hmi-cert robot.crt"),
-    (["--hmi-token-file", "twice"], "--hmi-token-file twice: line 2: name 'anna': there already"),
-    (["--hmi-token-file", "captain"], "--hmi-token-file captain: line 1: role 'captain': unknown; "
-                                      "known: look, drive, inject"),
-    (["--hmi-token-file", "nobody"], "--hmi-token-file nobody: is empty; rampart tokens issue"),
-])
-def test_a_page_that_cannot_be_served_like_this_is_one_clear_line(tmp_path, arguments, words):
-    for name in ("robot", "other", "old"):
-        pair(tmp_path, name)
-    for name, text in (("twice", f"anna look {'a' * 64}\nanna look {'b' * 64}\n"),
-                       ("captain", f"anna captain {'a' * 64}\n"), ("nobody", "# nobody\n")):
-        (tmp_path / name).touch(0o600)
-        (tmp_path / name).write_text(text)
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "launch.py"), "--report", str(tmp_path / "r"), *arguments],
-        check=False, capture_output=True, text=True, timeout=60, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"launch.py: {words}")
-    assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_a_page_for_the_network_prints_its_new_token_once_and_tools_are_not_told_it(tmp_path):
@@ -167,15 +127,12 @@ def answers(port: int, trusting: ssl.SSLContext) -> bool:
 
 
 @pytest.mark.slow
-def test_what_visitors_do_over_tls_is_in_the_report_though_the_node_of_the_page_is_killed(
-        tmp_path):
+def test_what_visitors_do_over_tls_is_in_the_report_though_the_node_of_the_page_is_killed(tmp_path):
     port, tokens = free_base_port(), tmp_path / "page.tokens"
     certificate, key = pair(tmp_path)
     anna, bob = issue(tokens, "anna", Role.INJECT), issue(tokens, "bob", Role.LOOK)
-    short = tmp_path / "SHORT.miss"
-    short.write_text("x=-27,y=-8,taxi=1\n")
     trusting = ssl.create_default_context(cafile=str(certificate))
-    with RealRun(tmp_path, "paper", "--mission", str(short), "--hmi-port", str(port),
+    with RealRun(tmp_path, "paper", "--mission", short(tmp_path), "--hmi-port", str(port),
                  *ELSEWHERE, "--hmi-cert", str(certificate), "--hmi-key", str(key),
                  "--hmi-token-file", str(tokens), hmi=True) as run:
         run.sleep_until(2.0)
@@ -203,8 +160,7 @@ def test_what_visitors_do_over_tls_is_in_the_report_though_the_node_of_the_page_
     assert (code, told) == (0, ["error", "done", "done"])
     record = json.loads(Path(result["record"]).read_text())
     page = Path(result["report"]).read_text()
-    kept = [(line["who"], line["what"], line["outcome"])
-            for line in record["audit"]]
+    kept = [(line["who"], line["what"], line["outcome"]) for line in record["audit"]]
     assert [line for line in kept if line[1] in ("signal", "strategy")] == [
         ("bob", "signal", "refused"), ("anna", "signal", "accepted"),
         ("anna", "strategy", "accepted")]
@@ -223,10 +179,8 @@ def test_what_visitors_do_over_tls_is_in_the_report_though_the_node_of_the_page_
 def test_the_operators_own_token_opens_the_page_and_turns_up_nowhere(tmp_path, monkeypatch):
     monkeypatch.setenv("RAMPART_HMI_TOKEN", TOKEN)
     port, bag = free_base_port(), tmp_path / "run.mcap"
-    short = tmp_path / "SHORT.miss"
-    short.write_text("x=-27,y=-8,taxi=1\n")
-    with RealRun(tmp_path, "paper", "--mission", str(short), "--rate", "4", "--hmi-port", str(port),
-                 "--record", str(bag), hmi=True) as run:
+    with RealRun(tmp_path, "paper", "--mission", short(tmp_path), "--rate", "4", "--hmi-port",
+                 str(port), "--record", str(bag), hmi=True) as run:
         run.sleep_until(2.0)
         at = f"http://127.0.0.1:{port}/nothing"
         bearer = {"Authorization": f"Bearer {TOKEN}"}

@@ -13,21 +13,19 @@ import pytest
 
 from rampart.actors.web import server as web_server
 from rampart.actors.web.tcp_peer import user_of_peer
-from rampart.testing import eventually, free_port
-from tests.actors.operator.test_operating import TOKEN, Hand, open_page
-from tests.actors.operator.world import served
+from rampart.testing import eventually
+from tests.actors.operator.test_operating import Hand
+from tests.actors.operator.world import TOKEN, open_page, served
 from tests.other_user import as_nobody, needs_root
-
-BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
 
 @pytest.mark.usefixtures("patient")
 async def test_beyond_so_many_connections_requests_are_refused_and_an_open_page_drives_on(
         world, monkeypatch):
     monkeypatch.setattr(web_server, "ROOM", 8)
-    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi:
+    async with world.hmi(hmi_token=TOKEN) as hmi:
         at = await served(hmi)
-        async with open_page(at, additional_headers=BEARER) as page:
+        async with open_page(at, TOKEN) as page:
             hand = Hand(page)
             await hand.take()
             with contextlib.ExitStack() as idle:
@@ -74,49 +72,41 @@ async def output(process) -> str:
     return told
 
 
-GET = 'b"GET / HTTP/1.1\\r\\nHost: " + sys.argv[1].encode() + b"\\r\\n%s\\r\\n"'
+def request(path: str, *headers: str) -> str:
+    """Return code that sends a request over the connection `c`."""
+    head = "\\r\\n".join((f"GET {path} HTTP/1.1", "Host: ", ""))
+    more = "\\r\\n".join((*headers, "", ""))
+    return f'c = connect(); c.sendall(b"{head[:-4]}" + sys.argv[1].encode() + b"\\r\\n{more}")'
 
 
 @needs_root
-async def test_on_loopback_another_user_is_refused_in_one_clear_line(world):
-    code = f'c = connect(); c.sendall({GET % "Connection: close"}); print(told(c))'.replace(
-        "close\\r\\n", "close\\r\\n\\r\\n")
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        told = await output(as_nobody(await served(hmi), code))
-        assert told.startswith("HTTP/1.1 403 Forbidden\n")
-        assert told.rstrip().endswith("Other users need a token: "
-                                      "launch.py --hmi-token-file FILE.")
-        assert "<html" not in told
+async def test_on_loopback_another_user_is_refused_in_one_clear_line(hmi):
+    code = f'{request("/", "Connection: close")}; print(told(c))'
+    told = await output(as_nobody(await served(hmi), code))
+    assert told.startswith("HTTP/1.1 403 Forbidden\n")
+    assert told.rstrip().endswith("Other users need a token: launch.py --hmi-token-file FILE.")
+    assert "<html" not in told
 
 
 @needs_root
-async def test_another_user_who_is_gone_before_it_is_looked_at_is_not_taken_for_root(world):
+async def test_another_user_who_is_gone_before_it_is_looked_at_is_not_taken_for_root(hmi):
     """Of a socket without a process the kernel says that it is user 0's, who runs this test."""
-    code = f"""
-for _ in range(200):
-    c = connect()
-    c.sendall({GET % ""} + b'')
-    c.close()
-"""
-    async with world.hmi(hmi_port=free_port()) as hmi:
-        seen = []
-        handlers = hmi._server._handlers
-        hmi._server._handlers = msgspec.structs.replace(
-            handlers, came=lambda page: (seen.append(page), handlers.came(page))[1])
-        upgrade = code.replace("\\r\\n\\r\\n", "\\r\\n").replace("GET / ", "GET /ws ").replace(
-            "b''", 'b"Upgrade: websocket\\r\\nConnection: Upgrade\\r\\nSec-WebSocket-Version: 13'
-                   '\\r\\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\\r\\n\\r\\n"')
-        assert await output(as_nobody(await served(hmi), upgrade)) == ""
-        assert seen == []
+    upgrade = request("/ws", "Upgrade: websocket", "Connection: Upgrade",
+                      "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==")
+    seen = []
+    handlers = hmi._server._handlers
+    hmi._server._handlers = msgspec.structs.replace(
+        handlers, came=lambda page: (seen.append(page), handlers.came(page))[1])
+    code = f"for _ in range(200): {upgrade}; c.close()"
+    assert await output(as_nobody(await served(hmi), code)) == ""
+    assert seen == []
 
 
 @needs_root
 async def test_a_token_lets_another_user_in(world):
-    code = f'c = connect(); c.sendall({GET % "Connection: close"}); print(told(c))'
-    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi:
-        at = await served(hmi)
-        told = await output(as_nobody(at, code.replace("close\\r\\n", "close\\r\\n\\r\\n")))
-        assert told.startswith("HTTP/1.1 200 OK\n")
-        told = await output(as_nobody(at, code.replace("GET / ", "GET /camera.jpg ").replace(
-            "close\\r\\n", f"close\\r\\nAuthorization: Bearer {TOKEN}\\r\\n\\r\\n")))
-        assert told.startswith("HTTP/1.1 503 ")  # this HMI has no camera
+    async with world.hmi(hmi_token=TOKEN) as hmi:
+        for path, headers, status in (("/", [], "200 OK\n"), (
+                "/camera.jpg", [f"Authorization: Bearer {TOKEN}"], "503 ")):  # there is none
+            code = f'{request(path, "Connection: close", *headers)}; print(told(c))'
+            told = await output(as_nobody(await served(hmi), code))
+            assert told.startswith(f"HTTP/1.1 {status}")

@@ -4,82 +4,94 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
+import os
 from contextlib import asynccontextmanager
 from dataclasses import replace
 
-from rampart.actors.bus import messages as bm
+import numpy as np
+import websockets
+
 from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
-from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.actor import Actor, Context, on
 from rampart.actors.runtime.clock import Clock
+from rampart.manager.spec.specification import parse_specification
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.testing import eventually
+from rampart.testing import eventually, free_port
+from tests import system_file
 from tests.osmosis_system import run_context
 
 AIRPORT = load_airport("vallombre")
+FILE = system_file("osmosis")
+SPEC = parse_specification(FILE.read_text(encoding="utf-8"), FILE.name)
 RATE = 20.0
+TOKEN = "abcdefghijklmnop"
+
+
+NOTED = {"requests": topics.MISSION_REQUEST, "resets": ftm_topics.RESET,
+         "orders": topics.MISSION_ORDER, "stick": topics.JOYSTICK, "signals": ftm_topics.SIGNAL,
+         "adaptations": ftm_topics.ADAPT, "injections": bus_topics.INJECT,
+         "diagnostics": bus_topics.DIAGNOSTIC}
+"""Lists of messages in `Others`, by topic."""
+
+
+def noting(name: str, topic: Topic):
+    """Return a handler that notes each message of a topic."""
+    def note(self, message, _header) -> None:
+        getattr(self, name).append(message)
+
+    return on(topic)(note)
 
 
 class Others(Actor):
-    """Stands for the rest of the system."""
+    """Stands for the rest of the system: notes what it hears, and says what a test wants."""
 
-    outputs = (topics.MISSION_STATUS, ftm_topics.MANAGER_STATUS, topics.POSE, ftm_topics.DETECTION,
-               topics.MISSION_ORDER_ANSWER, topics.PILOT_STATUS, ftm_topics.NODES,
-               topics.BASE_STATUS, ftm_topics.ADAPTATION, bus_topics.INJECTION_REPORT,
-               bus_topics.DIAGNOSTIC)
+    outputs = tuple(topics.ALL)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.requests: list[m.MissionRequest] = []
-        self.resets: list[fm.Reset] = []
-        self.orders: list[m.MissionOrder] = []
-        self.diagnostics: list[bm.Diagnostic] = []
-        self.stick: list[m.Joystick] = []
-        self.signals: list[fm.SignalOrder] = []
-        self.adaptations: list[fm.AdaptationRequest] = []
-        self.injections: list[bm.Injection] = []
-        self.actuator_faults: list[m.ActuatorFault] = []
+        for name in NOTED:
+            setattr(self, name, [])
 
-    @on(ftm_topics.SIGNAL)
-    def signal(self, message: fm.SignalOrder, _header: Header) -> None:
-        self.signals.append(message)
+    on_request, on_reset, on_order, on_stick, on_signal, on_adapt, on_injection, on_diagnostic = (
+        noting(name, topic) for name, topic in NOTED.items())
 
-    @on(topics.MISSION_REQUEST)
-    def request(self, message: m.MissionRequest, _header: Header) -> None:
-        self.requests.append(message)
+    def manager(self, *active: str, activated: tuple[str, ...] = (),
+                latched: tuple[str, ...] = ()) -> None:
+        """Publish the manager's status: some mechanisms are active, and so are their modules."""
+        detecting = {d for x in SPEC.mechanisms if x.name in active for d in x.detections}
+        self.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
+            active, (), activated, latched, "guarded-repair", 1, tuple(
+                fm.DetectionView(d.name, d.name in detecting, "a test" * (d.name in detecting), ())
+                for d in SPEC.detections)))
 
-    @on(ftm_topics.RESET)
-    def reset(self, message: fm.Reset, _header: Header) -> None:
-        self.resets.append(message)
+    def sweep(self) -> None:
+        """Publish a pose and a sweep with one echo, 3 m straight ahead."""
+        ranges = np.full(181, 8.0, dtype="<f4")
+        ranges[90] = 3.0
+        self.publish(topics.POSE, m.Pose(-10.0, 5.0, 0.5))
+        self.publish(topics.SCAN, m.LaserScan(
+            -math.radians(135), math.radians(1.5), 8.0, ranges.tobytes()))
 
-    @on(topics.MISSION_ORDER)
-    def order(self, message: m.MissionOrder, _header: Header) -> None:
-        self.orders.append(message)
-
-    @on(topics.JOYSTICK)
-    def joystick(self, message: m.Joystick, _header: Header) -> None:
-        self.stick.append(message)
-
-    @on(ftm_topics.ADAPT)
-    def adapt(self, message: fm.AdaptationRequest, _header: Header) -> None:
-        self.adaptations.append(message)
-
-    @on(bus_topics.INJECT)
-    def injection(self, message: bm.Injection, _header: Header) -> None:
-        self.injections.append(message)
-
-    @on(topics.ACTUATOR_FAULT)
-    def actuator_fault(self, message: m.ActuatorFault, _header: Header) -> None:
-        self.actuator_faults.append(message)
-
-    @on(bus_topics.DIAGNOSTIC)
-    def diagnostic(self, message: bm.Diagnostic, _header: Header) -> None:
-        self.diagnostics.append(message)
+    def busy(self) -> None:
+        """Publish something for every part of the page."""
+        self.sweep()
+        self.manager("FTM4", activated=("RM3",), latched=("RM1",))
+        goals = tuple(m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in AIRPORT.mission("AB").goals)
+        self.publish(topics.MISSION_STATUS, m.MissionStatus(
+            "r1/first", "AB", m.MissionPhase.RUNNING, 1, goals, (12.0,), (), "",
+            orders=tuple(m.MissionAction)))
+        self.publish(topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.AUTO, False, "", 0))
+        self.publish(ftm_topics.NODES, fm.NodeTable(tuple(
+            fm.NodeInfo(n.name, n.kind.value, os.getpid(), fm.NodeState.RUNNING, 1, 0)
+            for n in SPEC.actors())))
 
 
 class World:
@@ -92,8 +104,9 @@ class World:
         self.others = Others(self.context("others", 1))
 
     def context(self, name: str, incarnation: int, **shared: object) -> Context:
+        run = {"airport": AIRPORT, "run_id": "r1", "hmi_port": free_port(), **shared}
         return Context(name, incarnation, self.clock, VirtualBus(self.hub, name, incarnation),
-                       run=run_context(**{"airport": AIRPORT, "run_id": "r1", **shared}))
+                       run=run_context(**run))
 
     @asynccontextmanager
     async def running(self, actor: Actor):
@@ -146,6 +159,28 @@ async def repeated(say, period_s: float = 0.02):
 async def served(hmi: OsmosisHmi) -> str:
     await eventually(lambda: hmi._server is not None)
     return f"127.0.0.1:{hmi._server.port}"
+
+
+def open_page(at: str, token: str = "", **options):
+    options.setdefault("additional_headers", bearer(token) if token else None)
+    return websockets.connect(f"ws://{at}/ws", **options)
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}
+
+
+@asynccontextmanager
+async def visited(world: World, token: str = "", **shared: object):
+    """Yield an HMI and a page on it, of a visitor with a token."""
+    async with world.hmi(**shared) as hmi, open_page(await served(hmi), token) as page:
+        yield hmi, page
+
+
+async def ask(page, **wish: object) -> dict:
+    """Send a wish and return what the page is told."""
+    await page.send(json.dumps(wish))
+    return await hear(page, "done", "error", "stick")
 
 
 async def hear(page, *kinds: str) -> dict:
