@@ -110,27 +110,22 @@ def test_a_world_that_is_killed_ends_its_run_with_exit_code_4(tmp_path, monkeypa
 
 @pytest.mark.parametrize("name", ["Courier", "9lives", "a-b", "a b", "", "../x", "/tmp/x", "class",
                                   "x" * 32, "naïve"])
-def test_a_name_that_no_package_can_have_is_refused_in_one_line(tmp_path, monkeypatch, capsys,
-                                                                 name):
+def test_a_name_that_no_package_can_have_is_refused(tmp_path, monkeypatch, refused, name):
     monkeypatch.chdir(tmp_path)
-    assert main(["new", name]) == 2
-    assert capsys.readouterr().err == (
-        f"rampart: NAME {name!r}: expected at most 31 small letters, digits and _, a letter first, "
-        "not a keyword of Python: it becomes the name of a package\n")
+    assert refused("new", name).startswith(
+        f"rampart: NAME {name!r}: expected at most 31 small letters, digits and _")
     assert contents(tmp_path) == {}
 
 
-@pytest.mark.parametrize("name", ["json", "rampart", "numpy", "tests", "controller"])
-def test_a_name_that_is_taken_is_refused(tmp_path, monkeypatch, capsys, name):
+@pytest.mark.parametrize("name", ["json", "numpy", "tests", "controller"])
+def test_a_name_that_is_taken_is_refused(tmp_path, monkeypatch, refused, name):
     monkeypatch.chdir(tmp_path)
-    assert main(["new", name]) == 2
-    assert capsys.readouterr().err == (
-        f"rampart: NAME {name!r}: another module or node has this name already\n")
+    assert "another module or node has this name already" in refused("new", name)
     assert contents(tmp_path) == {}
 
 
 @pytest.mark.parametrize("there", ["folder", "empty folder", "file", "dangling link"])
-def test_what_is_there_is_never_overwritten(tmp_path, monkeypatch, capsys, there):
+def test_what_is_there_is_never_overwritten(tmp_path, monkeypatch, refused, there):
     place = tmp_path / "courier"
     if there == "file":
         place.write_text("mine")
@@ -142,22 +137,19 @@ def test_what_is_there_is_never_overwritten(tmp_path, monkeypatch, capsys, there
         (place / "nodes.py").write_text("mine")
     before = contents(tmp_path)
     monkeypatch.chdir(tmp_path)
-    assert main(["new", "courier"]) == 2
-    assert capsys.readouterr().err == (
-        "rampart: courier: exists already; nothing was changed\n")
+    assert refused("new", "courier") == "rampart: courier: exists already; nothing was changed\n"
     assert contents(tmp_path) == before
     assert not (tmp_path / "gone").exists()
 
 
-def test_a_disk_that_fills_up_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
+def test_a_disk_that_fills_up_leaves_nothing_behind(tmp_path, monkeypatch, refused):
     def full(folder, _name):
         (folder / "courier.toml").write_text("half of it")
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(new, "fill", full)
     monkeypatch.chdir(tmp_path)
-    assert main(["new", "courier"]) == 2
-    assert capsys.readouterr().err == "rampart: courier: No space left on device\n"
+    assert refused("new", "courier") == "rampart: courier: No space left on device\n"
     assert not (tmp_path / "courier").exists()
 
 

@@ -13,12 +13,10 @@ from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
 from rampart.testing.ports import free_base_port
 from tests import CELL, ROOT, TANK
+from tests.actors.web.pems import pair
 from tests.two_hosts import two_hosts
-from tests.whole.checkpoint_runs import write_short_mission
 
-
-def short(tmp_path):
-    return ["--virtual", "--system", "paper", "--mission", str(write_short_mission(tmp_path))]
+SHORT = ["--virtual", "--system", str(CELL), "--duration", "1"]
 
 
 @pytest.mark.parametrize(("start", "name"), [
@@ -55,25 +53,26 @@ def test_a_system_without_an_application_offers_no_options_or_examples_of_a_robo
 
 def test_the_verb_writes_its_report_where_one_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert rampart(["run", *short(tmp_path)]) == 0
-    page, = (tmp_path / "reports").glob("*-SHORT/inspection-*.html")
-    assert "light" in page.read_text("utf-8")
+    assert rampart(["run", *SHORT]) == 0
+    assert len([*(tmp_path / "reports").glob("*-cell/inspection-*.html")]) == 1
 
 
 def test_launch_py_writes_its_report_into_its_checkout(tmp_path):
     (tmp_path / "checkout").mkdir()
     shutil.copy(ROOT / "launch.py", tmp_path / "checkout")
     done = subprocess.run(
-        [sys.executable, str(tmp_path / "checkout/launch.py"), *short(tmp_path)],
-        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=100)
+        [sys.executable, str(tmp_path / "checkout/launch.py"), *SHORT], cwd=tmp_path,
+        capture_output=True, text=True, check=False, timeout=100)
     assert done.returncode == 0, done.stderr
-    assert len([*(tmp_path / "checkout/reports").glob("*-SHORT/inspection-*.html")]) == 1
+    assert len([*(tmp_path / "checkout/reports").glob("*-cell/inspection-*.html")]) == 1
     assert not (tmp_path / "reports").exists()
 
 
 NO_OPTION = "not an option of the launcher or of tank; --system tank.toml --help lists the options"
 OF_TANK, TWO = ["--system", "tank.toml"], ["--system", "two.toml"]
 GROUND = [*TWO, "--host", "ground"]
+FOR_ALL = ["--hmi-host", "0.0.0.0"]
+TOKEN = "secret-of-the-hangar-7"
 REFUSED = [
     (["--mission", "Z"], "'Z'"),
     (["--mission", "far.miss"], "far.miss: missions.far.goals[1]: (500, 0)"),
@@ -113,6 +112,33 @@ REFUSED = [
     ([*TWO, "--no-keys", "--hmi-port", "9000"],
      "--hmi-port 9000: no node of osmosis on host the first serves an operator's page"),
     ([*TWO, "--no-keys"], "cannot listen at 192.0.2.1 port 7462 for the other hosts"),
+    (["--record", "no/such/place/x.mcap"], "no/such/place/x.mcap: cannot be written"),
+    (["--record", "far.miss"], "far.miss: exists already"),
+    (["--overwrite"], "--overwrite: only with --record FILE"),
+    (["--virtual", "--black-box"], "--black-box: not with --virtual"),
+    ([*TWO, "--no-keys", "--black-box"], "--black-box: not on several hosts"),
+    *((["--hmi-host", host, "--hmi-unencrypted"],
+       f"--hmi-host {host}: expected an address of this machine")
+      for host in ("192.0.2.1", "no such host")),
+    (FOR_ALL, "--hmi-host 0.0.0.0: page on 0.0.0.0: has to be encrypted, because other machines "
+              "can reach it: --hmi-cert FILE --hmi-key FILE; or --hmi-unencrypted"),
+    ([*FOR_ALL, "--hmi-cert", "robot.crt"],
+     "--hmi-cert robot.crt: contains no key; expected --hmi-key FILE, too"),
+    ([*FOR_ALL, "--hmi-cert", "none"], "--hmi-cert, --hmi-key: key none: cannot be read"),
+    ([*FOR_ALL, "--hmi-key", "robot.key"], "--hmi-key robot.key: expected --hmi-cert FILE, too"),
+    ([*FOR_ALL, "--hmi-cert", "robot.crt", "--hmi-key", "other.key"],
+     "--hmi-cert, --hmi-key: key other.key: does not fit certificate robot.crt"),
+    ([*FOR_ALL, "--hmi-cert", "robot.crt", "--hmi-key", "robot.key", "--hmi-unencrypted"],
+     "--hmi-unencrypted: contradicts --hmi-cert robot.crt"),
+    (["--hmi-token-file", "twice"], "--hmi-token-file twice: line 2: name 'anna': there already"),
+    (["--hmi-token-file", "nobody"], "--hmi-token-file nobody: is empty; rampart tokens issue"),
+    (["--hmi-token-file", "bad"], "--hmi-token-file bad: token of 11 characters: "),
+    (["--hmi-token-file", "far.miss"], "--hmi-token-file far.miss: mode 0644: others can access"),
+    *((where, "launch.py: --hmi-token: every user of this machine can read a command line; put "
+              "another token into a file of mode 0600 for --hmi-token-file FILE, or into the "
+              "variable RAMPART_HMI_TOKEN")
+      for where in ([f"--hmi-token={TOKEN}"], ["--hmi-token"], ["--virtual", "--hmi-token", TOKEN],
+                    ["--no-hmi", "--hmi-token", TOKEN])),
 ]
 
 
@@ -123,8 +149,25 @@ def test_bad_usage_is_one_clear_line_and_exit_code_2(
     (tmp_path / "tank.toml").write_text(TANK)
     (tmp_path / "two.toml").write_text(two_hosts({"robot": "192.0.2.1", "ground": "192.0.2.2"}))
     (tmp_path / "far.miss").write_text("x=-22,y=-18.5,taxi=1\nx=500,y=0,taxi=0\n")
+    (tmp_path / "far.miss").chmod(0o644)
+    pair(tmp_path, "robot")
+    pair(tmp_path, "other")
+    for name, text in (("twice", f"anna look {'a' * 64}\nanna look {'b' * 64}\n"),
+                       ("nobody", "# nobody\n"), ("bad", "a-bad token")):
+        (tmp_path / name).touch(0o600)
+        (tmp_path / name).write_text(text)
     report = [] if "--report" in arguments else ["--report", str(tmp_path / "report")]
     assert launch.main([*arguments, *report]) == 2
     told = capfd.readouterr()
     assert (told.out, told.err.count("\n")) == ("", 1), told.err
     assert words in told.err
+    assert not {TOKEN, "a-bad"} & set(told.err.split())
+    assert not (tmp_path / "report").exists()
+
+
+def test_a_bad_token_of_the_environment_is_refused_and_not_repeated(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("RAMPART_HMI_TOKEN", "short-one")
+    assert launch.main(["--report", str(tmp_path / "report")]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("launch.py: RAMPART_HMI_TOKEN: token of 9 characters: ")
+    assert "short-one" not in told

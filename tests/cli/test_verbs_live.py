@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-from contextlib import AsyncExitStack
+import re
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import msgspec
 import pytest
@@ -117,100 +118,101 @@ class Bystander(Actor):
 class Run:
     """Calls the toolbox in a thread, as the shell would in a process."""
 
-    def __init__(self, node: Everything, bus: ZenohBus, info: RunInfo) -> None:
+    def __init__(self, node: Actor, bus: ZenohBus, info: RunInfo, capsys) -> None:
         self.node = node
         self.info = info
         self.bus = bus
+        self.capsys = capsys
 
-    async def call(self, capsys, *arguments: str) -> tuple[int, str, str]:
+    async def call(self, *arguments: str) -> tuple[int, str, str]:
         code = await asyncio.to_thread(main, list(arguments))
-        captured = capsys.readouterr()
+        captured = self.capsys.readouterr()
         return code, captured.out, captured.err
 
+    async def out(self, *arguments: str) -> str:
+        code, out, err = await self.call(*arguments)
+        assert code == 0, err
+        return out
 
-@pytest.fixture
-async def run(monkeypatch, bus_folder):
+    async def err(self, code: int, *arguments: str) -> str:
+        found, _, err = await self.call(*arguments)
+        assert found == code
+        return err
+
+
+@asynccontextmanager
+async def running(monkeypatch, capsys, folder, *nodes):
+    """Run nodes on a bus: name, class and fields of the context; yields a `Run` with the first."""
     loop = asyncio.get_running_loop()
     clock = Clock(loop.time(), RATE, loop.time)
-    names = ("simulator", "DM1")
-    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), bus_folder, names,
-                   "r1", 0, "test run", plan={"mission": "AB"})
+    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), folder,
+                   tuple(name for name, *_ in nodes), "r1", 0, "test run", plan={"mission": "AB"})
     monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: info)
     monkeypatch.setattr("rampart.actors.bus.run_info.find_runs", list)  # those of others
     async with AsyncExitStack() as stack:
-        nodes = []
-        for name, cls in (("simulator", Everything), ("DM1", Bystander)):
-            bus = ZenohBus(name, endpoints(bus_folder))
-            node = cls(Context(name, 1, clock, bus))
-            task = asyncio.create_task(node.run())
-            stack.push_async_callback(asyncio.wait_for, task, 5)
+        started = []
+        for name, kind, more in nodes:
+            bus = ZenohBus(name, endpoints(folder))
+            node = kind(Context(name, 1, clock, bus, **more))
+            stack.push_async_callback(asyncio.wait_for, asyncio.create_task(node.run()), 5)
             stack.callback(node.stop)
-            nodes.append((node, bus))
+            started.append((node, bus))
         await asyncio.sleep(0.1)
-        yield Run(*nodes[0], info)
+        yield Run(*started[0], info, capsys)
 
 
-async def test_status_shows_the_run_at_a_glance_and_as_json(run, capsys):
-    code, out, _ = await run.call(capsys, "status")
-    assert code == 0
+@pytest.fixture
+async def run(monkeypatch, capsys, bus_folder):
+    async with running(monkeypatch, capsys, bus_folder, ("simulator", Everything, {}),
+                       ("DM1", Bystander, {})) as made:
+        yield made
+
+
+async def test_status_shows_the_run_at_a_glance_and_as_json(run):
+    out = await run.out("status")
     assert "test run" in out
     assert "mission   AB running, step 1 of 1, 0 lights measured" in out
     assert "pilot     stop, STOPPED: RM2" in out
     assert "manager   safety-first, decision 1; ACTIVE FTM1; recovery RM1; latched RM1" in out
     assert "nodes     1 of 2 running, 2 restarts; hmi crashed" in out
-    code, out, _ = await run.call(capsys, "status", "--json")
+    out = await run.out("status", "--json")
     status = json.loads(out)
-    assert code == 0
     assert (status["mission"]["phase"], status["pilot"]["mode"]) == ("running", "stop")
     assert status["manager"]["latched"] == ["RM1"]
     assert status["time_s"] > 0
-    code, out, _ = await run.call(capsys, "node", "list", "--json")
-    assert code == 0
+    assert re.search(r"hmi +non-control +42 +crashed +3 +2", await run.out("node", "list"))
+    out = await run.out("node", "list", "--json")
     assert json.loads(out)[0] == {"name": "hmi", "kind": "non-control", "pid": 42,
                                   "state": "crashed", "incarnation": 3, "restarts": 2}
 
 
-async def test_status_shows_nothing_that_the_system_has_not(run, capsys, monkeypatch):
+async def test_status_shows_nothing_that_the_system_has_not(run, monkeypatch):
     publish = run.node.publish
     monkeypatch.setattr(run.node, "publish", lambda topic, *rest, **more: None if topic in (
         topics.MISSION_STATUS, topics.PILOT_STATUS, ftm_topics.MANAGER_STATUS
         ) else publish(topic, *rest, **more))
     run.info.plan["mission"] = ""
-    _, out, _ = await run.call(capsys, "status")
+    out = await run.out("status")
     assert "nodes     1 of 2 running" in out
     for word in ("mission", "pilot", "manager", "silent"):
         assert word not in out
     run.info.plan["mission"] = "AB"
-    _, out, _ = await run.call(capsys, "status")
+    out = await run.out("status")
     assert "mission   silent" in out
 
 
-async def test_echo_prints_one_line_per_message(run, capsys):
-    code, out, _ = await run.call(capsys, "topic", "echo", "localization/pose", "-n", "3")
-    assert code == 0
+async def test_echo_prints_one_line_per_message(run):
+    out = await run.out("topic", "echo", "localization/pose", "-n", "3")
     lines = out.splitlines()
     assert len(lines) == 3
     assert all("simulator#1 localization/pose {\"x_m\":1.0," in line for line in lines)
 
 
-async def test_node_list_shows_times_with_two_decimals(run, capsys, monkeypatch):
-    table = fm.NodeTable((fm.NodeInfo(
-        "hmi", "non-control", 42, fm.NodeState.RUNNING, 1, 0, heard_s=12.345678901),))
-    publish = run.node.publish
-    monkeypatch.setattr(run.node, "publish", lambda topic, body, **more: publish(
-        topic, table if topic is ftm_topics.NODES else body, **more))
-    await asyncio.sleep(0.2)
-    _, out, _ = await run.call(capsys, "node", "list")
-    assert "12.35" in out
-    assert "12.345" not in out
-
-
-async def test_a_viewer_is_refused_before_anything_else_is_checked(run, capsys, monkeypatch):
+async def test_a_viewer_is_refused_before_anything_else_is_checked(run, monkeypatch):
     monkeypatch.setattr("rampart.cli.session.tools_credentials", lambda _run: (None, "viewer"))
     run.node.latched = ()
     for verb in (("reset", "RM1"), ("reset", "rampart-4711"), ("obstacle", "remove", "crate")):
-        code, _, err = await run.call(capsys, *verb)
-        assert code == 2
+        err = await run.err(2, *verb)
         assert "viewer" in err
 
 
@@ -218,65 +220,61 @@ NO_TEXT = b"\x95\xa1\xff\x01\x01\xcb" + bytes(8) + b"\x90"
 
 
 @pytest.mark.parametrize("garbage", [b"\xc1garbage", NO_TEXT])
-async def test_echo_shows_garbage_as_such_with_the_reason(run, capsys, garbage):
+async def test_echo_shows_garbage_as_such_with_the_reason(run, garbage):
     async def spoil() -> None:
         while True:
             run.bus.publish(topics.ROUTE, topics.ROUTE.at(), garbage)
             await asyncio.sleep(0.02)
 
     spoiler = asyncio.create_task(spoil())
-    _, out, _ = await run.call(capsys, "topic", "echo", "plan/route", "-n", "1")
+    out = await run.out("topic", "echo", "plan/route", "-n", "1")
     assert out.startswith(f"garbage plan/route {len(garbage)} bytes, not a Route: ")
-    _, out, _ = await run.call(capsys, "topic", "echo", "plan/route", "-n", "1", "--json")
+    out = await run.out("topic", "echo", "plan/route", "-n", "1", "--json")
     spoiler.cancel()
     assert json.loads(out)["garbage"] == garbage.hex()
 
 
-async def test_a_silent_topic_is_said_to_be_silent(run, capsys):
-    code, out, err = await run.call(capsys, "topic", "echo", "plan/route", "--duration", "0.2")
+async def test_a_silent_topic_is_said_to_be_silent(run):
+    code, out, err = await run.call("topic", "echo", "plan/route", "--duration", "0.2")
     assert (code, out) == (1, "")
     assert err == "rampart: no message on plan/route within 0.2 s\n"
-    code, _, _ = await run.call(capsys, "topic", "hz", "plan/route", "--duration", "0.2", "--json")
+    code, _, _ = await run.call("topic", "hz", "plan/route", "--duration", "0.2", "--json")
     assert code == 1
 
 
 @pytest.mark.parametrize("verb", ["echo", "hz"])
-async def test_echo_and_hz_end_with_the_run(run, capsys, monkeypatch, verb):
+async def test_echo_and_hz_end_with_the_run(run, monkeypatch, verb):
     looks = iter([False, False])
     monkeypatch.setattr("rampart.cli.look.topic_verbs.is_over", lambda _run: next(looks, True))
-    code, out, err = await run.call(capsys, "topic", verb, "localization/pose")
+    code, out, err = await run.call("topic", verb, "localization/pose")
     assert code == 0
     assert "localization/pose" in out
     assert err == "rampart: the run has ended: test run (port 7450)\n"
 
 
-async def test_hz_measures_in_simulated_time(run, capsys):
-    code, out, _ = await run.call(
-        capsys, "topic", "hz", "localization/pose", "--duration", "1", "--json")
+async def test_hz_measures_in_simulated_time(run):
+    out = await run.out("topic", "hz", "localization/pose", "--duration", "1", "--json")
     measured = json.loads(out)[0]
-    assert code == 0
     assert measured["nominal_hz"] == 20
     assert 5 < measured["rate_hz"] < 15
     assert measured["window"] > 20
 
 
 async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
-        run, capsys, monkeypatch, tmp_path):
-    own = RunInfo(1, 7450, RATE, 0.0, str(write_porter_system(tmp_path)), "", (),
-                  "r1", 0, "porter")
+        run, monkeypatch, tmp_path):
+    own = RunInfo(1, 7450, RATE, 0.0, str(write_porter_system(tmp_path)), "", (), "r1", 0, "porter")
     monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: own)
-    code, out, _ = await run.call(capsys, "topic", "echo", "porter/axle/front", "-n", "1")
-    assert (code, out.split()[1:]) == (0, ["simulator#1", "porter/axle/front", "[3.0]"])
-    code, out, _ = await run.call(capsys, "topic", "echo", "porter/axle/*", "-n", "4")
+    out = await run.out("topic", "echo", "porter/axle/front", "-n", "1")
+    assert out.split()[1:] == ["simulator#1", "porter/axle/front", "[3.0]"]
+    code, out, _ = await run.call("topic", "echo", "porter/axle/*", "-n", "4")
     assert (code, {line.split()[2] for line in out.splitlines()}) == (
         0, {"porter/axle/front", "porter/axle/simulator"})
-    code, out, _ = await run.call(
-        capsys, "topic", "hz", "porter/load", "--duration", "0.5", "--json")
-    assert (code, json.loads(out)[0]["nominal_hz"]) == (0, 10)
+    out = await run.out("topic", "hz", "porter/load", "--duration", "0.5", "--json")
+    assert json.loads(out)[0]["nominal_hz"] == 10
     for fault in (["corrupt:porter/load"], ["drop:porter/axle/simulator"],
                   ["corrupt:porter/load", "--set", "mass_kg=0"]):
-        code, out, _ = await run.call(capsys, "inject", *fault, "--duration", "1", "--json")
-        assert (code, json.loads(out)["effective"]) == (0, True)
+        out = await run.out("inject", *fault, "--duration", "1", "--json")
+        assert json.loads(out)["effective"] is True
 
 
 async def pictured(run, monkeypatch, system) -> RunPicture:
@@ -313,11 +311,9 @@ async def test_a_run_whose_actors_are_not_here_is_shown_all_the_same(
     assert len(err.splitlines()) == 1
 
 
-async def test_an_injection_acts_and_tells_how_many_messages_it_affected(run, capsys):
-    code, out, _ = await run.call(
-        capsys, "inject", "localization-not-updated", "--duration", "2", "--json")
+async def test_an_injection_acts_and_tells_how_many_messages_it_affected(run):
+    out = await run.out("inject", "localization-not-updated", "--duration", "2", "--json")
     told = json.loads(out)
-    assert code == 0
     assert told["effective"] is True
     (injection,) = told["injections"]
     assert injection["nodes"] == ["simulator"]
@@ -326,13 +322,13 @@ async def test_an_injection_acts_and_tells_how_many_messages_it_affected(run, ca
     assert len(run.node.orders) == 1, "copies of an order must not reach the actor"
 
 
-async def test_a_fault_of_the_robot_s_own_is_carried_out_by_its_node(run, capsys):
-    code, out, _ = await run.call(capsys, "inject", "stuck-wheel:rear-left", "--duration", "1")
+async def test_a_fault_of_the_robot_s_own_is_carried_out_by_its_node(run):
+    code, out, _ = await run.call("inject", "stuck-wheel:rear-left", "--duration", "1")
     assert (code, out) == (0, "stuck-wheel:rear-left: in force at simulator for 1 s\n"
                               "stuck-wheel:rear-left: over, 40 ticks changed\n")
     (ordered,) = run.node.actuator_faults
     assert (ordered.wheel, ordered.duration_s) == ("rear left", 1.0)
-    code, out, _ = await run.call(capsys, "inject", "brake-failure", "--duration", "inf", "--json")
+    code, out, _ = await run.call("inject", "brake-failure", "--duration", "inf", "--json")
     told = json.loads(out)
     assert (code, told["effective"], told["fault"]) == (0, True, "brake-failure")
     (one,) = told["injections"]
@@ -343,13 +339,10 @@ async def test_a_fault_of_the_robot_s_own_is_carried_out_by_its_node(run, capsys
 @pytest.mark.parametrize(("arguments", "words"), [
     (["localization-not-updated", "--duration", "60", "--at-once"], "simulator for 60 s"),
     (["stuck:localization/pose", "--duration", "inf"], "affects localization/pose, continues")])
-async def test_a_fault_at_once_or_without_end_goes_on_when_the_verb_returns(
-        run, capsys, arguments, words):
-    code, out, _ = await run.call(capsys, "inject", *arguments)
-    assert code == 0
+async def test_a_fault_at_once_or_without_end_goes_on_when_the_verb_returns(run, arguments, words):
+    out = await run.out("inject", *arguments)
     assert words in out
-    _, out, _ = await run.call(
-        capsys, "topic", "echo", "localization/pose", "-n", "3", "--json")
+    out = await run.out("topic", "echo", "localization/pose", "-n", "3", "--json")
     assert len({json.loads(line)["message"]["y_m"] for line in out.splitlines()}) == 1
 
 
@@ -365,90 +358,80 @@ POSE = ["corrupt:localization/pose", "--duration", "1"]
     (["inject", "drop:detection/DM9", "--duration", "1"], 2,
      "unknown node 'DM9'"),
     (["topic", "echo", "detection/DM9"], 2, "unknown node 'DM9'; known: simulator, DM1")])
-async def test_what_has_no_effect_says_so_and_fails(run, capsys, arguments, code, words):
-    found, _, err = await run.call(capsys, *arguments)
+async def test_what_has_no_effect_says_so_and_fails(run, arguments, code, words):
+    found, _, err = await run.call(*arguments)
     assert found == code
     assert words in err
 
 
-async def test_a_permanent_fault_without_effect_is_ended_and_said_to_have_none(run, capsys):
-    code, _, err = await run.call(capsys, "inject", "drop:plan/route", "--duration", "inf")
-    assert code == 1
+async def test_a_permanent_fault_without_effect_is_ended_and_said_to_have_none(run):
+    err = await run.err(1, "inject", "drop:plan/route", "--duration", "inf")
     assert "no effect: simulator published no message on plan/route" in err
     assert run.node.orders[-1].duration_s == 0.0
 
 
-async def test_a_fault_that_does_not_fit_its_messages_is_refused_by_the_node(
-        run, capsys, monkeypatch):
+async def test_a_fault_that_does_not_fit_its_messages_is_refused_by_the_node(run, monkeypatch):
     monkeypatch.setattr("rampart.cli.operate.inject_verbs.flaw", lambda *_: "")
-    code, _, err = await run.call(
-        capsys, "inject", "corrupt:localization/pose",
-        "--noise", "x_m=-1", "--duration", "1")
-    assert code == 1
+    err = await run.err(
+        1, "inject", "corrupt:localization/pose", "--noise", "x_m=-1", "--duration", "1")
     assert "no effect: refused by simulator: noise_fields 'x_m' = -1" in err
 
 
-async def test_reset_releases_a_latched_recovery_once(run, capsys):
-    assert (await run.call(capsys, "reset", "RM1"))[:2] == (0, "RM1 released\n")
+async def test_reset_releases_a_latched_recovery_once(run):
+    assert await run.out("reset", "RM1") == "RM1 released\n"
     assert run.node.resets == 1
-    code, _, err = await run.call(capsys, "reset", "RM1")
-    assert code == 1
+    err = await run.err(1, "reset", "RM1")
     assert err == "rampart: no effect: RM1 is not latched; latched: none\n"
-    code, _, err = await run.call(capsys, "reset", "RM9")
-    assert code == 2
+    err = await run.err(2, "reset", "RM9")
     assert "unknown recovery 'RM9'; known: RM1, RM2" in err
 
 
-async def test_status_names_who_holds_the_brake_and_reset_lets_go_in_its_place(run, capsys):
+async def test_status_names_who_holds_the_brake_and_reset_lets_go_in_its_place(run):
     run.node.holders = ("x\x1b", "y")
-    _, out, _ = await run.call(capsys, "status")
+    out = await run.out("status")
     assert "held      brake by x\\u001b, not a recovery module of this system" in out
-    _, out, _ = await run.call(capsys, "status", "--json")
+    out = await run.out("status", "--json")
     assert json.loads(out)["holders"] == {"x\x1b": ["brake"], "y": ["brake"]}
-    code, _, err = await run.call(capsys, "reset", "z")
-    assert code == 2
+    err = await run.err(2, "reset", "z")
     assert err.endswith(", x\\u001b, y\n")
-    assert (await run.call(capsys, "reset", "y"))[:2] == (0, "y released: brake\n")
+    assert await run.out("reset", "y") == "y released: brake\n"
     run.node.obstinate = True
-    code, _, err = await run.call(capsys, "reset", "x\x1b")
-    assert code == 1
+    err = await run.err(1, "reset", "x\x1b")
     assert "still holds brake" in err
 
 
-async def test_a_reset_while_the_cause_is_there_says_that_nothing_was_released(run, capsys):
+async def test_a_reset_while_the_cause_is_there_says_that_nothing_was_released(run):
     run.node.obstinate = True
-    code, _, err = await run.call(capsys, "reset", "RM1")
-    assert code == 1
+    err = await run.err(1, "reset", "RM1")
     assert err == "rampart: RM1 was not released; active: FTM1\n"
 
 
-async def test_a_refused_reset_prints_the_manager_s_reason(run, capsys):
+async def test_a_refused_reset_prints_the_manager_s_reason(run):
     run.node.refusal = "FTM1 never clears; only a new run ends it"
-    code, _, err = await run.call(capsys, "reset", "RM1")
-    assert code == 1
+    err = await run.err(1, "reset", "RM1")
     assert err == ("rampart: RM1 was not released: FTM1 never clears; only a new run ends it\n")
 
 
-async def test_status_shows_how_each_active_mechanism_clears(run, capsys):
-    _, out, _ = await run.call(capsys, "status")
+async def test_status_shows_how_each_active_mechanism_clears(run):
+    out = await run.out("status")
     for name in ("FTM1", "RM1"):
         assert f"clearing  {name} clears by operator (role drive) once its error is gone" in out
 
 
-async def test_obstacles_come_move_and_go(run, capsys):
-    assert (await run.call(capsys, "obstacle", "add", "crate", "-1", "2.5"))[0] == 0
-    assert (await run.call(capsys, "obstacle", "add", "crate", "3", "2.5"))[0] == 0
-    _, out, _ = await run.call(capsys, "obstacle", "list", "--json")
+async def test_obstacles_come_move_and_go(run):
+    await run.out("obstacle", "add", "crate", "-1", "2.5")
+    await run.out("obstacle", "add", "crate", "3", "2.5")
+    out = await run.out("obstacle", "list", "--json")
     assert json.loads(out) == [{"name": "crate", "x_m": 3.0, "y_m": 2.5, "radius_m": 0.4}]
     wide = ("obstacle", "add", "crate", "3", "2.5", "--radius", "1")
-    assert (await run.call(capsys, *wide))[0] == 0
+    await run.out(*wide)
     assert run.node.obstacles["crate"].radius_m == 1.0
-    code, _, err = await run.call(capsys, "obstacle", "remove", "box")
-    assert (code, err) == (2, "rampart: unknown obstacle 'box'; known: crate\n")
-    assert (await run.call(capsys, "obstacle", "remove", "crate"))[0] == 0
+    err = await run.err(2, "obstacle", "remove", "box")
+    assert err == "rampart: unknown obstacle 'box'; known: crate\n"
+    await run.out("obstacle", "remove", "crate")
     assert run.node.obstacles == {}
 
 
-async def test_an_obstacle_that_the_world_refuses_is_reported_with_its_reason(run, capsys):
-    code, _, err = await run.call(capsys, "obstacle", "add", "moon", "1", "2", "--radius", "9")
-    assert (code, err) == (1, "rampart: no effect: too big\n")
+async def test_an_obstacle_that_the_world_refuses_is_reported_with_its_reason(run):
+    err = await run.err(1, "obstacle", "add", "moon", "1", "2", "--radius", "9")
+    assert err == "rampart: no effect: too big\n"

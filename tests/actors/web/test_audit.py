@@ -29,9 +29,17 @@ def made() -> World:
     return World()
 
 
-def test_a_line_says_who_when_what_and_what_came_of_it(tmp_path, made):
-    file = tmp_path / "audit.jsonl"
-    log = made.log(file)
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "audit.jsonl"
+
+
+@pytest.fixture
+def log(made, file) -> AuditLog:
+    return made.log(file)
+
+
+def test_a_line_says_who_when_what_and_what_came_of_it(file, log):
     log.write("reset", who="anna", address="10.0.0.7", role="drive", page=3,
               asked={"recovery": "RM1"}, why="reset of RM1 asked for")
     log.write("log in", address="10.0.0.8", refused=True, why="unknown token")
@@ -54,8 +62,7 @@ def test_without_a_file_nothing_is_kept_and_without_one_there_nothing_read(tmp_p
     assert made.told == []
 
 
-def test_lines_of_a_process_that_is_killed_are_there_and_its_successor_goes_on(tmp_path, made):
-    file = tmp_path / "audit.jsonl"
+def test_lines_of_a_process_that_is_killed_are_there_and_its_successor_goes_on(file, made):
     code = ("import sys, time; from pathlib import Path\n"
             "from rampart.actors.web.audit import AuditLog\n"
             "log = AuditLog(Path(sys.argv[1]), lambda: 1.0, print, time.monotonic)\n"
@@ -71,8 +78,7 @@ def test_lines_of_a_process_that_is_killed_are_there_and_its_successor_goes_on(t
     assert lines[-1].what == "close"
 
 
-def test_a_line_that_was_cut_in_two_spoils_no_other(tmp_path, made):
-    file = tmp_path / "audit.jsonl"
+def test_a_line_that_was_cut_in_two_spoils_no_other(file, made):
     made.log(file).write("open", who="anna")
     with file.open("ab") as torn:
         torn.write(b'{"utc":"2026-01-01T00:00:00","t_s":1,"wh')
@@ -82,9 +88,7 @@ def test_a_line_that_was_cut_in_two_spoils_no_other(tmp_path, made):
 
 
 def test_of_visitors_without_a_token_one_line_a_second_is_kept_and_the_others_counted(
-        tmp_path, made):
-    file = tmp_path / "audit.jsonl"
-    log = made.log(file)
+        file, log, made):
     for i in range(300):
         log.write("log in", address=f"10.0.0.{i % 250}", refused=True)
         log.write("reset", who="anna")
@@ -94,10 +98,8 @@ def test_of_visitors_without_a_token_one_line_a_second_is_kept_and_the_others_co
     assert sum(line.left_out for line in read_audit(file)) == 299
 
 
-def test_a_full_file_says_so_in_its_last_line_and_grows_no_more(tmp_path, made, monkeypatch):
+def test_a_full_file_says_so_in_its_last_line_and_grows_no_more(file, log, made, monkeypatch):
     monkeypatch.setattr(audit, "MAX_BYTES", 5000)
-    file = tmp_path / "audit.jsonl"
-    log = made.log(file)
     for i in range(300):
         log.write("reset", who="anna", asked={"n": i})
     size = file.stat().st_size
@@ -119,9 +121,7 @@ def test_a_file_that_cannot_be_written_keeps_nobody_from_acting_and_is_told_once
     assert [(line.who, line.left_out) for line in read_audit(file)] == [("anna", 3)]
 
 
-def test_a_disk_that_takes_half_a_line_loses_that_line_alone(tmp_path, made, monkeypatch):
-    file = tmp_path / "audit.jsonl"
-    log = made.log(file)
+def test_a_disk_that_takes_half_a_line_loses_that_line_alone(file, log, made, monkeypatch):
     log.write("open", who="anna")
     real = os.write
     monkeypatch.setattr(audit.os, "write", lambda handle, data: real(handle, data[:20]))
@@ -141,8 +141,7 @@ def test_a_link_in_the_place_of_the_file_is_not_followed(tmp_path, made):
     assert len(made.told) == 1
 
 
-def test_a_long_request_is_kept_without_what_it_asked(tmp_path, made):
-    file = tmp_path / "audit.jsonl"
+def test_a_long_request_is_kept_without_what_it_asked(file, made):
     made.log(file).write("order", who="anna", asked={"reason": "x" * 5000}, why="y" * 5000)
     (line,) = read_audit(file)
     assert (line.what, line.asked, len(line.why)) == ("order", {}, 500)

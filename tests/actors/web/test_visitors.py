@@ -143,14 +143,10 @@ def test_the_verbs_issue_show_and_revoke(tmp_path, capsys):
     (["show", "--file", "nowhere"], "nowhere: cannot be read (No such file or directory)"),
     (["issue", "bob", "--role", "look", "--file", "no/where"], "no/where: No such file"),
     (["show", "--file", "open"], "open: mode 0644: others can access it; chmod 600")])
-def test_what_a_verb_cannot_do_is_one_line_and_code_2(tmp_path, monkeypatch, capsys, arguments,
-                                                      words):
+def test_what_a_verb_cannot_do_is_one_line_and_code_2(
+        tmp_path, monkeypatch, refused, arguments, words):
     monkeypatch.chdir(tmp_path)
     issue(tmp_path / "page.tokens", "anna", Role.DRIVE)
     (tmp_path / "open").write_text("")
     (tmp_path / "open").chmod(0o644)
-    assert main(["tokens", *arguments]) == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.startswith(f"rampart: {words}")
-    assert len(told.err.splitlines()) == 1
+    assert refused("tokens", *arguments).startswith(f"rampart: {words}")

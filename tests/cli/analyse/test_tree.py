@@ -77,19 +77,6 @@ def assert_apart(boxes) -> None:
         assert x + w <= x2 or x2 + w2 <= x or y + h <= y2 or y2 + h2 <= y
 
 
-@pytest.mark.parametrize("form", ["text", "svg", "json"])
-@pytest.mark.parametrize("what", ["fault-tree", "ftm-tree", "order"])
-def test_every_name_appears_in_every_format(capsys, what, form):
-    assert main(["tree", "--what", what, "--format", form]) == 0
-    out = told(capsys)
-    spec = systems.load(None)
-    names = {"fault-tree": [*(e.name for e in spec.events), *(m.name for m in spec.mechanisms)],
-             "ftm-tree": [m.name for m in spec.mechanisms],
-             "order": [r.name for r in spec.recoveries]}[what]
-    for name in names:
-        assert re.search(rf"\b{name}\b", out), name
-
-
 @settings(max_examples=60, deadline=None)
 @given(fault_trees())
 def test_every_renderer_shows_every_box_of_any_graph(diagram):
@@ -251,32 +238,12 @@ def test_each_kind_of_gate_has_its_symbol(gate, words, qualifier):
     assert qualifier in texts
 
 
-@pytest.mark.parametrize(("name", "start"), [
-    ("x.svg", "<svg "), ("x.json", "["), ("x", "Fault"), ("x.txt", "Fault"),
-])
-def test_a_file_gets_the_format_of_its_ending(capsys, tmp_path, name, start):
-    file = tmp_path / name
-    assert main(["tree", "--output", str(file)]) == 0
-    assert file.read_text(encoding="utf-8").startswith(start)
-    assert f"{file}: fault-tree, 12 boxes" in told(capsys)
-
-
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["--active", "FTM9"], ["'FTM9'", "known: FTM1"]),
-    (["--order", "bravest"], ["'bravest'", "known: safer"]),
-    (["--active", "FTM1", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
-    (["--strategy", "bravely"], ["'bravely'", "safety-first"]),
-    (["--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
-    (["--output", "x.pdf"], ["--output x.pdf: unknown ending", ".svg, .json, .txt"]),
-    (["--output", "/no/such/tree.svg"], ["--output /no/such/tree.svg", "No such file"]),
-])
-def test_nonsense_is_refused_in_one_line_that_names_it(capsys, arguments, words):
-    assert main(["tree", *arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    for word in words:
-        assert word in captured.err
+def test_a_file_gets_the_format_of_its_ending(capsys, tmp_path):
+    for name, start in (("x.svg", "<svg "), ("x.json", "["), ("x", "Fault"), ("x.txt", "Fault")):
+        file = tmp_path / name
+        assert main(["tree", "--output", str(file)]) == 0
+        assert file.read_text(encoding="utf-8").startswith(start)
+        assert f"{file}: fault-tree, 12 boxes" in told(capsys)
 
 
 def test_the_picture_in_the_documents_is_the_one_that_the_verb_draws(capsys):
@@ -294,5 +261,10 @@ def test_a_terminal_without_these_characters_is_told_so(capsys, monkeypatch):
 def test_the_json_is_the_diagram(capsys):
     main(["tree", "--json"])
     diagrams = msgspec.json.decode(told(capsys), type=list[Diagram])
-    assert [d.what for d in diagrams] == ["fault-tree", "ftm-tree", "order"]
+    spec = systems.load(None)
+    assert [(d.what, {box.name for box in d.boxes}) for d in diagrams] == [
+        (what, {one.name for one in of}) for what, of in (
+            ("fault-tree", spec.events), ("ftm-tree", spec.mechanisms),
+            ("order", spec.recoveries))]
+    assert {box.mechanism for box in diagrams[0].boxes} > {m.name for m in spec.mechanisms}
     assert ("RM1", "RM2") in diagrams[2].edges

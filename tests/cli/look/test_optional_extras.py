@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import os
 import re
+import socket
 import sys
 from types import SimpleNamespace
 
 import httpx
 import msgspec
 import pytest
+from prometheus_client import exposition, parser
 
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.run_info import RunInfo
@@ -20,8 +22,10 @@ from rampart.actors.machine.process_usage import ProcessCount
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.web.server import WebServer
 from rampart.cli import following
+from rampart.cli.look import metrics_server
 from rampart.cli.look.live_foxglove import _watch
-from rampart.cli.main import main
+from rampart.cli.look.metrics_families import Exposition, families
+from rampart.cli.run_picture import RunPicture
 from tests import ROOT
 from tests.cli.look.test_top_view import busy
 
@@ -32,31 +36,26 @@ RUN = RunInfo(1, 7450, 1.0, 0.0, "paper.toml", "", (), "run", 0, 'a "title"\\ an
     ("prometheus_client.exposition", ["metrics"], "prometheus"),
     ("foxglove", ["live", "foxglove"], "foxglove")])
 def test_a_missing_extra_is_one_line_that_says_what_to_install(
-        module, arguments, extra, monkeypatch, capsys):
+        module, arguments, extra, monkeypatch, refused):
     monkeypatch.setitem(sys.modules, module, None)
-    assert main(arguments) == 2
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1
-    assert f"pip install 'rampart-robot[{extra}]'" in told[0]
+    assert f"pip install 'rampart-robot[{extra}]'" in refused(*arguments)
 
 
 @pytest.mark.parametrize("arguments", [
     ["metrics", "--port", "99999"], ["live", "foxglove", "--port", "-1"],
-    ["metrics", "--host", "nobody.invalid"], ["metrics", "--host", ".."],
-    ["metrics", "--host", "a" * 64]])
-def test_an_address_that_is_none_is_named(arguments, capsys):
-    pytest.importorskip("prometheus_client")
-    pytest.importorskip("foxglove")
-    assert main(arguments) == 2
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1
-    assert arguments[-1] in told[0]
+    ["metrics", "--host", "nobody.invalid"], ["metrics", "--host", "a" * 64]])
+def test_an_address_that_is_none_is_named(arguments, refused):
+    assert arguments[-1] in refused(*arguments)
+
+
+def test_a_port_that_is_taken_is_named(refused):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        for verb in (("metrics",), ("live", "foxglove")):
+            assert port in refused(*verb, "--port", port)
 
 
 def exposed(now):
-    exposition = pytest.importorskip("prometheus_client.exposition")
-    from rampart.cli.look.metrics_families import families
-
     return exposition.generate_latest(SimpleNamespace(collect=lambda: families(now))).decode()
 
 
@@ -65,9 +64,6 @@ def test_without_a_run_prometheus_is_told_so():
 
 
 def test_a_run_becomes_metrics_that_prometheus_reads_back():
-    parser = pytest.importorskip("prometheus_client.parser")
-    from rampart.cli.look.metrics_families import Exposition
-
     text = exposed(Exposition(RUN, 10.5, busy(), {"hmi": ProcessCount(2.5, 4096, 1.0)}))
     found = {s.name: s for f in parser.text_string_to_metric_families(text) for s in f.samples}
     assert found["rampart_run_info"].labels["title"] == RUN.title
@@ -83,9 +79,6 @@ def test_a_run_becomes_metrics_that_prometheus_reads_back():
 
 
 def test_the_handbook_lists_every_metric_with_its_labels():
-    parser = pytest.importorskip("prometheus_client.parser")
-    from rampart.cli.look.metrics_families import Exposition
-
     picture = busy()
     for topic, body in (
             (ftm_topics.NODES, fm.NodeTable((fm.NodeInfo(
@@ -109,20 +102,12 @@ def test_the_handbook_lists_every_metric_with_its_labels():
 
 
 def test_a_run_of_which_nothing_was_heard_yet_is_no_error():
-    from rampart.cli.run_picture import RunPicture
-
-    pytest.importorskip("prometheus_client")
-    from rampart.cli.look.metrics_families import Exposition
-
     assert "rampart_up 1.0" in exposed(Exposition(RUN, 0.0, RunPicture()))
 
 
 @pytest.mark.parametrize("replay_of", ["", "run.mcap"])
 async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a_replay(
         monkeypatch, replay_of):
-    pytest.importorskip("prometheus_client")
-    from rampart.cli.look import metrics_server
-
     run = msgspec.structs.replace(RUN, pid=os.getpid(), replay_of=replay_of)
     mine = fm.NodeTable((fm.NodeInfo("hmi", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0),))
     looks = []
@@ -155,9 +140,6 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
 
 
 async def test_prometheus_is_answered_without_a_run():
-    pytest.importorskip("prometheus_client")
-    from rampart.cli.look import metrics_server
-
     listening = metrics_server.listen("127.0.0.1", 0)
     port = listening.getsockname()[1]
     server = WebServer(metrics_server._app(metrics_server.Exporter()), listening)

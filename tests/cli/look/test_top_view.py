@@ -114,8 +114,7 @@ def test_nothing_heard_is_no_reason_to_fail():
 
 def test_words_of_a_node_do_not_move_the_cursor():
     picture = busy()
-    told(picture, topics.PILOT_STATUS, m.PilotStatus(
-        m.PilotMode.AUTO, False, "a\x1b[2Jb\nc\rd", 0))
+    told(picture, topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.AUTO, False, "a\x1b[2Jb\nc\rd", 0))
     assert all(line.isprintable() for line in screen(picture))
 
 
@@ -180,8 +179,7 @@ def test_on_a_replay_nobodys_processes_are_measured(monkeypatch, replay_of):
     mine = fm.NodeTable((fm.NodeInfo("hmi", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0),))
     monkeypatch.setattr(following, "draw", lambda _session, picture: told(
         picture, ftm_topics.NODES, mine))
-    run = RunInfo(os.getpid(), 7450, 1.0, 0.0, "", "", (), "run", 0, "AB",
-                  replay_of=replay_of)
+    run = RunInfo(os.getpid(), 7450, 1.0, 0.0, "", "", (), "run", 0, "AB", replay_of=replay_of)
     shown = top_screen._Screen(SimpleNamespace(run=run, clock=Clock(0.0))).frame()
     assert list(shown.usage) == ([] if replay_of else ["hmi", "launch.py"])
     assert [row["name"] for row in shown.guards] == ([] if replay_of else ["launch.py"])
