@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import socket
 import threading
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
+from mcap.writer import Writer
 
 from rampart.actors.bus import run_info
 from rampart.actors.bus.envelope import Header, encode
@@ -17,7 +21,9 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_writer import BagWriter
+from rampart.actors.recording.recorder import Recorder
 from rampart.actors.recording.run_documents import Documents, collect
+from rampart.actors.recording.run_listener import RUN_ENDED
 from tests import ROOT
 
 PLAN = {"system_file": str(ROOT / "systems" / "paper.toml"), "airport": "vallombre",
@@ -61,6 +67,47 @@ def write(path: Path, sent: list[Sent], *, close: bool = True, flush_every: int 
     if close:
         writer.close()
     return writer
+
+
+def foreign(path: Path, sent: Iterable[tuple[str, str, int, bytes]], profile: str = "",
+            **settings: Any) -> Path:
+    """Write a file of another tool: topic, encoding, time in ns and data of each message."""
+    with path.open("wb") as file:
+        writer, channels = Writer(file, **settings), {}
+        writer.start(profile, "others")
+        for topic, encoding, at_ns, data in sent:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, encoding, 0)
+            writer.add_message(channels[topic], at_ns, data, at_ns)
+        writer.finish()
+    return path
+
+
+@contextlib.contextmanager
+def small_disk(size: int) -> Iterator[None]:
+    """Let no file of this process become larger than some bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextlib.contextmanager
+def running(recorder: Recorder, *, is_told: bool = True) -> Iterator[None]:
+    """Run a recorder that is open in a thread; it is told that the run has ended, or sees that."""
+    read_end, write_end = os.pipe()
+    thread = threading.Thread(target=recorder.run, args=(read_end,))
+    thread.start()
+    try:
+        yield
+    finally:
+        if is_told:
+            os.write(write_end, bytes([RUN_ENDED]))
+        thread.join(20)
+        os.close(read_end)
+        os.close(write_end)
 
 
 class AnsweringLauncher:

@@ -8,11 +8,11 @@ import shutil
 
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from rampart.actors.recording.bag_reader import BagReader
 from rampart.cli.main import main
-from tests.actors.recording.samples import sample, write
+from tests.actors.recording.samples import foreign, sample, write
 
 
 def contents(path):
@@ -138,14 +138,8 @@ def test_a_bag_of_ros_2_reports_what_of_the_recording_is_gone(tmp_path, torn, ca
 
 @pytest.mark.parametrize("chunked", [True, False])
 def test_a_file_of_others_without_checksums_and_index_is_read_whole(tmp_path, chunked):
-    path = tmp_path / "other.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, use_chunking=chunked, compression=CompressionType.ZSTD,
-                        enable_crcs=False, use_statistics=False)
-        writer.start("", "others")
-        channel = writer.register_channel("c", "json", 0)
-        for number in range(10):
-            writer.add_message(channel, number, b"{}", number)
-        writer.finish()
+    path = foreign(tmp_path / "other.mcap", [("c", "json", number, b"{}") for number in range(10)],
+                   use_chunking=chunked, compression=CompressionType.ZSTD, enable_crcs=False,
+                   use_statistics=False)
     found, reader = contents(path)
     assert (len(found), reader.damage, reader.closed) == (10, "", True)

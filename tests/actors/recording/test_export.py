@@ -8,10 +8,10 @@ import math
 import sys
 
 import pytest
-from mcap.writer import Writer
+from pyarrow import parquet
 
 from rampart.cli.main import main
-from tests.actors.recording.samples import sample, write
+from tests.actors.recording.samples import foreign
 
 
 def table(path):
@@ -19,23 +19,11 @@ def table(path):
         return list(csv.DictReader(file))
 
 
-@pytest.fixture
-def recording(tmp_path):
-    write(tmp_path / "run.mcap", sample())
-    return tmp_path / "run.mcap"
-
-
-def foreign(path, *values):
+def of_others(path, *values):
     """An MCAP file of another tool with a JSON channel, and one that is not JSON."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("", "others")
-        texts = writer.register_channel("/a/b", "json", 0)
-        writer.add_message(writer.register_channel("a-b", "cdr", 0), 0, b"\0", 0)
-        for number, value in enumerate(values):
-            writer.add_message(texts, number * 10**9, json.dumps(value).encode(), 0)
-        writer.finish()
-    return path
+    return foreign(path, [("a-b", "cdr", 0, b"\0"), *(
+        ("/a/b", "json", number * 10**9, json.dumps(value).encode())
+        for number, value in enumerate(values))])
 
 
 def test_each_topic_is_a_table_with_one_row_per_message(recording, capsys):
@@ -55,8 +43,7 @@ def test_each_topic_is_a_table_with_one_row_per_message(recording, capsys):
 
 
 def test_parquet_has_numbers_and_lists(tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet")
-    path = foreign(tmp_path / "other.mcap", {"x": 1, "list": [1, 2]}, {"x": 2.5, "more": None}, 7)
+    path = of_others(tmp_path / "other.mcap", {"x": 1, "list": [1, 2]}, {"x": 2.5, "more": None}, 7)
     assert main(["bag", "export", str(path), str(tmp_path / "out"), "--to", "parquet"]) == 0
     assert parquet.read_table(tmp_path / "out" / "a-b.parquet").to_pylist() == [
         {"time_s": 0.0, "x": 1.0, "list": [1, 2], "more": None, "value": None},
@@ -65,7 +52,6 @@ def test_parquet_has_numbers_and_lists(tmp_path):
 
 
 def test_parquet_of_a_recording_has_the_same_rows_as_csv(recording, tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet")
     for kind in ("csv", "parquet"):
         assert main(["bag", "export", str(recording), str(tmp_path / kind), "--to", kind]) == 0
     for path in (tmp_path / "csv").iterdir():
@@ -76,24 +62,18 @@ def test_parquet_of_a_recording_has_the_same_rows_as_csv(recording, tmp_path):
 
 
 def test_what_cannot_be_in_a_table_is_left_out_and_named(tmp_path, capsys):
-    pytest.importorskip("pyarrow")
-    path = foreign(tmp_path / "other.mcap", {"x": 1})
+    path = of_others(tmp_path / "other.mcap", {"x": 1})
     assert main(["bag", "export", str(path), str(tmp_path / "csv")]) == 0
     assert "left out: a-b: encoding 'cdr', not JSON (1 times)" in capsys.readouterr().out
-    path = foreign(tmp_path / "mixed.mcap", {"x": 1}, {"x": "text"})
+    path = of_others(tmp_path / "mixed.mcap", {"x": 1}, {"x": "text"})
     assert main(["bag", "export", str(path), str(tmp_path / "out"), "--to", "parquet"]) == 1
     assert "no message that could be written" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
 def test_two_topics_with_the_same_file_name_are_two_files(tmp_path):
-    path = tmp_path / "other.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("", "others")
-        for topic in ("/a/b", "a-b", "/../../a/b"):
-            writer.add_message(writer.register_channel(topic, "json", 0), 0, b"{}", 0)
-        writer.finish()
+    path = foreign(tmp_path / "other.mcap", [
+        (topic, "json", 0, b"{}") for topic in ("/a/b", "a-b", "/../../a/b")])
     assert main(["bag", "export", str(path), str(tmp_path / "out")]) == 0
     assert len(list((tmp_path / "out").iterdir())) == 3
 
@@ -114,12 +94,9 @@ def test_topics_are_chosen_and_a_damaged_recording_is_exported_as_far_as_it_goes
     (["new", "--topics", "nothing"], "--topics nothing: matches no topic"),
     (["new", "--to", "parquet"], "pip install 'rampart-robot[export]'")])
 def test_an_export_that_cannot_be_is_refused_in_one_line(
-        recording, monkeypatch, capsys, words, told):
+        recording, monkeypatch, refused, words, told):
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     monkeypatch.chdir(recording.parent)
     (recording.parent / "there").mkdir()
-    assert main(["bag", "export", str(recording), *words]) == 2
-    error = capsys.readouterr().err
-    assert told in error
-    assert error.count("\n") == 1
+    assert told in refused("bag", "export", recording, *words)
     assert not (recording.parent / "new").exists()

@@ -16,15 +16,9 @@ from rampart.cli.record.film import HEIGHT, WIDTH, Stage
 from rampart.cli.record.replaying import RecordedRun
 from rampart.testing import free_base_port
 from tests import ROOT
-from tests.actors.recording.samples import pose, sample, write
+from tests.actors.recording.samples import pose
 
 mujoco = pytest.importorskip("mujoco")
-
-
-@pytest.fixture
-def recording(tmp_path):
-    write(tmp_path / "run.mcap", sample())
-    return tmp_path / "run.mcap"
 
 
 def test_a_video_has_a_frame_each_25th_of_a_second_and_the_robot_moves(recording):
@@ -59,13 +53,10 @@ def test_the_model_stands_where_the_messages_put_it_and_ignores_what_is_no_pose(
     (["--video", "no/such/place.mp4"], "there is no such directory"),
     (["--video", "new.mp4", "--loop"], "--video new.mp4: plays nothing")])
 def test_a_video_that_cannot_be_is_refused_in_one_line(
-        recording, monkeypatch, capsys, words, told):
+        recording, monkeypatch, refused, words, told):
     monkeypatch.chdir(recording.parent)
     recording.with_name("there.mp4").touch()
-    assert main(["replay", str(recording), *words]) == 2
-    error = capsys.readouterr().err
-    assert told in error
-    assert error.count("\n") == 1
+    assert told in refused("replay", recording, *words)
 
 
 def test_a_machine_that_cannot_render_and_a_robot_without_a_model_are_told(

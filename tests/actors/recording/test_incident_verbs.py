@@ -16,13 +16,11 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.cli.main import main
 from rampart.cli.record.incident_verbs import names
 from rampart.cli.run import _black_box, black_box_folder
-from rampart.cli.run import main as run_main
 from rampart.cli.run_options import parse
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
 from tests.actors.recording.test_black_box import Box, box_pid, crash, decision
 from tests.osmosis_system import shipped_system
-from tests.two_hosts import two_hosts
 
 CELL = ROOT / "tests" / "systems" / "cell.toml"
 
@@ -93,9 +91,9 @@ def test_an_incident_is_played_back(box, capsys):
     (["show", "nothing"], "nothing: no such incident"),
     (["show", "2027"], "2027: 2 incidents begin so"),
     (["list", "--system", "nothing"], "unknown system 'nothing'; known: ")])
-def test_an_unknown_name_is_refused_in_one_line(box, capsys, arguments, words):
-    assert main(["incident", *arguments]) == 2
-    assert words in capsys.readouterr().err
+@pytest.mark.usefixtures("box")
+def test_an_unknown_name_is_refused_in_one_line(refused, arguments, words):
+    assert words in refused("incident", *arguments)
 
 
 def test_without_incidents_the_verbs_are_clear(home, capsys):
@@ -164,16 +162,6 @@ def test_a_state_folder_that_cannot_be_used_does_not_disturb_the_run(tmp_path, m
     assert run.story.count("black box: ") == 1
     assert "Not a directory" in run.story
     assert code == 0, result
-
-
-def test_virtual_time_and_several_hosts_have_none(capsys, tmp_path):
-    assert run_main(["--virtual", "--black-box", "--report", str(tmp_path)]) == 2
-    assert "--black-box: not with --virtual" in capsys.readouterr().err
-    spec = tmp_path / "two.toml"
-    spec.write_text(two_hosts({"robot": "127.0.0.1", "ground": "127.0.0.2"}), encoding="utf-8")
-    assert run_main(["--system", str(spec), "--no-keys", "--black-box", "--report",
-                     str(tmp_path)]) == 2
-    assert "--black-box: not on several hosts" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("arguments", "has_one"), [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import threading
 import time
 
 import msgspec
@@ -28,11 +27,10 @@ from rampart.actors.recording.other_hosts import (
     others_of,
 )
 from rampart.actors.recording.recorder import Recorder
-from rampart.actors.recording.run_listener import RUN_ENDED
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
-from rampart.testing import free_base_port, wait_until
-from tests.actors.recording.samples import AnsweringLauncher, documents, pose
+from rampart.testing import wait_until
+from tests.actors.recording.samples import AnsweringLauncher, documents, pose, running
 from tests.two_hosts import two_hosts
 
 GUARDS = {"ground": ("supervisor_ground", "router_a_ground")}
@@ -198,19 +196,16 @@ def test_what_makes_no_sense_in_a_file_is_left_out(tmp_path, text):
 
 
 @pytest.mark.processes
-def test_the_recorder_writes_what_comes_by_the_bus_and_tells_when_nothing_does(tmp_path):
-    port, path = free_base_port(), tmp_path / "run.mcap"
+def test_the_recorder_writes_what_comes_by_the_bus_and_tells_when_nothing_does(port, tmp_path):
+    path = tmp_path / "run.mcap"
     folder = run_folder.make(port, os.getpid())
-    read_end, write_end = os.pipe()
+    recorder = Recorder(port, path, launcher=os.getpid(), others=OTHERS)
     router = zenoh.open(session_config([endpoint(folder, "router_a")], []))
+    origin_s = time.monotonic()
     try:
-        origin_s = time.monotonic()
         with AnsweringLauncher(port, origin_s) as launcher:
             launcher.info = msgspec.structs.replace(launcher.info, folder=folder)
-            recorder = Recorder(port, path, launcher=os.getpid(), others=OTHERS)
             recorder.open()
-            thread = threading.Thread(target=recorder.run, args=(read_end,))
-            thread.start()
             here = RecorderConnection(port)
             sent = {"pilot": 0, "hmi": 0, "supervisor_ground": 0}
 
@@ -228,20 +223,18 @@ def test_the_recorder_writes_what_comes_by_the_bus_and_tells_when_nothing_does(t
                 writer = recorder.writer
                 return writer is not None and writer.silences == {"ground": "[]"}
 
-            wait_until(heard, 10, "the other host is not heard")
-            for _ in range(50):
-                send("pilot", "hmi", "supervisor_ground")
-            wait_until(lambda: "null" in recorder.writer.silences["ground"], 10, "no silence")
-            send("supervisor_ground")
-            wait_until(lambda: "null" not in recorder.writer.silences["ground"], 10, "no end of it")
-            os.write(write_end, bytes([RUN_ENDED]))
-            thread.join(20)
+            with running(recorder):
+                wait_until(heard, 10, "the other host is not heard")
+                for _ in range(50):
+                    send("pilot", "hmi", "supervisor_ground")
+                wait_until(lambda: "null" in recorder.writer.silences["ground"], 10, "no silence")
+                send("supervisor_ground")
+                wait_until(lambda: "null" not in recorder.writer.silences["ground"], 10,
+                           "no end of it")
             here.close()
     finally:
         router.close()
         run_folder.remove(folder)
-        os.close(read_end)
-        os.close(write_end)
     reader = BagReader(path)
     found = [(key_of(channel), message.sequence, message.log_time)
              for channel, message in reader.messages() if key_of(channel)]
@@ -255,7 +248,3 @@ def test_the_recorder_writes_what_comes_by_the_bus_and_tells_when_nothing_does(t
     lost = json.loads(summary.end["lost"])
     assert set(lost) <= {"supervisor_ground"}  # what it sent before it was listened to
     assert SILENT in summary.reader.metadata
-
-
-def test_what_other_hosts_are_is_told_to_the_recorder_in_plain_data():
-    assert msgspec.json.decode(msgspec.json.encode(OTHERS), type=OtherHosts) == OTHERS

@@ -10,7 +10,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,9 +32,9 @@ from rampart.actors.recording.process import Order, RecorderProcess, result_of
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.recording.run_listener import FLUSH_S, PERIOD_S
 from rampart.cli.main import main
-from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port, wait_until
+from rampart.testing import HEEDS_SIGNALS, RealRun, wait_until
 from tests import ROOT
-from tests.actors.recording.samples import AnsweringLauncher, documents, pose
+from tests.actors.recording.samples import AnsweringLauncher, documents, pose, running
 from tests.porter_actors import write_porter_system
 
 
@@ -45,11 +44,6 @@ def numbers(path):
         return []
     return [header_of(Forms(topics.ALL).of(key).payload(message.data)).sequence
             for channel, message in BagReader(path).messages() if (key := key_of(channel))]
-
-
-@pytest.fixture
-def port():
-    return free_base_port()
 
 
 @pytest.fixture
@@ -146,18 +140,6 @@ def test_a_killed_recorder_leaves_a_readable_file_that_lacks_the_last_second_at_
     assert main(["bag", "info", str(path)]) == 0
 
 
-def test_the_robot_does_not_notice_that_its_recorder_died(recording, port):
-    _, robot, _ = recording
-    robot.send(10)
-    os.kill(recorder_pid(port), signal.SIGKILL)
-
-    def let_go() -> bool:
-        robot.send(100)  # raises nothing, waits for nothing
-        return not robot.connection._sockets
-
-    wait_until(let_go, 15, "the connection is still there")
-
-
 def test_a_stopped_recorder_holds_nobody_up_and_what_did_not_fit_is_counted(recording, port):
     process, robot, path = recording
     robot.send(10)
@@ -211,8 +193,7 @@ def test_a_launcher_that_has_ended_before_its_recorder_has_begun_leaves_no_recor
     os.close(unread)
     order = msgspec.json.encode(Order(port, str(tmp_path / "run.mcap"), dead)).decode()
     done = subprocess.run([sys.executable, "-m", "rampart.actors.recording.process", order],
-                          cwd=ROOT,
-                          stdout=answers, stderr=subprocess.PIPE, check=False, timeout=60)
+                          cwd=ROOT, stdout=answers, stderr=subprocess.PIPE, check=False, timeout=60)
     os.close(answers)
     assert (done.returncode, done.stderr) == (0, b"")
     assert list(tmp_path.iterdir()) == []
@@ -220,22 +201,17 @@ def test_a_launcher_that_has_ended_before_its_recorder_has_begun_leaves_no_recor
 
 def test_what_nodes_send_after_their_launcher_has_ended_is_recorded(port, tmp_path, dead):
     path = tmp_path / "run.mcap"
-    read_end, write_end = os.pipe()
     with AnsweringLauncher(port, time.monotonic(), dead):
         recorder = Recorder(port, path)
         recorder.open()
-        thread = threading.Thread(target=recorder.run, args=(read_end,))
         robot = Robot(port)
         robot.send(1)
-        thread.start()
-        wait_until(path.exists, 15, "it has not begun")
-        for _ in range(20):
-            time.sleep(0.02)
-            robot.send()
-        robot.connection.close()
-        thread.join()
-    os.close(read_end)
-    os.close(write_end)
+        with running(recorder, is_told=False):
+            wait_until(path.exists, 15, "it has not begun")
+            for _ in range(20):
+                time.sleep(0.02)
+                robot.send()
+            robot.connection.close()
     assert numbers(path) == list(range(1, 22))
     assert Summary(BagReader(path)).end["ended"] == "the run has ended"
 
@@ -303,13 +279,18 @@ def test_a_full_disk_is_said_and_ends_only_the_recording(port, launcher, capfd):
     assert error.count("\n") == 1
 
 
-def test_a_recorder_that_dies_is_noticed_and_one_that_ends_in_order_is_no_problem(
-        recording, port):
+def test_a_recorder_that_dies_is_noticed_and_does_not_disturb_the_robot(recording, port):
     process, robot, path = recording
     robot.send(10)
     wait_until(lambda: numbers(path), 10, "nothing is written")
     assert process.problem() == ""
     os.kill(recorder_pid(port), signal.SIGKILL)
+
+    def let_go() -> bool:
+        robot.send(100)  # raises nothing, waits for nothing
+        return not robot.connection._sockets
+
+    wait_until(let_go, 15, "the connection is still there")
     wait_until(process.problem, 5, "it is not noticed")
     problem = process.problem()
     process.end()
@@ -322,17 +303,10 @@ def test_a_recording_that_becomes_large_goes_on_in_another_file(
     monkeypatch.setattr("rampart.actors.recording.recorder.Recorder.flush_s", 0.05)
     recorder = Recorder(port, tmp_path / "run.mcap", launcher=launcher.pid)
     recorder.open()
-    read_end, write_end = os.pipe()
-    with AnsweringLauncher(port, time.monotonic(), launcher.pid):
-        thread = threading.Thread(target=recorder.run, args=(read_end,))
-        thread.start()
+    with AnsweringLauncher(port, time.monotonic(), launcher.pid), running(recorder):
         robot = Robot(port)
         wait_until(lambda: bool(robot.send(20)) or len(recorder.files) > 2, 20, "one file")
-        os.write(write_end, b"x")
-        thread.join()
-        robot.connection.close()
-    os.close(read_end)
-    os.close(write_end)
+    robot.connection.close()
     files = [tmp_path / "run.mcap", *sorted(tmp_path.glob("run-*.mcap"))]
     assert len(files) >= 3
     assert [n for file in files for n in numbers(file)] == list(range(1, robot.sent + 1))
@@ -356,17 +330,18 @@ def test_a_disk_without_room_for_others_ends_the_recording(tmp_path, monkeypatch
     assert numbers(tmp_path / "run.mcap") == [1]
 
 
-def test_strangers_at_the_socket_are_not_recorded_and_do_no_harm(recording, port):
+def test_strangers_at_the_socket_and_a_message_that_is_too_long_are_left_out(recording, port):
     process, robot, path = recording
-    import socket
-
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
         stranger.connect(wire.address(port))
         for junk in (b"x", b"\xff" * 100, frame(float("nan"), "k", b"")[:-1]):
             stranger.send(junk)
-        robot.send(5)
+        robot.send(4)
+        robot.connection.take("rampart/manager/system", b"x" * (wire.MAX_FRAME_BYTES + 1))
+        robot.send(1)
     process.end()
     assert numbers(path) == [1, 2, 3, 4, 5]
+    assert Summary(BagReader(path)).messages >= 5
 
 
 def test_a_frame_comes_back_and_a_broken_one_is_refused():
@@ -387,32 +362,25 @@ def test_a_node_without_a_descriptor_left_goes_on_unrecorded(port, monkeypatch):
     node.take("rampart/k", b"")
 
 
-def test_topics_that_nobody_wants_are_left_out_and_gaps_are_told_all_the_same(
-        port, tmp_path):
+def test_topics_that_nobody_wants_are_left_out_and_gaps_are_told_all_the_same(port, tmp_path):
     path = tmp_path / "run.mcap"
-    read_end, write_end = os.pipe()
-    with AnsweringLauncher(port, time.monotonic()):
-        recorder = Recorder(port, path, wants=lambda key: "detection" in key)
-        recorder.open()
-        thread = threading.Thread(target=recorder.run, args=(read_end,))
-        thread.start()
+    recorder = Recorder(port, path, wants=lambda key: "detection" in key)
+    recorder.open()
+    with AnsweringLauncher(port, time.monotonic()), running(recorder):
         robot = Robot(port)
         robot.send(5)
         robot.sent += 3  # lost somewhere
         robot.send(1)
         wait_until(path.exists, 15, "it has not begun")
-        os.write(write_end, b"x")
-        thread.join()
-        robot.connection.close()
-    os.close(read_end)
-    os.close(write_end)
+    robot.connection.close()
     assert numbers(path) == []
     assert Summary(BagReader(path)).end["lost"] == '{"localization": 3}'
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["--topics", "detection/*", "nothing/like/it"], "--topics nothing/like/it: matches no topic"),
-    (["--duration", "0"], "--duration 0: must be above 0")])
+    (["--duration", "0"], "--duration 0: must be above 0"),
+    (["--port", "31999"], "--port 31999: no run there")])
 def test_a_wish_that_makes_no_sense_is_refused(port, tmp_path, capsys, arguments, words):
     with AnsweringLauncher(port, time.monotonic()):
         code = main(["record", str(tmp_path / "x.mcap"), "--port", str(port), *arguments])
@@ -422,8 +390,7 @@ def test_a_wish_that_makes_no_sense_is_refused(port, tmp_path, capsys, arguments
 
 
 def test_topics_of_the_robot_s_own_can_be_wished_for(port, tmp_path, monkeypatch, capsys):
-    own = RunInfo(1, port, 1.0, 0.0, str(write_porter_system(tmp_path)), "",
-                  (), "r1", 0, "porter")
+    own = RunInfo(1, port, 1.0, 0.0, str(write_porter_system(tmp_path)), "", (), "r1", 0, "porter")
     monkeypatch.setattr("rampart.cli.record.record_verbs.find_run", lambda _port: own)
     taken = tmp_path / "x.mcap"
     taken.touch()
@@ -431,16 +398,6 @@ def test_topics_of_the_robot_s_own_can_be_wished_for(port, tmp_path, monkeypatch
     assert "exists already" in capsys.readouterr().err  # the next thing that is checked
     assert main(["record", str(taken), "--topics", "porter/*", "nothing/like/it"]) == 2
     assert "--topics nothing/like/it: matches no topic" in capsys.readouterr().err
-
-
-def test_a_message_too_long_for_a_recording_is_left_out_and_those_after_it_are_not(recording):
-    process, robot, path = recording
-    robot.send(1)
-    robot.connection.take("rampart/manager/system", b"x" * (wire.MAX_FRAME_BYTES + 1))
-    robot.send(1)
-    process.end()
-    assert numbers(path) == [1, 2]
-    assert Summary(BagReader(path)).messages >= 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
@@ -479,26 +436,6 @@ def test_a_recording_that_fails_is_one_line(port, tmp_path, monkeypatch, capsys,
     with AnsweringLauncher(port, time.monotonic()):
         assert main(["record", str(tmp_path / "x.mcap"), "--port", str(port)]) == 1
     assert capsys.readouterr().err == f"rampart: {error}\n"
-
-
-def test_without_a_run_there_is_nothing_to_record(port, capsys):
-    assert main(["record", "--port", str(port)]) == 2
-    assert f"--port {port}: no run there" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["--record", "no/such/place/x.mcap"], "no/such/place/x.mcap: cannot be written"),
-    (["--record", "here.mcap"], "here.mcap: exists already"),
-    (["--overwrite"], "--overwrite: only with --record FILE")])
-def test_a_run_whose_recording_cannot_begin_does_not_begin(tmp_path, arguments, words):
-    (tmp_path / "here.mcap").write_text("precious")
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "launch.py"), "--no-hmi", "--report", "report", *arguments],
-        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["here.mcap"]
 
 
 @pytest.mark.processes

@@ -43,16 +43,18 @@ from rampart.cli.session import connect
 from rampart.systems import SHIPPED
 from rampart.testing import HEEDS_SIGNALS, eventually, free_base_port, wait_until
 from tests import ROOT as HERE
-from tests.actors.recording.samples import AnsweringLauncher, documents, pose, sample, write
+from tests.actors.recording.samples import (
+    AnsweringLauncher,
+    documents,
+    pose,
+    running,
+    sample,
+    write,
+)
 
 form_of = Forms(topics.ALL).of
 
 STRANGE = f"{ROOT}/no/such/topic"
-
-
-@pytest.fixture
-def port():
-    return free_base_port()
 
 
 @contextlib.asynccontextmanager
@@ -114,15 +116,9 @@ async def test_a_recording_of_a_replay_is_the_recording(tmp_path, port):
     player = Replay(tmp_path / "first.mcap", port=port, rate=4.0)
     recorder = Recorder(port, tmp_path / "second.mcap")
     recorder.open()
-    read_end, write_end = socket.socketpair()
-    loop = asyncio.get_running_loop()
-    running = loop.run_in_executor(None, recorder.run, read_end.fileno())
-    async with playing(player) as task:
-        await task
-        write_end.send(b"x")
-        await running
-    read_end.close()
-    write_end.close()
+    with running(recorder):
+        async with playing(player) as task:
+            await task
 
     def content(path):
         return [(key, form_of(key).payload(message.data))
@@ -186,46 +182,39 @@ async def test_what_lies_before_the_start_is_not_decoded_and_not_caught_up_with(
     assert sent[-1] - sent[0] > 0.9, "one each 0.2 s, never sooner"
 
 
-async def test_a_start_before_the_beginning_is_the_beginning(tmp_path, port):
-    write(tmp_path / "run.mcap", sample())
-    player = Replay(tmp_path / "run.mcap", port=port, start_s=-1000.0, rate=4.0)
-    async with asyncio.timeout(30):
-        await player.run(asyncio.Event())
+async def test_a_start_before_the_beginning_is_the_beginning(recording, port):
+    player = Replay(recording, port=port, start_s=-1000.0, rate=4.0)
+    await player.run(asyncio.Event())
     assert player.played == len(sample())
 
 
 async def test_a_recording_of_which_nothing_can_be_read_ends_also_in_a_loop(
-        tmp_path, port, monkeypatch):
-    write(tmp_path / "run.mcap", sample())
+        recording, port, monkeypatch):
     monkeypatch.setattr(Forms, "of", lambda *_: MessageForm(None))
     monkeypatch.setattr(MessageForm, "payload", lambda *_: int("no payload"))
-    player = Replay(tmp_path / "run.mcap", port=port, loop=True)
-    async with asyncio.timeout(30):
-        await player.run(asyncio.Event())
+    player = Replay(recording, port=port, loop=True)
+    await player.run(asyncio.Event())
     assert player.played == 0
 
 
-async def test_a_page_that_fails_is_said_to_have_ended(tmp_path, port, monkeypatch):
+async def test_a_page_that_fails_is_said_to_have_ended(recording, port, monkeypatch):
     def fail(*_):
         raise RuntimeError("it is\nbroken")
 
-    write(tmp_path / "run.mcap", sample())
     monkeypatch.setattr(OsmosisState, "pose", fail)
     said = []
-    player = Replay(tmp_path / "run.mcap", port=port, hmi_port=port + 30, rate=4.0,
-                    report=said.append)
+    player = Replay(recording, port=port, hmi_port=port + 30, rate=4.0, report=said.append)
     async with asyncio.timeout(60):
         await player.run(asyncio.Event(), 0.5)
     assert said[-1] == "the page has ended: RuntimeError: it is broken"
 
 
-def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(tmp_path, port):
-    write(tmp_path / "run.mcap", sample())
+def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(recording, tmp_path, port):
     folder = tmp_path / "folder"
     folder.mkdir()
     verb = subprocess.Popen(
         [*HEEDS_SIGNALS, sys.executable, "-m", "rampart.cli.main", "replay",
-         str(tmp_path / "run.mcap"),
+         str(recording),
          "--loop", "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
         env={**os.environ, "TMPDIR": str(folder)})
     assert "playing" in verb.stdout.readline()
@@ -248,9 +237,8 @@ async def test_the_rate_is_kept(tmp_path, port):
     assert times[10.0] < times[1.0]
 
 
-async def test_tools_find_a_replay_and_give_it_no_orders(tmp_path, port):
-    write(tmp_path / "run.mcap", sample())
-    async with playing(Replay(tmp_path / "run.mcap", port=port, loop=True)), reading(port):
+async def test_tools_find_a_replay_and_give_it_no_orders(recording, port):
+    async with playing(Replay(recording, port=port, loop=True)), reading(port):
         async with connect(port) as session:
             assert session.run.replay_of.endswith("run.mcap")
             assert session.run.title == "replay of run.mcap: a sample"
@@ -261,11 +249,10 @@ async def test_tools_find_a_replay_and_give_it_no_orders(tmp_path, port):
                 await session.command(ftm_topics.RESET, fm.Reset("RM1", "me"), lambda: True, 1.0)
 
 
-async def test_who_names_no_port_means_the_robot_and_not_the_replay(tmp_path, port, monkeypatch):
-    write(tmp_path / "run.mcap", sample())
+async def test_who_names_no_port_means_the_robot_and_not_the_replay(recording, port, monkeypatch):
     other = free_base_port()
     found = run_info.find_runs
-    async with playing(Replay(tmp_path / "run.mcap", port=port, loop=True)), reading(port):
+    async with playing(Replay(recording, port=port, loop=True)), reading(port):
         monkeypatch.setattr(run_info, "find_runs", lambda: [
             run for run in found() if run.base_port in (port, other)])
         assert run_info.find_run().replay_of
@@ -274,33 +261,30 @@ async def test_who_names_no_port_means_the_robot_and_not_the_replay(tmp_path, po
             assert run_info.find_run(port).replay_of
 
 
-def test_a_replay_does_not_take_the_number_of_whatever_lives(tmp_path, port, monkeypatch):
-    write(tmp_path / "run.mcap", sample())
+def test_a_replay_does_not_take_the_number_of_whatever_lives(recording, port, monkeypatch):
     monkeypatch.setattr(replaying, "find_processes", lambda: [
         RunProcess(1, port, 1, ("localization",), 1)])
     with pytest.raises(UsageError, match=f"--port {port}: belongs to a run"):
-        Replay(tmp_path / "run.mcap", port=port)
+        Replay(recording, port=port)
     monkeypatch.setattr(replaying, "find_processes", lambda: [
         RunProcess(1, port + 1, 1, ("localization",), 1)])
-    Replay(tmp_path / "run.mcap", port=port)
+    Replay(recording, port=port)
 
 
-def test_a_port_in_use_is_refused(tmp_path, port, capsys):
-    write(tmp_path / "run.mcap", sample())
+def test_a_port_in_use_is_refused(recording, port, capsys):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", port))
         taken.listen()
-        assert main(["replay", str(tmp_path / "run.mcap"), "--hmi-port", str(port)]) == 2
+        assert main(["replay", str(recording), "--hmi-port", str(port)]) == 2
         assert f"--hmi-port {port}: in use" in capsys.readouterr().err
     with AnsweringLauncher(port, 0.0):  # none of whose nodes lives just now
-        assert main(["replay", str(tmp_path / "run.mcap"), "--port", str(port)]) == 2
+        assert main(["replay", str(recording), "--port", str(port)]) == 2
     assert f"--port {port}: belongs to a run" in capsys.readouterr().err
 
 
-async def test_a_second_replay_on_the_same_port_is_refused(tmp_path, port):
-    write(tmp_path / "run.mcap", sample())
-    second = Replay(tmp_path / "run.mcap", port=port)
-    async with playing(Replay(tmp_path / "run.mcap", port=port, loop=True)), reading(port):
+async def test_a_second_replay_on_the_same_port_is_refused(recording, port):
+    second = Replay(recording, port=port)
+    async with playing(Replay(recording, port=port, loop=True)), reading(port):
         with pytest.raises(UsageError, match=f"--port {port}: in use"):
             await second.run(asyncio.Event())
 
@@ -313,12 +297,8 @@ async def test_a_second_replay_on_the_same_port_is_refused(tmp_path, port):
     (["--hmi-port", "80"], "--hmi-port 80: must be between 1024"),
     (["--port", "7411", "--hmi-port", "7411"], "--hmi-port 7411: is the replay's own --port")])
 def test_a_replay_that_makes_no_sense_is_refused_in_one_line(
-        tmp_path, port, capsys, arguments, words):
-    write(tmp_path / "run.mcap", sample())
-    assert main(["replay", str(tmp_path / "run.mcap"), "--port", str(port), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert words in error
-    assert error.count("\n") == 1
+        recording, port, refused, arguments, words):
+    assert words in refused("replay", recording, "--port", port, *arguments)
 
 
 def test_a_recording_without_messages_has_nothing_to_play(tmp_path, port, capsys):
@@ -350,8 +330,7 @@ def test_messages_of_another_version_are_left_out_and_counted(tmp_path, port, ca
         writer.start("rampart")
         writer.add_metadata("rampart.run", {"time_zero_s": "0"})
         writer.add_attachment(0, 0, "system.toml", "", (SHIPPED / "paper.toml").read_bytes())
-        channel = writer.register_channel("localization/pose", "json", 0, {
-            "key": topics.POSE.at()})
+        channel = writer.register_channel("localization/pose", "json", 0, {"key": topics.POSE.at()})
         writer.add_message(channel, 0, texts[0], 0)
         writer.add_message(channel, 1, texts[1].replace(b"yaw_rad", b"heading"), 1)
         writer.finish()
@@ -383,8 +362,7 @@ async def test_the_page_of_a_robot_without_application_is_a_replay_s_and_all_of_
                 told[message["type"]] = message
     assert (told["hello"]["badge"], told["hello"]["system"]) == ("replay", "courier")
     assert "map" not in told["hello"]
-    assert set(told["visitor"]["barred"]) == {
-        str(kind.__struct_config__.tag) for kind in REQUESTS}
+    assert set(told["visitor"]["barred"]) == {str(kind.__struct_config__.tag) for kind in REQUESTS}
     for verb in (["bag", "info"], ["bag", "ros2"], ["bag", "repair"]):
         out = [] if verb[1] == "info" else [str(tmp_path / verb[1])]
         assert main([*verb, str(tmp_path / "run.mcap"), *out]) == 0
