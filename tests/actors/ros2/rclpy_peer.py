@@ -1,11 +1,12 @@
 """Run by the Python that has the wheels of ROS 2: nodes of a robot in rclpy, over DDS.
 
-    python rclpy_peer.py base|rival|wrong|reporter
+    python rclpy_peer.py base|camera|rival|wrong|reporter
 
 `base` publishes /odom 20 times a second (best effort) and its name once (transient local), offers
 /base/shut, the action /count and the lifecycle node /camera, and calls /rampart/stop for a line on
-standard input. `rival` publishes /odom and /cmd_vel too; `wrong` publishes texts on /odom. Each
-writes a line of JSON for each message, request and transition.
+standard input. `camera` is that lifecycle node alone. `rival` publishes /odom and /cmd_vel too;
+`wrong` publishes texts on /odom. Each writes a line of JSON for each message, request and
+transition.
 
 `reporter` publishes the status of a lidar ten times a second, logs, and ends goals of /count. A
 word on standard input sets that: well, bad or quiet (no status); log (a line); succeed or abort.
@@ -35,7 +36,7 @@ from test_msgs.action import Fibonacci
 
 
 def say(**what):
-    os.write(1, f"{json.dumps(what)}\n".encode())
+    os.write(1, f"{json.dumps({'pid': os.getpid(), 'at_s': time.time(), **what})}\n".encode())
 
 
 class Camera(LifecycleNode):
@@ -153,7 +154,8 @@ def main():
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     signal.signal(signal.SIGTERM, lambda *_: is_over.set())
     executor = MultiThreadedExecutor(2)
-    nodes = {"base": base, "rival": rival, "wrong": wrong, "reporter": reporter}[sys.argv[1]]()
+    nodes = {"base": base, "camera": lambda: [Camera()], "rival": rival, "wrong": wrong,
+             "reporter": reporter}[sys.argv[1]]()
     for node in nodes:
         executor.add_node(node)
     say(up=sys.argv[1])

@@ -119,6 +119,18 @@ def beside(more: str = "", base: str = SYSTEM):
     return made
 
 
+def start(system, *names):
+    """Start nodes, and return them."""
+    return [system.start_node(name) for name in names]
+
+
+def watched(system):
+    """Start the gateway; return it, what it passes on of /odom, and its diagnostics."""
+    gateway = system.start_node("gateway")
+    return (gateway, system.hear(gateway.chosen_topic("base/odometry")),
+            system.hear(DIAGNOSTIC, "gateway"))
+
+
 @beside()
 async def test_what_the_system_says_reaches_ros_2_and_what_that_says_the_system(system):
     base = system.start_node("base")
@@ -136,9 +148,7 @@ async def test_what_the_system_says_reaches_ros_2_and_what_that_says_the_system(
 
 @beside()
 async def test_when_the_system_falls_silent_ros_2_is_told_zeros(system):
-    base = system.start_node("base")
-    system.start_node("gateway")
-    system.start_node("driver")
+    base, *_ = start(system, "base", "gateway", "driver")
     await asyncio.sleep(1.0)
     await system.kill("driver")
     await asyncio.sleep(0.35)
@@ -149,9 +159,7 @@ async def test_when_the_system_falls_silent_ros_2_is_told_zeros(system):
 
 @beside()
 async def test_at_an_orderly_end_ros_2_gets_one_last_zero(system):
-    base = system.start_node("base")
-    system.start_node("gateway")
-    system.start_node("driver")
+    base, *_ = start(system, "base", "gateway", "driver")
     await asyncio.sleep(1.0)
     assert base.heard[-1] == 0.5
     await system.stop("gateway")
@@ -162,8 +170,7 @@ async def test_at_an_orderly_end_ros_2_gets_one_last_zero(system):
 
 @beside()
 async def test_a_gateway_that_has_commanded_nothing_ends_without_a_zero(system):
-    base = system.start_node("base")
-    system.start_node("gateway")
+    base, _ = start(system, "base", "gateway")
     await asyncio.sleep(1.0)
     await system.stop("gateway")
     await asyncio.sleep(0.5)
@@ -172,9 +179,7 @@ async def test_a_gateway_that_has_commanded_nothing_ends_without_a_zero(system):
 
 @beside(base=SYSTEM.replace("stop_after_s = 0.2\n", ""))
 async def test_without_stop_after_s_no_zero_ends_a_topic(system):
-    base = system.start_node("base")
-    system.start_node("gateway")
-    system.start_node("driver")
+    base, *_ = start(system, "base", "gateway", "driver")
     await asyncio.sleep(1.0)
     await system.stop("gateway")
     await asyncio.sleep(0.5)
@@ -197,9 +202,7 @@ async def test_the_graph_says_who_is_there_and_when_a_process_dies_it_is_gone(sy
 
 @beside()
 async def test_a_second_publisher_is_refused_and_told(system):
-    gateway = system.start_node("gateway")
-    odometry = system.hear(gateway.chosen_topic("base/odometry"))
-    told = system.hear(DIAGNOSTIC, "gateway")
+    _, odometry, told = watched(system)
     base = system.start_node("base")
     await asyncio.sleep(0.5)
     base.publisher("/odom", "nav_msgs/msg/Odometry")
@@ -227,10 +230,8 @@ kind = "world"
 @beside(base=NAMED)
 async def test_messages_of_another_node_than_the_named_one_never_pass(system):
     stranger = system.start_node("stranger")
-    gateway = system.start_node("gateway")
+    _, odometry, told = watched(system)
     graph = system.hear(GRAPH, "gateway")
-    odometry = system.hear(gateway.chosen_topic("base/odometry"))
-    told = system.hear(DIAGNOSTIC, "gateway")
     await asyncio.sleep(3.0)  # it is the only publisher
     assert stranger.count > 50
     assert not odometry
@@ -396,9 +397,7 @@ async def test_a_service_is_offered(system):
     (-1.7e9, "if it is simulated time, the gateway needs clock = 'ros'")])
 @beside()
 async def test_a_stamp_that_cannot_be_true_is_refused_and_told(system, offset_s, words):
-    gateway = system.start_node("gateway")
-    odometry = system.hear(gateway.chosen_topic("base/odometry"))
-    told = system.hear(DIAGNOSTIC, "gateway")
+    _, odometry, told = watched(system)
     base = system.start_node("base")
     base.offset_ns = int(offset_s * 1e9)
     await asyncio.sleep(1.0)
@@ -413,9 +412,7 @@ async def test_a_stamp_that_cannot_be_true_is_refused_and_told(system, offset_s,
 
 @beside()
 async def test_bytes_that_are_no_message_and_one_without_attachment_are_refused_and_told(system):
-    gateway = system.start_node("gateway")
-    odometry = system.hear(gateway.chosen_topic("base/odometry"))
-    told = system.hear(DIAGNOSTIC, "gateway")
+    gateway, odometry, told = watched(system)
     base = system.start_node("base")
     await asyncio.sleep(1.2)
     heard = len(odometry)
@@ -432,9 +429,8 @@ async def test_bytes_that_are_no_message_and_one_without_attachment_are_refused_
 
 @beside()
 async def test_a_rotation_that_is_none_is_refused_and_counted_and_the_topic_falls_silent(system):
-    gateway = system.start_node("gateway")
-    odometry = system.hear(gateway.chosen_topic("base/odometry"))
-    told, graph = system.hear(DIAGNOSTIC, "gateway"), system.hear(GRAPH, "gateway")
+    _, odometry, told = watched(system)
+    graph = system.hear(GRAPH, "gateway")
     base = system.start_node("base")
     await asyncio.sleep(1.0)
     say = base.say_odometry
@@ -483,9 +479,7 @@ CLOCK = SYSTEM.replace('actor = "rampart.actors.ros2.gateway:Gateway"\n',
 
 @beside(base=CLOCK)
 async def test_with_a_clock_of_ros_2_its_stamps_are_simulated_time(system):
-    gateway = system.start_node("gateway")
-    odometry = system.hear(gateway.chosen_topic("base/odometry"))
-    told = system.hear(DIAGNOSTIC, "gateway")
+    _, odometry, told = watched(system)
     base = system.start_node("base")
     system.start_node("driver")
     await asyncio.sleep(1.0)
@@ -541,8 +535,7 @@ async def test_who_publishes_past_the_gateway_is_counted_and_named(system):
     base.publisher("/cmd_vel", "geometry_msgs/msg/Twist")
     await asyncio.sleep(0.5)
     assert graph[-1].message.bypassed == 1
-    assert graph[-1].message.problems[0] == (
-        "/cmd_vel: /robot/base publishes besides /rampart")
+    assert graph[-1].message.problems[0] == ("/cmd_vel: /robot/base publishes besides /rampart")
     assert ear.states[-1] == "active"
 
 

@@ -6,11 +6,11 @@ kills in a row the node would be unstable.
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import statistics
 import time
-from pathlib import Path
 
 import psutil
 import pytest
@@ -18,33 +18,14 @@ import pytest
 from rampart.testing import RealRun
 from tests import ROOT
 from tests.actors.ros2.test_against_ros import ROS
+from tests.actors.ros2.test_gateway import SYSTEM
+from tests.actors.ros2.test_relay import PEER
 
 pytestmark = [pytest.mark.ros, pytest.mark.processes, pytest.mark.slow]
 
 KILLS = 10
 PAUSE_S = 1.0
-SYSTEM = """
-name = "filmed"
-title = "A camera with a life cycle"
-
-[[node]]
-name = "camera"
-command = ["{python}", "{program}", "{log}"]
-kind = "control"
-respawn = "R_RESTART"
-
-[[node]]
-name = "gateway"
-actor = "rampart.actors.ros2.gateway:Gateway"
-kind = "non-control"
-parameters = {{ middleware = "rclpy", setup = "{setup}", domain = {domain}, \
-distribution = "kilted" }}
-
-[[node]]
-name = "manager"
-actor = "rampart.manager.actor:FtmManager"
-kind = "manager"
-
+LINKS = """
 [[ros2]]
 call = "/camera/get_state"
 type = "lifecycle_msgs/srv/GetState"
@@ -56,38 +37,31 @@ call = "/camera/change_state"
 type = "lifecycle_msgs/srv/ChangeState"
 from = "camera/change"
 to = "camera/changed"
-
-[[detection]]
-name = "D_CRASH"
-title = "The camera has crashed"
-actor = "rampart.actors.detection.watchdog:Watchdog"
-parameters = {{ watch = ["camera"], timeout_s = "heartbeat_timeout_s" }}
-
-[[recovery]]
-name = "R_RESTART"
-title = "Restart it"
-actor = "rampart.actors.ros2.respawn_lifecycle:RespawnLifecycle"
-kind = "masking"
-deadline_s = 15.0
-
-[recovery.parameters]
-lifecycle = ["camera"]
-ask = ["camera/ask"]
-state = ["camera/state:current_state.id"]
-change = ["camera/change"]
-
-[[mechanism]]
-name = "M_CRASH"
-detect = "D_CRASH"
-recover = "R_RESTART"
-event = "crash"
-against = {{ within_s = 60.0, hazard = "no pictures" }}
-
-[[event]]
-name = "crash"
-
-[orders.safer]
 """
+
+
+def filmed(log, domain):
+    """Return the system of a camera with a life cycle in place of driver and base."""
+    text = SYSTEM[:SYSTEM.index("[[ros2]]")] + LINKS
+    for old, new in {
+            'name = "driver"\nactor = "tests.actors.ros2.robot:Driver"':
+                'name = "camera"\ncommand = ["sh", "-c", '
+                f'"exec {ROS / "bin/python"} {PEER} camera >> {log}"]',
+            '[[node]]\nname = "base"\nactor = "tests.actors.ros2.robot:Base"\nkind = "world"\n': "",
+            'actor = "rampart.actors.ros2.gateway:Gateway"\n':
+                'actor = "rampart.actors.ros2.gateway:Gateway"\n'
+                f'parameters = {{ middleware = "rclpy", domain = {domain}, '
+                f'setup = "{ROS.resolve() / "bin/activate"}", '
+                'distribution = "kilted" }\n',
+            '"driver", "gateway"': '"camera", "gateway"',
+            'actor = "rampart.actors.recovery.respawn:Respawn"\n':
+                'actor = "rampart.actors.ros2.respawn_lifecycle:RespawnLifecycle"\n'
+                'deadline_s = 15.0\nparameters = { lifecycle = ["camera"], ask = ["camera/ask"], '
+                'state = ["camera/state:current_state.id"], change = ["camera/change"] }\n',
+            "within_s = 5.0": "within_s = 60.0"}.items():
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    return text
 
 
 def test_a_lifecycle_node_is_active_again_after_each_kill(tmp_path, monkeypatch):
@@ -98,13 +72,11 @@ def test_a_lifecycle_node_is_active_again_after_each_kill(tmp_path, monkeypatch)
     log = tmp_path / "transitions"
     log.touch()
     path = tmp_path / "filmed.toml"
-    path.write_text(SYSTEM.format(
-        python=ROS / "bin/python", program=Path(__file__).with_name("rclpy_camera.py"), log=log,
-        setup=ROS.resolve() / "bin/activate", domain=domain))
+    path.write_text(filmed(log, domain))
 
     def active():
-        return [(int(pid), float(at_s)) for pid, state, at_s in map(
-            str.split, log.read_text().splitlines()) if state == "active"]
+        told = map(json.loads, log.read_text().splitlines())
+        return [(one["pid"], one["at_s"]) for one in told if one.get("state") == "active"]
 
     with RealRun(tmp_path, path, "--rate", "1") as run:
         run.wait_until(lambda: run.pid("camera"), 20, "it does not run")
@@ -127,7 +99,7 @@ def test_a_lifecycle_node_is_active_again_after_each_kill(tmp_path, monkeypatch)
 def first_program(run):
     def programs():
         return [p.pid for p in psutil.Process(run.pid("camera")).children(recursive=True)
-                if any("rclpy_camera" in word for word in p.cmdline())]
+                if any("rclpy_peer" in word for word in p.cmdline())]
 
     run.wait_until(programs, 20, "the program does not run")
     return programs()[-1]

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -51,8 +50,8 @@ def robot(request, tmp_path):
     port, output = free_port(), tmp_path / "robot.txt"
     with output.open("w") as out:
         process = subprocess.Popen(network.command(
-            "robot", sys.executable, str(Path(__file__).with_name("far_robot.py")), ROBOT,
-            str(port), request.param), stdout=out, cwd=ROOT)
+            "robot", sys.executable, "-m", "tests.actors.ros2.far_robot", ROBOT, str(port),
+            request.param), stdout=out, cwd=ROOT)
     try:
         until_s = time.monotonic() + 20
         while "up" not in output.read_text() and time.monotonic() < until_s:

@@ -23,6 +23,7 @@ from tests import ROOT
 from tests.actors.ros2.test_against_ros import ROS
 from tests.actors.ros2.test_gateway import SYSTEM
 from tests.actors.ros2.test_live import MORE, Peer
+from tests.cli.look.test_ros_verbs import checked
 
 pytestmark = [pytest.mark.ros, pytest.mark.processes]
 
@@ -179,56 +180,48 @@ def test_topics_services_actions_states_and_parameters_over_dds(tmp_path, system
         assert peer.said("heard").count(0.0) == 1
 
 
-@pytest.mark.parametrize(("number", "line"), [
-    (signal.SIGKILL, "the relay to ROS 2 ended: signal 9"),
-    (signal.SIGSTOP, "the relay to ROS 2 hung: no answer for 1 s")])
-def test_a_relay_that_is_killed_or_stopped_comes_back_with_its_gateway(
-        tmp_path, system, number, line):
-    with Peer(PEER, "base") as peer, RealRun(tmp_path, system()) as run:
-        run.wait_until(lambda: len(peer.said("heard")) > 40, 30, "no command")
-        before, relay = run.pid("gateway"), relay_of(run)
-        relay.send_signal(number)
-        run.wait_for(line, 10)
-        run.wait_until(lambda: not relay.is_running(), 5, "the relay is left")
-        heard = len(peer.said("heard"))
-        run.wait_until(lambda: run.pid("gateway") not in {None, before}, 10, "no new gateway")
-        run.wait_until(lambda: len(peer.said("heard")) > heard + 20, 20, "no command any more")
-        assert set(peer.said("heard")) <= {0.5}
+def idle(run):
+    run.wait_until(lambda: echoed(run, "detection/D_NODES")[0]["state"] == "idle", 10,
+                   "the node is missing still")
 
 
-def test_a_killed_gateway_leaves_no_relay(tmp_path, system):
-    with Peer(PEER, "base") as peer, RealRun(tmp_path, system()) as run:
-        run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
-        relay = relay_of(run)
-        run.kill("gateway")
-        run.wait_until(lambda: not relay.is_running(), 5, "the relay is left")
-        heard = len(peer.said("heard"))
-        run.wait_until(lambda: len(peer.said("heard")) > heard + 20, 20, "no command any more")
-
-
-def test_a_second_publisher_is_refused_and_a_bypass_reported(tmp_path, system):
-    with Peer(PEER, "base") as peer, RealRun(tmp_path, system(NODES)) as run:
-        run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
-        with Peer(PEER, "rival"):
-            run.wait_until(lambda: "two publishers, /base and /rival" in run.tool(
-                "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3").stdout, 10,
-                "not refused")
-            assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
-            run.wait_for("(D_NODES): /cmd_vel: /rival publishes besides /rampart", 10)
-
-
-def test_a_node_that_ends_is_missing_until_it_is_back(tmp_path, system):
+def test_relay_and_gateway_come_back_and_a_missing_node_and_a_rival_are_reported(tmp_path, system):
     with RealRun(tmp_path, system(NODES)) as run:
         with Peer(PEER, "base") as peer:
-            run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command")
+            run.wait_until(lambda: len(peer.said("heard")) > 40, 30, "no command")
+
+            def comes_back(gateway, relay):
+                run.wait_until(lambda: not relay.is_running(), 5, "the relay is left")
+                heard = len(peer.said("heard"))
+                run.wait_until(lambda: run.pid("gateway") not in {None, gateway}, 10,
+                               "no new gateway")
+                run.wait_until(lambda: len(peer.said("heard")) > heard + 20, 20,
+                               "no command any more")
+                assert set(peer.said("heard")) <= {0.5}
+
+            for number, line in ((signal.SIGKILL, "the relay to ROS 2 ended: signal 9"),
+                                 (signal.SIGSTOP, "the relay to ROS 2 hung: no answer for 1 s")):
+                gateway, relay = run.pid("gateway"), relay_of(run)
+                relay.send_signal(number)
+                run.wait_for(line, 10)
+                comes_back(gateway, relay)
+            gateway, relay = run.pid("gateway"), relay_of(run)
+            run.kill("gateway")
+            comes_back(gateway, relay)
+
+            idle(run)
             peer.process.terminate()
             run.wait_for("(D_NODES): /base: not in the graph of ROS 2", 10)
-            nodes = echoed(run, "ros2/gateway/graph")[0]["nodes"]
-            assert "/base" not in nodes
+            assert "/base" not in echoed(run, "ros2/gateway/graph")[0]["nodes"]
         with Peer(PEER, "base") as peer:
             run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command any more")
-            run.wait_until(lambda: echoed(run, "detection/D_NODES")[0]["state"] == "idle", 10,
-                           "the node is missing still")
+            idle(run)
+            with Peer(PEER, "rival"):
+                run.wait_until(lambda: "two publishers, /base and /rival" in run.tool(
+                    "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3").stdout,
+                    10, "not refused")
+                assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
+                run.wait_for("(D_NODES): /cmd_vel: /rival publishes besides /rampart", 10)
 
 
 def test_a_killed_node_is_detected_by_its_topic_before_it_leaves_the_graph(tmp_path, system):
@@ -396,17 +389,10 @@ async def test_a_setup_that_is_not_there_is_refused(domain, monkeypatch):
 # -- verbs -----------------------------------------------------------------------------------------
 
 
-def checked(capsys, path):
-    code = main(["ros2", "check", "--system", str(path), "--json"])
-    printed = capsys.readouterr()
-    return code, printed.err, {one["what"]: (one["well"], one["why"]) for one in json.loads(
-        printed.out or '{"findings": []}')["findings"]}
-
-
 def test_the_check_finds_the_nodes_on_dds(capsys, system):
     with Peer(PEER, "base") as peer:
         peer.wait_for("up")
-        code, _, found = checked(capsys, system(MANY))
+        code, found = checked(capsys, system(MANY))
     assert found["relay of gateway"] == (True, "rclpy")
     assert found["subscribe /odom"] == (True, "/base, nav_msgs/msg/Odometry")
     assert found["publish /cmd_vel"] == (True, "/base, geometry_msgs/msg/Twist")
@@ -419,22 +405,20 @@ def test_the_check_finds_a_wrong_type_and_a_rival(capsys, system):
     with Peer(PEER, "wrong") as wrong, Peer(PEER, "rival") as rival, Peer(PEER, "base") as base:
         for peer in (wrong, rival, base):
             peer.wait_for("up")
-        code, _, found = checked(capsys, system())
+        code, found = checked(capsys, system())
     assert code == 1
     assert "/wrong has the type std_msgs/msg/String" in found["subscribe /odom"][1]
     assert "/rival publishes it too" in found["publish /cmd_vel"][1]
 
 
-def test_the_check_without_rclpy_is_one_line_and_exit_code_2(capsys, system, tmp_path):
+def test_the_check_without_rclpy_is_one_line_and_exit_code_2(refused, system, tmp_path):
     (tmp_path / "empty.bash").write_text("")
-    code, err, _ = checked(capsys, system(setup="empty.bash"))
-    assert code == 2
-    assert err.count("\n") == 1
-    assert "No module named 'rclpy'" in err
+    error = refused("ros2", "check", "--system", system(setup="empty.bash"), "--json")
+    assert "No module named 'rclpy'" in error
 
 
 def test_a_type_that_the_environment_lacks_is_found(capsys, system):
-    code, _, found = checked(capsys, system("""
+    code, found = checked(capsys, system("""
 [[ros2]]
 publish = "/rampart/pose"
 type = "bond/msg/Status"

@@ -228,8 +228,7 @@ async def test_a_module_does_not_take_the_gateway_s_own_diagnostics_for_those_of
     await asyncio.sleep(3.0)  # the gateway reports D_STATUS itself as an error now
     system.start_node("reporter")
     await asyncio.sleep(1.0)
-    assert changes("D_STATUS") == [
-        ("idle", ""), ("active", "arm: no status for 2 s"), ("idle", "")]
+    assert changes("D_STATUS") == [("idle", ""), ("active", "arm: no status for 2 s"), ("idle", "")]
 
 
 @beside(REPORTS)
