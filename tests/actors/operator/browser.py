@@ -115,7 +115,7 @@ def _started() -> Path:
 
 @contextlib.asynccontextmanager
 async def browser() -> AsyncIterator[Browser]:
-    """Open a tab with a memory of its own in Chromium, and close it afterwards."""
+    """Open a tab with its own cookies and storage in Chromium, and close it afterwards."""
     assert CHROMIUM is not None
     address = await _debug_address(_started() / "DevToolsActivePort")
     root = address.partition("/devtools/")[0]

@@ -11,7 +11,7 @@ from tests.actors.operator.world import World, open_page, served
 
 @pytest.fixture
 async def world():
-    """A small world for an HMI, with nobody else in it but `others`."""
+    """A small world for an HMI: only `others` are in it."""
     made = World()
     async with made.running(made.others):
         yield made
@@ -42,5 +42,5 @@ async def tab():
 
 @pytest.fixture
 def patient(monkeypatch):
-    """For tests in which time is not the subject: a busy machine is no silent page."""
+    """Let a page of a busy machine not count as silent, where time is not the subject."""
     monkeypatch.setattr(stick_arbitration, "TIMEOUT_S", 5.0)

@@ -118,7 +118,7 @@ async def test_no_panel_lies_on_another_or_is_too_narrow(world, tab):
             await tab.value("document.getElementById('arrange-reset').click()")
 
 
-async def test_nor_one_of_a_robot_with_panels_of_its_own(world, tab):
+async def test_no_panel_of_a_robot_s_own_lies_on_another(world, tab):
     async with page(world, tab, width=1366, height=768) as hmi, repeated(world.others.busy):
         for height in (768, 1080):
             await show(tab, hmi, width=height * 16 // 9, height=height)
