@@ -136,7 +136,7 @@ def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
     (["tree", "--order", "bravest"], ["'bravest'", "known: safer"]),
     (["tree", "--active", "FTM1", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
     (["tree", "--output", "x.pdf"], ["--output x.pdf: unknown ending", ".svg, .json, .txt"]),
-    (["tree", "--output", "/no/such/tree.svg"], ["--output /no/such/tree.svg", "No such file"]),
+    (["tree", "--output", "/no/such/tree.svg"], ["/no/such/tree.svg: No such file"]),
     (["cut-sets", "nowhere.xml"], ["nowhere.xml: No such file or directory"]),
     (["cut-sets", "--active", "FTM99"], ["unknown mechanism 'FTM99'; known: FTM1"]),
     (["cut-sets", "--limit", "-1"], ["--limit -1: must be 0 or more"]),
