@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from rampart.cli.output import UsageError, say
+from rampart.cli.output import UsageError, say, using
 from rampart.cli.verbs import add_verb, option
 
 PLACES = {
@@ -52,7 +52,8 @@ def new(options: argparse.Namespace) -> int:
     except FileExistsError:
         raise UsageError(f"{name}: exists already; nothing was changed") from None
     try:
-        fill(folder, name)
+        with using(folder):  # a write to a full disk names no file
+            fill(folder, name)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
