@@ -10,6 +10,7 @@ import pytest
 
 from rampart.testing import RealRun, free_port
 from tests import ROOT
+from tests.whole.checkpoint_runs import write_near_mission
 from tests.whole.test_chaos import write_row
 
 SYSTEM = ROOT / "systems/osmosis-ros2.toml"
@@ -22,7 +23,7 @@ def test_a_mission_in_virtual_time_survives_the_gateway(tmp_path, faults):
     planned = [word for fault in faults for word in ("--fault", fault)]
     done = subprocess.run(
         [sys.executable, str(ROOT / "launch.py"), "--system", str(SYSTEM), "--virtual", "--json",
-         "--mission", str(write_row(tmp_path)), "--report", str(tmp_path), *planned],
+         "--mission", str(write_near_mission(tmp_path)), "--report", str(tmp_path), *planned],
         capture_output=True, text=True, check=False, timeout=120)
     result = json.loads(done.stdout)
     assert (result["mission"], result["safety"]) == ("success", "safe"), done.stderr

@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter
 from contextlib import contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -70,19 +71,20 @@ def with_keys(folder: Path, spec: Path) -> dict[str, tuple[str, ...]]:
     return {name: ("--keys", str(folder / name)) for name in ("robot", "ground")}
 
 
-def kill_node(net: Network, name: str, run: RealRun, node: str):
-    """Kill a node from a host."""
-    command = net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_node",
-                          node, "--port", str(run.port))
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+def tool(net: Network, name: str, run: RealRun, *words: str, program: str = "rampart.cli.main"
+         ) -> subprocess.CompletedProcess[str]:
+    """Run a verb of `rampart` on a host."""
+    command = net.command(name, sys.executable, "-P", "-m", program, *words,
+                          "--port", str(run.port))
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+
+
+kill_node = partial(tool, program="rampart.cli.operate.kill_node")
 
 
 def listed(net: Network, name: str, run: RealRun) -> tuple[dict[str, str], str]:
     """Return each node that `kill-node --list` lists, with its host, and what it tells."""
-    done = subprocess.run(
-        net.command(name, sys.executable, "-P", "-m", "rampart.cli.operate.kill_node",
-                    "--list", "--json", "--port", str(run.port)),
-        capture_output=True, text=True, check=True, timeout=30)
+    done = kill_node(net, name, run, "--list", "--json")
     return {row["name"]: row["host"] for row in json.loads(done.stdout)}, done.stderr
 
 
@@ -134,11 +136,8 @@ def test_what_a_host_ran_that_cannot_be_reached_goes_on_on_the_first_until_it_is
             assert {found[node] for node in (*CELL_ON_GROUND, "supervisor_ground")} == {"ground"}
             assert {found[node] for node in ("gripper", "supervisor", "router_a")} == {"robot"}
             assert told == ""
-        beside = subprocess.run(  # on the other host, too, while the run goes on
-            net.command("ground", sys.executable, "-P", "-m", "rampart.cli.main", "record",
-                        str(tmp_path / "beside.mcap"), "--duration", "2",
-                        "--port", str(ground.port)),
-            capture_output=True, text=True, check=False, timeout=60)
+        beside = tool(net, "ground", ground,  # on the other host, too, while the run goes on
+                      "record", str(tmp_path / "beside.mcap"), "--duration", "2")
         assert beside.returncode == 0, beside.stderr
         ground.kill("camera")
         robot.wait_for("camera respawned by R_RESTART_VISION, incarnation 2")
@@ -146,10 +145,7 @@ def test_what_a_host_ran_that_cannot_be_reached_goes_on_on_the_first_until_it_is
         killed = kill_node(net, "robot", robot, "camera")
         assert killed.stdout.startswith("camera (pid "), killed.stderr
         robot.wait_for("camera respawned by R_RESTART_VISION, incarnation 3")
-        struck = subprocess.run(
-            net.command("robot", sys.executable, "-P", "-m", "rampart.cli.main", "inject",
-                        "kill:camera", "--json", "--port", str(robot.port)),
-            capture_output=True, text=True, check=False, timeout=30)
+        struck = tool(net, "robot", robot, "inject", "kill:camera", "--json")
         assert struck.returncode == 0, struck.stderr
         robot.wait_for("camera respawned by R_RESTART_VISION, incarnation 4")
         refused = kill_node(net, "robot", robot, "kamera")
@@ -215,9 +211,7 @@ def test_the_manager_survives_its_machine_and_never_are_two_obeyed(net, tmp_path
     spec = specification(net, tmp_path, ("cell_manager",), "cell", 0.07)
 
     def trigger(run: RealRun, module: str) -> None:
-        command = net.command("robot", sys.executable, "-m", "rampart.cli.main", "trigger", module,
-                              "--for", "1", "--port", str(run.port))
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+        done = tool(net, "robot", run, "trigger", module, "--for", "1")
         assert done.returncode == 0, done.stderr
 
     with (host(net, "ground", tmp_path / "g", spec, "--no-keys") as ground,
