@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from rampart.actors.runtime.checkpoint_file import files_of
 from rampart.actors.supervision.process_title import RUN, find_processes
 from rampart.cli import run as launch
 from rampart.testing import wait_until
@@ -41,7 +42,8 @@ def test_a_run_that_is_cut_off_twice_in_a_write_measures_each_light_once(tmp_pat
     run = first_part(tmp_path, PORT)
     report = tmp_path / "report"
     for torn in ("osmosis_control", "mission_manager"):
-        time.sleep(9)
+        wait_until(lambda node=torn: files_of(report / "checkpoints", node), 60, lambda: "no state")
+        time.sleep(8)
         run.send_signal(signal.SIGKILL)
         run.communicate()
         assert cut_last_write(report, torn)
