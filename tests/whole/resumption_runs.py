@@ -65,7 +65,7 @@ def wrongs(report: Path, code: int, result: dict[str, Any], told: str) -> list[s
     """Return what is wrong with a resumed run, one line each."""
     if (code, result.get("mission"), result.get("safety")) != (0, "success", "safe"):
         return [f"code {code}, {result.get('mission')}, {result.get('safety')}: "
-                f"{result.get('reasons')} {told}"]
+                f"{result.get('reasons')} {told[-600:]}"]
     seen = {light["name"]: light["verdict"] for light in result["lights"]
             if light["verdict"] != "not measured"}
     wrong = [] if seen == SHORT_LIGHTS else [f"lights {seen}"]
