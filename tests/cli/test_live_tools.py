@@ -12,7 +12,6 @@ import struct
 import subprocess
 import sys
 import time
-import urllib.error
 import urllib.request
 
 import pytest
@@ -216,10 +215,6 @@ def test_prometheus_is_given_the_figures_of_the_run(run):
         with urllib.request.urlopen(urllib.request.Request(
                 url, headers={"accept": "application/openmetrics-text"}), timeout=10) as answer:
             assert answer.read().endswith(b"# EOF\n")
-        with pytest.raises(urllib.error.HTTPError) as caught:
-            urllib.request.urlopen(f"{url}/other", timeout=10)
-        caught.value.close()
-        assert caught.value.code == 404
 
 
 # -- live ---------------------------------------------------------------------------------------

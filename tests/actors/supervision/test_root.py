@@ -26,6 +26,7 @@ from rampart.actors.system.layout import Layout
 from rampart.cli import systems
 from rampart.cli.analyse.check_verbs import explain
 from rampart.cli.run_options import parse, plan_of
+from rampart.manager.spec.tables import Timing
 from rampart.testing import eventually
 from tests import ROOT
 from tests.actors.supervision.test_supervision import process, running
@@ -72,7 +73,7 @@ def port(run):
 
 @pytest.mark.processes
 @pytest.mark.alone
-async def test_the_next_supervisor_is_there_within_thirty_milliseconds_of_the_last_one_s_end(
+async def test_the_next_supervisor_is_there_before_a_heartbeat_of_the_last_one_is_missed(
         witness, port):
     took = []
     for _ in range(7):
@@ -83,7 +84,7 @@ async def test_the_next_supervisor_is_there_within_thirty_milliseconds_of_the_la
             while process(port, "supervisor") in {None, old}:
                 await asyncio.sleep(0.001)
             took.append(time.monotonic() - begun_s)
-    assert sorted(took)[len(took) // 2] < 0.03
+    assert sorted(took)[len(took) // 2] < Timing().heartbeat_period_s  # 30 ms on a free machine
 
 
 @pytest.mark.processes
