@@ -84,7 +84,8 @@ async def test_the_next_supervisor_is_there_before_a_heartbeat_of_the_last_one_i
             while process(port, "supervisor") in {None, old}:
                 await asyncio.sleep(0.001)
             took.append(time.monotonic() - begun_s)
-    assert sorted(took)[len(took) // 2] < Timing().heartbeat_period_s  # 30 ms on a free machine
+    assert min(took) < 0.03  # the root's own time; the others wait for a processor as well
+    assert sorted(took)[len(took) // 2] < Timing().heartbeat_period_s
 
 
 @pytest.mark.processes
