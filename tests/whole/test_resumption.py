@@ -41,7 +41,7 @@ def test_a_run_that_is_cut_off_twice_in_a_write_measures_each_light_once(tmp_pat
     run = first_part(tmp_path, PORT)
     report = tmp_path / "report"
     for torn in ("osmosis_control", "mission_manager"):
-        time.sleep(9)
+        time.sleep(13)
         run.send_signal(signal.SIGKILL)
         run.communicate()
         assert cut_last_write(report, torn)
