@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.runtime.actor import BASE_INPUTS, Actor, Context, Header, on
@@ -57,6 +58,10 @@ class Observer(Actor):
         """Pass one message on."""
         # Each of these topics has a different type.
         self._pass_on(self._topic_of[type(message)], message, header)
+
+    @on(bus_topics.INJECT)
+    def _on_injection(self, order: Injection, header: Header) -> None:
+        self._pass_on(bus_topics.INJECT, order, header)  # an observer publishes nothing to disturb
 
     def _pass_on(self, topic: Topic[Any], message: Any, header: Header) -> None:
         for sink in self._sinks:

@@ -147,6 +147,8 @@ class RunRecorder:
         self._respawned: Remembered[tuple[str, int], None] = Remembered(KEPT)
         self._injections: dict[str, str] = Remembered(KEPT)
         self._lasts_s: dict[str, float] = Remembered(KEPT)
+        self._disturbed: dict[str, str] = Remembered(KEPT)
+        """The node that carries an injection out, by injection."""
         self._take: dict[str, Callable[[Any, Header], None]] = {
             ftm_topics.DETECTION.key: self._detection, ftm_topics.MANAGER_STATUS.key: self._manager,
             ftm_topics.DECISION.key: self._decision, ftm_topics.SHADOW.key: self._shadow,
@@ -254,6 +256,7 @@ class RunRecorder:
             if one not in self._respawned:
                 self._respawned[one] = None
                 self._restarts[event.node] = self._restarts.get(event.node, 0) + 1
+                self._end_injections(event.node, header.stamp)
 
     def _nodes(self, table: fm.NodeTable, header: Header) -> None:
         """End intervals whose final event was lost with a router. The node table is repeated."""
@@ -272,7 +275,14 @@ class RunRecorder:
 
     def _injection_report(self, report: bm.InjectionReport, header: Header) -> None:
         what = self._injections.get(report.injection, report.injection)
+        self._disturbed[report.injection] = report.node
         self.turn("injection", report.injection, not report.finished, header.stamp, what)
+
+    def _end_injections(self, node: str, t_s: float) -> None:
+        """End what disturbs topics of a node: its next process does not."""
+        for injection in self._injections:
+            if self._disturbed.get(injection) == node:
+                self.turn("injection", injection, False, t_s)
 
     # -- for recorders of a robot ---------------------------------------------------------------
 

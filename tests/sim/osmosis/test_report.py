@@ -125,6 +125,18 @@ def test_repeated_states_make_one_bar_and_one_that_never_ends_lasts_to_the_end()
         ("detection", "DM2", 1.0, 2.0), ("detection", "DM1", 90.0, 100.0)]
 
 
+def test_a_fault_of_a_topic_is_drawn_until_its_node_is_restarted_and_one_of_a_sensor_longer():
+    story = Story()
+    story.tell(4.0, bus_topics.INJECT, bm.Injection("i1", "localization/pose", "freeze", math.inf))
+    for injection in ("i1", "gps-bias"):
+        story.tell(5.0, bus_topics.INJECTION_REPORT, bm.InjectionReport(
+            injection, "localization", 0, False, ""))
+    story.tell(7.0, ftm_topics.PROCESS_EVENT, fm.ProcessEvent(
+        "localization", "respawned", 9, 2, "RM4", ""))
+    assert bars(story.end(100.0)) == [
+        ("injection", "i1", 5.0, 7.0), ("injection", "gps-bias", 5.0, 100.0)]
+
+
 def test_an_injection_is_told_with_its_effect_whether_or_not_its_order_was_heard():
     story = Story()
     story.tell(4.0, bus_topics.INJECT, bm.Injection("i1", "localization/pose", "freeze", 2.0))
