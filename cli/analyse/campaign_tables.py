@@ -69,7 +69,7 @@ def _show_rows(spec: SystemSpec, runs: Sequence[Run], rows: Sequence[Row]) -> No
     margins = ("smallest margin",) if trial.margins else ()
     print_table(
         ("fault", *options, "FTM", "strategy", "runs", "no effect", *verdicts, "detected after",
-         *margins),
+         "first by", *margins),
         [_cells(row, options, trial) for row in shown[:_SHOWN]])
     if len(shown) > _SHOWN:
         say(f"... and {len(shown) - _SHOWN} rows more, in the report")
@@ -81,8 +81,13 @@ def _cells(row: Row, options: Sequence[str], trial: type[Trial]) -> tuple[Any, .
     return (row.fault, *(row.options.get(name, NONE) for name in options),
             "yes" if row.ftm else "no", row.strategy or "-", row.runs, row.ineffective,
             *((_share(row.success), _share(row.safe), row.worst) if row.judged
-              else (row.restarts,)), _milliseconds(row.detected_after_s),
-            *margins)
+              else (row.restarts,)), _milliseconds(row.detected_after_s), _detecting(row), *margins)
+
+
+def _detecting(row: Row) -> str:
+    """Return the module that detected most often first, and those expected that stayed idle."""
+    first = next(iter(row.first_by), NONE)
+    return "; ".join([first, *(f"{name} idle: {number}" for name, number in row.idle.items())])
 
 
 def _share(found: Rate) -> str:

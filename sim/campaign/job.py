@@ -100,6 +100,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
         unsafe_s: When it first became unsafe.
         injected_s: When the first effective fault was injected.
         detected_after_s: Time from then to the first detection.
+        detected_by: Detection modules that have detected something since, the first one first.
         recovered_after_s: Time from then until no recovery was active.
         false_alarms: Detections before any fault.
         decisions: All decisions of the manager.
@@ -129,6 +130,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
     judged: bool = True
     restarts: int = 0
+    detected_by: tuple[str, ...] = ()
 
     @property
     def stopped_for_good(self) -> bool:
@@ -211,12 +213,13 @@ def virtual_run(job: Job) -> VirtualRun:
 
 
 def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
-    """Return time to detect, time to recover and the number of false alarms of a run."""
-    detections = sorted(bar.from_s for bar in record.intervals if bar.lane == "detection")
+    """Return time to detect, detecting modules, time to recover and number of false alarms."""
+    detections = [(bar.from_s, bar.name) for bar in record.intervals if bar.lane == "detection"]
     if injected_s is None:
         return {"detected_after_s": None, "recovered_after_s": None,
                 "false_alarms": len(detections)}
-    after = [t for t in detections if t >= injected_s]
+    found = sorted(bar for bar in detections if bar[0] >= injected_s)
+    after = [t for t, _ in found]
     calm = None
     if after:
         decided = [d for d in record.decisions if d.t_s >= after[0]]
@@ -224,8 +227,9 @@ def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
             calm = decided[-1].t_s
     return {
         "detected_after_s": round(after[0] - injected_s, 4) if after else None,
+        "detected_by": tuple(dict.fromkeys(name for _, name in found)),
         "recovered_after_s": round(calm - injected_s, 3) if calm is not None else None,
-        "false_alarms": sum(t < injected_s for t in detections)}
+        "false_alarms": len(detections) - len(found)}
 
 
 @lru_cache(maxsize=8)

@@ -252,6 +252,9 @@ def _cells(row: Row, ftm: bool, trial: type[Trial]) -> dict[str, Any]:
     found = [seconds(detected.median), *_tail(detected)] if ftm and detected else [NONE]
     if ftm and row.undetected:
         found.append(f"{row.undetected:,} not detected")
+    if ftm:
+        found += [f"first by {name}: {number:,}" for name, number in row.first_by.items()][:3]
+        found += [f"{name} idle: {number:,}" for name, number in row.idle.items()]
     calm = [seconds(recovered.median), *_tail(recovered)] if ftm and recovered else [NONE]
     if ftm and recovered and recovered.n < counted:
         calm.append(f"{counted - recovered.n:,} not recovered")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -57,7 +58,9 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     """All runs with one fault under one condition.
 
     `seeds` is the number of different seeds. Runs without an effect are `ineffective` and count for
-    nothing else, unless they were unsafe or failed: see `RunResult.counts`.
+    nothing else, unless they were unsafe or failed: see `RunResult.counts`. `first_by` counts runs
+    by the module that detected something first. `idle` counts, of a fault of the specification,
+    runs in which a module of its `detected_by` detected nothing.
     """
 
     fault: str
@@ -76,6 +79,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     worst_key: str
     stopped_for_good: int
     undetected: int
+    first_by: dict[str, int]
+    idle: dict[str, int]
     false_alarms: int
     detected_after_s: Spread | None
     recovered_after_s: Spread | None
@@ -143,6 +148,7 @@ def total(runs: Sequence[Run], name: str) -> Row:
 def _row(condition: Job, runs: Sequence[Run]) -> Row:
     counted = [run for run in runs if run.result.counts]
     results = [run.result for run in counted]
+    effective = [run for run in counted if run.result.outcomes and run.result.effective]
     bad = worst(counted or runs)
     return Row(
         fault=condition.row, options=condition.options, ftm=condition.ftm,
@@ -154,13 +160,22 @@ def _row(condition: Job, runs: Sequence[Run]) -> Row:
         safe=rate(sum(r.safe for r in results), len(results)),
         worst=verdict(bad) if counted else NO_EFFECT, worst_key=bad.job.key,
         stopped_for_good=sum(r.stopped_for_good for r in results),
-        undetected=sum(bool(r.outcomes) and r.effective and r.detected_after_s is None
-                       for r in results),
+        undetected=sum(run.result.detected_after_s is None for run in effective),
+        first_by=dict(Counter(name for r in results for name in r.detected_by[:1]).most_common()),
+        idle=dict(Counter(name for run in effective if run.job.ftm for name in _expected(run.job)
+                          if name not in run.result.detected_by)),
         false_alarms=sum(r.false_alarms for r in results),
         detected_after_s=spread(r.detected_after_s for r in results),
         recovered_after_s=spread(r.recovered_after_s for r in results),
         margins={name: spread(r.margins.get(name) for r in results)
                  for name in dict.fromkeys(name for r in results for name in r.margins)})
+
+
+def _expected(job: Job) -> set[str]:
+    """Return the modules that should detect a run's faults, as the specification says."""
+    named = faults_of_system(job.system).named
+    return {module for fault in job.faults if fault.fault in named
+            for module in named[fault.fault].detected_by}
 
 
 def as_json(row: Row) -> dict[str, object]:

@@ -305,6 +305,14 @@ def test_a_run_that_ends_badly_is_counted_though_its_fault_is_said_to_have_chang
     assert row.undetected == 0, "nothing to detect"
 
 
+def test_a_row_names_who_detected_first_and_which_expected_module_stayed_idle():
+    jump = (PlannedFault("localization-jump", 5.0),)  # the specification expects D_JUMP
+    row, = table(runs_of(result(detected_by=("D_LOST", "D_JUMP")), result(detected_by=("D_LOST",)),
+                         result(detected_by=("D_JUMP",)), result(detected_after_s=None),
+                         system=str(ROOT / "examples/nav2/warehouse.toml"), faults=jump))
+    assert (row.first_by, row.idle) == ({"D_LOST": 2, "D_JUMP": 1}, {"D_JUMP": 2})
+
+
 def test_the_worst_run_is_unsafe_before_failed_before_close():
     close, failed, unsafe = (
         result(margins={"obstacle_m": 0.1}), result(success=False), result(safe=False))
