@@ -137,10 +137,11 @@ class Sustained(Finding):
 
     def note(self, why: str, now_s: float) -> None:
         """Note the present error, "" for none."""
-        self.known = True
         self._why = why
         lasted = self._wrong.note(bool(why), now_s)
         cured = self._well.note(not why, now_s)
+        # Idle during an error that may yet last would release the recovery that acts against it.
+        self.known = self.known or lasted or not why
         if lasted and not self.active:
             self.reason, self.nodes = why, self.accused
         elif cured and self.active:

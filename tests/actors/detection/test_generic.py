@@ -283,6 +283,13 @@ def test_a_respawned_module_claims_nothing_before_it_knows(kind, parameters):
     assert reports(kind, [], 0.15, respawned=True, **parameters) == []
 
 
+def test_a_respawned_module_that_finds_an_error_reports_when_it_has_lasted():
+    """Idle before would release the recovery that acts against it."""
+    found = reports(Threshold, levels(3.0, 3.0, 3.0, 3.0), 0.45, respawned=True,
+                    value="tank/level:height_m", above=2.0, for_s=0.2)
+    assert [state for _, state, _ in found] == ["active"]
+
+
 def test_a_rate_is_reported():
     found = reports(Rate, levels(*[1.0] * 60), 8.0, topic="tank/level", at_least_hz=5.0)
     assert [(state, why) for _, state, why in found] == [
