@@ -12,6 +12,9 @@ from rampart.manager.spec.tables import Positive
 from warehouse import topics
 from warehouse.topics import GuardState, Limit, Order, Velocity
 
+EXECUTING = 2
+"""Of action_msgs/msg/GoalStatus."""
+
 TURNED_S = 0.4
 """Time in which a command is replaced or the robot brakes: it then drives in another direction."""
 
@@ -25,6 +28,7 @@ class Guard(Actor):
         Attributes:
             command: topic of the navigation's velocity.
             scan: topic of the laser, translated from a LaserScan.
+            goals: topic of the navigation's goals, translated from a GoalStatusArray.
             top_mps, top_radps: largest velocities.
             slow_mps: largest speed while a recovery limits it.
             ahead_m: smallest distance of an obstacle in the direction of the drive: the robot's
@@ -36,6 +40,7 @@ class Guard(Actor):
 
         command: TopicHeard
         scan: TopicHeard
+        goals: TopicHeard
         top_mps: Positive = 0.8
         top_radps: Positive = 1.5
         slow_mps: Positive = 0.5
@@ -51,17 +56,21 @@ class Guard(Actor):
         given = self.parameters
         self._angles_rad = self._ranges_m = np.empty(0)
         self._seen_s = self._commanded_s = self._released_s = -math.inf
-        self._stop = self._slow = False
+        self._stop = self._slow = self._has_goal = False
         self._why = "no command"
         self._passed = (0.0, 0.0)
         self.hear_topic(given.command, self._command)
         self.hear_topic(given.scan, self._scan)
+        self.hear_topic(given.goals, self._goals)
 
     def _scan(self, message: Any, header: Header) -> None:
         self._ranges_m = np.nan_to_num(np.frombuffer(message.ranges_f32, np.float32), nan=0.0)
         self._angles_rad = (message.angle_min_rad
                             + message.angle_increment_rad * np.arange(len(self._ranges_m)))
         self._seen_s = header.stamp
+
+    def _goals(self, message: Any, _header: Header) -> None:
+        self._has_goal = any(goal.status == EXECUTING for goal in message.status_list)
 
     @on(topics.ORDER)
     def order(self, message: Order, header: Header) -> None:
@@ -117,5 +126,5 @@ class Guard(Actor):
             self._why = "the navigation is silent"
             self._pass(Velocity(0.0, 0.0, now_s), now_s)
         self.publish(topics.STATE, GuardState(
-            bool(self._why), bool(self._why) and not self._stop, self._slow, self._why,
-            *self._passed))
+            bool(self._why), self._has_goal and not self._stop and not self._passed[0], self._slow,
+            self._why, *self._passed))

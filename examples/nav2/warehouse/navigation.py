@@ -22,7 +22,7 @@ TRANSITIONS = {(UNCONFIGURED, 1): INACTIVE, (INACTIVE, 3): ACTIVE, (ACTIVE, 4): 
                (INACTIVE, 2): UNCONFIGURED}
 """State and transition (configure, activate, deactivate, clean up) to the next state."""
 
-EXECUTING, ABORTED = 2, 6
+EXECUTING, CANCELED, ABORTED = 2, 5, 6
 """Of action_msgs/msg/GoalStatus."""
 
 ERROR = 40
@@ -133,7 +133,8 @@ class PlannerServer(Lifecycle):
             return
         goals, goal = (self.types.blank(f"action_msgs/msg/{name}")
                        for name in ("GoalStatusArray", "GoalStatus"))
-        goal.status = ABORTED if self.trouble.aborted else EXECUTING
+        goal.status = (ABORTED if self.trouble.aborted else
+                       CANCELED if self._is_cancelled else EXECUTING)
         goals.status_list = [goal]
         self._publish_goals(goals)
         if self.trouble.no_way:

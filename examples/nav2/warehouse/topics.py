@@ -32,15 +32,15 @@ class GuardState(Message, frozen=True):
     """What the guard passes, and why not more.
 
     Attributes:
-        stopped: whether it passes no speed.
-        refusing: whether it does so by its own judgement, without an order.
+        stopped: whether it refuses speed.
+        standing: whether it passes no speed without an order, although there is a goal.
         slow: whether it passes at most its slow speed.
         reason: why it is stopped, "" if it is not.
         linear_mps, angular_radps: the velocity that it passes.
     """
 
     stopped: bool
-    refusing: bool
+    standing: bool
     slow: bool
     reason: str
     linear_mps: float
