@@ -4,10 +4,10 @@
 import sys
 from pathlib import Path
 
-from rampart.files import interrupts
+from rampart.files import loading
 
 if __name__ == "__main__":
-    interrupts.end_at_once()
+    loading.begin()
     from rampart.cli.run import main
 
     sys.exit(main(reports=Path(__file__).resolve().parent / "reports"))

@@ -35,7 +35,7 @@ from rampart.cli.operate import (
 from rampart.cli.output import NoEffectError, say_text, warn
 from rampart.cli.record import incident_verbs, record_verbs
 from rampart.cli.verbs import FORMATTER, PORT
-from rampart.files import interrupts, streams, working_folder
+from rampart.files import loading, streams, working_folder
 
 _MODULES = (
     node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
@@ -119,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         arguments = sys.argv[1:]
     if arguments[:1] == ["run"]:
-        interrupts.end_at_once()
+        loading.begin()
         from rampart.cli.run import main as run  # noqa: PLC0415 other verbs need no physics
 
         return run(arguments[1:], "rampart run")

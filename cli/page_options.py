@@ -102,6 +102,8 @@ def page_of(options: argparse.Namespace, own: str, note: Callable[[str], None]
         which = f"--hmi-port {options.hmi_port}" if error.is_taken else (
             f"--hmi-host {host}: expected an address of this machine, or 0.0.0.0 for all")
         raise UsageError(f"{which}: {error}") from None
+    import rampart.actors.operator.server  # noqa: F401, PLC0415 before the fork, if there is a page
+
     return PagePlan(
         options.hmi_port, host, token, is_new, listed,
         cert=str(Path(options.hmi_cert).resolve()) if certificate else "",

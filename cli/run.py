@@ -37,7 +37,7 @@ from rampart.actors.system.topics import system_topics
 from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.page_options import audited
 from rampart.cli.run_options import ERROR_LOG, of_one_process, parse, plan_of, refuse
-from rampart.files import interrupts, streams, working_folder
+from rampart.files import loading, streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.spec.tables import BlackBox
@@ -420,7 +420,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     resumed = None
     try:
-        interrupts.end_at_once()
+        loading.begin()
         try:
             given = sys.argv[1:] if arguments is None else arguments
             which, lasting = of_one_process(given)
@@ -434,7 +434,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
             run = None if plan.host else Run(options, plan, spec, reports, arguments=lasting,
                                              resumed=resumed)
         finally:
-            interrupts.raise_again()
+            loading.end()
         return run.run() if run else _on_another_host(options, plan, reports)
     except (LaunchError, BagError, ValueError, OSError) as error:
         _say(str(error))

@@ -17,7 +17,7 @@ import socket
 from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
 
@@ -45,7 +45,6 @@ from rampart.actors.operator.panels import (
 )
 from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.operator.requests import REQUESTS, RefusedError, Request, ResetRequest
-from rampart.actors.operator.server import Handlers, PageServer
 from rampart.actors.operator.state import STALE_S, HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
@@ -61,6 +60,9 @@ from rampart.files.plain_text import one_line
 from rampart.manager.spec.clearing import reset_role
 from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.specification import SystemSpec, check_document
+
+if TYPE_CHECKING:
+    from rampart.actors.operator.server import PageServer
 
 REPEAT_S = 0.5
 """Simulated seconds between repetitions of unanswered messages."""
@@ -292,6 +294,11 @@ class Hmi(Actor):
             self._operating.drove = self._server.drove
 
     def _serve(self) -> PageServer:
+        from rampart.actors.operator.server import (  # noqa: PLC0415 not without a page
+            Handlers,
+            PageServer,
+        )
+
         page, complain = self.context.run.plan.page, self._complain
         if page.cert:
             self._tls = Tls(Path(page.cert), Path(page.key), complain)

@@ -26,12 +26,16 @@ from rampart.actors.supervision.requests import LaunchError
 from rampart.actors.supervision.unseen import report_callbacks, watch
 from rampart.files.streams import complain
 
-STARTUP_S = (0.8, 5.0)
+STARTUP_S = (0.4, 5.0)
 """Least and most wall seconds from the start of the processes to simulated time 0. Until then,
 silence is not a fault."""
 
-_LOADS = 1.4
-"""The same, in multiples of the time to load the root; all processes run after 0.6 to 0.95."""
+_LOADS = 1.9
+"""The same, in multiples of the time to load the root; all processes run after 0.8 to 1.3."""
+
+_LATE_S = 0.5
+"""Simulated seconds that a process may start after time 0: no timeout is as short. The first
+mission waits for all nodes."""
 
 _MAX_LINE = 1 << 26
 _Answer = TypeVar("_Answer", bound=requests.FromRoot)
@@ -109,7 +113,7 @@ class Launcher:
     def origin_s(self) -> float:
         """Return the reading of the monotonic clock at simulated time 0, if loading ends now."""
         startup_s = STARTUP_S[1] if self.plan.part else min(
-            max(STARTUP_S[0], _LOADS * self._load_s), STARTUP_S[1])
+            max(STARTUP_S[0], _LOADS * self._load_s - _LATE_S / self.plan.rate), STARTUP_S[1])
         return time.monotonic() + startup_s - self.plan.begins_s / self.plan.rate
 
     def failed(self, why: str) -> None:

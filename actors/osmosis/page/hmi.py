@@ -12,6 +12,8 @@ from typing import Any
 
 import msgspec
 
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator.bounds import MAX_NAME
 from rampart.actors.operator.camera_eye import CameraEye, renderer
 from rampart.actors.operator.hmi import Hmi
@@ -29,6 +31,7 @@ from rampart.actors.osmosis.page.missions import (
     Orders,
     StartRequest,
     Submission,
+    all_run,
     first_request,
     system_is_up,
 )
@@ -120,13 +123,24 @@ class OsmosisHmi(Hmi):
         now = self.clock.now()
         if outcome := self._submission.expire(now):
             self._state.log(now, "note", outcome)
-        if self._submission.pending is not None and system_is_up(
-                self._table, now - self.context.run.plan.begins_s):
-            self.publish(topics.MISSION_REQUEST, self._submission.pending)
+        self._submit()
         self._show_outcome(self._orders.expire(now))
         if self._orders.pending is not None:
             self.publish(topics.MISSION_ORDER, self._orders.pending)
         super()._repeat()
+
+    @on(ftm_topics.NODES)
+    def _nodes(self, message: fm.NodeTable, header: Header) -> None:
+        did_all_run = all_run(self._table)
+        super()._nodes(message, header)
+        if not did_all_run:
+            self._submit()
+
+    def _submit(self) -> None:
+        """Send the pending mission, if the system is up."""
+        if self._submission.pending is not None and system_is_up(
+                self._table, self.clock.now() - self.context.run.plan.begins_s):
+            self.publish(topics.MISSION_REQUEST, self._submission.pending)
 
     def _show_outcome(self, outcome: str) -> None:
         """Show the outcome of an order, if there is one."""

@@ -38,11 +38,15 @@ are a matter of the fault tolerance."""
 _BUSY = (m.MissionPhase.RUNNING, m.MissionPhase.PAUSED, m.MissionPhase.RETURNING)
 
 
+def all_run(table: fm.NodeTable | None) -> bool:
+    """Whether all nodes run, as far as the supervisor has reported."""
+    return table is not None and all(
+        row.state is fm.NodeState.RUNNING for row in table.nodes)
+
+
 def system_is_up(table: fm.NodeTable | None, now_s: float) -> bool:
-    """Whether a mission may be sent: simulated time has begun and all known nodes run."""
-    if now_s < 0 or table is None:
-        return now_s >= 0
-    return now_s > START_ANYWAY_S or all(row.state is fm.NodeState.RUNNING for row in table.nodes)
+    """Whether a mission may be sent: simulated time has begun and all nodes run."""
+    return now_s > START_ANYWAY_S or (now_s >= 0 and all_run(table))
 
 
 class Submission(Pending[m.MissionRequest]):
