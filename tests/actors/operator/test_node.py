@@ -11,6 +11,7 @@ import pytest
 import websockets
 
 from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator import feed as hmi_feed
 from rampart.actors.operator import server as hmi_server
 from rampart.actors.osmosis import messages as m
@@ -42,6 +43,23 @@ async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world)
             "", "", m.MissionPhase.IDLE, 0, (), (), (), ""))
         await asyncio.sleep(2.0 / RATE)
         assert len(world.others.requests) == count
+
+
+async def test_the_mission_waits_for_the_last_node_and_is_sent_as_soon_as_it_runs(world):
+    async def report(state: fm.NodeState) -> None:
+        world.others.publish(ftm_topics.NODES, fm.NodeTable((
+            fm.NodeInfo("hmi", "non_control", 1, fm.NodeState.RUNNING, 1, 0),
+            fm.NodeInfo("DM1", "detection", 2, state, 1, 0))))
+        for _ in range(20):
+            await asyncio.sleep(0)
+
+    async with world.hmi(mission=AIRPORT.mission("AB")):
+        assert not world.others.requests
+        await report(fm.NodeState.STARTING)
+        await asyncio.sleep(1.0 / RATE)  # two repetitions
+        assert not world.others.requests
+        await report(fm.NodeState.RUNNING)
+        assert world.others.requests
 
 
 async def test_the_emergency_stop_is_reset_from_the_page(world, hmi, page):

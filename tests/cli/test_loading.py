@@ -1,13 +1,16 @@
-"""Ctrl-C while a run loads."""
+"""What happens while a run loads: ctrl-C, the garbage collector, imports."""
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
 
 import pytest
 
+from rampart.files import loading
+from rampart.testing import free_base_port
 from tests import ROOT
 from tests.actors.ros2.test_gateway import SYSTEM
 
@@ -44,3 +47,26 @@ def test_a_world_is_loaded_without_glfw_which_would_start_a_process_in_the_middl
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
                           env={k: v for k, v in os.environ.items() if k != "MUJOCO_GL"})
     assert done.stdout == "False False\n"
+
+
+def test_the_collector_rests_while_a_program_loads_and_leaves_what_is_loaded_alone():
+    loading.begin()
+    try:
+        assert not gc.isenabled()
+    finally:
+        loading.end()
+    try:
+        assert gc.isenabled()
+        assert gc.get_freeze_count() > 0
+    finally:
+        gc.unfreeze()
+
+
+@pytest.mark.parametrize(("options", "is_loaded"), [(["--no-hmi"], False), ([], True)])
+def test_the_web_server_is_loaded_before_the_fork_and_only_for_a_page(options, is_loaded):
+    code = ("import sys; from rampart.cli.run_options import parse, plan_of; "
+            f"plan_of(*parse({[*options, '--hmi-port', str(free_base_port())]}, 'run')); "
+            "print('uvicorn' in sys.modules)")
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True,
+                          check=True)
+    assert done.stdout == f"{is_loaded}\n"
