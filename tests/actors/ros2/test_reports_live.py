@@ -11,7 +11,7 @@ from rampart.testing import RealRun, free_port
 from tests import ROOT
 from tests.actors.ros2.test_gateway import SYSTEM
 from tests.actors.ros2.test_live import Peer
-from tests.actors.ros2.test_relay import PEER, SETUP, domain, echoed, interfaces  # noqa: F401
+from tests.actors.ros2.test_relay import PEER, SETUP, domain, interfaces  # noqa: F401
 
 pytestmark = pytest.mark.processes
 
@@ -106,6 +106,13 @@ def reported(tmp_path, parameters, action, more=""):
         yield run
 
 
+def echo(run, key):
+    """Start `rampart topic echo` on a run; its lines come as those of a peer."""
+    run.wait_until(lambda: run.pid("gateway"), 30, "the run did not start")
+    return Peer("-P", "-m", "rampart.cli.main", "topic", "echo", key, "--json",
+                "--port", str(run.port), python=sys.executable)
+
+
 @contextlib.contextmanager
 def over_zenoh(tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -127,11 +134,13 @@ def over_dds(tmp_path, number):
 
 @pytest.mark.parametrize("wire", ["zenoh", pytest.param("dds", marks=pytest.mark.ros)])
 def test_statuses_lines_and_goals_that_other_nodes_report(tmp_path, domain, wire):  # noqa: F811
-    with over_zenoh(tmp_path) if wire == "zenoh" else over_dds(tmp_path, domain) as (run, peer):
+    over = over_zenoh(tmp_path) if wire == "zenoh" else over_dds(tmp_path, domain)
+    with over as (run, peer), echo(run, "detection/*") as reports:
         def until(module, state, reason=""):
             def is_so():
-                return any(report["state"] == state and reason in report["reason"]
-                           for report in echoed(run, f"detection/{module}"))
+                said = [line["message"] for line in list(reports.lines)
+                        if line["source"] == module]
+                return bool(said) and said[-1]["state"] == state and reason in said[-1]["reason"]
             run.wait_until(is_so, 40, f"{module} is not {state}: {reason}")
 
         for module in ("D_STATUS", "D_LOG", "D_GOAL", "D_OWN"):
