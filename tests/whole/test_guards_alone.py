@@ -12,6 +12,7 @@ from functools import partial
 import pytest
 
 from rampart.sim.campaign.job import RunResult, run_job, run_virtually
+from rampart.sim.osmosis.trial import run_end
 from tests.whole.layer_runs import LAYERS, layered_job
 
 STALE = "command-not-updated@14+inf"
@@ -22,8 +23,12 @@ NO_STANDBY = "kill:standby_control@13"
 
 
 @pytest.fixture
-def job(tmp_path):
-    """Return a maker of runs of a system in which only the layers named are on."""
+def job(tmp_path, monkeypatch):
+    """Return a maker of runs of a system in which only the layers named are on.
+
+    An unguarded robot that drives away is not watched for a whole minute.
+    """
+    monkeypatch.setattr(run_end, "WATCH_S", 2.0)
     return partial(layered_job, tmp_path)
 
 

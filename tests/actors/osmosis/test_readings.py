@@ -27,6 +27,7 @@ from rampart.sim.campaign.job import Job, run_job
 from rampart.sim.faults.scenario import parse_fault
 from tests.actors.osmosis.control.laser_sweeps import RAYS, full_sweep
 from tests.osmosis_system import shipped_system
+from tests.whole.checkpoint_runs import write_near_mission
 
 REACH = reach_of(shipped_system())
 NO_RAY = [0.0, -1.0, -math.inf, math.nan, 0.01, 8.5, 1e6]
@@ -173,8 +174,9 @@ def test_readings_beyond_what_a_device_can_say_are_none():
     "zero:summit_xl/scan@5+inf",
     *(pytest.param(f"{way}:summit_xl/{laser}@5+inf", marks=pytest.mark.slow) for way, laser in (
         ("zero", "upper_scan"), ("negative", "scan"), ("tiny", "scan"), ("nan", "upper_scan")))])
-def test_a_laser_of_nonsense_costs_the_full_system_nothing(fault):
-    result = run_job(Job(row="x", system="osmosis", options={"mission": "A", "obstacles": 2},
+def test_a_laser_of_nonsense_costs_the_full_system_nothing(tmp_path, fault):
+    mission = str(write_near_mission(tmp_path))  # an obstacle is on its way
+    result = run_job(Job(row="x", system="osmosis", options={"mission": mission, "obstacles": 2},
                          seed=3, faults=(parse_fault(fault),)))
     assert result.effective
     assert (result.safe, result.success) == (True, True), result.reasons

@@ -92,7 +92,8 @@ def compare(pose_filter: PoseFilter, truth: Truth, now_s: float, outcome: Outcom
 # ---- without a fault -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [
+    1, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (2, 3))])
 def test_without_a_fault_it_is_right_to_a_few_centimetres_and_excludes_nobody(seed):
     outcome = run(seed=seed)
     assert outcome.excluded == set()
@@ -156,7 +157,8 @@ def test_a_fresh_life_that_hears_two_positions_that_contradict_each_other_says_n
 
 
 @pytest.mark.parametrize("name", sensor_faults(*SOURCES))
-@pytest.mark.parametrize("how", ["transient", "intermittent", "permanent"])
+@pytest.mark.parametrize("how", ["permanent", *(
+    pytest.param(how, marks=pytest.mark.nightly) for how in ("transient", "intermittent"))])
 def test_any_single_fault_of_a_source_is_bridged(name, how):
     what, until_s = fault(name), FOR_EVER
     if how == "transient":
@@ -171,7 +173,8 @@ def test_any_single_fault_of_a_source_is_bridged(name, how):
 
 @pytest.mark.parametrize("wrong", WRONG_STAMPS)
 @pytest.mark.parametrize("topic", STAMPED, ids=lambda topic: topic.key)
-@pytest.mark.parametrize("once", [True, False], ids=["once", "permanent"])
+@pytest.mark.parametrize("once", [
+    False, pytest.param(True, marks=pytest.mark.nightly)], ids=["permanent", "once"])
 def test_stamps_of_no_possible_time_are_bridged_like_any_other_fault(topic, wrong, once):
     outcome = run_all(mis_stamped(disturbed([]), topic, wrong, 4.0, once=once))
     assert outcome.worst_m < BOUND_M

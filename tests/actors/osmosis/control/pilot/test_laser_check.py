@@ -13,6 +13,7 @@ from rampart.actors.osmosis.control.pilot.laser_pair import LaserCheck
 from rampart.sim.campaign.job import Job, run_job
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
+from tests.whole.checkpoint_runs import write_near_mission
 
 
 def judge(references, period_s=0.05):
@@ -60,9 +61,11 @@ def test_a_robot_that_cannot_trust_its_laser_stands(fault):
     assert result.duration_s < 26 + 43
 
 
-def test_once_the_laser_is_right_again_the_mission_goes_on():
-    result = run_job(Job(row="x", system="paper", options={"mission": "A"},
-                         faults=(parse_fault("laser-stuck@26+3"),)))
+def test_once_the_laser_is_right_again_the_mission_goes_on(tmp_path):
+    mission = str(write_near_mission(tmp_path))
+    result = run_job(Job(row="x", system="paper", options={"mission": mission},
+                         faults=(parse_fault("laser-stuck@12+3"),)))
+    assert result.effective
     assert (result.safe, result.success) == (True, True)
 
 
