@@ -21,9 +21,9 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 # What waits for a processor at the lowest priority is not slow. `make test-nightly` tries more.
-hypothesis.settings.register_profile("patient", deadline=None, max_examples=30,
+hypothesis.settings.register_profile("patient", deadline=None, max_examples=25,
                                        derandomize=True)
-hypothesis.settings.register_profile("thorough", deadline=None, max_examples=300)
+hypothesis.settings.register_profile("thorough", deadline=None, max_examples=200)
 hypothesis.settings.register_profile(
     "fuzz", deadline=None, max_examples=int(os.environ.get("FUZZ_RUNS", "10000")))
 hypothesis.settings.load_profile("patient")

@@ -77,7 +77,6 @@ def assert_apart(boxes) -> None:
         assert x + w <= x2 or x2 + w2 <= x or y + h <= y2 or y2 + h2 <= y
 
 
-@settings(max_examples=60, deadline=None)
 @given(fault_trees())
 def test_every_renderer_shows_every_box_of_any_graph(diagram):
     text, svg = to_text([diagram]), to_svg([diagram])
@@ -94,7 +93,6 @@ def test_every_renderer_shows_every_box_of_any_graph(diagram):
     assert svg.count("<circle") == sum(not b.gate for b in diagram.boxes)
 
 
-@settings(max_examples=60, deadline=None)
 @given(fault_trees(), st.booleans())
 def test_boxes_stay_apart_and_lines_go_from_box_to_box(diagram, square):
     sizes = {box.name: (40.0 + 7 * len(box.title), 50.0) for box in diagram.boxes}
@@ -112,7 +110,6 @@ def test_boxes_stay_apart_and_lines_go_from_box_to_box(diagram, square):
         assert place_.left + place_.width <= placing.width + 0.01
 
 
-@settings(max_examples=60, deadline=None)
 @given(fault_trees(), st.booleans())
 def test_no_line_crosses_a_box(diagram, square):
     sizes = {box.name: (40.0 + 7 * len(box.title), 50.0) for box in diagram.boxes}

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
@@ -119,7 +119,6 @@ def test_words_of_a_node_do_not_move_the_cursor():
 
 
 @given(st.integers(1, 250), st.integers(0, 80), st.integers(0, 99), st.text(max_size=30))
-@settings(max_examples=60, deadline=None)
 def test_every_screen_fits(width, height, skip, words):
     picture = busy()
     told(picture, topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.AUTO, False, words, 0))

@@ -16,7 +16,7 @@ from functools import partial
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.cli import systems
@@ -154,7 +154,7 @@ def test_a_job_that_makes_no_sense_is_named_and_what_was_finished_is_kept(tmp_pa
 
 def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
     command = [sys.executable, "-m", "rampart.cli.main", "campaign", "--system", "paper", "--fault",
-               "kill:mission_manager@3", "--seeds", "12", "--obstacles", "0", "--jobs", "1",
+               "kill:mission_manager@3", "--seeds", "5", "--obstacles", "0", "--jobs", "1",
                "--out", str(tmp_path), "--json"]
 
     def stored() -> int:
@@ -178,19 +178,19 @@ def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
         os.killpg(first.pid, signal.SIGKILL)
         first.wait()
     kept = stored()
-    assert 2 <= kept < 12, "it was not killed in the middle"
+    assert 2 <= kept < 5, "it was not killed in the middle"
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert stored() == 12
+    assert stored() == 5
     row, = json.loads(done.stdout)
     assert (row["fault"], row["runs"], row["safe"], row["success"]) == (
-        "kill:mission_manager", 12, 12, 0)
+        "kill:mission_manager", 5, 5, 0)
     assert row["ineffective"] == 0
     assert (tmp_path / "report.html").read_text().startswith("<!")
 
 
 def test_a_campaign_whose_disk_fills_up_says_so_in_one_line_and_goes_on_from_there(tmp_path):
     command = [sys.executable, "-m", "rampart.cli.main", "campaign", "--system", "paper", "--fault",
-               "kill:mission_manager@3", "--seeds", "6", "--obstacles", "0", "--jobs", "1",
+               "kill:mission_manager@3", "--seeds", "4", "--obstacles", "0", "--jobs", "1",
                "--out", str(tmp_path), "--json"]
     code = ("import resource, sys; from rampart.sim.campaign.store import Store; kept = Store.add\n"
             "def add(self, *run):\n"
@@ -208,7 +208,7 @@ def test_a_campaign_whose_disk_fills_up_says_so_in_one_line_and_goes_on_from_the
     assert "Traceback" not in full.stderr
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     row, = json.loads(done.stdout)
-    assert row["runs"] == 6
+    assert row["runs"] == 4
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ValueError("a chart")])
@@ -263,7 +263,6 @@ def test_a_cluster_that_is_not_there_is_refused_in_one_line(
 # ---- what is counted -------------------------------------------------------------------------
 
 
-@settings(max_examples=100)
 @given(st.integers(1, 3000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
 def test_the_interval_holds_the_share_and_narrows_with_more_runs(pair):
     count, of = pair
@@ -495,7 +494,7 @@ def test_a_robot_s_own_topics_can_fail_like_all_others(tmp_path, capsys):
     assert rampart([*own, "--list", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)["topic"]
     assert {"drop:porter/load", "stuck:porter/axle/rear"} <= set(listed)
-    (tmp_path / "NEAR.miss").write_text("x=-27,y=-8,taxi=1\n")
+    (tmp_path / "NEAR.miss").write_text("x=-28.5,y=4,taxi=1\n")
     assert rampart([*own, "--fault", "drop:porter/*@2+1", "--obstacles", "0", "--jobs", "1",
                     "--mission", str(tmp_path / "NEAR.miss"), "--out", str(tmp_path / "out"),
                     "--json"]) == 0

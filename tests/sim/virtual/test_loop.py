@@ -6,7 +6,7 @@ import asyncio
 import time
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis import topics
@@ -44,7 +44,6 @@ def test_timeouts_threads_and_queues_of_asyncio_work_on_it():
     assert run(scenario) == 8.0
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from([0.0, 0.5, 1.0, 2.0]) | st.floats(0, 2), st.booleans()),
                 max_size=30))
 def test_posted_calls_and_timers_share_one_order_of_time_and_of_scheduling_if_at_once(calls):
@@ -77,7 +76,6 @@ def test_a_call_that_raises_is_reported_and_those_due_with_it_are_made(posted):
     assert run(scenario) == (["after"], [ZeroDivisionError])
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from([1.0, 1.5, 2.0]), st.booleans()), max_size=30))
 def test_what_was_withdrawn_is_not_called_and_the_rest_keeps_its_order(calls):
     async def scenario():

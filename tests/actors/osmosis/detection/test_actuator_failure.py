@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis.detection.actuator_failure import ActuatorMonitor, MotionLimits
@@ -103,7 +103,6 @@ def test_a_respawned_monitor_claims_nothing_before_it_knows():
     assert monitor.known
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=30))
 def test_neighbours_that_turn_alike_are_never_accused(sides):
     bench = Bench()

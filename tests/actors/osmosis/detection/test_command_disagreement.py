@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis.detection.command_disagreement import (
@@ -96,14 +96,12 @@ def test_a_command_from_the_future_is_not_compared_when_its_sender_is_silent(sta
     assert not bench.comparison.active
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.text("=~", min_size=1, max_size=40))
 def test_who_agrees_is_never_accused(events):
     bench = Bench()
     assert "A" not in bench.play(events)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.text("=wv1a", max_size=30))
 def test_active_and_an_accused_life_go_together(events):
     bench = Bench()

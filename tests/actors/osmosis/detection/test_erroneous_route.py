@@ -7,7 +7,7 @@ import math
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis import messages as m
@@ -290,7 +290,6 @@ def test_a_new_life_is_forgiven_and_judged_by_what_it_says():
     assert monitor.nodes == ("graph_planner#2",)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(
     st.sampled_from(["mission", "goal", "route", "control"]), st.integers(0, 2),
     st.floats(0.05, 1.2)), max_size=25))

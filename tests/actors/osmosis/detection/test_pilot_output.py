@@ -6,7 +6,7 @@ import asyncio
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart import systems
@@ -209,7 +209,6 @@ def test_before_the_system_runs_silence_is_start_up_and_then_it_is_not():
 shares = st.floats(0.0, 1.0)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-2, 2), shares, shares), max_size=30))
 def test_a_pilot_that_only_takes_away_and_says_so_is_never_accused(steps):
     bench = Bench()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.bus.envelope import Header
@@ -145,7 +145,6 @@ def test_doubt_outlasts_the_respawn_of_one_and_ends_when_nobody_is_left_to_compa
 commands = st.one_of(st.none(), st.tuples(st.floats(-1, 1), st.floats(-2, 2)))
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(commands, commands, st.booleans(), st.booleans()), max_size=25))
 def test_whatever_comes_what_drives_lies_between_zero_and_what_one_of_the_two_wants(steps):
     pair, now, lives = CommandPair(), 0.0, [1, 1]
@@ -266,7 +265,6 @@ def test_a_drag_that_is_over_is_unlearnt():
     assert rates[-1] == pytest.approx(0.2, abs=DEAD_BAND_RADPS + 0.05)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-3, 3), st.floats(-9, 9)), max_size=40))
 def test_whatever_the_poses_say_the_sum_keeps_its_bound_and_so_does_what_is_added(steps):
     loop = MotionLoop(2.0)

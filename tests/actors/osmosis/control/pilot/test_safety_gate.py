@@ -293,7 +293,6 @@ def test_what_the_echoes_allow(points, linear, angular, expected):
         assert out == (0.0, 0.0)
 
 
-@settings(deadline=None, max_examples=60)
 @given(st.floats(-1, 1), st.floats(-2, 2),
        st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=6))
 def test_what_is_let_through_is_free_or_standstill(linear, angular, places):

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis import messages as m
@@ -46,7 +46,6 @@ def on_graph(point, nodes, edges):
         for a, b in ((nodes[x], nodes[y]) for x, y in edges))
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.floats(-1, 21), st.floats(-1, 21)), max_size=3),
        st.floats(0.3, 3.0))
 def test_what_is_left_of_the_graph_is_what_is_not_near_a_closed_place(places, gap_m):

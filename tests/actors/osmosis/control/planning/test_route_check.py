@@ -8,7 +8,7 @@ from random import Random
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis.airport.formats import load_airport
@@ -40,7 +40,6 @@ def at(place):
     return x0 + share * (x1 - x0) + dx, y0 + share * (y1 - y0) + dy
 
 
-@settings(max_examples=60, deadline=None)
 @given(places(), places(), st.booleans())
 def test_every_route_that_the_planner_finds_is_a_good_one(start, goal, straight):
     robot, target = at(start), at(goal)
@@ -49,7 +48,6 @@ def test_every_route_that_the_planner_finds_is_a_good_one(start, goal, straight)
     assert CHECK.fault(plan.waypoints, robot, target) == ""
 
 
-@settings(max_examples=60, deadline=None)
 @given(places(), places(), places())
 def test_so_is_every_way_round_something(start, goal, blocked):
     nodes, edges = without(AIRPORT.nodes, AIRPORT.edges, [at(blocked)], 1.0)
@@ -58,7 +56,6 @@ def test_so_is_every_way_round_something(start, goal, blocked):
         assert CHECK.fault(plan.waypoints, at(start), at(goal)) == ""
 
 
-@settings(max_examples=60, deadline=None)
 @given(places(), places())
 def test_a_straight_way_to_the_goal_is_good_only_if_it_runs_along_the_graph_on_pavement(a, b):
     robot, target = at(a), at(b)
@@ -76,7 +73,6 @@ def test_a_straight_way_to_the_goal_is_good_only_if_it_runs_along_the_graph_on_p
             assert near_end <= 1.0 or shapely.distance(graph, point) <= 2.0
 
 
-@settings(max_examples=40, deadline=None)
 @given(places(), places(), st.integers(0, 10**6))
 def test_a_route_that_is_shifted_as_a_whole_is_noticed_by_its_end(start, goal, seed):
     draw = Random(seed)

@@ -2,7 +2,7 @@ import itertools
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis.control.planning.route_search import plan_route
@@ -36,7 +36,6 @@ def graphs(draw):
     return nodes, edges
 
 
-@settings(max_examples=150, deadline=None)
 @given(graphs())
 def test_a_route_is_as_short_as_the_best_of_all_paths(graph):
     nodes, edges = graph
