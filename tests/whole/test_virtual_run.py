@@ -106,7 +106,7 @@ def recorded_run(tmp_path) -> subprocess.Popen[str]:
         [*HEEDS_SIGNALS, sys.executable, "launch.py", "--virtual", "--record", str(path),
          "--report", str(tmp_path / "report"), "--json"], cwd=ROOT, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True)
-    while not (path.exists() and path.stat().st_size > 1_000_000):
+    while not (path.exists() and path.stat().st_size > 300_000):
         assert launched.poll() is None, launched.communicate()
         time.sleep(0.01)
     return launched
