@@ -18,6 +18,7 @@ from rampart.manager.spec.nodes import COMMAND_FIELDS, ChildLimits
 from rampart.testing import RealRun, VirtualSystem, run
 from tests.actors.access.keyed import layout_of, make_keys
 from tests.documents.page import Page
+from tests.real_tools import printed
 
 PAGE = Page("how-to/any-language")
 TUG = PAGE.block("toml", 'name = "tug"')
@@ -103,4 +104,4 @@ def heard(tug: RealRun) -> list[float]:
 
 
 def nodes(tug: RealRun) -> list[dict]:
-    return msgspec.json.decode(tug.tool("node", "list", "--json").stdout)
+    return msgspec.json.decode(printed(tug, "node", "list", "--json"))

@@ -24,6 +24,7 @@ from tests.actors.ros2.test_against_ros import ROS
 from tests.actors.ros2.test_gateway import SYSTEM
 from tests.actors.ros2.test_live import MORE, Peer
 from tests.cli.look.test_ros_verbs import checked
+from tests.real_tools import printed
 
 pytestmark = [pytest.mark.ros, pytest.mark.processes]
 
@@ -80,8 +81,8 @@ def relay_of(run):
 
 
 def echoed(run, key, count=1):
-    done = run.tool("topic", "echo", key, "-n", str(count), "--json", "--duration", "15")
-    return [json.loads(line)["message"] for line in done.stdout.splitlines()]
+    lines = printed(run, "topic", "echo", key, "-n", str(count), "--json", "--duration", "15")
+    return [json.loads(line)["message"] for line in lines.splitlines()]
 
 
 MANY = """
@@ -217,8 +218,8 @@ def test_relay_and_gateway_come_back_and_a_missing_node_and_a_rival_are_reported
             run.wait_until(lambda: len(peer.said("heard")) > 10, 30, "no command any more")
             idle(run)
             with Peer(PEER, "rival"):
-                run.wait_until(lambda: "two publishers, /base and /rival" in run.tool(
-                    "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3").stdout,
+                run.wait_until(lambda: "two publishers, /base and /rival" in printed(
+                    run, "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3"),
                     10, "not refused")
                 assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
                 run.wait_for("(D_NODES): /cmd_vel: /rival publishes besides /rampart", 10)
@@ -247,8 +248,8 @@ def test_messages_of_another_node_than_the_named_one_never_pass(tmp_path, system
     path.write_text(path.read_text().replace('frame = "odom"\n',
                                              'frame = "odom"\npublisher = "/base"\n'))
     with RealRun(tmp_path, path) as run, Peer(PEER, "rival"):
-        run.wait_until(lambda: "published by /rival; expected /base" in run.tool(
-            "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3").stdout, 20,
+        run.wait_until(lambda: "published by /rival; expected /base" in printed(
+            run, "topic", "echo", "diagnostic/gateway", "-n", "3", "--duration", "3"), 20,
             "not refused")
         with Peer(PEER, "base"):
             assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
