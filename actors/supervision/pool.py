@@ -41,17 +41,16 @@ class Pool:
         self._fork = fork
         self._since_s = time.monotonic()
 
-    def take(self, request: bytes) -> int:
-        """Give a request to a process of the pool and return its pid; 0 if there is none."""
+    def take(self, request: bytes) -> tuple[int, socket.socket] | None:
+        """Give a request to a process of the pool; return its pid and the connection, if any."""
         self._since_s = time.monotonic()
         for pid, connection in list(self.waiting.items()):
             if process_state(pid) in "TtXZ":  # a SIGCHLD to the root is on its way
                 continue
             with contextlib.suppress(OSError):  # it has just ended
                 connection.send(request)
-                self.forget(pid)
-                return pid
-        return 0
+                return pid, self.waiting.pop(pid)
+        return None
 
     def fill(self) -> None:
         """Add a process if one is missing."""
@@ -99,7 +98,6 @@ async def wait(control: socket.socket, plan: RunPlan) -> tuple[bytes, ZenohBus |
     await bus.open()
     if shown is not None:
         await bus.close()
-    with control:
-        control.setblocking(False)
-        request = await asyncio.get_running_loop().sock_recv(control, REQUEST_BYTES)
+    control.setblocking(False)
+    request = await asyncio.get_running_loop().sock_recv(control, REQUEST_BYTES)
     return request, bus if shown is None else None

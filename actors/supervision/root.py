@@ -143,7 +143,6 @@ class Root:
         self._watch_pid = 0
         self._has_ended = False
         self._children: dict[int, tuple[str, ...]] = {}
-        self._issued: dict[str, int] = {}
         self._supervisor_link: socket.socket | None = None
         self._pool: Pool | None = None
         self._held: list[socket.socket] = []
@@ -480,15 +479,19 @@ class Root:
     def _start_supervisor(self) -> None:
         self._start_routers()
         supervisor = self._supervisor
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        try:
-            with theirs:
-                pid = self._fork((self.plan.supervisor,), supervisor.incarnation + 1, theirs)
-        except OSError:
-            ours.close()
-            raise
+        names, incarnation = (self.plan.supervisor,), supervisor.incarnation + 1
+        if taken := self._from_pool(names, ForkRequest(self.plan.supervisor, incarnation)):
+            pid, ours = taken
+        else:
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            try:
+                with theirs:
+                    pid = self._fork(names, incarnation, theirs)
+            except OSError:
+                ours.close()
+                raise
         supervisor.pid, supervisor.works = pid, False
-        supervisor.incarnation += 1
+        supervisor.incarnation = incarnation
         supervisor.checked_s = time.monotonic()
         supervisor.patience.answered()
         self._supervisor_link = ours
@@ -541,17 +544,24 @@ class Root:
         if before := [pid for pid, other in self._children.items() if other == names]:
             kill(before[0])
             raise ValueError(f"its process {before[0]} has not ended yet")
-        assert self._pool is not None  # noqa: S101 for the type checker
-        pooled = self._loaded.spare_of(names) != "none" and self._pool.take(
-            msgspec.json.encode(request))
-        if not pooled:
+        if self._loaded.spare_of(names) == "none" or (
+                taken := self._from_pool(names, request)) is None:
             return self._fork(names, request.incarnation)
-        self._note(pooled, names, request.incarnation)
-        return pooled
+        pid, connection = taken
+        connection.close()
+        return pid
+
+    def _from_pool(self, names: tuple[str, ...], request: ForkRequest
+                   ) -> tuple[int, socket.socket] | None:
+        taken = self._pool.take(msgspec.json.encode(request)) if self._pool is not None else None
+        if taken is not None:
+            self._note(taken[0], names, request.incarnation)
+        return taken
 
     def _note(self, pid: int, names: tuple[str, ...], incarnation: int) -> None:
         self._children[pid] = names
-        self._issued.update(dict.fromkeys(names, incarnation))
+        with contextlib.suppress(OSError):  # the process issues it too, when it begins
+            run_folder.issue(self.plan.folder, names, incarnation, pid)
 
     def _names_of(self, name: str) -> tuple[str, ...]:
         layout = self._loaded
@@ -611,8 +621,12 @@ class Root:
             if not data:
                 return 0
             request = msgspec.json.decode(data, type=ForkRequest)
-            role = Role(self._names_of(request.name), request.incarnation)
-            return await live(self._loaded, role, self._context_of(None), bus)
+            is_supervisor = request.name == self.plan.supervisor
+            if not is_supervisor:
+                control.close()
+            names = (request.name,) if is_supervisor else self._names_of(request.name)
+            return await live(self._loaded, Role(names, request.incarnation),
+                              self._context_of(control if is_supervisor else None), bus)
 
         def be_pooled() -> int:
             set_title(self.plan.base_port, self._pid, (POOL,), 1)
@@ -628,10 +642,8 @@ class Root:
         assert self._run is not None  # noqa: S101 for the type checker
         if link is None:
             return self._run
-        known = run_folder.issued(self.plan.folder)
-        for name, incarnation in self._issued.items():  # its process may not have begun yet
-            known[name] = max(known.get(name, 0), incarnation)
-        return replace(self._run, root=link.fileno(), known_incarnations=known)
+        return replace(self._run, root=link.fileno(),
+                       known_incarnations=run_folder.issued(self.plan.folder))
 
     def _in_child(self, be: Callable[[], int], *kept: socket.socket | None) -> NoReturn:
         """Live as a process of the run, in a fork."""

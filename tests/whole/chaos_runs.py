@@ -173,7 +173,7 @@ def deaths(root: Path, seed: int, rate: float) -> list[str]:
     wrong = complaints(run, code, result, ROWS, chaos.struck) + leaks(before, after)
     if len(chaos.struck) < DEATHS or took_s > 60 * MINUTES:
         wrong.append(f"{len(chaos.struck)} of {DEATHS} deaths in {took_s:.0f} s")
-    wrong += [f"shared memory: {name}" for name in sorted(shared_memory() - memory_before)]
+    wrong += [f"shared memory: {name}" for name in sorted(shared_memory(run.port) - memory_before)]
     if f"rampart.{run.port}." in Path("/proc/net/unix").read_text(encoding="utf-8"):
         wrong.append("a unix socket is left")
     return _concluded("leaks", run, chaos.struck, result, wrong)

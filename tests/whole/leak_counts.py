@@ -22,6 +22,8 @@ from tests.whole.chaos import ROOT_PROCESS
 
 MAX_GROWTH_MB = 15.0
 
+_OTHERS = ("joblib_", "sem.loky", "fastdds_", "sem.fastdds_")
+
 
 @dataclass(frozen=True, slots=True)
 class Counts:
@@ -60,16 +62,18 @@ def count(run: RealRun, survivors: tuple[str, ...]) -> Counts:
         sum(p.info["status"] == psutil.STATUS_ZOMBIE and p.info["ppid"] in family
             for p in psutil.process_iter(["status", "ppid"])),
         sum(1 for _ in Path(run.info.folder).rglob("*")),
-        shared_memory())
+        shared_memory(run.port))
 
 
-def shared_memory() -> frozenset[str]:
-    """Return the names of the machine's shared memory segments.
+def shared_memory(port: int = 0) -> frozenset[str]:
+    """Return the names of shared memory segments, without those of programs that may run beside.
 
-    Those of joblib are left out: they come and go with a campaign that runs beside.
+    Args:
+        port: Base port of the run; folders of other runs are left out.
     """
-    return frozenset(entry.name for entry in Path("/dev/shm").iterdir()
-                     if not entry.name.startswith("joblib_"))
+    names = (entry.name for entry in Path("/dev/shm").iterdir())
+    return frozenset(name for name in names if not name.startswith(_OTHERS) and (
+        not name.startswith("rampart-") or name.startswith(f"rampart-{port}-")))
 
 
 def leaks(before: Counts, after: Counts) -> list[str]:
