@@ -23,6 +23,7 @@ from tests.cli.look.test_ros_verbs import (
     secured,
     shown,
 )
+from tests.real_tools import printed
 
 pytestmark = pytest.mark.processes
 
@@ -49,7 +50,7 @@ parameters = {{ connect = ["tls/127.0.0.1:{port}"]{shown()} }}
 
 
 def in_ros2(run):
-    return next((line for line in run.tool("status").stdout.splitlines()
+    return next((line for line in printed(run, "status").splitlines()
                  if line.startswith("ros2 ")), "")
 
 
