@@ -84,7 +84,8 @@ _OPTIONS = (
     flag("--no-ftm", "run the unprotected baseline: the base keeps the last command, and no "
          "node is restarted"),
     number("--rate", "R",
-           f"simulated seconds per second, {LEAST_RATE:g} to {MOST_RATE} (default: 1)", 1.0),
+           f"simulated seconds per second, {LEAST_RATE:g} to {MOST_RATE}; 1 with a robot on the "
+           "wall clock (default: 1)", 1.0),
     whole("--seed", "N", "seed of sensor noise and faults (default: 1)", 1),
     flag("--no-hmi", "serve no operator's page; its node runs"),
     *page_options.OPTIONS,
@@ -230,6 +231,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application],
         if node.spare not in {"", "none", "pool"}:
             note(f"{system_file}: node {node.name}: spare = {node.spare!r} means 'pool' now")
     layout = Layout(plan, spec)
+    _check_rate(plan, layout)
     _check_network(options, spec)
     if options.keys:
         plan = msgspec.structs.replace(plan, keys=_checked_keys(options, layout))
@@ -255,6 +257,15 @@ def _host(options: argparse.Namespace, system_file: Path) -> str:
     if options.virtual:
         raise UsageError(f"--host {options.host}: not with --virtual, which runs on one machine")
     return "" if options.host == names[0] else str(options.host)
+
+
+def _check_rate(plan: RunPlan, layout: Layout) -> None:
+    """Refuse a rate at which the timeouts of a robot on the wall clock would be wrong."""
+    for name, member in layout.members.items() if plan.rate != 1 and not plan.virtual else ():
+        if member.actor.on_wall_clock(member.parameters):
+            raise UsageError(f"--rate {plan.rate:g}: expected 1: node {name} exchanges messages "
+                             "with a robot on the wall clock, and all timeouts would be "
+                             f"{1 / plan.rate:.3g} times as long")
 
 
 def _check_network(options: argparse.Namespace, spec: SystemSpec) -> None:

@@ -77,6 +77,11 @@ class VelocityLink(Actor):
         self._socket.setblocking(False)
         self.hear_topic(key, self._send)
 
+    @classmethod
+    def on_wall_clock(cls, _parameters: Parameters) -> bool:
+        """Return True: `rampart-stop` counts real seconds."""
+        return True
+
     def on_stop(self) -> None:
         """Close the socket; the program hands nothing on any more."""
         self._socket.close()

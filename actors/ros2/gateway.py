@@ -160,6 +160,11 @@ class Gateway(Actor):
         return found
 
     @classmethod
+    def on_wall_clock(cls, parameters: Parameters) -> bool:
+        """See `Declared.on_wall_clock`."""
+        return parameters.clock == "wall"
+
+    @classmethod
     def own_topics(cls, parameters: Parameters) -> tuple[Topic[Any], ...]:
         """Return the topics whose types are made from types of ROS 2.
 

@@ -228,6 +228,11 @@ class Declared(Handlers):
         return {}
 
     @classmethod
+    def on_wall_clock(cls, parameters: Any) -> bool:  # noqa: ARG003
+        """Whether it exchanges messages with a robot for which a simulated second is a real one."""
+        return False
+
+    @classmethod
     def check_topics(cls, parameters: Any, topics: Mapping[str, Topic[Any]]) -> None:
         """Check parameters against the topics that they name.
 

@@ -108,7 +108,7 @@ def processors() -> Iterator[Finding]:
     count, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     yield _finding("processors", f"{count}, load {load:.1f}", there=count >= 2 and load < count,
                    cost="other programs and too few processors make messages late, and the robot "
-                        "stops: end them, or use --rate 0.5 or --virtual")
+                        "stops: end them, or use --virtual, or --rate 0.5 for a simulated robot")
     meminfo = Path("/proc/meminfo").read_text(encoding="ascii")
     free = int(re.findall(r"MemAvailable:\s+(\d+) kB", meminfo)[0]) / 1e3
     yield _finding("memory", f"{free:,.0f} MB available", there=free >= NEEDED_MB,

@@ -11,6 +11,7 @@ import pytest
 
 from rampart.cli import run as launch
 from rampart.cli.main import main as rampart
+from rampart.cli.run_options import parse, plan_of
 from rampart.testing.ports import free_base_port
 from tests import CELL, ROOT, TANK
 from tests.actors.web.pems import pair
@@ -71,6 +72,18 @@ def test_launch_py_writes_its_report_into_its_checkout(tmp_path):
 NO_OPTION = "not an option of the launcher or of tank; --system tank.toml --help lists the options"
 OF_TANK, TWO = ["--system", "tank.toml"], ["--system", "two.toml"]
 GROUND = [*TWO, "--host", "ground"]
+LINK = (ROOT / "systems/osmosis.toml").read_text() + """
+[[node]]
+name = "link"
+actor = "rampart.actors.foreign.velocity_link:VelocityLink"
+kind = "non-control"
+respawn = "supervisor"
+
+[node.parameters]
+socket = "/run/robot/stop"
+linear = "summit_xl/command:linear_mps"
+angular = "summit_xl/command:angular_radps"
+"""
 FOR_ALL = ["--hmi-host", "0.0.0.0"]
 TOKEN = "secret-of-the-hangar-7"
 REFUSED = [
@@ -84,6 +97,9 @@ REFUSED = [
     (["--system", "/tmp"], "--system /tmp: is a directory"),
     (["--system", sys.executable], "not UTF-8 text"),
     (["--rate", "0"], "--rate 0"),
+    (["--system", "osmosis-ros2", "--rate", "0.5"],
+     "--rate 0.5: expected 1: node gateway exchanges messages with a robot on the wall clock, and"),
+    (["--system", "link.toml", "--rate", "4"], "--rate 4: expected 1: node link exchanges"),
     (["--obstacles", "-1"], "--obstacles -1"),
     (["--obstacles", "99"], "99"),
     (["--port", "80"], "--port 80"),
@@ -147,6 +163,7 @@ def test_bad_usage_is_one_clear_line_and_exit_code_2(
         tmp_path, monkeypatch, capfd, arguments, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tank.toml").write_text(TANK)
+    (tmp_path / "link.toml").write_text(LINK)
     (tmp_path / "two.toml").write_text(two_hosts({"robot": "192.0.2.1", "ground": "192.0.2.2"}))
     (tmp_path / "far.miss").write_text("x=-22,y=-18.5,taxi=1\nx=500,y=0,taxi=0\n")
     (tmp_path / "far.miss").chmod(0o644)
@@ -163,6 +180,17 @@ def test_bad_usage_is_one_clear_line_and_exit_code_2(
     assert words in told.err
     assert not {TOKEN, "a-bad"} & set(told.err.split())
     assert not (tmp_path / "report").exists()
+
+
+def test_another_rate_is_accepted_where_no_robot_is_on_the_wall_clock(tmp_path):
+    simulated = tmp_path / "simulated.toml"
+    simulated.write_text((ROOT / "systems/osmosis-ros2.toml").read_text().replace(
+        'interfaces = ["osmosis-ros2"]',
+        f'clock = "ros", interfaces = ["{ROOT / "systems/osmosis-ros2"}"]'))
+    for arguments in (["--system", str(simulated)], ["--system", "osmosis-ros2", "--virtual"],
+                      ["--system", "osmosis"]):
+        plan, _ = plan_of(*parse([*arguments, "--rate", "0.5"], "launch.py"))
+        assert plan.rate == 0.5
 
 
 def test_a_bad_token_of_the_environment_is_refused_and_not_repeated(tmp_path, monkeypatch, capsys):
