@@ -118,7 +118,8 @@ def test_a_pose_that_is_stuck_with_fresh_stamps_is_found_out_within_half_a_metre
 
 
 @pytest.mark.parametrize("name", sensor_faults("gps", "imu", "odom", "encoders"))
-@pytest.mark.parametrize("how", ["permanent", "intermittent"])
+@pytest.mark.parametrize("how", [
+    "permanent", pytest.param("intermittent", marks=pytest.mark.nightly)])
 def test_the_fault_of_a_sensor_is_not_taken_for_localizations(name, how):
     what = fault(name) if how == "permanent" else fault(name, on_s=0.7, off_s=1.6)
     assert watch(faults=[(what, FROM_S, math.inf)]) == []

@@ -81,7 +81,8 @@ def test_without_a_fault_it_is_the_gps_fix(seed):
 
 
 @pytest.mark.parametrize("name", sensor_faults(*SOURCES))
-@pytest.mark.parametrize("how", ["permanent", "intermittent"])
+@pytest.mark.parametrize("how", [
+    "permanent", pytest.param("intermittent", marks=pytest.mark.nightly)])
 def test_any_single_fault_leaves_it_a_position_that_is_right_to_decimetres(name, how):
     what = fault(name) if how == "permanent" else fault(name, on_s=0.7, off_s=1.6)
     worst_m, unknown_s = follow((what, FROM_S, math.inf))
