@@ -1,6 +1,6 @@
 """Verbs of `rampart` on a real run, in the process of the test.
 
-A look at a run takes 10 ms. A new interpreter for each look takes half a second of a processor.
+Tests that poll a run use them: a new interpreter for each look takes most of a processor.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ def test_a_job_that_makes_no_sense_is_named_and_what_was_finished_is_kept(tmp_pa
 
 def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
     command = [sys.executable, "-m", "rampart.cli.main", "campaign", "--system", "paper", "--fault",
-               "kill:mission_manager@3", "--seeds", "5", "--obstacles", "0", "--jobs", "1",
+               "kill:mission_manager@3", "--seeds", "12", "--obstacles", "0", "--jobs", "1",
                "--out", str(tmp_path), "--json"]
 
     def stored() -> int:
@@ -178,12 +178,12 @@ def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
         os.killpg(first.pid, signal.SIGKILL)
         first.wait()
     kept = stored()
-    assert 2 <= kept < 5, "it was not killed in the middle"
+    assert 2 <= kept < 12, "it was not killed in the middle"
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert stored() == 5
+    assert stored() == 12
     row, = json.loads(done.stdout)
     assert (row["fault"], row["runs"], row["safe"], row["success"]) == (
-        "kill:mission_manager", 5, 5, 0)
+        "kill:mission_manager", 12, 12, 0)
     assert row["ineffective"] == 0
     assert (tmp_path / "report.html").read_text().startswith("<!")
 
