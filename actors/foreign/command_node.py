@@ -67,7 +67,9 @@ class CommandNode(Actor):
         self._program: ProgramProcess | None = None
         self._channel: Channel | None = None
         self._notify: NotifySocket | None = None
-        self._pulse = self._new_pulse()
+        self._pulse = Pulse(
+            self._heartbeat.timeout_s, self._timing.startup_grace_s, 2 * context.heartbeat_period_s,
+            [node for node in context.publishers(self._heartbeat.key) if node != self.name])
         self._failure = ""  # of this incarnation
         self._is_done = False
         if self._heartbeat.topic:  # from its own client; for its socket see `_take`
@@ -106,6 +108,10 @@ class CommandNode(Actor):
             self._failure = f"was stopped {limit}"
         elif self._pulse.has_beaten:
             self._failure = f"hung: no heartbeat {limit}"
+        elif self._pulse.carriers:
+            self._failure = (f"hung: no heartbeat {limit} after its start or that of "
+                             f"{' and '.join(self._pulse.carriers)}, which publishes "
+                             f"{self._heartbeat.key}")
         else:
             self._failure = (f"hung: no heartbeat {limit} after its start; a larger "
                              "startup_grace_s in [timing] gives it more time")
@@ -120,8 +126,9 @@ class CommandNode(Actor):
         self._log.close()
 
     @on(PROCESS_EVENT)
-    def respawned(self, message: ProcessEvent, _header: Header) -> None:
+    def process_event(self, message: ProcessEvent, _header: Header) -> None:
         """Start the program again when the supervisor decides so."""
+        self._pulse.note_process(message.node, message.event)
         if (message.node, message.event, message.pid) == (
                 self.name, "respawned", self.context.pid
                 ) and message.incarnation > self._incarnation and self._program is None:
@@ -130,12 +137,9 @@ class CommandNode(Actor):
 
     # -- the program ------------------------------------------------------------------------------
 
-    def _new_pulse(self) -> Pulse:
-        return Pulse(self._heartbeat.timeout_s, self._timing.startup_grace_s,
-                     2 * self.context.heartbeat_period_s)
-
     def _start(self) -> None:
-        self._failure, self._pulse = "", self._new_pulse()
+        self._failure = ""
+        self._pulse.restart()
         parameters, plan = self.parameters, self.context.run.plan
         name, folder = parameters.command[0], folder_of(plan, parameters.folder)
         program = find_program(name, folder, parameters.env.get("PATH"))

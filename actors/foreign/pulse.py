@@ -7,11 +7,15 @@ import math
 import os
 import secrets
 import socket
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 
 from rampart.actors.foreign.descendants import is_below
+from rampart.actors.ftm.messages import FAILURES, NEW_PROCESSES
 from rampart.actors.machine.unix_peer import receive_signed
+
+WORKING = (*NEW_PROCESSES, "running", "resumed", "adopted", "back")
+"""Events after which a process of the node works, or starts."""
 
 _DATAGRAM_BYTES = 8192
 _MOST_S = 3600.0
@@ -28,16 +32,19 @@ class Pulse:
         timeout_s: A command that is silent for longer hangs.
         first_s: The same until its first heartbeat.
         look_s: The longest time between two checks that counts.
+        carriers: Nodes that publish its heartbeats. While one of them is down, nothing counts.
     """
 
     timeout_s: float
     first_s: float
     look_s: float
+    carriers: Collection[str] = ()
     silent_s: float = 0.0
     has_beaten: bool = False
     _extended_s: float = 0.0
     _ends: bool = False
     _at_s: float | None = None
+    _down: set[str] = field(default_factory=set)
 
     @property
     def limit_s(self) -> float:
@@ -45,8 +52,24 @@ class Pulse:
         usual_s = self.timeout_s if self.has_beaten else max(self.first_s, self.timeout_s)
         return max(usual_s, self._extended_s)
 
+    def restart(self) -> None:
+        """Allow the silence of a start again."""
+        self.silent_s, self.has_beaten, self._extended_s = 0.0, False, 0.0
+        self._ends, self._at_s = False, None
+
+    def note_process(self, node: str, event: str) -> None:
+        """Note an event of a process, as in `ProcessEvent`."""
+        if node not in self.carriers:
+            return
+        if event in FAILURES:
+            self._down.add(node)
+        elif event in WORKING:
+            self._down.discard(node)
+            self.restart()
+
     def beat(self) -> None:
         """Note a heartbeat; after `stopping` it has no effect."""
+        self._down.clear()
         if not self._ends:
             self.silent_s, self.has_beaten, self._extended_s = 0.0, True, 0.0
 
@@ -65,7 +88,7 @@ class Pulse:
 
     def is_well(self, now_s: float) -> bool:
         """Whether the silence is not too long."""
-        if self._at_s is not None:
+        if self._at_s is not None and not self._down:
             self.silent_s += min(max(0.0, now_s - self._at_s), self.look_s)
         self._at_s = now_s
         return self.silent_s <= self.limit_s

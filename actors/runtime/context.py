@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,6 +41,7 @@ class Context:
         members: names of all nodes of the system. The memory for other sources is bounded.
         command_age_s: older commands are refused, simulated s.
         topics: topics that parameters of the system's nodes name, by key.
+        publishers: returns the names of the nodes that publish on a key below `rampart/`.
         usage: returns how much processor time and memory a process has used.
         scheduled: returns how long a main thread has run and waited for a processor.
         is_here: whether the process of a node is on this machine.
@@ -61,6 +62,7 @@ class Context:
     members: frozenset[str] = frozenset()
     command_age_s: float = math.inf
     topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
+    publishers: Callable[[str], Iterable[str]] = lambda _key: ()
     usage: Callable[[int], ProcessCount | None] = read_count
     scheduled: Callable[[int], Usage] = read_usage
     is_here: Callable[[str], bool] = lambda _node: True

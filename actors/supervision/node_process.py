@@ -70,6 +70,7 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
         renewed=partial(_take_place, layout, (name,)), failed=failed,
         is_here=partial(is_here, layout.plan.folder),
         members=frozenset((*layout.members, *layout.routers)), topics=layout.topics,
+        publishers=layout.publishers,
         command_age_s=layout.hosts.command_age_s))
 
 

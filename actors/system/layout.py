@@ -116,6 +116,7 @@ class Layout:
             everyone, (*ftm_topics.ALL, *kind.topics, *stand_in_topics(spec)),
             judge.inputs() if judge else (), judged_by, file)
         self.topics = connections.named
+        self.publishers = connections.publishers
         self.members = {name: member for name, member in connections.members.items()
                         if name in self.unit_of or member.kind is Kind.SUPERVISION}
         silent = [] if spec.layers.ftm else [topic.key for topic in ftm_topics.ALL]
@@ -212,6 +213,12 @@ class Connections:
         for member in self.members.values():
             for key, names in published(member).items():
                 self._publishers.setdefault(key, []).append((member, names))
+
+    def publishers(self, key: str) -> list[str]:
+        """Return the names of the nodes that publish on a key below `rampart/`."""
+        return [member.name for pattern, publishers in self._publishers.items()
+                if (name := self._topics[pattern][0].member(key)) is not None
+                for member, names in publishers if names is None or name in names]
 
     def check(self, started: Collection[Member], silent: Collection[str]) -> None:
         """Check the publishers of all topics.

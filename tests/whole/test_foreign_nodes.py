@@ -213,6 +213,60 @@ process = "both"
         assert gone(beside)
 
 
+CARRIER = """
+from rampart import Actor, Message, Qos, Topic, every
+
+
+class Alive(Message):
+    pass
+
+
+ALIVE = Topic("sleeper/alive", Alive, Qos.SENSOR, 20.0, "", "The sleeper works.")
+
+
+class Carrier(Actor):
+    outputs = (ALIVE,)
+
+    def on_start(self):
+        self.began_s = self.clock.now()
+
+    @every(0.05)
+    def carry(self):
+        if self.clock.now() > self.began_s + 1.0 and self.context.incarnation < 3:
+            self.publish(ALIVE, Alive())
+"""
+"""Publishes from a second after its start on; the third incarnation publishes nothing."""
+
+
+def test_a_program_is_not_blamed_while_the_node_that_publishes_its_heartbeat_restarts(tmp_path):
+    write_tug(tmp_path, compiled=False)
+    (tmp_path / "carrier.py").write_text(CARRIER)
+    head, _, rest = TUG.partition('[[node]]\nname = "driver"')
+    head = head.replace("[timing]", "[timing]\nstartup_grace_s = 2.5")
+    (tmp_path / "tug.toml").write_text(head + """
+[[node]]
+name = "carrier"
+actor = "carrier:Carrier"
+kind = "non-control"
+
+[[node]]
+name = "sleeper"
+command = ["sleep", "605"]
+kind = "non-control"
+heartbeat = { key = "sleeper/alive", timeout_s = 0.5 }
+
+""" + rest[rest.index("[[event]]"):])
+    with RealRun(tmp_path, "tug.toml") as tug:
+        tug.sleep_until(2)
+        tug.kill("carrier")
+        tug.wait_until(lambda: state(tug, "carrier") == ("running", 2), 10, "no new carrier")
+        time.sleep(1.5)
+        assert state(tug, "sleeper") == ("running", 1)
+        tug.kill("carrier")
+        tug.wait_for("sleeper crashed, incarnation 1: sleep hung: no heartbeat for 2.5 s after its "
+                     "start or that of carrier, which publishes sleeper/alive;", 10)
+
+
 def test_a_memory_limit_and_a_program_of_another_format_are_told(tmp_path):
     write_tug(tmp_path)
     (tmp_path / "odd").write_bytes(b"\x7fNONSENSE")

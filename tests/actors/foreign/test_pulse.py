@@ -48,6 +48,30 @@ def test_it_may_ask_for_more_time_until_its_next_beat(started):
     assert [pulse.is_well(4.0 + n / 10) for n in range(8)][-1] is False, "the usual time again"
 
 
+def test_silence_does_not_count_while_a_carrier_is_down_and_starts_again_after_its_restart():
+    pulse = Pulse(timeout_s=0.5, first_s=1.0, look_s=0.2, carriers=("gateway",))
+    pulse.beat()
+    pulse.note_process("other", "crashed")
+    assert [pulse.is_well(n / 10) for n in range(8)] == [True] * 6 + [False] * 2
+    pulse.beat()
+    for failure in ("wedged", "crashed", "given up"):
+        pulse.note_process("gateway", failure)
+    assert all(pulse.is_well(1.0 + n / 10) for n in range(50))
+    pulse.restart()  # of the program
+    assert all(pulse.is_well(6.0 + n / 10) for n in range(50))
+    pulse.note_process("gateway", "respawned")
+    wells = [pulse.is_well(11.0 + n / 10) for n in range(13)]
+    assert wells[:10] == [True] * 10
+    assert wells[-2:] == [False] * 2
+
+
+def test_a_heartbeat_shows_that_the_carrier_works_if_its_event_was_lost():
+    pulse = Pulse(timeout_s=0.5, first_s=1.0, look_s=0.2, carriers=("gateway",))
+    pulse.note_process("gateway", "crashed")
+    pulse.beat()
+    assert [pulse.is_well(n / 10) for n in range(8)] == [True] * 6 + [False] * 2
+
+
 def test_one_that_says_that_it_ends_has_to_end():
     pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
     pulse.stopping()
