@@ -45,7 +45,8 @@ def rampart(run, *words, key=None):
 def test_nodes_and_routers_that_are_killed_come_back_with_their_keys(tmp_path, keys):
     with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2", "--keys", str(keys)) as run:
         run.wait_for("goal 1/3", 60)
-        for victim in ("osmosis_control", "router_a", "localization", "router_b", "ftm_manager"):
+        for victim in ("osmosis_control", "supervisor", "router_a", "localization", "router_b",
+                       "ftm_manager"):
             kill(run, victim)
         pids = [run.process.pid, *(p.pid for p in find_processes(run.port))]
         listening = {c.laddr for pid in pids for c in psutil.Process(pid).net_connections("inet")
