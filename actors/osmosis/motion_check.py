@@ -290,6 +290,7 @@ class MotionParity:
             return
         if dt_s > _LONGEST_ODOMETRY_S:
             self._gap_s = stamp_s
+            self._gyro_was = None
             return
         step_m = math.hypot(x_m - was.x_m, y_m - was.y_m)
         self._own = _capped(

@@ -55,6 +55,7 @@ class RunEnd:
     _progress_at_s: float = -math.inf
     _over_at_s: float = math.inf
     _over: str = ""
+    _paused: str = ""
     _lost_at_s: float = math.inf
     _truth_at_s: float = math.inf
     _moves: bool = False
@@ -81,6 +82,8 @@ class RunEnd:
         if status.phase is m.MissionPhase.IDLE:
             return
         self._mission_id = status.mission_id
+        self._paused = (f": mission paused, {status.reason}"
+                        if status.phase is m.MissionPhase.PAUSED else "")
         progress = (status.step, len(status.lights))
         detour = status.phase is m.MissionPhase.RUNNING and status.reason not in self._reasons \
             and len(self._reasons) < _DETOURS
@@ -134,5 +137,5 @@ class RunEnd:
             return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s", accepted_by_s
         stuck_s = self._progress_at_s + self.patience_s
         if (self._mission_id or not self.waits) and now_s > stuck_s:
-            return f"no progress for {self.patience_s:.0f} s", stuck_s
+            return f"no progress for {self.patience_s:.0f} s{self._paused}", stuck_s
         return "", now_s

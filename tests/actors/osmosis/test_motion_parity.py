@@ -90,3 +90,12 @@ def test_a_gyro_that_drifts_does_not_agree_with_the_wheels():
     parity = MotionParity()
     drive(parity, 30.0, gyro=0.03)
     assert not parity.gyro_agrees
+
+
+@pytest.mark.parametrize("lost", [("odometry",), ("imu",), ("odometry", "imu", "encoders")])
+def test_a_turn_that_is_missed_in_part_is_not_held_against_the_gyro(lost):
+    """The event loop of a module was late, or messages were lost."""
+    parity = MotionParity()
+    end_s = drive(parity, 1.0, start_s=drive(parity, 5.0), without=lost)
+    drive(parity, 1.0, start_s=end_s)
+    assert parity.gyro_agrees

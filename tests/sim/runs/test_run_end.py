@@ -92,6 +92,14 @@ def test_patience_counts_from_the_last_progress_and_driving_in_circles_is_none()
     assert end.ended(25.0) is None
 
 
+def test_a_mission_that_a_recovery_holds_to_the_end_says_which():
+    end = RunEnd(10.0)
+    held = MissionStatus("m1", "A", MissionPhase.PAUSED, 0, GOALS, (), (), "held by RM1: DM1: lost")
+    end.mission(mission(MissionPhase.RUNNING), 0.0)
+    end.mission(held, 3.0)
+    assert end.ended(10.1) == "no progress for 10 s: mission paused, held by RM1: DM1: lost"
+
+
 def test_a_run_whose_mission_the_operator_starts_waits_for_it_and_then_is_like_any_other():
     end = RunEnd(10.0, waits=True)
     assert end.ended(10_000.0) is None
