@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable
 from functools import partial
 from pathlib import Path
-from signal import Signals
 from typing import Any, ClassVar
 
 from msgspec.structs import replace
@@ -36,12 +35,12 @@ from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import Record
 from rampart.actors.runtime.run_plan import SUPERVISOR, on_host
 from rampart.actors.supervision.kill_node import (
-    SIGNALS,
     SignalError,
     UnknownNodeError,
     find_node,
+    send,
 )
-from rampart.actors.supervision.process_title import kill
+from rampart.actors.supervision.process_title import RunProcess
 from rampart.actors.supervision.processes import Processes
 from rampart.actors.supervision.supervised_process import SupervisedProcess
 from rampart.actors.supervision.supervisor import Supervisor
@@ -205,7 +204,7 @@ class HostSupervisor(Supervisor):
         else:
             pid, incarnation = victim.pid, victim.incarnation
             event, detail = "signalled", order.signal
-            self.call_later(_ANSWER_S, partial(_kill, pid, SIGNALS[order.signal]))
+            self.call_later(_ANSWER_S, partial(_send, victim, order.signal))
         answer = fm.ProcessEvent(order.node, event, pid, incarnation, order.order, detail)
         self._signalled.append(answer)
         return answer
@@ -311,8 +310,9 @@ class HostSupervisor(Supervisor):
         self.publish(topics.HOST_NODES, fm.NodeTable((*self._own_rows(), *given_back)))
 
 
-def _kill(pid: int, number: Signals) -> None:
-    kill(pid, number)
+def _send(victim: RunProcess, name: str) -> None:
+    with contextlib.suppress(OSError):
+        send(victim, name)
 
 
 class FirstSupervisor(HostSupervisor):

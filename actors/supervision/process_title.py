@@ -35,13 +35,19 @@ setproctitle.getproctitle()
 
 @dataclass(frozen=True, slots=True)
 class RunProcess:
-    """A process of a run in /proc; `launcher` is the pid of its root."""
+    """A process of a run in /proc.
+
+    Attributes:
+        launcher: pid of its root.
+        is_program: whether it is the program of a command, which leads a process group.
+    """
 
     pid: int
     port: int
     launcher: int
     names: tuple[str, ...]
     incarnation: int
+    is_program: bool = False
 
 
 def set_title(port: int, launcher: int, names: tuple[str, ...], incarnation: int) -> None:

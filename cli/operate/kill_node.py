@@ -15,6 +15,8 @@ signals:
   TERM   end the process in order; the supervisor treats this as a crash, too
   SEGV   crash the process as a memory error does
   WEDGE  hang the process: it exists, and its event loop is blocked (SIGUSR2)
+STOP, CONT, TERM and SEGV go to the program of a node that has a `command`, and
+to all of its process group. KILL of the node's own process ends the program too.
 """
 # A process of this host is found in /proc. The supervisors of other hosts list and signal their
 # processes, over the bus.

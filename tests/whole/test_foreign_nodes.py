@@ -12,6 +12,7 @@ import pytest
 
 from rampart.actors.foreign.descendants import descendants
 from rampart.actors.foreign.output_log import LOG_BYTES
+from rampart.actors.supervision.kill_node import signal_node
 from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.testing import RealRun
 from tests.documents.test_foreign_nodes import nodes
@@ -211,6 +212,38 @@ process = "both"
         comes_back(tug, "wheels", 2, "/wheels")
         comes_back(tug, "beside", 2, "sleep 604")
         assert gone(beside)
+
+
+def test_a_signal_that_stops_a_command_reaches_its_program_and_what_that_has_forked(tmp_path):
+    write_tug(tmp_path, compiled=False)
+    head, _, rest = TUG.partition('[[node]]\nname = "driver"')
+    (tmp_path / "tug.toml").write_text(head + "".join(f"""
+[[node]]
+name = "{name}"
+process = "both"
+command = ["sh", "-c", "sleep 606; echo {name}"]
+kind = "non-control"
+""" for name in ("first", "second")) + rest[rest.index("[[event]]"):])
+    with RealRun(tmp_path, "tug.toml") as tug:
+        tug.sleep_until(0.5)
+        node, first = tug.pid("first"), find(tug, "first", "echo first")
+        second = find(tug, "second", "echo second")
+        asleep = {pid for pid, line in below(tug, "first").items() if line == "sleep 606"}
+        assert signal_node("first", "STOP", tug.port).pid == first
+
+        def stopped():
+            return {pid for pid in (first, second, node, *asleep) if process_state(pid) == "T"}
+
+        tug.wait_until(lambda: len(stopped()) == 2, 2, "not stopped")
+        assert stopped() - asleep == {first}
+        signal_node("first", "CONT", tug.port)
+        tug.wait_until(lambda: not stopped(), 2, "not continued")
+        signal_node("first", "STOP", tug.port)
+        tug.wait_for("first crashed, incarnation 1", 10)
+        comes_back(tug, "first", 2, "echo first")
+        assert gone(first)
+        assert tug.pid("first") == signal_node("first", "KILL", tug.port).pid
+        comes_back(tug, "first", 3, "echo first")
 
 
 CARRIER = """
