@@ -132,6 +132,7 @@ class Gateway(Actor):
         self._graph_due = False
         self._was_linked: bool | None = None
         self._due_s = self.clock.now() + _LINK_S
+        self._others_had_time = False
         self._diagnostics: Diagnostics | None = None
         self._newest: dict[str, tuple[msgspec.Struct, float] | None] = {
             link.beside: None for link in given.ros2 if link.beside}
@@ -240,6 +241,7 @@ class Gateway(Actor):
         self._side.tokens(f"{ADMIN}/{given.domain}/**", self._token)
         for name, note in self._types.notes.items():
             self._note(name, note)
+        self.call_later(run.system.timing.startup_grace_s, self._report_unpublished)
 
     def _start_relay(self) -> RelaySide:
         given, run = self.parameters, self.context.run
@@ -331,6 +333,12 @@ class Gateway(Actor):
         if self._diagnostics is not None and self.time.is_known:
             self._diagnostics.publish(self.clock.now())
 
+    def _report_unpublished(self) -> None:
+        """Report the topics that no node publishes, once the others have had time to start."""
+        self._others_had_time = True
+        for topic, why in self._unpublished():
+            self._note(topic, why)
+
     def _report_graph(self) -> None:
         self._graph_due = False
         if self._side is None:
@@ -341,8 +349,9 @@ class Gateway(Actor):
         nodes = self.graph.nodes()
         bypassed = self._bypassed()
         problems = [f"{topic}: {who} publishes besides {self.node.full_name}"
-                    for topic, who in bypassed] + self._strangers() + self._misfits() + (
-                        self._relay.problems if self._relay else [])
+                    for topic, who in bypassed] + self._strangers() + self._misfits() + [
+                        *(self._relay.problems if self._relay else ()),
+                        *(f"{topic}: {why}" for topic, why in self._unpublished())]
         self.publish(GRAPH, RosGraphReport(
             is_linked, tuple(clip(one, NAME_CHARS) for one in list(nodes)[:MANY]),
             tuple(clip(name, NAME_CHARS) for name, count in nodes.items() if count > 1)[:MANY],
@@ -371,6 +380,16 @@ class Gateway(Actor):
         return [f"{one.topic}: {one.full_name} publishes; only messages of {expected[one.topic]} "
                 "are passed on" for one in self.graph.of(EndpointKind.PUBLISHER)
                 if expected.get(one.topic, one.full_name) != one.full_name]
+
+    def _unpublished(self) -> list[tuple[str, str]]:
+        """Return subscribed topics without a publisher, each with the report."""
+        if not self._others_had_time or self._side is None or not self._side.is_linked():
+            return []
+        there = {one.topic for one in self.graph.of(EndpointKind.PUBLISHER)}
+        why = (f"no node publishes it in domain {self.parameters.domain}; `rampart ros2 check` "
+               "looks for the cause")
+        return [(link.subscribe, why) for link in self.parameters.ros2
+                if link.subscribe and link.subscribe not in there]
 
     def _misfits(self) -> list[str]:
         endpoints = self.graph.of(*EndpointKind)

@@ -201,6 +201,21 @@ async def test_the_graph_says_who_is_there_and_when_a_process_dies_it_is_gone(sy
 
 
 @beside()
+async def test_a_topic_that_no_node_publishes_is_reported_once_and_named_until_one_does(system):
+    _, _, told = watched(system)
+    graph = system.hear(GRAPH, "gateway")
+    await asyncio.sleep(4.0)
+    assert graph[-1].message.problems == ()  # the nodes of ROS 2 may still be starting
+    await asyncio.sleep(4.0)
+    why = "no node publishes it in domain 0; `rampart ros2 check` looks for the cause"
+    assert graph[-1].message.problems == (f"/odom: {why}",)
+    assert [(one.message.offender, one.message.reason) for one in told] == [("/odom", why)]
+    system.start_node("base")
+    await asyncio.sleep(0.5)
+    assert graph[-1].message.problems == ()
+
+
+@beside()
 async def test_a_second_publisher_is_refused_and_told(system):
     _, odometry, told = watched(system)
     base = system.start_node("base")
