@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 from rampart.actors.runtime.run_plan import RunPlan
@@ -22,10 +23,16 @@ def check_programs(plan: RunPlan, spec: SystemSpec) -> None:
     Raises:
         SpecificationError: A program is not; the message names file, node and program.
     """
+    for error in wrong_programs(plan, spec):
+        raise error
+
+
+def wrong_programs(plan: RunPlan, spec: SystemSpec) -> Iterator[SpecificationError]:
+    """Yield an error for each command whose program is not executable on this machine."""
     for node in spec.nodes:
         if node.command and (flaw := _flaw(plan, node)):
             field, value, problem = flaw
-            raise SpecificationError(plan.system_file, f"{node.name}: {field}", problem, value)
+            yield SpecificationError(plan.system_file, f"{node.name}: {field}", problem, value)
 
 
 def folder_of(plan: RunPlan, folder: str) -> Path:

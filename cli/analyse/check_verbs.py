@@ -9,12 +9,13 @@ from typing import Any
 import msgspec
 
 from rampart.actors.detection.watchdog import Watchdog
+from rampart.actors.foreign.program import wrong_programs
 from rampart.actors.runtime.run_plan import OBSERVER, SUPERVISOR
 from rampart.actors.supervision.process_title import POOL, RUN
 from rampart.actors.system.layout import Layout, Unit
 from rampart.cli import systems
 from rampart.cli.look import topic_catalogue as catalogue
-from rampart.cli.output import print_json, print_table, say
+from rampart.cli.output import print_json, print_table, say, warn
 from rampart.cli.verbs import JSON, add_verb, flag
 from rampart.manager.analysis.pairs import Pair, pairs
 from rampart.manager.spec.schema import Kind, SystemSpec
@@ -268,7 +269,8 @@ def check(options: argparse.Namespace) -> int:
 
     Check everything that can be checked before a run, as a start does:
     specification, time budgets, classes and parameters of all actors, application
-    and judge, and that each topic with a reader has a publisher.
+    and judge, and that each topic with a reader has a publisher. The program of a
+    command may be on another machine: one that is missing here is a warning.
 
     Examples:
       rampart check
@@ -285,6 +287,8 @@ def check(options: argparse.Namespace) -> int:
         print_json({"sound": False, "problem": str(error)})
         return 2
     spec = layout.spec
+    for error in wrong_programs(layout.plan, spec):
+        warn(f"{error}; a run on this machine is refused")
     sizes = {"processes": len(layout.units), "nodes": len(spec.nodes),
              "detection modules": len(spec.detections), "recovery modules": len(spec.recoveries),
              "mechanisms": len(spec.mechanisms)}

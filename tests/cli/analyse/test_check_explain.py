@@ -62,6 +62,20 @@ def test_a_system_that_is_not_sound_for_scripts(capsys, tmp_path):
     assert err == ""
 
 
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_a_command_that_this_machine_lacks_is_a_warning(capsys, tmp_path, options):
+    file = tmp_path / "cell.toml"
+    file.write_text(TEXT.replace(*("""actor = "rampart.actors.runtime.stub_node:StubNode"
+""", """command = ["no-such-program"]
+"""), 2))
+    out, err = said(capsys, "check", str(file), *options)
+    assert "sound" in out
+    assert len(lines := err.splitlines()) == 2
+    assert lines[0].startswith(f"rampart: {file}: ")
+    assert all("'no-such-program' in PATH; one in the folder is './no-such-program'; a run on this "
+               "machine is refused" in line for line in lines)
+
+
 def test_what_a_system_is_for_scripts(capsys):
     found = json.loads(said(capsys, "explain", "paper", "--json")[0])
     assert found["format"] == 1
