@@ -287,8 +287,8 @@ def check(options: argparse.Namespace) -> int:
         print_json({"sound": False, "problem": str(error)})
         return 2
     spec = layout.spec
-    for error in wrong_programs(layout.plan, spec):
-        warn(f"{error}; a run on this machine is refused")
+    for missing in wrong_programs(layout.plan, spec):
+        warn(f"{missing}; a run on this machine is refused")
     sizes = {"processes": len(layout.units), "nodes": len(spec.nodes),
              "detection modules": len(spec.detections), "recovery modules": len(spec.recoveries),
              "mechanisms": len(spec.mechanisms)}
