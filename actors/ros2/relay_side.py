@@ -63,7 +63,8 @@ class RelaySide:
         domain: of ROS.
         distribution: name of the distribution.
         setup: file that bash sources first, e.g. a workspace's `install/setup.bash`; "" for the
-            environment as it is or, if that has no ROS 2, `/opt/ros/DISTRIBUTION/setup.bash`.
+            environment as it is, else an active virtual environment with rclpy, else
+            `/opt/ros/DISTRIBUTION/setup.bash`.
         lost: called once with a `RelayError` when the relay has ended.
         output: takes what the relay prints, if given.
         whole: whether the graph has the endpoints of all topics, or those of our topics only.
@@ -347,10 +348,14 @@ def setup_file(setup: str, distribution: str) -> str:
         return setup
     if "AMENT_PREFIX_PATH" in os.environ:
         return ""
+    active = Path(os.environ.get("VIRTUAL_ENV", "/dev/null"))
+    if any(active.glob("lib/python*/site-packages/rclpy")):
+        return str(active / "bin/activate")
     usual = f"/opt/ros/{distribution}/setup.bash"
     if not Path(usual).is_file():
-        raise RelayError(f"no ROS 2: no environment is sourced, and there is no {usual}; set "
-                         "setup = '…/setup.bash'")
+        raise RelayError("no ROS 2: no environment is sourced, no virtual environment with rclpy "
+                         f"is active, and there is no {usual}; source one, or set "
+                         "setup = '…/setup.bash' of the gateway")
     return usual
 
 

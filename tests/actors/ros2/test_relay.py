@@ -379,11 +379,21 @@ async def test_without_rclpy_the_reason_is_one_line(domain, tmp_path):
     side.side.close()
 
 
+def activate(monkeypatch, environment):
+    """Activate a virtual environment, as its `bin/activate` does, without a sourced ROS 2."""
+    for name in ("AMENT_PREFIX_PATH", "ROS_DISTRO"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("VIRTUAL_ENV", str(environment))
+    monkeypatch.setenv("PATH", f"{environment}/bin{os.pathsep}{os.environ['PATH']}")
+
+
 async def test_a_setup_that_is_not_there_is_refused(domain, monkeypatch):
     with pytest.raises(RelayError, match=r"setup = '/nowhere/setup\.bash': no such file"):
         Side(domain, "/nowhere/setup.bash")
-    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    with pytest.raises(RelayError, match=r"no ROS 2: .* /opt/ros/kilted/setup.bash"):
+    activate(monkeypatch, "/nowhere")
+    with pytest.raises(RelayError, match=(
+            r"no ROS 2: no environment is sourced, .* with rclpy is active, .* "
+            r"/opt/ros/kilted/setup.bash; source one, or set setup .* of the gateway")):
         Side(domain, "")
 
 
@@ -431,9 +441,7 @@ fields = { heartbeat_period = "linear_mps" }
 
 
 def test_topics_on_dds_are_listed_shown_and_measured(capsys, monkeypatch):
-    monkeypatch.setenv("AMENT_PREFIX_PATH", str(ROS))
-    monkeypatch.setenv("ROS_DISTRO", "kilted")
-    monkeypatch.setenv("PATH", f"{SETUP.parent}{os.pathsep}{os.environ['PATH']}")
+    activate(monkeypatch, SETUP.parent.parent)
     with Peer(PEER, "base") as peer:
         peer.wait_for("up")
         assert main(["topic", "list", "--ros", "rclpy", "--json"]) == 0
