@@ -23,6 +23,9 @@ from rampart.actors.runtime.clock import Clock
 SILENT_S = 1.0
 """A publisher that is silent for so many simulated seconds may be replaced by another one."""
 
+_MISSED = 3
+"""A publisher that has missed so many messages in a row is probably gone."""
+
 _ROUNDING = 0.999
 
 _ZEROS = 20
@@ -73,6 +76,7 @@ class Subscription:
         self._passed_s = -math.inf
         self._publisher = b""
         self._published_s = -math.inf
+        self._gap_s = math.inf  # between the publisher's last two messages
         self._sequence = 0
         self._is_in_graph = False  # only then the graph shows that the publisher ends
         self._slot = None if topic.qos is BusQos.COMMAND else f"ros2 {link.name}"
@@ -117,7 +121,7 @@ class Subscription:
         gid, graph = attachment.gid, self._gateway.graph
         if gid == UNKNOWN_GID and self._link.publishers == "one":
             raise ValueError("several publishers, which this ROS 2 does not tell apart; none is "
-                             "passed on")
+                             "passed on; a killed one counts until its lease ends")
         if gid != self._publisher:
             expected, name = self._link.publisher, self._name_of(gid)
             if expected and name != expected:
@@ -125,13 +129,17 @@ class Subscription:
             has_left = self._is_in_graph and graph.endpoint(self._publisher) is None
             if (self._link.publishers == "one" and now_s - self._published_s < SILENT_S
                     and not has_left):
-                raise ValueError(f"two publishers, {self._name_of(self._publisher)} and "
-                                 f"{name}; only the first one is passed on")
+                is_silent = now_s - self._published_s > _MISSED * self._gap_s
+                raise ValueError(
+                    f"two publishers, {self._name_of(self._publisher)} and {name}; " + (
+                        "the first one is silent, probably a killed one, which is in the graph "
+                        f"until its lease ends; the other is passed on after {SILENT_S:g} s"
+                        if is_silent else "only the first one is passed on"))
             self._publisher, self._sequence, self._is_in_graph = gid, 0, False
         elif 0 < attachment.sequence <= self._sequence:
             return False
         self._sequence = attachment.sequence
-        self._published_s = now_s
+        self._gap_s, self._published_s = now_s - self._published_s, now_s
         self._is_in_graph = self._is_in_graph or graph.endpoint(gid) is not None
         return True
 

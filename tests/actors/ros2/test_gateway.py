@@ -228,7 +228,31 @@ async def test_a_second_publisher_is_refused_and_told(system):
     other(message)
     await asyncio.sleep(0.5)
     assert 99.0 not in {heard.message.x_m for heard in odometry}
-    assert "two publishers, /robot/base and /robot/base" in told[0].message.reason
+    assert told[0].message.reason == ("two publishers, /robot/base and /robot/base; only the first "
+                                      "one is passed on")
+
+
+@beside()
+async def test_a_publisher_that_was_killed_and_is_still_in_the_graph_is_named_so(system):
+    _, odometry, told = watched(system)
+    base = system.start_node("base")
+    await asyncio.sleep(0.5)
+    next_one = base.publisher("/odom", "nav_msgs/msg/Odometry")
+    message = base.types.blank("nav_msgs/msg/Odometry")
+    message.header.frame_id = "odom"
+    message.pose.pose.position.x = 99.0
+    base.say_odometry = lambda _message: None
+    await asyncio.sleep(0.3)
+    next_one(message)
+    await asyncio.sleep(0.1)
+    assert told[0].message.reason == (
+        "two publishers, /robot/base and /robot/base; the first one is silent, probably a killed "
+        "one, which is in the graph until its lease ends; the other is passed on after 1 s")
+    assert 99.0 not in {heard.message.x_m for heard in odometry}
+    await asyncio.sleep(1.0)
+    next_one(message)
+    await asyncio.sleep(0.1)
+    assert odometry[-1].message.x_m == 99.0
 
 
 NAMED = SYSTEM.replace('''frame = "odom"
