@@ -17,6 +17,7 @@ from rampart.actors.ros2.node import RosNode
 from rampart.actors.ros2.relay_side import RelayError, RelaySide
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import UNKNOWN_GID, Qos
+from rampart.actors.supervision.kill_node import signal_node
 from rampart.cli.main import main
 from rampart.testing import RealRun, wait_until
 from tests import ROOT
@@ -223,6 +224,35 @@ def test_relay_and_gateway_come_back_and_a_missing_node_and_a_rival_are_reported
                     10, "not refused")
                 assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
                 run.wait_for("(D_NODES): /cmd_vel: /rival publishes besides /rampart", 10)
+
+
+COMMAND = f"""
+[[node]]
+name = "navigation"
+command = ["{ROS / 'bin/python'}", "{PEER}", "base"]
+kind = "non-control"
+heartbeat = {{ key = "base/odometry", timeout_s = 2.0 }}
+"""
+
+
+def test_a_killed_gateway_leaves_a_command_alone_that_it_hears_and_a_stop_does_not(
+        tmp_path, system):
+    with RealRun(tmp_path, system(COMMAND)) as run:
+        run.sleep_until(1.0)
+        assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
+        program = psutil.Process(signal_node("navigation", "CONT", run.port).pid)
+        for _ in range(2):
+            gateway = run.kill("gateway")
+            run.wait_until(lambda killed=gateway: run.pid("gateway") not in {None, killed}, 10,
+                           "no new gateway")
+            assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
+        time.sleep(2.0)
+        assert "navigation crashed" not in run.story
+        assert signal_node("navigation", "STOP", run.port).pid == program.pid
+        run.wait_for("navigation crashed, incarnation 1: ", 10)
+        run.wait_for("navigation respawned by supervisor, incarnation 2", 10)
+        assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
+        assert not program.is_running()
 
 
 def test_a_killed_node_is_detected_by_its_topic_before_it_leaves_the_graph(tmp_path, system):
