@@ -60,7 +60,7 @@ class KeptUp(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         world = f", the world {1e3 * self.world_late_s:.0f} ms behind" if self.world_late_s else ""
         found = f"{self.with_rate:.2g}"
-        what = (f"rate {self.rate:g} most of the time" if float(found) >= self.rate
+        what = (f"rate {self.rate:g} but for moments" if float(found) >= self.rate
                 else f"rate {found}, not {self.rate:g}")
         return (f"this machine keeps up with {what}: event loops are up to "
                 f"{1e3 * self.late_s:.0f} ms late ({self.node}){world}; allowed are "

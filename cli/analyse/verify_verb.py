@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Collection
 from typing import Any
 
 from rampart.cli import systems
@@ -43,19 +44,20 @@ def run(options: argparse.Namespace) -> int:
     """
     spec = systems.check(options.system).spec
     positive("--together", options.together)
+    wanted = set(options.strategy or [spec.strategy]) | {""}
     start = time.monotonic()
     with progress() as show:
         report = verify(spec, options.strategy, options.together, show)
     if options.json:
         print_json(report)
     else:
-        _show(spec, report, time.monotonic() - start)
-    wanted = set(options.strategy or [spec.strategy]) | {""}
+        _show(spec, report, time.monotonic() - start, wanted)
     failed = any(not p.holds and p.strategy in wanted for p in report.properties)
     return 1 if options.strict and failed else 0
 
 
-def _show(spec: SystemSpec, report: Report, seconds: float) -> None:
+def _show(spec: SystemSpec, report: Report, seconds: float, wanted: Collection[str]) -> None:
+    """Print the table of all strategies, and a counterexample of each wanted one."""
     strategies = list(report.permissiveness)
     say(f"{spec.title} ({report.system}): {report.active_sets} active sets, "
         f"{report.states} states of the arbiter, in {seconds:.1f} s")
@@ -83,7 +85,12 @@ def _show(spec: SystemSpec, report: Report, seconds: float) -> None:
     say()
     say("not explored: the start of a manager, until each module has reported or its grace period "
         "is over")
+    if others := {p.strategy: None for p in report.properties
+                  if not p.holds and p.strategy not in wanted}:
+        say(f"counterexamples of {' and '.join(others)}: --strategy NAME")
     for checked in report.properties:
+        if checked.strategy not in wanted:
+            continue
         for trace in checked.counterexamples[:1]:
             say()
             say(f"{checked.name} fails{f' under {checked.strategy}' if checked.strategy else ''},"

@@ -7,7 +7,7 @@ Examples:
   kill-node localization --signal STOP       # its heartbeat stops: it is replaced
   kill-node --list                           # list the nodes
 In a system of several hosts it signals and lists the nodes of all hosts.
-`kill -9 PID` and `pkill -9 -f osmosis_control` also work.
+`kill -9 PID` also works.
 
 signals:
   KILL   end the process at once (default)

@@ -62,7 +62,8 @@ class Console:
         self._is_limited = not virtual
         self._narrator.titles = spec.titles
         mode = spec.strategy if plan.ftm else "no fault tolerance"
-        time_is = f"virtual time, seed {plan.seed}" if virtual else f"rate {plan.rate:g}"
+        time_is = f"virtual time, seed {plan.seed}" if virtual else (
+            f"rate {plan.rate:g}, port {plan.base_port}")
         self.say(f"Rampart: {what}, {mode}, {time_is}")
         if virtual:
             return
@@ -96,7 +97,7 @@ class Console:
         for reason in record.reasons:
             self.say(f"  {reason}")
         if (kept_up := record.keeping_up) and kept_up.behind_s:
-            self.say(f"  for {kept_up.behind_s:.0f} s of {record.duration_s:.0f} s {kept_up}")
+            self.say(f"  late for {kept_up.behind_s:.0f} s of {record.duration_s:.0f} s: {kept_up}")
         if report is not None:
             self.say(f"Report: {report}")
 
