@@ -14,7 +14,7 @@ from rampart.actors.foreign.descendants import is_below
 from rampart.actors.ftm.messages import FAILURES, NEW_PROCESSES
 from rampart.actors.machine.unix_peer import receive_signed
 
-WORKING = (*NEW_PROCESSES, "running", "resumed", "adopted", "back")
+WORKING = (*NEW_PROCESSES, "running", "resumed", "adopted")
 """Events after which a process of the node works, or starts."""
 
 _DATAGRAM_BYTES = 8192

@@ -129,6 +129,7 @@ class Gateway(Actor):
         self._side: Side | None = None
         self._relay: RelaySide | None = None  # the same, if it is one
         self._links: dict[tuple[str, str], Publication | ServiceCall | ActionCall] = {}
+        self._subscriptions: dict[str, Subscription] = {}
         self._graph_due = False
         self._was_linked: bool | None = None
         self._due_s = self.clock.now() + _LINK_S
@@ -224,8 +225,8 @@ class Gateway(Actor):
         for link in given.ros2:
             to, from_ = (self.chosen_topic(key) if key else None for key in (link.to, link.from_))
             if link.way == "subscribe" and to is not None:
-                Subscription(self, link, to,
-                             self.chosen_topic(link.beside) if link.beside else None)
+                self._subscriptions[link.name] = Subscription(
+                    self, link, to, self.chosen_topic(link.beside) if link.beside else None)
             elif link.way == "serve" and to is not None:
                 OfferedService(self, link, to)
             elif link.way == "publish" and from_ is not None:
@@ -382,14 +383,14 @@ class Gateway(Actor):
                 if expected.get(one.topic, one.full_name) != one.full_name]
 
     def _unpublished(self) -> list[tuple[str, str]]:
-        """Return subscribed topics without a publisher, each with the report."""
+        """Return subscribed topics without publisher and messages, each with the report."""
         if not self._others_had_time or self._side is None or not self._side.is_linked():
             return []
         there = {one.topic for one in self.graph.of(EndpointKind.PUBLISHER)}
         why = (f"no node publishes it in domain {self.parameters.domain}; `rampart ros2 check` "
                "looks for the cause")
-        return [(link.subscribe, why) for link in self.parameters.ros2
-                if link.subscribe and link.subscribe not in there]
+        return [(topic, why) for topic, subscription in self._subscriptions.items()
+                if topic not in there and not subscription.has_received]
 
     def _misfits(self) -> list[str]:
         endpoints = self.graph.of(*EndpointKind)

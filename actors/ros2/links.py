@@ -84,6 +84,11 @@ class Subscription:
             link.name, link.type, Qos(link.reliable, link.transient_local, depth=link.depth),
             self._arrived)
 
+    @property
+    def has_received(self) -> bool:
+        """Whether a message of its publisher has come."""
+        return self._published_s > -math.inf
+
     def _arrived(self, payload: bytes, attachment: Attachment) -> None:
         self._gateway.enqueue(self._slot, partial(self._pass_on, payload, attachment))
 

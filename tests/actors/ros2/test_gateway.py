@@ -216,6 +216,17 @@ async def test_a_topic_that_no_node_publishes_is_reported_once_and_named_until_o
 
 
 @beside()
+async def test_a_topic_with_messages_is_not_reported_though_the_graph_has_no_publisher(system):
+    gateway, odometry, told = watched(system)
+    base = system.start_node("base")
+    base.speed_mps = 0.5
+    gateway.graph.changed = lambda _token, _alive: None  # as with a rule that denies liveliness
+    await asyncio.sleep(8.0)
+    assert odometry
+    assert told == []
+
+
+@beside()
 async def test_a_second_publisher_is_refused_and_told(system):
     _, odometry, told = watched(system)
     base = system.start_node("base")
