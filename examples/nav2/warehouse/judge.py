@@ -24,7 +24,8 @@ class Rounds(Judge):
     @on(topics.TRUTH)
     def truth(self, message: Truth, header: Header) -> None:
         """Note the smallest clearance."""
-        self._clearance_m = min(message.clearance_m, self._clearance_m or message.clearance_m)
+        self._clearance_m = (message.clearance_m if self._clearance_m is None
+                             else min(message.clearance_m, self._clearance_m))
         self._rounds = message.rounds
         if message.clearance_m < 0 and self._unsafe_s is None:
             self._unsafe_s = header.stamp
