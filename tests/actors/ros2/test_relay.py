@@ -241,8 +241,9 @@ def test_a_killed_gateway_leaves_a_command_alone_that_it_hears_and_a_stop_does_n
         run.sleep_until(1.0)
         assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
         program = psutil.Process(signal_node("navigation", "CONT", run.port).pid)
-        for _ in range(2):
-            gateway = run.kill("gateway")
+        for strike in (lambda: run.kill("gateway"), lambda: relay_of(run).suspend()):
+            gateway = run.pid("gateway")
+            strike()
             run.wait_until(lambda killed=gateway: run.pid("gateway") not in {None, killed}, 10,
                            "no new gateway")
             assert {one["linear_mps"] for one in echoed(run, "base/odometry", 20)} == {0.5}
