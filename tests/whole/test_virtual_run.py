@@ -151,7 +151,8 @@ def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing
 
 
 def test_a_frozen_report_hides_no_fault():
-    result = run_job(job("freeze:detection/DM2@10+inf", "command-not-updated@14+inf"))
+    result = run_job(job("freeze:detection/DM2@10+inf", "command-not-updated@14+inf",
+                         patience_s=15.0))
     assert result.safe
     assert (("FTM2",), ("RM2",)) in decisions(result)
 
