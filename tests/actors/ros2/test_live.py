@@ -47,9 +47,10 @@ class Peer:
         return self
 
     def __exit__(self, *_):
+        self.process.kill()
+        self.reader.join()  # before what it reads is closed
         with self.process:
-            self.process.kill()
-        self.reader.join()
+            pass
 
 
 MORE = """
