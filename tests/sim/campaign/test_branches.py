@@ -130,7 +130,7 @@ kept, branches.result_of = branches.result_of, result_of
     ("branches.LONGEST_S, _ = None, time.sleep(60)", "its process was killed by SIGKILL")])
 def test_a_child_that_fails_or_does_not_end_is_one_run_that_failed(what, error):
     before = BAD.format(what=what)
-    made = in_children(THREE, before + ("branches.LONGEST_S = 3.0\n" if "sleep" in what else ""))
+    made = in_children(THREE, before + ("branches.LONGEST_S = 8.0\n" if "sleep" in what else ""))
     assert made[1] == Attempt(
         THREE[1].key, None, f"run {THREE[1].key} (kill:mission_manager@3): {error}")
     assert all(each.result for each in (made[0], made[2]))
