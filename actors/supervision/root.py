@@ -30,6 +30,7 @@ import asyncio
 import contextlib
 import ctypes
 import gc
+import math
 import os
 import resource
 import selectors
@@ -89,6 +90,10 @@ _NEEDED = {resource.RLIMIT_NOFILE: (40, 4), resource.RLIMIT_NPROC: (30, 4)}
 
 _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
+_ONE_SIGNAL_S = 0.2
+"""A signal that comes again so soon is the same one: timeout(1) sends it to the process and to its
+group. A later one ends the run at once."""
+
 
 @dataclass
 class SupervisorState:
@@ -138,6 +143,7 @@ class Root:
         self._signals: list[int] = []
         self._woken = -1
         self._interrupts = 0
+        self._interrupted_s = -math.inf
         self._link: socket.socket | None = None
         self._received = b""
         self._watch_pid = 0
@@ -231,6 +237,10 @@ class Root:
         while self._signals:
             number = self._signals.pop(0)
             if number in _ENDS:
+                now_s = time.monotonic()
+                if now_s - self._interrupted_s < _ONE_SIGNAL_S:
+                    continue
+                self._interrupted_s = now_s
                 self._interrupts += 1
                 self._send(requests.Interrupt(signal.Signals(number).name))
             elif number == signal.SIGTSTP:

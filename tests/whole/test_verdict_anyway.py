@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jinja2
@@ -228,7 +229,7 @@ def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listen
 @pytest.mark.processes
 @pytest.mark.alone
 def test_a_terminal_that_goes_away_ends_a_run_with_its_verdict(tmp_path):
-    """All of its processes get the SIGHUP, and stderr takes nothing any more."""
+    """All its processes get the SIGHUP, the first one twice, and stderr takes nothing any more."""
     with (tmp_path / "out").open("w") as out:
         run = subprocess.Popen(
             [*HEEDS_SIGNALS, sys.executable, str(ROOT / "launch.py"), "--mission", "A", "--no-hmi",
@@ -239,6 +240,8 @@ def test_a_terminal_that_goes_away_ends_a_run_with_its_verdict(tmp_path):
     while "goal 1/3" not in (line := run.stderr.readline()):
         assert line, "it ended"
     run.stderr.close()
+    run.send_signal(signal.SIGHUP)
+    time.sleep(0.02)  # as timeout(1) does; two signals end a run without a verdict
     os.killpg(run.pid, signal.SIGHUP)
     assert run.wait(30) == 1
     result = result_of((tmp_path / "out").read_text())
