@@ -34,8 +34,8 @@ _LOADS = 1.9
 """The same, in multiples of the time to load the root; all processes run after 0.8 to 1.3."""
 
 _LATE_S = 0.5
-"""Simulated seconds that a process may start after time 0: no timeout is as short. The first
-mission waits for all nodes."""
+"""Simulated seconds after time 0 in which a process may still start: silence from the beginning
+has `startup_grace_s`, and the first mission waits for all nodes."""
 
 _MAX_LINE = 1 << 26
 _Answer = TypeVar("_Answer", bound=requests.FromRoot)

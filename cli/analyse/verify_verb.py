@@ -29,7 +29,8 @@ def run(options: argparse.Namespace) -> int:
     Check a system as `rampart check` does. Then explore its arbitration
     exhaustively: the decision of each strategy for every set of active mechanisms,
     and every state of the arbiter after it has received a report of each module.
-    Each property holds, or the shortest counterexample is shown.
+    Each property holds, or the shortest counterexample is shown: of the system's
+    strategy, or of those given by --strategy.
     docs/explanation/arbitration.md explains the properties and the limits.
 
     Examples:

@@ -349,3 +349,11 @@ def test_the_command_prints_a_table_the_states_and_the_traces(capsys):
                   "not explored: the start of a manager",
                   "  2. RM3 never runs, so FTM4 stays active forever"):
         assert words in told
+
+
+def test_only_the_counterexamples_of_the_system_s_strategy_are_shown(capsys):
+    assert main(["verify", "paper"]) == 0
+    told = capsys.readouterr().out
+    assert "mission-first and simultaneous: --strategy NAME" in told
+    assert "fails under safety-first" in told
+    assert "fails under mission-first" not in told
