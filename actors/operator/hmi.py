@@ -32,7 +32,6 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.history import read_history
 from rampart.actors.ftm.keeping_up import LINE_S, KeepingUp
 from rampart.actors.operator.bounds import Bounds
-from rampart.actors.operator.camera_eye import CameraEye
 from rampart.actors.operator.feed import Feed
 from rampart.actors.operator.operating import Operating
 from rampart.actors.operator.panels import (
@@ -176,7 +175,6 @@ class Hmi(Actor):
         self._panels = self.parameters.panels
         self._state = self._make_state()
         self._operating = self._make_operating()
-        self._camera = self._make_camera()
         self._table: fm.NodeTable | None = None
         self._server: PageServer | None = None
         self._tls: Tls | None = None
@@ -199,16 +197,12 @@ class Hmi(Actor):
     def _make_operating(self) -> Operating:
         return Operating(self, self._state, self._panels)
 
-    def _make_camera(self) -> CameraEye | None:
-        return None
-
     def _hello(self) -> dict[str, Any]:
         """Return the first message to a page; it offers only what this announces."""
         return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
                 "badge": self.badge,
                 "system": one_line(self.context.run.system.name),
-                "expires": self._expires(), "camera": self._camera is not None,
-                "tables": self._state.picture.tables,
+                "expires": self._expires(), "tables": self._state.picture.tables,
                 "panels": _PANELS.fit(self._panels)[0], "past": self._state.past()}
 
     def _expires(self) -> tuple[str, float] | None:
@@ -321,7 +315,7 @@ class Hmi(Actor):
                      self.refuses, self._role),
             lambda port: Gate(register, secret, port, owner=owner,
                               tls=tls is not None or page.behind.startswith("https:")), audit,
-            tls=tls, camera=self._camera, files=self.files, complain=complain)
+            tls=tls, files=self.files, complain=complain)
 
     def _complain(self, why: str) -> None:
         self.report_diagnostic("operator's page", one_line(why), f"port {self._port}")
@@ -329,8 +323,6 @@ class Hmi(Actor):
     def on_stop(self) -> None:
         """Close the page."""
         self._operating.stop()
-        if self._camera is not None:
-            self._camera.close()
         if self._server is not None:
             self._server.stop()
 

@@ -18,11 +18,10 @@ import msgspec
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request as HttpRequest
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from rampart.actors.operator.camera_eye import CameraError, CameraEye
 from rampart.actors.operator.feed import SEND_TIMEOUT_S, Feed, PageFeed
 from rampart.actors.operator.requests import (
     RefusedError,
@@ -55,7 +54,6 @@ _INDEX = "/"
 ROBOT = "/robot/"
 """Path of the files of the robot's panels."""
 _LINKS = "<!-- links -->\n"
-_CAMERA = "/camera.jpg"
 _REFUSAL = ("This page is for the user who runs the robot, and you are another user of this "
             "machine. Other users need a token: launch.py --hmi-token-file FILE.")
 _REVOKED = "your token was revoked, or your role has changed"
@@ -126,7 +124,6 @@ class PageServer:
         gate: returns the gate of a page on a port.
         audit: of the page.
         tls: certificate, or None.
-        camera: source of pictures, or None.
         files: folder with the robot's JavaScript and CSS, or None.
         complain: called with one line for each error of a handler.
 
@@ -136,11 +133,9 @@ class PageServer:
 
     def __init__(self, access: Access, feed: Feed, handlers: Handlers,
                  gate: Callable[[int], Gate], audit: AuditLog, *, tls: Tls | None = None,
-                 camera: CameraEye | None = None, files: Path | None = None,
-                 complain: Callable[[str], None] = to_stderr) -> None:
+                 files: Path | None = None, complain: Callable[[str], None] = to_stderr) -> None:
         self._feed = feed
         self._complain = complain
-        self._camera = camera
         self._handlers = handlers
         self._audit = audit
         self._reader = RequestReader(handlers.requests)
@@ -157,8 +152,8 @@ class PageServer:
             return Response(asked.content, media_type=asked.kind, headers=_HEADERS)
 
         asks = self._gate.asks
-        routes = [*(Route(path, file) for path in public), Route(_CAMERA, self._picture),
-                  *login_routes(self._gate, audit), WebSocketRoute("/ws", self._page)]
+        routes = [*(Route(path, file) for path in public), *login_routes(self._gate, audit),
+                  WebSocketRoute("/ws", self._page)]
         self._server = WebServer(
             Starlette(routes=routes, middleware=[Middleware(
                 Door, access=access, gate=self._gate, public=frozenset(public),
@@ -185,17 +180,6 @@ class PageServer:
         if page is not None:
             self._audit.write(what, who=page.visitor.name, role=page.visitor.role,
                               address=page.address, page=page.number, **more)
-
-    async def _picture(self, request: HttpRequest) -> Response:
-        if request.headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
-            return PlainTextResponse("foreign origin", 403)
-        try:
-            if self._camera is None:
-                raise CameraError("this system has no camera")
-            return Response(await self._camera.picture(), media_type="image/jpeg",
-                            headers={"cache-control": "no-store"})
-        except CameraError as error:
-            return PlainTextResponse(str(error), 503)
 
     async def _page(self, socket_: WebSocket) -> None:
         offered = socket_.scope.get("subprotocols", ())

@@ -1,8 +1,8 @@
 """The world of Osmosis in MuJoCo: Summit XL, sensors, judge, report.
 
 A run opens no window, so MuJoCo is imported without a way to render: GLFW would start a process to
-look for its library. The camera and `rampart replay` choose a way with `MUJOCO_GL` before they
-import this package.
+look for its library. `rampart replay` chooses a way with `MUJOCO_GL` before it imports this
+package.
 """
 
 import os

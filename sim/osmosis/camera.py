@@ -1,27 +1,11 @@
-"""Renders the robot from behind and above, for replays and for the operator's page.
-
-The page runs it as the program `python -m rampart.sim.osmosis.camera`. It reads one line with the
-airport, then one line per picture, and answers each with a JPEG behind its length in four bytes
-(big-endian). So it renders only on request, and ends with its input.
-
-It has its own scene and shows the published pose and obstacles. The physics never waits for it. It
-runs at the lowest priority. If it cannot render (no EGL), it prints one line on standard error and
-exits with code 1.
-"""
+"""The robot at its airport from behind and above, for `rampart replay --viewer` and `--video`."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import io
 import math
-import os
-import signal
-import struct
-import sys
 from typing import Any
 
-import msgspec
 import mujoco
 import numpy as np
 import shapely
@@ -29,7 +13,6 @@ from PIL import Image, ImageDraw
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.application import Osmosis
 from rampart.sim.osmosis.scene import Scene, WorldError
@@ -45,30 +28,6 @@ MARGIN_M = 30.0
 _GRASS, _PAVEMENT, _RUNWAY = (96, 122, 78), (150, 155, 160), (112, 117, 123)
 _LIGHT, _LINE = (255, 244, 200), (210, 190, 90)
 _SKY, _HORIZON = (0.55, 0.72, 0.9), (0.86, 0.91, 0.96)
-_PR_SET_PDEATHSIG = 1
-_JPEG_QUALITY = 72
-
-
-class Order(msgspec.Struct, forbid_unknown_fields=True):
-    """The first line: the airport."""
-
-    airport: str
-
-
-Obstacle = tuple[str, float | None, float | None, float | None]
-"""Name, x, y and radius."""
-
-PICTURE_PIXELS = 416, 260
-"""Width and height of a picture."""
-
-
-class View(msgspec.Struct, forbid_unknown_fields=True):
-    """Request of a picture: pose and obstacles in `map`; null for numbers that are not finite."""
-
-    x_m: float | None
-    y_m: float | None
-    yaw_rad: float | None
-    obstacles: tuple[Obstacle, ...] = ()
 
 
 class AirportModel(RobotModel):
@@ -91,8 +50,7 @@ class AirportModel(RobotModel):
         if topic == topics.POSE:
             self.place(body.x_m, body.y_m, body.yaw_rad)
         elif topic == topics.OBSTACLES:
-            self.put(tuple((o.name, o.x_m, o.y_m, o.radius_m)
-                           for o in body.obstacles if o.present))
+            self.put({o.name: (o.x_m, o.y_m, o.radius_m) for o in body.obstacles if o.present})
 
     def place(self, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Place the robot; a pose that is not finite is ignored."""
@@ -103,45 +61,16 @@ class AirportModel(RobotModel):
                                      y_m + ahead * math.sin(yaw_rad), 0.3)
             self.camera.azimuth = math.degrees(yaw_rad)
 
-    def put(self, obstacles: tuple[Obstacle, ...]) -> None:
-        """Show these obstacles and no others."""
+    def put(self, obstacles: dict[str, tuple[float, float, float]]) -> None:
+        """Show these obstacles and no others: name → x, y and radius, m."""
         scene = self._scene
-        wanted = {name: (_number(x), _number(y), _number(r)) for name, x, y, r in obstacles}
-        for name in [n for n in scene.present if n not in wanted]:
+        for name in [n for n in scene.present if n not in obstacles]:
             scene.remove(name)
-        for name, (x, y, r) in wanted.items():
+        for name, (x, y, r) in obstacles.items():
             there = scene.present.get(name)
             if there is None or (there.x_m, there.y_m, there.radius_m) != (x, y, r):
                 with contextlib.suppress(WorldError):  # too many, or invalid
                     scene.put(name, x, y, r, shapely.Polygon())
-
-
-class Camera:
-    """Renders an airport.
-
-    Raises:
-        Exception: MuJoCo cannot render.
-    """
-
-    def __init__(self, airport: Airport) -> None:
-        self._robot = AirportModel(Osmosis.on_map(airport))
-        width, height = PICTURE_PIXELS
-        self._renderer = mujoco.Renderer(self._robot.model, height, width)
-
-    def picture(self, view: View) -> bytes:
-        """Return a JPEG of a view; a pose that is not finite is ignored."""
-        robot = self._robot
-        robot.place(_number(view.x_m), _number(view.y_m), _number(view.yaw_rad))
-        robot.put(view.obstacles)
-        mujoco.mj_forward(robot.model, robot.data)
-        self._renderer.update_scene(robot.data, robot.camera, robot.options)
-        out = io.BytesIO()
-        Image.fromarray(self._renderer.render()).save(out, "JPEG", quality=_JPEG_QUALITY)
-        return out.getvalue()
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def dress(spec: Any, airport: Airport) -> None:
@@ -211,30 +140,3 @@ def ground_image(airport: Airport) -> Image.Image:
 def _extent(airport: Airport) -> tuple[float, float, float, float]:
     x0, y0, x1, y1 = airport.bounds_m
     return x0 - MARGIN_M, y0 - MARGIN_M, x1 + MARGIN_M, y1 + MARGIN_M
-
-
-def main() -> int:
-    """Write a picture for each line of standard input."""
-    # Its parent may be killed at any time; a hung graphics driver would not notice the pipe.
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    os.nice(19)
-    source, out = sys.stdin.buffer, sys.stdout.buffer
-    try:
-        order = msgspec.json.decode(source.readline(), type=Order)
-        camera = Camera(load_airport(order.airport))
-        decoder = msgspec.json.Decoder(View)
-        for line in source:
-            picture = camera.picture(decoder.decode(line))
-            out.write(struct.pack(">I", len(picture)) + picture)
-            out.flush()
-    except (BrokenPipeError, KeyboardInterrupt):
-        return 0
-    except Exception as error:  # reported by the exit code
-        reason = " ".join(str(error).split()) or "no reason given"
-        print(f"{type(error).__name__}: {reason}", file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,7 +3,6 @@
 import { $, Memory, clock, element, pill, say } from "./dom.js";
 import { NOT_LOGGED_IN, Visitor, bar, barred } from "./access.js";
 import { Arrangement } from "./arrange.js";
-import { Camera } from "./camera.js";
 import { DecisionLog, EventLog, LINES, showHistory } from "./log.js";
 import { Operating } from "./operate.js";
 import { ProcessTable } from "./nodes.js";
@@ -20,7 +19,6 @@ const logs = {
   events: new EventLog($("events"), "No events yet."),
 };
 const operating = new Operating((wish) => send(wish));
-const camera = new Camera();
 const memory = new Memory();
 const visitor = new Visitor(connect, () => { if (socket) lost("logged out"); });
 let picture = {};            // latest value of each section
@@ -165,7 +163,6 @@ async function hello(message) {
   changed.clear();
   memory.forget();
   for (const log of Object.values(logs)) log.begin();
-  camera.begin(message.camera);
   system(null);
   tooMuch = message.left_out || {};
   leftOut({});

@@ -10,12 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator.bounds import MAX_NAME
-from rampart.actors.operator.camera_eye import CameraEye, renderer
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.panels import Panel
 from rampart.actors.operator.requests import RefusedError, Request
@@ -45,16 +42,6 @@ class OsmosisHmi(Hmi):
 
     optional_inputs = topics.ROBOT
 
-    class Parameters(Hmi.Parameters, frozen=True):
-        """Parameters.
-
-        Attributes:
-            camera: module that renders the robot (`rampart.sim.osmosis.camera`); "" for none.
-        """
-
-        camera: str = ""
-
-    parameters: Parameters
     outputs = (*Hmi.outputs, topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.ACTUATOR_FAULT)
     requests = OSMOSIS_REQUESTS
     files = Path(__file__).with_name("files")
@@ -89,19 +76,6 @@ class OsmosisHmi(Hmi):
 
     def _make_operating(self) -> Driving:
         return Driving(self, self._state, self._panels)
-
-    def _make_camera(self) -> CameraEye | None:
-        module = self.parameters.camera
-        if not (module and self._port and self._airport and self._airport.source):
-            return None
-        return CameraEye(renderer(module), {"airport": self._airport.source}, self._camera_view)
-
-    def _camera_view(self) -> dict[str, Any] | None:
-        heard = self._state.picture.value("pose")
-        if heard is None:
-            return None
-        return {**msgspec.structs.asdict(heard.value), "obstacles": [
-            (o.name, o.x_m, o.y_m, o.radius_m) for o in self._state.picture.value("obstacles")]}
 
     def _hello(self) -> dict[str, Any]:
         robot = self.context.run.system.mobile

@@ -106,7 +106,7 @@ async def test_another_user_who_is_gone_before_it_is_looked_at_is_not_taken_for_
 async def test_a_token_lets_another_user_in(world):
     async with world.hmi(hmi_token=TOKEN) as hmi:
         for path, headers, status in (("/", [], "200 OK\n"), (
-                "/camera.jpg", [f"Authorization: Bearer {TOKEN}"], "503 ")):  # there is none
+                "/other", [f"Authorization: Bearer {TOKEN}"], "404 ")):
             code = f'{request(path, "Connection: close", *headers)}; print(told(c))'
             told = await output(as_nobody(await served(hmi), code))
             assert told.startswith(f"HTTP/1.1 {status}")

@@ -85,7 +85,6 @@ def test_what_plan_and_spec_say_is_given_to_the_actors_that_take_it():
     ("recoveries", "RM7", {"nodes": []}, r"nodes = \[\]: expected a list of node names"),
     ("nodes", "mission_manager", {"held_by": ["RM99"]}, "held_by = .*unknown recovery module 'RM9"),
     ("nodes", "osmosis_control", {"yaw_loop": 1}, "yaw_loop = 1: expected true or false"),
-    ("nodes", "hmi", {"camera": 3}, "camera = 3: expected a text"),
     ("nodes", "teleoperation", {"left_axis": 256}, "left_axis = 256: .* 0 or more, at most 255"),
     ("nodes", "teleoperation", {"left_axis": 1},
      "left_axis = 1: expected another axis than forward_axis"),
