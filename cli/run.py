@@ -23,9 +23,8 @@ import msgspec
 
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.incidents import state_folder
-from rampart.actors.recording.other_hosts import others_of
 from rampart.actors.recording.process import Order, RecorderProcess
-from rampart.actors.recording.virtual import VirtualRecording
+from rampart.actors.recording.recorder import VirtualRecording, keys_elsewhere
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.run_context import RunContext
 from rampart.actors.runtime.run_plan import RunPlan, load_document
@@ -309,7 +308,7 @@ def _recorded(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec
         return
     recorder = RecorderProcess(Order(
         options.port, str(Path(options.record).resolve()), os.getppid(), options.overwrite,
-        others_of(Layout(plan, spec))))
+        keys_elsewhere(Layout(plan, spec))))
     recorder.start()
     try:
         yield recorder

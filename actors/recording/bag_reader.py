@@ -1,4 +1,4 @@
-"""Reads and repairs recordings, and the MCAP and rosbag2 files of other tools.
+"""Reads and repairs recordings, and the MCAP files of other tools.
 
 The `mcap` library parses records, index and chunks. Its readers stop at the first damaged byte;
 this one goes on. A closed file has an index with its own checksum, and with the place and times of
@@ -9,9 +9,7 @@ damage never creates a message.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import sqlite3
 import struct
 import zlib
 from bisect import bisect_right
@@ -37,7 +35,6 @@ from rampart.actors.recording.bag_writer import (
     KEY,
     PROFILE,
     RUN,
-    SILENT,
     BagError,
     complete,
     open_target,
@@ -51,7 +48,7 @@ MAX_RECORD_BYTES = (64 << 20) + (64 << 10)
 MAX_CHUNK_BYTES = 64 << 20
 """Largest chunk, uncompressed. Writers close a chunk at 1 MB or 4 MB."""
 
-_MAGIC, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"SQLite f", b"\x28\xb5\x2f\xfd"
+_MAGIC, _ZSTD = b"\x89MCAP0\r\n", b"\x28\xb5\x2f\xfd"
 _HEAD = struct.Struct("<BQ")
 _PRIVATE = 0x80
 """First opcode for applications."""
@@ -120,9 +117,8 @@ class BagReader:
             raise BagError(f"{path}: is empty; expected a recording")
         if start.startswith(_ZSTD):
             raise BagError(f"{path}: compressed as a whole; decompress it first (zstd -d)")
-        if start not in {_MAGIC, _SQLITE}:
+        if start != _MAGIC:
             raise BagError(f"{path}: not an MCAP file: it begins with {start!r}")
-        self._is_sqlite = start == _SQLITE
 
     def _reset(self) -> None:
         self.profile = ""
@@ -142,9 +138,6 @@ class BagReader:
         """
         self._reset()
         try:
-            if self._is_sqlite:
-                yield from self._rows()
-                return
             with self.path.open("rb") as file:
                 for record in self._walk(file):
                     if isinstance(record, rec.Metadata):
@@ -260,22 +253,6 @@ class BagReader:
                 yield record
         if orphans:
             self._lose(f"{orphans} messages of a lost channel", at, place.end, *place.times)
-
-    def _rows(self) -> Iterator[rec.McapRecord]:
-        """Yield the messages of a rosbag2 file in SQLite."""
-        self.profile, self.library, self.closed = "ros2", "rosbag2 (SQLite)", True
-        try:
-            with contextlib.closing(sqlite3.connect(
-                    f"{self.path.absolute().as_uri()}?mode=ro", uri=True)) as bag:
-                for number, topic, kind, encoding in bag.execute(
-                        "SELECT id, name, type, serialization_format FROM topics"):
-                    self.schemas[number] = rec.Schema(number, b"", "", kind)
-                    self.channels[number] = rec.Channel(number, topic, encoding, {}, number)
-                for number, at_ns, data in bag.execute(
-                        "SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp"):
-                    yield rec.Message(number, at_ns, data, at_ns, 0)
-        except (sqlite3.Error, KeyError) as error:
-            self._lose(f"rows of SQLite ({error})", 0, self.size_bytes)
 
     def _lose(self, what: str, from_byte: int, to_byte: int, from_ns: int | None = None,
               to_ns: int | None = None) -> None:
@@ -397,18 +374,6 @@ class Summary:
     def duration_s(self) -> float:
         """Seconds from the first message to the last."""
         return (self.last_ns - (self.first_ns or 0)) / 1e9
-
-    @property
-    def unheard(self) -> dict[str, list[tuple[float, float | None]]]:
-        """Other hosts → spans of simulated seconds without their messages; None is the end.
-
-        Malformed spans are left out.
-        """
-        found = {}
-        for host, text in self.reader.metadata.get(SILENT, {}).items():
-            with contextlib.suppress(ValueError, RecursionError):
-                found[host] = msgspec.json.decode(text, type=list[tuple[float, float | None]])
-        return found
 
     @property
     def keys(self) -> dict[str, int]:

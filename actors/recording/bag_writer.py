@@ -36,11 +36,6 @@ RUN = "rampart.run"
 END = "rampart.end"
 """Names of the metadata records about the run, and about the end of the recording."""
 
-SILENT = "rampart.unheard"
-"""Name of the metadata record with the silences of each other host: a JSON list of pairs of
-simulated seconds; the last pair ends with null if the host is silent now. It is written at each
-change, and the last one counts. A recording of one host has none."""
-
 KEY = "key"
 """Channel metadata with the full key; only channels of the bus have it."""
 
@@ -180,7 +175,6 @@ class BagWriter:
         self.messages = 0
         self.garbage = 0
         self.untranslated = 0
-        self.silences: dict[str, str] = {}
         self.gaps = SequenceGaps(from_start=from_start)
         self._file = file
         self._zero_s = time_zero_s
@@ -237,16 +231,6 @@ class BagWriter:
             self._show(self._views, self._views.of(form.topic, key, header, body, log_ns), log_ns)
         except (ValueError, TypeError, OverflowError):  # the message itself is recorded
             self.untranslated += 1
-
-    def write_silences(self, record: dict[str, str]) -> None:
-        """Write the silences of other hosts if they have changed; see `SILENT`.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
-        if record != self.silences:
-            self.silences = record
-            self._writer.add_metadata(SILENT, record)
 
     def flush(self) -> None:
         """Close the chunk and hand everything to the kernel, which keeps it if this process dies.

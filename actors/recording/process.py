@@ -23,7 +23,6 @@ from rampart.actors.bus.run_info import RunInfo
 from rampart.actors.bus.zenoh_session import Credentials, credentials_in
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.black_box import BlackBox
-from rampart.actors.recording.other_hosts import OtherHosts
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.recording.run_listener import RUN_ENDED, RunListener
 from rampart.actors.runtime.run_plan import OBSERVER
@@ -50,7 +49,7 @@ class Order(msgspec.Struct, frozen=True):
         path: file; of a black box the folder of the system.
         launcher: pid of the launcher.
         overwrite: whether the file may exist.
-        others: the other hosts.
+        elsewhere: key expressions of what other hosts publish.
         black_box: limits of a black box; None for a recording.
         checkpoints: folder of the checkpoints that a black box keeps; "" without.
         again: whether a black box follows another one of this run, which has died.
@@ -60,7 +59,7 @@ class Order(msgspec.Struct, frozen=True):
     path: str
     launcher: int
     overwrite: bool = False
-    others: OtherHosts | None = None
+    elsewhere: tuple[str, ...] = ()
     black_box: Limits | None = None
     checkpoints: str = ""
     again: bool = False
@@ -206,7 +205,7 @@ def record(order: Order) -> int:
 def _recorder(order: Order, path: Path) -> RunListener:
     if order.black_box is None:
         return Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher,
-                        others=order.others, credentials=_launchers)
+                        elsewhere=order.elsewhere, credentials=_launchers)
     return BlackBox(order.port, path, order.black_box, launcher=order.launcher, again=order.again,
                     checkpoints=Path(order.checkpoints) if order.checkpoints else None)
 
@@ -226,11 +225,9 @@ def result_of(recorder: Recorder) -> str:
     lost = sum(sum(file.gaps.lost().values()) for file in files)
     found = sum(file.garbage for file in files)
     garbage = f", {found} of them garbage" if found else ""
-    silent = "".join(f"; {host} was silent for a time, see `rampart bag info`"
-                     for host, spans in recorder.writer.silences.items() if spans != "[]")
     more = f" and {len(files) - 1} more files" if len(files) > 1 else ""
     return (f"recorded {sum(file.messages for file in files)} messages in {recorder.path}{more}"
-            f"{garbage}, {lost or 'none'} lost{silent}")
+            f"{garbage}, {lost or 'none'} lost")
 
 
 def _answer(text: str) -> None:

@@ -29,9 +29,8 @@ from rampart.actors.bus.run_info import RunInfo, find_run
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording.bag_reader import BagReader, Summary, repair, time_zero_s
 from rampart.actors.recording.bag_writer import BagError, check_target
-from rampart.actors.recording.other_hosts import OtherHosts, others_of
 from rampart.actors.recording.process import result_of, stop_pipe
-from rampart.actors.recording.recorder import Recorder
+from rampart.actors.recording.recorder import Recorder, keys_elsewhere
 from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.topics import declared_topics, system_topics
@@ -139,7 +138,8 @@ def record(options: argparse.Namespace) -> int:
     path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
     check_target(path, overwrite=options.overwrite)
     recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants,
-                        others=_others(run), credentials=lambda run: tools_credentials(run)[0])
+                        elsewhere=_elsewhere(run),
+                        credentials=lambda run: tools_credentials(run)[0])
     recorder.open()
     stop = stop_pipe()
     say(f"recording {run.title} in {path}; ctrl-C ends it")
@@ -232,18 +232,18 @@ def matcher(globs: list[str], known: Iterable[str]) -> Callable[[str], bool]:
         fnmatch.fnmatchcase(key.removeprefix(f"{ROOT}/"), pattern) for pattern in patterns)
 
 
-def _others(run: RunInfo) -> OtherHosts | None:
-    """Return the other hosts of a run, of which messages arrive here.
+def _elsewhere(run: RunInfo) -> tuple[str, ...]:
+    """Return key expressions of what other hosts of a run publish.
 
     Raises:
         UsageError: the specification or the folder of keys cannot be used.
     """
     if not run.hosts:
-        return None
+        return ()
     plan = RunPlan(system_file=run.system_file, host=run.host)
     tools_credentials(run)
     working_folder.admit(Path(run.system_file).parent)
-    return others_of(Layout(plan, load_system(plan)))
+    return keys_elsewhere(Layout(plan, load_system(plan)))
 
 
 def _wanted(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
@@ -324,11 +324,6 @@ def _lines(summary: Summary) -> Iterator[tuple[str, str]]:
     losses = _losses(summary)
     yield "lost", "unknown" if losses is None else (
         ", ".join(f"{count} of {name}" for name, count in losses.items()) or "none")
-    if summary.unheard:
-        spans = [f"{host} from {begin_s:.1f} s {'on' if end_s is None else f'to {end_s:.1f} s'}"
-                 for host, those in summary.unheard.items() for begin_s, end_s in those]
-        yield "unheard", (", ".join(spans)
-                          or f"no host: {' and '.join(summary.unheard)} all the time")
     if not reader.closed:
         closing = "no: its writer was interrupted"
     elif reader.damage:
@@ -440,7 +435,7 @@ def described(summary: Summary) -> dict[str, Any]:
         "library": reader.library, "recording": reader.is_recording, "closed": reader.closed,
         "damage": reader.damage, "gone": gone(reader), "duration_s": round(summary.duration_s, 3),
         "messages": summary.messages, "time_zero_s": summary.time_zero_s, "run": summary.run,
-        "end": summary.end, "lost": _losses(summary), "unheard": summary.unheard,
+        "end": summary.end, "lost": _losses(summary),
         "attachments": [name for name, _, _ in summary.files], "channels": summary.table()}
 
 

@@ -185,18 +185,13 @@ def test_what_a_host_ran_that_cannot_be_reached_goes_on_on_the_first_until_it_is
             assert again.result(20)[0] == 0
     assert code == 0
     assert not [line for line in robot.story.splitlines() if "failed" in line]
-    sources, summary = recorded(tmp_path / "beside.mcap")
+    sources, _ = recorded(tmp_path / "beside.mcap")
     assert all(sources[node] > 10 for node in ("camera", "gripper", "router_a")), sources
-    assert summary.unheard.keys() == {"robot"}
     sources, summary = recorded(file)
     for node in (*CELL_ON_GROUND, "supervisor_ground", "router_a_ground", "observer_ground"):
         assert sources[node] > 10, (node, sources)
     assert sources["gripper"] > 10
-    cut = [end_s - begin_s for begin_s, end_s in summary.unheard["ground"] if end_s and end_s > 1.5]
-    assert cut, summary.unheard  # the partition is told
-    assert 0.6 < max(cut) < 20
     assert not {"gripper", "supervisor", "cell_manager"} & json.loads(summary.end["lost"]).keys()
-    assert "; ground was silent for a time" in robot.story
     numbers = counted(file)
     assert [incarnation // 1_000_000 for incarnation in numbers] == [0] * 4 + [1, 1, 2, 2], numbers
     (_, last), *later = numbers.values()

@@ -16,7 +16,7 @@ import pytest
 from msgspec.structs import replace
 
 import rampart.sim.osmosis.trial.mission_trial
-from rampart.actors.recording.virtual import VirtualRecording
+from rampart.actors.recording.recorder import VirtualRecording
 from rampart.cli import run as launch
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port
 from tests import ROOT

@@ -31,8 +31,8 @@ from rampart.actors.recording.bag_writer import (
 )
 from rampart.actors.recording.json_schema import plain_schema
 from rampart.actors.recording.message_form import Forms
+from rampart.actors.recording.recorder import VirtualRecording
 from rampart.actors.recording.run_documents import collect, restore
-from rampart.actors.recording.virtual import VirtualRecording
 from rampart.cli.main import main
 from rampart.systems import SHIPPED
 from tests.actors.recording.samples import (
@@ -257,6 +257,10 @@ def test_every_view_is_of_the_type_that_its_channel_announces(recording):
     (False, [("a", 4, 300), ("a", 4, 305)], {"a": 4}),
     (False, [("a", 4, 300), ("a", 5, 2)], {"a": 1}),  # a life that began while it recorded
     (True, [("a", 1, 1), ("b", 1, 1), ("a", 2, 1), ("a", 1, 2)], {}),  # last words of a dead node
+    # what another one has overtaken on its way is not lost
+    *((True, [("a", 1, number) for number in numbers], lost) for numbers, lost in (
+        ([1, 2, 4, 3], {}), ([1, 5, 2, 4], {"a": 1}), ([1, 5, 2, 2, 2], {"a": 2}),
+        ([3, 3, 1], {"a": 1}), ([1, 900_000, 899_999], {"a": 899_997}))),
 ])
 def test_what_is_missing_shows_in_the_numbers(from_start, heard, lost):
     gaps = SequenceGaps(from_start=from_start)
