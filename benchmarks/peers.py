@@ -28,10 +28,10 @@ from pathlib import Path
 import msgspec
 import zenoh
 
+from benchmarks.restarts import in_words, spread
 from benchmarks.systems import INPUT_HZ, OUTPUT, is_mean, peers_system, scan
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.bus.zenoh_session import session_config
-from rampart.cli.operate.bench_verb import in_words, spread
 from rampart.cli.output import print_json, print_table, progress
 from rampart.testing import RealRun
 

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import psutil
 
+from benchmarks.restarts import spread
 from benchmarks.systems import BESIDES, sized_system
 from rampart.actors.supervision.process_title import find_processes
-from rampart.cli.operate.bench_verb import spread
 from rampart.cli.output import print_json, print_table
 from rampart.testing import RealRun
 
@@ -45,7 +45,7 @@ def measure(processes: int, kills: int) -> dict[str, object]:
             cores = (sum(sum(one.cpu_times()[:2]) for one in everyone) - before) / REST_S
             memory = [one.memory_full_info() for one in everyone]
             done = subprocess.run(
-                [sys.executable, "-m", "rampart.cli.main", "bench", "--port", str(run.port),
+                [sys.executable, "-m", "benchmarks.restarts", "--port", str(run.port),
                  "--node", f"n{(processes - BESIDES) // 2}", "--kills", str(kills), "--json"],
                 check=True, capture_output=True, text=True)
     mean = 1e6 * len(memory)

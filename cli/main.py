@@ -25,7 +25,6 @@ from rampart.cli.analyse import (
 from rampart.cli.look import doctor_verb, ros_verbs, serving_verbs, topic_verbs
 from rampart.cli.operate import (
     adapt_verb,
-    bench_verb,
     inject_verbs,
     keys_verb,
     node_verbs,
@@ -39,14 +38,14 @@ from rampart.files import loading, streams, working_folder
 
 _MODULES = (
     node_verbs, topic_verbs, ros_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
-    record_verbs, incident_verbs, keys_verb, token_verbs, bench_verb, check_verbs, cut_set_verbs,
+    record_verbs, incident_verbs, keys_verb, token_verbs, check_verbs, cut_set_verbs,
     decide_verbs, tree_verbs, verify_verb, doctor_verb, service_verb)
 """Each adds its verbs."""
 
 _GROUPS = {
     "start": ("new", "run", "record", "replay", "doctor"),
     "look": ("status", "top", "node", "topic", "bag", "incident", "live", "ros2"),
-    "operate": ("reset", "inject", "adapt", "bench"),
+    "operate": ("reset", "inject", "adapt"),
     "analyse": ("check", "explain", "decide", "tree", "verify", "cut-sets", "campaign"),
     "administer": ("keys", "tokens", "service")}
 """Groups of the help. Verbs of other packages come last, under `robots`."""

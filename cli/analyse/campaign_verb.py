@@ -19,7 +19,7 @@ from rampart.cli.verbs import (
     whole,
     word,
 )
-from rampart.sim.campaign.defaults import BACKENDS, PATIENCE_S, SEEDS
+from rampart.sim.campaign.defaults import PATIENCE_S, SEEDS
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.virtual.network import NETWORKS
 
@@ -51,10 +51,7 @@ _CONDITIONS = (
 
 _PLACE = (
     word("--out", "DIR", "directory of results and report (default: reports/campaign-NAME)"),
-    whole("--jobs", "N", "parallel processes (default: one per core)", 0),
-    option("--backend", default="loky", choices=BACKENDS,
-           help="loky: this machine; dask, ray: an existing cluster (default: loky)"),
-    word("--address", "A", "address of the cluster's scheduler", ""))
+    whole("--jobs", "N", "parallel processes (default: one per core)", 0))
 
 
 def parser(program: str, system: str, campaigns: Sequence[type[NamedCampaign]]

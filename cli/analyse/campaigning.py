@@ -35,7 +35,7 @@ from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
 from rampart.sim.campaign.defaults import SEEDS
-from rampart.sim.campaign.execute import BackendError, JobError, execute
+from rampart.sim.campaign.execute import JobError, execute
 from rampart.sim.campaign.job import (
     Job,
     RunResult,
@@ -230,8 +230,7 @@ def _execute(options: argparse.Namespace, jobs: Sequence[Job], store: Store) -> 
             bar.set_postfix(unsafe=unsafe, refresh=False)
             bar.update()
 
-        return execute(jobs, store, workers=options.jobs, backend=options.backend,
-                       address=options.address, progress=progress)
+        return execute(jobs, store, workers=options.jobs, progress=progress)
 
 
 def _replay(options: argparse.Namespace) -> int:
@@ -302,10 +301,9 @@ def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
 
         def run(jobs: Sequence[Job]) -> Sequence[RunResult]:
             try:
-                execute(jobs, store, workers=workers, backend=options.backend,
-                        address=options.address)
+                execute(jobs, store, workers=workers)
                 made = {r.job.key: r.result for r in store.runs({job.key for job in jobs})}
-            except (StoreError, JobError, BackendError) as error:
+            except (StoreError, JobError) as error:
                 raise UsageError(f"{error}; the finished runs are in {directory}, and the same "
                                  "command continues there") from None
             return [made[job.key] for job in jobs]

@@ -29,14 +29,12 @@ NEEDED_MB = 600
 
 EXTRAS = {
     "keys": ("cryptography", "no run with --keys"),
-    "ros2": ("rosbags", "no gateway to ROS 2, no bags of ROS 2"),
+    "ros2": ("rosbags", "no gateway to ROS 2"),
     "foxglove": ("foxglove", "no `rampart live foxglove`"),
     "prometheus": ("prometheus_client", "no `rampart live metrics`"),
     "export": ("pyarrow", "no `rampart bag export --to parquet`"),
     "video": ("imageio_ffmpeg", "no `rampart replay --video`"),
-    "search": ("optuna", "no `rampart campaign --search`"),
-    "dask": ("distributed", "no `rampart campaign --backend dask`"),
-    "ray": ("ray", "no `rampart campaign --backend ray`")}
+    "search": ("optuna", "no `rampart campaign --search`")}
 """Extra → its module, and the consequence if it is not installed."""
 
 State = Literal["ok", "without", "missing"]

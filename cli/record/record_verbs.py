@@ -7,7 +7,6 @@ Examples:
   rampart bag info run.mcap
   rampart bag repair torn.mcap whole.mcap
   rampart bag export run.mcap --to parquet
-  rampart bag ros2 run.mcap run-ros2
 """
 
 from __future__ import annotations
@@ -55,7 +54,6 @@ from rampart.cli.verbs import (
     PORT,
     add_family,
     add_verb,
-    extra,
     flag,
     number,
     option,
@@ -110,14 +108,6 @@ def add(verbs: Any) -> None:
              option("--to", choices=("csv", "parquet"), default="csv",
                     help="format (default: csv)"),
              option("--topics", **_TOPICS, help="write only channels that match a pattern"), JSON)
-    add_verb(bag, "ros2", "convert to a bag of ROS 2", bag_ros2,
-             option("file", metavar="IN", help="MCAP file"),
-             option("out", metavar="FOLDER", help="new folder"),
-             option("--system", metavar="SPEC", help="system file, or name of a shipped system, "
-                    "with actors and definitions (default: those in the recording)"),
-             option("--distribution", metavar="NAME", help="distribution of ROS 2 (default: the "
-                    "gateway's, or jazzy)"),
-             JSON)
 
 
 def record(options: argparse.Namespace) -> int:
@@ -379,28 +369,6 @@ def bag_export(options: argparse.Namespace) -> int:
     done = Export(reader, wants)
     done.write(folder, options.to)
     return _copied(options, folder, done.counts, done.left_out, reader)
-
-
-def bag_ros2(options: argparse.Namespace) -> int:
-    """Write a recording as a bag of ROS 2.
-
-    Write a recording as a bag folder (MCAP, cdr, ros2msg) for `ros2 bag play`,
-    RViz and PlotJuggler. It contains the messages that passed a gateway, byte for
-    byte; all topics of the run below /rampart, with generated types; and topics
-    for viewers: /tf, /rosout, /view/scan, /view/map.
-
-    Examples:
-      rampart bag ros2 run.mcap run-ros2
-      rampart bag ros2 run.mcap run-ros2 --system warehouse.toml
-
-    exit code: 0 all was written, 1 a damaged part was left out, 2 bad usage
-    """
-    extra("ros2", "rosbags", "xxhash")
-    from rampart.cli.record.ros_bags import write  # noqa: PLC0415 of the extra
-
-    folder = Path(options.out)
-    bag, reader = write(Path(options.file), folder, options.system, options.distribution)
-    return _copied(options, folder, bag.counts, bag.left_out, reader)
 
 
 def _copied(options: argparse.Namespace, folder: Path, counts: Counter[str],

@@ -5,6 +5,3 @@ PATIENCE_S = 40.0
 
 SEEDS = 20
 """Default number of seeds of a sample; runs with the same seed share their beginning."""
-
-BACKENDS = ("loky", "dask", "ray")
-"""loky: processes on this machine. The others: an existing cluster."""

@@ -1,8 +1,7 @@
-"""Targets: what arrives from ROS 2, and recordings on their way into a bag of it."""
+"""Targets: bytes that arrive from ROS 2."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -10,10 +9,6 @@ from typing import Any
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.envelope import Header, decode, encode
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.recording.bag_reader import BagReader
-from rampart.actors.recording.bag_writer import BagError
-from rampart.actors.recording.ros_bag import RosBag
 from rampart.actors.ros2.graph import RosGraph, misfits
 from rampart.actors.ros2.translation.forms import READY
 from rampart.actors.ros2.translation.mapping import TF, Inward, NotMeantError
@@ -21,7 +16,6 @@ from rampart.actors.ros2.translation.mirror import topic_of
 from rampart.actors.ros2.translation.tables import Ros2Link
 from rampart.actors.ros2.translation.types import Types
 from rampart.actors.ros2.wire import Attachment, Endpoint, EndpointKind, Qos, gid_of
-from tests.fuzz.file_targets import folder, recordings, written
 from tests.fuzz.target import target
 
 _TYPES = (*sorted(READY), "nav_msgs/msg/OccupancyGrid", "diagnostic_msgs/msg/DiagnosticArray",
@@ -85,11 +79,3 @@ def ros_attachment(data: bytes) -> None:
     """What goes with a message."""
     if Attachment.unpack(data).pack() != data:
         raise AssertionError("another one comes back")
-
-
-@target("ros-bag", refuses=(BagError,), form="mcap", one_line=True, samples=recordings)
-def ros_bag(data: bytes) -> None:
-    """Whatever recording on its way into a bag of ROS 2."""
-    there = folder() / "ros-bag"
-    shutil.rmtree(there, ignore_errors=True)
-    RosBag(types(), topics.ALL).write(BagReader(written("to-ros.mcap", data)), there)

@@ -163,28 +163,6 @@ class Types:
             return np.asarray(value, np.dtype(_NUMPY[of[0]]))
         return [self.field_like(detail[0], one) for one in value]
 
-    def new(self, name: str, values: Mapping[str, Any]) -> Any:
-        """Return a message with these fields."""
-        return self._store.types[name](**values)
-
-    def define(self, definitions: Mapping[str, Fields]) -> None:
-        """Add types that are in no file: name of a message → its fields.
-
-        Raises:
-            ValueError: a definition is not valid; one line.
-        """
-        self._add({name: ([], fields) for name, fields in definitions.items()})
-
-    def definition(self, name: str) -> tuple[str, str]:
-        """Return the definition of a message and of the types in it as text, and its hash.
-
-        Raises:
-            ValueError: the type is not known.
-        """
-        self._definition(name)
-        text, _ = self._described.generate_msgdef(name, ros_version=2)
-        return text, self._described.hash_rihs01(name)
-
     def _blank_field(self, what: Any) -> Any:
         import numpy as np  # noqa: PLC0415 with the first message
 

@@ -22,10 +22,9 @@ from hypothesis import strategies as st
 from rampart.cli import systems
 from rampart.cli.analyse import campaigning
 from rampart.cli.main import main as rampart
-from rampart.sim.campaign import execute as execution
 from rampart.sim.campaign.content import with_content
-from rampart.sim.campaign.execute import BackendError, JobError, execute
-from rampart.sim.campaign.job import Job, RunResult, run_job
+from rampart.sim.campaign.execute import JobError, execute
+from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.plan import cross, fault_groups, sample
 from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.statistics import (
@@ -232,32 +231,6 @@ def test_a_campaign_without_a_place_is_refused_in_one_line(tmp_path, capsys):
     assert capsys.readouterr().err == (
         f"rampart: {tmp_path / 'file' / 'out'}: no directory that can be written "
         "(Not a directory)\n")
-
-
-@pytest.mark.slow
-def test_the_same_jobs_run_on_a_dask_cluster(tmp_path):
-    distributed = pytest.importorskip("distributed")
-    jobs = cross(BASES[:1], [(SHORT,)], range(1, 4))
-    store = Store(tmp_path)
-    with distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
-        assert execute(jobs, store, backend="dask", address=cluster.scheduler_address) == 3
-    traces = {r.job.key: r.result.trace for r in store.runs()}
-    store.close()
-    assert traces == {job.key: run_job(job).trace for job in jobs}
-
-
-@pytest.mark.parametrize(("backend", "address", "words"), [
-    ("dask", "", "--address is missing"), ("dask", "tcp://127.0.0.1:9", "no dask scheduler"),
-    ("ray", "", "--address is missing|not installed"), ("slurm", "", "unknown; known: loky")])
-def test_a_cluster_that_is_not_there_is_refused_in_one_line(
-        tmp_path, monkeypatch, backend, address, words):
-    monkeypatch.setattr(execution, "CONNECT_TIMEOUT_S", 0.5)
-    store = Store(tmp_path)
-    with pytest.raises(BackendError, match=words) as caught:
-        execute(cross(BASES[:1], [(SHORT,)], [1]), store, backend=backend, address=address)
-    assert "\n" not in str(caught.value)
-    store.close()
 
 
 # ---- what is counted -------------------------------------------------------------------------

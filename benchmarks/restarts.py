@@ -1,6 +1,8 @@
-"""`rampart bench`: the time from the SIGKILL of a node to the first message of its replacement.
+"""The time from the SIGKILL of a node of a running system to the first message of its replacement.
 
-Times count from the call of kill(2) until this process receives the replacement's first message.
+Kills go in rounds, so that a slow moment of the machine affects all nodes. Times count from the
+call of kill(2) until this process receives the report of the death, and the replacement's first
+message. Works with any robot, but not with one in service.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import os
 import random
 import signal
 import statistics
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -27,10 +30,8 @@ from rampart.actors.runtime.run_plan import RunPlan, load_system
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.system.layout import Layout
 from rampart.actors.system.members import Member, load_application
-from rampart.cli import completion
-from rampart.cli.output import UsageError, between, print_rows, progress, unknown, warn
+from rampart.cli.output import print_rows, progress, unknown
 from rampart.cli.session import Session, connect
-from rampart.cli.verbs import JSON, PORT, add_verb, several, whole
 from rampart.manager.spec.nodes import Kind
 
 WARM_S = 3.0
@@ -41,8 +42,6 @@ BACK_S = 20.0
 
 CALM_S = 1.0
 """Real seconds between two kills, in which detection modules become idle and the pool fills."""
-
-MOST_KILLS = 1000
 
 _ALIKE = (Kind.DETECTION, Kind.RECOVERY)
 
@@ -74,33 +73,11 @@ class Row(msgspec.Struct):
     failure: str = ""
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser."""
-    add_verb(verbs, "bench", "measure how soon killed nodes work again", bench, PORT,
-             several("--node", "NAME", "kill only this node; repeatable (default: all nodes, one "
-                     "detection and one recovery module)", completion.nodes),
-             whole("--kills", "N", "kills of each node (default: 5)", 5), JSON)
-
-
-async def bench(options: argparse.Namespace) -> int:
-    """Measure restarts.
-
-    Kill the nodes of the run with SIGKILL, one after the other. Measure the time
-    until a detection module or the supervisor reports each death, and until the
-    replacement publishes. Kills go in rounds, so that a slow moment of the machine
-    affects all nodes. Do not use it on a robot in service.
-
-    Examples:
-      rampart bench
-      rampart bench --node localization --kills 20
-    """
-    between("--kills", options.kills, 1, MOST_KILLS)
+async def measure(options: argparse.Namespace) -> int:
+    """Kill the nodes, print the table, and return the exit code."""
     async with connect(options.port) as session:
-        run = session.run
-        if run.replay_of:
-            raise UsageError(f"port {run.base_port} is a replay of {run.replay_of}, without nodes")
-        members = {name: member for name, member in members_of(run.system_file).items()
-                   if name in run.nodes}
+        members = {name: member for name, member in members_of(session.run.system_file).items()
+                   if name in session.run.nodes}
         names = options.node or usual(members)
         for name in names:
             if name not in members:
@@ -108,15 +85,15 @@ async def bench(options: argparse.Namespace) -> int:
         with progress() as show:
             rows = await Restarts(session, {name: members[name] for name in names}).measure(
                 options.kills, show)
-    failed = [row for row in rows if row.failure]
     print_rows(("node", "topic", "kills", "detected, ms", "output, ms (5 to 95 %)"), [
         (row.node, row.topic, len(row.output_ms), in_words(row.detected_ms),
          in_words(row.output_ms)) for row in rows],
         [{**msgspec.to_builtins(row), "detected": spread(row.detected_ms),
           "output": spread(row.output_ms)} for row in rows], as_json=options.json)
-    for row in failed:
-        warn(f"{row.node}: {row.failure}")
-    return 1 if failed else 0
+    for row in rows:
+        if row.failure:
+            print(f"{row.node}: {row.failure}", file=sys.stderr)
+    return 1 if any(row.failure for row in rows) else 0
 
 
 def members_of(system_file: str) -> dict[str, Member]:
@@ -179,7 +156,7 @@ class Restarts:
                 if not row.failure:
                     show(f"round {number + 1} of {kills}: {row.node}")
                     await self._kill(row)
-                    await asyncio.sleep(CALM_S * random.uniform(1, 1.1))  # noqa: S311 out of step
+                    await asyncio.sleep(CALM_S * random.uniform(1, 1.1))  # out of step
         return rows
 
     def _topic_of(self, member: Member) -> str:
@@ -242,3 +219,18 @@ def in_words(samples: Sequence[float]) -> str:
     """Return the spread of samples for a table; "" without any."""
     found = spread(samples)
     return f"{found.median:.1f} ({found.low:.1f} to {found.high:.1f})" if found else ""
+
+
+def main() -> int:
+    """Measure the run of this machine, or that of a base port."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--port", type=int, metavar="N", help="base port of the run")
+    parser.add_argument("--node", action="append", metavar="NAME", help="kill only this node; "
+                        "repeatable (default: all, one detection and one recovery module)")
+    parser.add_argument("--kills", type=int, default=5, metavar="N", help="of each node")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    return asyncio.run(measure(parser.parse_args()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
