@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from markupsafe import Markup
 
 from rampart.actors.system.members import import_class
 from rampart.files.writing import replace_file
-from rampart.sim.campaign.charts import distributions
 from rampart.sim.campaign.job import trial_of_system
 from rampart.sim.campaign.named import Section
 from rampart.sim.campaign.statistics import (
@@ -121,13 +120,13 @@ def render(directory: Path, about: Campaign, runs: Sequence[Run],
                 "margin": _margin(run.result.margin, trial), "picture": picture, **chapter}
 
     return pages.get_template("campaign/report.html").render(
-        about=about, runs=runs, headline=headline(runs), figures=_figures(runs),
-        in_common=in_common(runs), section=about.section and about.section.html(shown, replay),
+        about=about, runs=runs, headline=headline(runs), in_common=in_common(runs),
+        section=about.section and about.section.html(shown, replay),
         sentence=about.section and about.section.sentence,
         summary=[(each, _summary(each, trial)) for each in found],
         every=_every_fault(found, trial), shown_at_once=SHOWN_AT_ONCE,
-        charts=distributions(runs, trial), pictures=pictures,
-        tracks=[shown_run(*each) for each in shown_runs], shown=shown, failures=_failures(runs),
+        pictures=pictures, tracks=[shown_run(*each) for each in shown_runs], shown=shown,
+        failures=[(run.job.key, text) for run in runs for text in run.result.failures],
         replay=replay, margins=list(trial.margins.values()), exact_below=trial.exact_below,
         unit=trial.margin_unit, none=NONE)
 
@@ -179,31 +178,6 @@ def _many(runs: Sequence[Run], what: str, more: str = "") -> str:
 
 
 # -- tables ------------------------------------------------------------------------------------
-
-
-def _figures(runs: Sequence[Run]) -> list[tuple[str, str, str]]:
-    """Return name, value and class of the figures at the top, of runs with FTM and a fault."""
-    figures = [("runs in all", f"{len(runs):,}", "")]
-    protected = [run for run in runs if run.job.ftm and run.job.faults]
-    if not any(run.result.counts for run in protected):
-        return figures
-    row = total(protected, "")
-    if not row.judged:
-        return [*figures, ("not counted, no effect", f"{row.ineffective:,}", ""),
-                ("detected after, median",
-                 seconds(row.detected_after_s.median if row.detected_after_s else None), ""),
-                ("restarts", f"{row.restarts:,}", "")]
-    unsafe = row.safe.of - row.safe.count
-    return [
-        *figures,
-        ("with FTM and a fault, counted", f"{row.safe.of:,}", ""),
-        ("not counted, no effect", f"{row.ineffective:,}", ""),
-        ("of these unsafe", f"{unsafe:,}", "bad-text" if unsafe else "good-text"),
-        ("mission completed", f"{percent(row.success.share)} %", ""),
-        ("detected after, median",
-         seconds(row.detected_after_s.median if row.detected_after_s else None), ""),
-        ("stopped for good", f"{row.stopped_for_good:,}", ""),
-    ]
 
 
 def _summary(condition: Condition, trial: type[Trial]) -> list[dict[str, Any]]:
@@ -286,11 +260,6 @@ def _tail(found: Spread) -> list[str]:
 
 def _margin(value: float | None, trial: type[Trial]) -> str:
     return margin_text(value, trial.margin_unit, trial.exact_below)
-
-
-def _failures(runs: Iterable[Run]) -> list[tuple[str, str]]:
-    """Return key and text of the actors that ended by an error of the program."""
-    return [(run.job.key, text) for run in runs for text in run.result.failures]
 
 
 _DECISIONS = 8

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from rampart.sim.virtual.virtual_bus import Link
 
@@ -87,9 +86,7 @@ class SeededNetwork:
                  local: Sequence[str] = ()) -> None:
         self.model = model
         self._rng = random.Random(f"network {seed}")  # noqa: S311 no secret
-        delays_ms = (timing or measured()).message_ms
-        self._delay_s = drawer(delays_ms, self._rng)
-        self._stock = Stock(delays_ms, self._rng)
+        self._delay_s = drawer((timing or measured()).message_ms, self._rng)
         self._local = frozenset(local)
         self._links: dict[tuple[str, str], Link] = {}
 
@@ -97,28 +94,12 @@ class SeededNetwork:
         """Return the link between two nodes; None if messages arrive at once."""
         if source in self._local or reader in self._local:
             return None
-        ends, model = (source, reader), self.model
+        ends = source, reader
         if ends not in self._links:
-            plain = not (model.extra_s or model.loss or model.duplication or model.reordering)
-            self._links[ends] = self._in_order() if plain and model.delay else self._troubled()
+            self._links[ends] = self._new_link()
         return self._links[ends]
 
-    def _in_order(self) -> Link:
-        """Return a link that only delays messages; most runs have no others."""
-        fill, delays_s, last_s = self._stock.fill, self._stock.draws_s, 0.0
-
-        def arrivals(now_s: float) -> Sequence[float]:
-            nonlocal last_s
-            if not delays_s:
-                fill()
-            at_s = now_s + delays_s.pop()
-            last_s = at_s if at_s > last_s else last_s
-            return (last_s,)
-
-        return arrivals
-
-    def _troubled(self) -> Link:
-        """Return a link with the faults of the model."""
+    def _new_link(self) -> Link:
         model, dice, last_s = self.model, self._rng.random, 0.0
 
         def arrivals(now_s: float) -> Sequence[float]:
@@ -191,31 +172,3 @@ def drawer(quantiles_ms: tuple[float, ...], rng: random.Random) -> Callable[[], 
         return (here + rise * (at - low)) * 1e-3
 
     return next_s
-
-
-class Stock:
-    """Blocks of draws, bit for bit those of a `drawer` that is the only user of its generator.
-
-    numpy's older generator is the same as Python's and makes a block at once.
-
-    Args:
-        quantiles_ms: As for `drawer`.
-        rng: The generator; draws come from a copy of its state.
-    """
-
-    BLOCK = 2048
-
-    def __init__(self, quantiles_ms: tuple[float, ...], rng: random.Random) -> None:
-        self.draws_s: list[float] = []
-        self._low_ms = np.array(quantiles_ms[:-1])
-        self._rise_ms = np.diff(quantiles_ms)
-        _, (*words, used), _ = rng.getstate()
-        self._dice = np.random.RandomState()
-        self._dice.set_state(("MT19937", np.array(words, dtype=np.uint32), used, 0, 0.0))
-
-    def fill(self) -> None:
-        """Put the next block into the empty `draws_s`, in reverse order."""
-        at = self._dice.random_sample(self.BLOCK) * len(self._low_ms)
-        low = at.astype(int)
-        block_s = (self._low_ms[low] + self._rise_ms[low] * (at - low)) * 1e-3
-        self.draws_s += block_s[::-1].tolist()
