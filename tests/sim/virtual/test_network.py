@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import random
 from collections import Counter
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rampart.sim.virtual.network import (
     NETWORKS,
     NetworkModel,
     SeededNetwork,
-    Stock,
     Timing,
-    drawer,
 )
 
 
@@ -55,23 +50,6 @@ def test_delays_are_drawn_from_the_measured_distribution():
         assert below == pytest.approx(np.interp(value, quantiles, (0.0, 0.5, 1.0)), abs=0.03)
     assert min(delays) + 1e-6 >= 1.0
     assert 9.9 < max(delays) <= 10.0 + 1e-6
-
-
-@given(st.lists(st.floats(0, 1e4), min_size=2, max_size=40).map(sorted), st.integers(),
-       st.integers(0, 5))
-def test_a_stock_gives_bit_by_bit_what_a_drawer_gives_from_one_block_to_the_next(
-        quantiles, seed, used):
-    one, other = random.Random(seed), random.Random(seed)
-    for rng in (one, other):
-        for _ in range(used):
-            rng.random()
-    stock, drawn = Stock(tuple(quantiles), one), []
-    for _ in range(stock.BLOCK + 20):
-        if not stock.draws_s:
-            stock.fill()
-        drawn.append(stock.draws_s.pop())
-    next_s = drawer(tuple(quantiles), other)
-    assert drawn == [next_s() for _ in range(stock.BLOCK + 20)]
 
 
 def test_loss_duplication_and_overtaking_come_as_often_as_said():
